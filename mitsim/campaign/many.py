@@ -24,7 +24,8 @@ from characterisation.documents import Document, read_toml
 from characterisation.errors import InputError
 from mitsim.campaign.orders import laid_out
 from mitsim.campaign.plan import sensor_checksum
-from mitsim.capture.folder import packed, write_packed
+from mitsim.capture.folder import write_packed
+from mitsim.capture.packed_files import packed
 from mitsim.progress import track
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.ray_casting.triangles import triangles

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import fourier_gaussian
 from scipy.optimize import brentq
 
-from mitsim.fit.observation import Bench, Floats, View, coupon_roi
+from mitsim.fit.observation import Floats, View
+from mitsim.fit.white_coupon import Bench, coupon_roi
 
 #: blurs [px] that are tried
 _LARGEST_BLUR = 4.0

@@ -1,26 +1,25 @@
-"""What a capture shows of a coupon, in blocks, beside what a white coupon would have shown.
+"""Blocks of pixels on a coupon in a capture, beside those that a white coupon would have shown.
 
 Signal chain: images [DN] -> photo-electrons, by the imager's curve undone -> mean of the images, less the scene's own
-light -> the pixels inside the coupon -> blocks. Beside it: mean of the patterns -> radiance L_1 of a Lambertian coupon
-at the same pose, through the same lenses -> electrons per unit of pi f and of relative power; directions toward camera
-and lamp at every pixel.
+light -> the pixels inside the coupon -> blocks. Beside it: radiance L_1 of a white coupon at the same pose, through the
+same lenses (:mod:`mitsim.fit.white_coupon`) -> electrons per unit of pi f and of relative power; directions toward
+camera and lamp at every pixel.
 
-**Low pass.** Only the mean over the images of a capture is compared. Where the projected pattern is not known to be
-the sensor file's (a device's), the pattern is replaced by its mean over the field, and its dots count as grain.
+**Low pass.** Only the mean over the images of a capture is compared.
 
 **Light of the room.** A simulated scene without an ambient image is dark. A device's is not: there the room adds a
 radiance that is the same all over the coupon, of unknown size, less the lens's loss toward the corners.
 
 **Censoring.** A block with a saturated pixel in any image is left out, and so are its eight neighbours: next to the
-limit, grain and noise cut off the bright half of what they do, and what is left is too dark.
+limit, saturation cuts off the bright half of grain and noise, so their mean would be too dark.
 
 The noise of a pixel is that of :mod:`mitsim.fit.electrons`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,33 +28,20 @@ from scipy import ndimage
 from mitsim.capture.capture import Capture
 from mitsim.errors import InputError
 from mitsim.fit.electrons import PixelNoise, chip_of, linearised, pixel_noise
-from mitsim.fit.place import Place, found_place, known_place
-from mitsim.fit.specimen import specimen_place
-from mitsim.reconstruction.cloud import capture_cloud
-from mitsim.scene.differentiable import lambertian_coupon
-from mitsim.scene.light_transport.projector_light import LitPatterns
-from mitsim.sensor.camera import Camera, Rig
+from mitsim.fit.place import Place
+from mitsim.fit.white_coupon import Bench, Pattern, coupon_roi
+from mitsim.sensor.camera import Camera
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import AmplitudeModulation
-from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
-from mitsim.sensor.projector import Projector
-from mitsim.sensor.roi import Roi, roi_around
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
+from mitsim.sensor.roi import Roi
 
 Floats = NDArray[np.float64]
-
-#: one image instead of a sensor's patterns: the mean of all of them; their mean level, the same all over the field;
-#: the first alone
-Pattern = Literal["mean", "level", "first"]
 
 #: pixels beside the coupon's edge that its blur may reach
 _EDGE_PX = 5.0
 #: a block must have this share of its pixels inside the coupon
 _BLOCK_SHARE = 0.5
-#: pixels of the region around the coupon
-_MARGIN_PX = 12
 #: light of a pixel relative to the brightest under which the projector does not reach it
 _UNLIT = 1e-3
 
@@ -116,84 +102,6 @@ class View:
         half = self.view + self.lamp
         angle = np.arccos(np.clip(half[:, 2] / np.linalg.norm(half, axis=1), -1.0, 1.0))
         return float(angle.min()), float(angle.max())
-
-
-class Bench:
-    """What is set up once for a sensor: its lenses, and its projector with one image instead of its patterns."""
-
-    def __init__(self, sensor: Sensor, samples: int = 16) -> None:
-        self.sensor, self.samples = sensor, samples
-        # the patterns come below, one by one: they are not laid on the device all together
-        self._simulated = SimulatedSensor(replace(sensor, pattern=RandomDots(kind="random_dots", run_length_px=10.0)))
-        self._lit: dict[Pattern, LitPatterns] = {}
-
-    def corner_loss(self, camera: str) -> NDArray[np.float32] | None:
-        """Loss of a camera's lens toward the corners (H, W) [1], None where there is none."""
-        return self._simulated.corner_loss[camera]
-
-    def white(self, place: Place, camera: str, roi: Roi, pattern: Pattern) -> Floats:
-        """Electrons per second (h, w) [e-/s] of a Lambertian coupon of reflectance 1, in a region."""
-        if pattern not in self._lit:
-            self._lit[pattern] = self._one(pattern)
-        self._simulated.patterns = self._lit[pattern]
-        scene = lambertian_coupon(*place.size, self.sensor.wavelength_nm)
-        radiance = self._simulated.radiance(
-            scene, place.world_from_sensor, camera, Rendering(samples=self.samples, depth=1), seed=0, roi=roi
-        )
-        return np.asarray(radiance[0], np.float64) * self.sensor.electrons()
-
-    def _one(self, pattern: Pattern) -> LitPatterns:
-        projector = self.sensor.projector
-        frames = self.sensor.patterns()
-        sent = projector.emit(frames[:1]) if pattern == "first" else _mean_sent(frames, projector)
-        if pattern == "level":
-            sent = np.full_like(sent, sent.mean())
-        values = (sent - projector.black_level) / (1.0 - projector.black_level)
-        values = np.clip(values, 0.0, 1.0) ** (1.0 / projector.gamma)
-        return LitPatterns(values.astype(np.float32), projector)
-
-
-def _mean_sent(frames: NDArray[np.float32], projector: Projector) -> NDArray[np.float32]:
-    """Mean of what frames (P, H, W) send, (1, H, W), one after the other: many fill the memory."""
-    total = np.zeros(frames.shape[1:])
-    for frame in frames:
-        total += projector.emit(frame)
-    return np.asarray(total[None] / len(frames), np.float32)
-
-
-def pattern_is_known(capture: Capture, sensor: Sensor) -> bool:
-    """Whether the images of a capture were taken with the very pattern of the sensor file."""
-    return capture.settings.get("pattern") == sensor.pattern.model_dump(mode="json")
-
-
-def with_rig(sensor: Sensor, rig: Rig) -> Sensor:
-    """The sensor with the cameras of a capture; the projector, of which recordings say nothing, stays the file's."""
-    return replace(sensor, rig=replace(rig, projector=sensor.rig.projector))
-
-
-def place_of(capture: Capture, sensor: Sensor, size: tuple[float, float], where: str, roi: Roi | None = None) -> Place:
-    """Place of the coupon: by the region of the image that shows it, else by the pose of the capture, else by the plane
-    of its cloud.
-
-    Raises
-    ------
-    InputError
-        If neither is there, or the coupon shows its back.
-    """
-    if roi is not None:
-        return specimen_place(capture, sensor.settings, roi, where)
-    if capture.world_from_sensor is None:
-        imager = sensor.imager if sensor.imager.bits == capture.bits else None
-        return found_place(capture_cloud(capture, sensor.settings, imager=imager), where)
-    place = known_place(capture.world_from_sensor, *size)
-    if place.world_from_sensor.translation[2] <= 0:
-        raise InputError(where, "world_from_sensor", "a sensor behind the coupon", "a place with z over 0")
-    return place
-
-
-def coupon_roi(camera: Camera, place: Place) -> Roi:
-    """Return the region of a camera's image that holds a coupon and a margin of 12 px."""
-    return roi_around(camera, place.corners(), _MARGIN_PX) or Roi.whole(camera.width, camera.height)
 
 
 @dataclass(frozen=True)

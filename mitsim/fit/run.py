@@ -21,10 +21,13 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.errors import InputError
 from mitsim.fit.dots import Dots, compare_dots
-from mitsim.fit.estimate import Fit, Parameter, Residual, fit_views
+from mitsim.fit.estimate import Fit, Parameter, fit_views
 from mitsim.fit.finish import MetalFinish, metal_finish
-from mitsim.fit.observation import Bench, CouponCapture, View, observe, pattern_is_known, place_of, with_rig
+from mitsim.fit.observation import CouponCapture, View, observe
 from mitsim.fit.place import Place
+from mitsim.fit.problem import Residual
+from mitsim.fit.specimen import place_of
+from mitsim.fit.white_coupon import Bench, pattern_is_known, with_rig
 from mitsim.progress import say, track
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.sensor.camera import Rig

@@ -17,9 +17,10 @@ from characterisation.features.robust_fit import FitError
 from mitsim.capture.capture import Capture
 from mitsim.errors import InputError
 from mitsim.fit.bend import Bend, fit_bend
-from mitsim.fit.place import Place, found_place, plane_points
+from mitsim.fit.place import Place, found_place, known_place, plane_points
 from mitsim.reconstruction.cloud import Settings, capture_cloud, capture_geometry
 from mitsim.sensor.camera import Camera
+from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import Roi, roi_around
 from mitsim.sensor.transforms import Transform
 
@@ -103,6 +104,26 @@ def specimen_place(capture: Capture, settings: Settings, roi: Roi | None, where:
     occupied = shown(pose.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1)))
     place = Place(pose, first, cell, occupied, float(1.482602218505602 * np.median(np.abs(off))))
     return replace(place, bend=_bend_of(place, points))
+
+
+def place_of(capture: Capture, sensor: Sensor, size: tuple[float, float], where: str, roi: Roi | None = None) -> Place:
+    """Place of the coupon: by the region of the image that shows it, else by the pose of the capture, else by the plane
+    of its cloud.
+
+    Raises
+    ------
+    InputError
+        If neither is there, or the coupon shows its back.
+    """
+    if roi is not None:
+        return specimen_place(capture, sensor.settings, roi, where)
+    if capture.world_from_sensor is None:
+        imager = sensor.imager if sensor.imager.bits == capture.bits else None
+        return found_place(capture_cloud(capture, sensor.settings, imager=imager), where)
+    place = known_place(capture.world_from_sensor, *size)
+    if place.world_from_sensor.translation[2] <= 0:
+        raise InputError(where, "world_from_sensor", "a sensor behind the coupon", "a place with z over 0")
+    return place
 
 
 def _bend_of(place: Place, points: Floats) -> Bend | None:

@@ -32,7 +32,7 @@ def cost(name: str) -> tuple[float, float, int, int, int]:
 
     from characterisation.cloud_files import write_ply
     from mitsim.capture.capture import Capture
-    from mitsim.capture.folder import packed
+    from mitsim.capture.packed_files import packed
     from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor

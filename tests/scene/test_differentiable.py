@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mitsim.fit.finish import metal_finish
-from mitsim.fit.observation import Bench, coupon_roi
 from mitsim.fit.place import known_place
+from mitsim.fit.white_coupon import Bench, coupon_roi
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
 from mitsim.sensor.transforms import look_at

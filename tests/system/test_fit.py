@@ -23,9 +23,11 @@ from mitsim.fit.dots import compare_dots
 from mitsim.fit.electrons import PixelNoise, linearised, pixel_noise
 from mitsim.fit.estimate import fit_views
 from mitsim.fit.finish import ALPHA_RANGE, metal_finish
-from mitsim.fit.observation import Bench, CouponCapture, View, observe, place_of
+from mitsim.fit.observation import CouponCapture, View, observe
 from mitsim.fit.place import found_place, known_place
 from mitsim.fit.run import KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX, fit_captures
+from mitsim.fit.specimen import place_of
+from mitsim.fit.white_coupon import Bench
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
 from mitsim.sensor.imager import Imager, Noise, expose
