@@ -39,6 +39,7 @@ from mitsim.scene.test_targets import FINISHES, ball, ball_on_plate, plate
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform, look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 Floats = NDArray[np.float64]
@@ -191,7 +192,7 @@ def gallery(sensor: Sensor, seed: int = 1) -> list[tuple[str, Capture, PointClou
     seen = []
     for finish in track(list(FINISHES), f"{sensor.name}: gallery"):
         scene = ball_on_plate(radius, 0.6 * mid, finish, sensor.wavelength_nm)
-        capture = bench.simulated.capture(scene, pose, seed=seed, samples=SAMPLES_PER_PIXEL, depth=1)
+        capture = bench.simulated.capture(scene, pose, seed=seed, rendering=Rendering(SAMPLES_PER_PIXEL))
         seen.append((finish, capture, bench.decoded(capture)))
     return seen
 
@@ -285,7 +286,7 @@ class _Bench:
     def _capture(self, scene: Scene, pose: Transform, around: Floats, noise: Noise) -> Capture:
         self.seed += 1
         return self.simulated.capture(
-            scene, pose.inverse(), seed=self.seed, samples=SAMPLES_PER_PIXEL, depth=1, around=around, noise=noise
+            scene, pose.inverse(), seed=self.seed, rendering=Rendering(SAMPLES_PER_PIXEL), around=around, noise=noise
         )
 
     def decoded(self, capture: Capture) -> PointCloud:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import platform
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,7 @@ from mitsim.report.stand import write_stand
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.simulation.render_residual import RenderResidual, render_residual, told, worst_of
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import Study
 from mitsim.version import __version__
@@ -142,7 +143,8 @@ def run_study(
         _show(study, twin, shown, folder, {} if planned is None else {leaders[0]: planned})
         residuals += [_residual(study, twin.simulated, number) for number in shown[:1]]
     clock.lap("pictures")
-    about = _about(study, performance_map, shown, chosen, tried, worst_of(residuals), clock, raced)
+    outcome = _Outcome(raced, shown, chosen, tried, worst_of(residuals), clock.steps)
+    about = _about(study, performance_map, outcome)
     about["files"] = digests_of(folder, _own_files(study, drawn, shown, bool(stated)))
     write_json(folder / "run.json", about)
     return stated
@@ -301,17 +303,11 @@ def _map(study: Study, twin: RenderedMeasurements | None, folder: Path) -> Perfo
 def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderResidual:
     """Return the render noise of a view, with interreflections as in its trials; takes as long as three trials."""
     table, pose = study.file.measure, study.views[number].world_from_sensor
+    camera = next(iter(study.sensor.rig.cameras))
+    rendering = Rendering(table.samples_per_pixel, table.light_path_depth)
     return told(
         f"view {number}",
-        render_residual(
-            simulated,
-            study.scene,
-            pose,
-            next(iter(study.sensor.rig.cameras)),
-            samples=table.samples_per_pixel,
-            depth=table.light_path_depth,
-            seed=study.file.seed,
-        ),
+        render_residual(simulated, study.scene, pose, camera, rendering, seed=study.file.seed),
     )
 
 
@@ -337,16 +333,23 @@ def pose_columns(scores: xr.Dataset) -> dict[str, np.ndarray]:
     return out | {f"quaternion_{axis}": turns[:, k] for k, axis in enumerate("xyzw")}
 
 
-def _about(
-    study: Study,
-    performance_map: PerformanceMap,
-    checked: list[int],
-    chosen: ViewSet | None,
-    tried: list[TriedSet],
-    residual: RenderResidual | None,
-    clock: _Clock,
-    raced: Raced,
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Outcome:
+    """Outcome of a run: the race, views whose pictures were ``checked``, the set and those ``tried``.
+
+    ``residual`` is the worst of the renderings, ``seconds`` the wall time of each step [s].
+    """
+
+    raced: Raced
+    checked: list[int]
+    chosen: ViewSet | None
+    tried: list[TriedSet]
+    residual: RenderResidual | None
+    seconds: dict[str, float]
+
+
+def _about(study: Study, performance_map: PerformanceMap, outcome: _Outcome) -> dict[str, Any]:
+    raced, chosen, residual = outcome.raced, outcome.chosen, outcome.residual
     features = {name: str(study.scene.finishes[study.scene.names.index(name)]) for name in study.task.shapes}
     return {
         "schema_version": 1,
@@ -359,8 +362,8 @@ def _about(
         "exposure_rule": study.sensor.exposure.rule,
         "seed": study.file.seed,
         "views": len(study.views),
-        "view_sets": [] if chosen is None else [_set_in_words(study, chosen, tried)],
-        "checked_views": checked,
+        "view_sets": [] if chosen is None else [_set_in_words(study, chosen, outcome.tried)],
+        "checked_views": outcome.checked,
         "raced_views": len(raced.views),
         "race_trials": raced.trials,
         "race_decided": raced.decided,
@@ -374,7 +377,7 @@ def _about(
             name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features)}
             for name, m in study.task.measurements.items()
         },
-        "seconds": clock.steps,
+        "seconds": outcome.seconds,
         "python": platform.python_version(),
         "machine": platform.machine(),
         "cores": os.cpu_count(),

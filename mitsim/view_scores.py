@@ -37,6 +37,7 @@ from mitsim.prediction import (
     LookedAt,
     Perturbation,
     Predictor,
+    ViewPoints,
     expected_points,
     feature_statistics,
     performance,
@@ -73,6 +74,18 @@ class _Cast:
     labels: NDArray[np.int16]
     n_only: Floats
     perturbation: Perturbation
+
+
+@dataclass(frozen=True)
+class _Scoring:
+    """Scene, task, map and predictor of a scoring; the ``predictor`` casts every ``step``-th ray of every such row."""
+
+    scene: Scene
+    task: Task
+    performance_map: PerformanceMap
+    minimum_points: float
+    predictor: Predictor
+    step: int
 
 
 @dataclass(frozen=True)
@@ -117,6 +130,7 @@ def score_candidates(
         For every view, the input quantities of its measurements, from which sets of views are chosen.
     """
     looking, step = predictor.thinned_to(RAYS)
+    scoring = _Scoring(scene, task, performance_map, minimum_points, looking, step)
     names = list(task.shapes)
     alone = [CharacterisedScene(scene.only(name), performance_map, MATT_WHITE) for name in names]
 
@@ -129,7 +143,7 @@ def score_candidates(
         return _Cast(ideal, labels, n_only, together((effect(view_of) for effect in effects), len(ideal.pixel)))
 
     def look(cast: _Cast, view: View) -> _Seen:
-        return _look(cast, scene, task, view, looking, performance_map, minimum_points, step)
+        return _look(scoring, cast, view)
 
     # the rays of the next view are cast while this view is evaluated
     seen = [one for _, one in track(one_ahead(views, cast, look), "score views", len(views))]
@@ -175,41 +189,24 @@ def score_candidates(
     return with_poses(scores, views), [one.inputs for one in seen]
 
 
-def _look(
-    cast: _Cast,
-    scene: Scene,
-    task: Task,
-    view: View,
-    predictor: Predictor,
-    performance_map: PerformanceMap,
-    minimum_points: float,
-    step: int,
-) -> _Seen:
+def _look(scoring: _Scoring, cast: _Cast, view: View) -> _Seen:
     """Return the results of a view from its rays: every ``step``-th ray of every ``step``-th row."""
-    names, pose, ideal, labels = list(task.shapes), view.world_from_sensor, cast.ideal, cast.labels
+    scene, task, performance_map = scoring.scene, scoring.task, scoring.performance_map
+    names, ideal, labels = list(task.shapes), cast.ideal, cast.labels
     shapes = [scene.names.index(name) for name in names]
     white = performance(ideal, scene, performance_map, MATT_WHITE)
     n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
-    thinning, pitch = step**2, predictor.grid.angular_pitch / step
+    thinning, pitch = scoring.step**2, scoring.predictor.grid.angular_pitch / scoring.step
+    points_of_view = ViewPoints(ideal, labels, view.world_from_sensor, thinning, pitch)
 
     def expected(perturbation: Perturbation | None) -> dict[str, ExpectedPoints]:
         return {
-            name: expected_points(
-                ideal,
-                labels,
-                scene,
-                shape,
-                performance_map,
-                pose,
-                thinning,
-                pitch,
-                perturbation,
-            )
+            name: expected_points(points_of_view, scene, shape, performance_map, perturbation)
             for name, shape in zip(names, shapes, strict=True)
         }
 
     as_mapped, points = expected(None), expected(cast.perturbation)
-    inputs = expected_inputs(task, points, minimum_points)
+    inputs = expected_inputs(task, points, scoring.minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _Seen(
         np.array([one.count for one in as_mapped.values()]),
@@ -225,7 +222,7 @@ def _look(
 def _white_points(predictor: Predictor, alone: CharacterisedScene, world_from_sensor: Transform) -> float:
     """Return the expected number of points of one feature in matt white, without the rest of the part."""
     predicted = predictor.look_up(alone, world_from_sensor)
-    counted = (predicted.labels[predicted.seen.window.inside] == 0) & np.isfinite(predicted.seen.sigma)
+    counted = (predicted.labels[predicted.seen.roi.slices] == 0) & np.isfinite(predicted.seen.sigma)
     return float(predicted.seen.fraction[counted].sum(dtype=float))
 
 

@@ -27,7 +27,9 @@ from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.evaluation import Feature, Measurement, read_task
 from mitsim.authoring.face import surface_distance
 from mitsim.errors import nearest
-from mitsim.scene.inspect import MeshFacts, SceneFacts, ShapeFacts, Sight
+from mitsim.scene.first_hits import Sight
+from mitsim.scene.inspect import SceneFacts, ShapeFacts
+from mitsim.scene.mesh_facts import MeshFacts
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.working_volume import depth, eyes_of, field_of_view, in_image, in_working_volume

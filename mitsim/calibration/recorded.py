@@ -103,8 +103,19 @@ def calibrate_recorded(
     for _ in range(_ROUNDS):
         rig, places, normal = _adjusted(rig, places, boards, board, noise, rig_prior(rig, sizes))
         noise = _noise(rig, places, boards, board, normal)
-    covariance = _covariance(rig, places, boards, board, noise, normal, source, own_units)
+    adjusted = _Adjustment(rig, places, noise, normal)
+    covariance = _covariance(adjusted, boards, board, source, own_units)
     return RecordedCalibration(rig, places, covariance, *noise.T)
+
+
+@dataclass(frozen=True)
+class _Adjustment:
+    """An adjusted rig, its places sensor_from_board, ``noise`` (poses, 2) [px] and ``normal`` matrix (q, q)."""
+
+    rig: Rig
+    places: list[Transform]
+    noise: Floats
+    normal: Floats
 
 
 @dataclass(frozen=True)
@@ -278,15 +289,9 @@ def _noise(rig: Rig, places: list[Transform], boards: Sequence[RecordedBoard], b
 
 
 def _covariance(
-    rig: Rig,
-    places: list[Transform],
-    boards: Sequence[RecordedBoard],
-    board: Board,
-    noise: Floats,
-    normal: Floats,
-    source: str,
-    own_units: bool,
+    adjusted: _Adjustment, boards: Sequence[RecordedBoard], board: Board, source: str, own_units: bool
 ) -> RigCovariance:
+    rig, places, noise, normal = adjusted.rig, adjusted.places, adjusted.noise, adjusted.normal
     names = parameter_names(rig)
     count = len(names)
     modes, sigma = board.imperfections()

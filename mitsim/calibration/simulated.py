@@ -162,13 +162,15 @@ def coverage(
     eyes: Mapping[str, Camera],
     board: Board,
     views: Sequence[BoardView],
-    names: Sequence[str],
-    sigma: Floats,
+    stated: Mapping[str, float],
     count: int,
     rng: np.random.Generator,
 ) -> Floats:
-    """Return errors over stated sigma of ``count`` simulated calibrations, (count, n), each from its own stream."""
-    rows = []
+    """Return errors over sigma of ``count`` simulated calibrations, (count, n), each from its own stream.
+
+    ``stated`` is the sigma of the n parameters by their names.
+    """
+    names, sigma, rows = list(stated), np.array(list(stated.values())), []
     for stream in rng.spawn(count):
         found, _ = estimate(rig, eyes, simulate_corners(eyes, board, views, stream))
         rows.append(parameter_differences(rig, found, names) / sigma)

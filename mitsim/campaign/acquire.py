@@ -29,8 +29,10 @@ from mitsim.errors import InputError
 from mitsim.reconstruction.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
 from mitsim.reconstruction.depth_range import depths_of, outside
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 from mitsim.simulation.render_residual import RenderResidual, render_residual, told
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 Item = TypeVar("Item")
@@ -48,12 +50,12 @@ DISTANCE_SLACK = 0.05
 
 def simulated_source(sensor: SimulatedSensor, samples_per_pixel: int) -> CaptureSource:
     """Return a source of rendered captures, limited to the coupon's part of the images."""
+    rendering = Rendering(samples_per_pixel)
 
     def take(shot: Shot) -> Capture:
         sample, pose = shot.series.sample, shot.sensor_from_coupon
-        return sensor.capture(
-            sample.scene, pose.inverse(), seed=shot.seed, samples=samples_per_pixel, around=sample.at(pose).corners()
-        )
+        around = sample.at(pose).corners()
+        return sensor.capture(sample.scene, pose.inverse(), seed=shot.seed, rendering=rendering, around=around)
 
     return take
 
@@ -145,8 +147,7 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
     corners = grid.project(coupon.corners())
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])
     high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, low + 1, [grid.width, grid.height])
-    window = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-    return capture_cloud(capture, sensor.settings, geometry, window, sensor.imager)
+    return capture_cloud(capture, sensor.settings, geometry, Roi.between(*low, *high), sensor.imager)
 
 
 def coupon_residuals(sensor: SimulatedSensor, campaign: Campaign) -> list[RenderResidual]:
@@ -164,7 +165,7 @@ def coupon_residuals(sensor: SimulatedSensor, campaign: Campaign) -> list[Render
             pose = campaign.shot(series, normals[len(normals) // 2]).sensor_from_coupon
             sample, corners = series.sample, series.sample.at(pose).corners()
             residual = render_residual(
-                sensor, sample.scene, pose.inverse(), camera, samples=samples, depth=1, seed=seed, around=corners
+                sensor, sample.scene, pose.inverse(), camera, Rendering(samples), seed=seed, around=corners
             )
             out.append(told(sample.label(), residual))
     return out

@@ -24,13 +24,15 @@ from characterisation.documents import Document, read_toml
 from characterisation.errors import InputError
 from mitsim.campaign.orders import laid_out
 from mitsim.campaign.plan import sensor_checksum
-from mitsim.capture.folder import packed, write_packed
+from mitsim.capture.folder import write_packed
+from mitsim.capture.packed_files import packed
 from mitsim.progress import track
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.simulation.truth import encode_exr, true_image
 from mitsim.surface.scatter import Deviation
@@ -112,7 +114,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Rendering:
+class CommonSettings:
     """Settings of all captures; a finish may replace ``parameters`` and ``deviation``."""
 
     parameters: dict[str, str]
@@ -124,8 +126,8 @@ class Rendering:
     truth: bool
 
 
-def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, rendering: Rendering) -> list[Job]:
-    """Return all jobs of a plan, finish by finish, views from the zenith down.
+def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, common: CommonSettings) -> list[Job]:
+    """All jobs of a plan, finish by finish, views from the zenith down.
 
     Raises
     ------
@@ -136,15 +138,15 @@ def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, rendering: Re
     jobs: list[Job] = []
     origin = ""
     for index, finish in enumerate(file.finishes):
-        parameters = rendering.parameters | {name: str(value) for name, value in finish.parameters.items()}
-        deviation = Deviation.parse(finish.deviation or rendering.deviation, f"{plan}: finishes.{finish.name}")
+        parameters = common.parameters | {name: str(value) for name, value in finish.parameters.items()}
+        deviation = Deviation.parse(finish.deviation or common.deviation, f"{plan}: finishes.{finish.name}")
         loaded = load_scene(scene, sensor.wavelength_nm, parameters, deviation)
         origin = origin or origin_of(Path(scene), sensor)
         radius = float(np.linalg.norm(loaded.bounds[1] - loaded.bounds[0])) / 2
         standoffs = chosen_standoffs(plan, file.views, sensor, radius)
         found = candidate_views(file.views, sensor, standoffs, loaded.centre, triangles(loaded), where=plan)
         for view in found.views:
-            (seed,) = np.random.SeedSequence([rendering.seed, index, view.number]).generate_state(1)
+            (seed,) = np.random.SeedSequence([common.seed, index, view.number]).generate_state(1)
             jobs.append(
                 Job(
                     sensor,
@@ -155,16 +157,16 @@ def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, rendering: Re
                     view.number,
                     view.world_from_sensor,
                     int(seed),
-                    rendering.samples,
-                    rendering.depth,
-                    rendering.noise,
-                    rendering.truth,
+                    common.samples,
+                    common.depth,
+                    common.noise,
+                    common.truth,
                     origin,
                 )
             )
     if file.captures is None or file.captures >= len(jobs):
         return jobs
-    drawn = np.random.default_rng(rendering.seed).choice(len(jobs), file.captures, replace=False)
+    drawn = np.random.default_rng(common.seed).choice(len(jobs), file.captures, replace=False)
     return [jobs[number] for number in sorted(drawn)]
 
 
@@ -219,9 +221,8 @@ def take_job(job: Job) -> dict[str, bytes]:
 def _taken(job: Job, simulated: SimulatedSensor) -> dict[str, bytes]:
     """Return the files of a capture's folder, on request with the truth of its cameras as OpenEXR."""
     scene = _scene(job.scene, job.sensor.wavelength_nm, job.parameters, job.deviation)
-    capture = simulated.capture(
-        scene, job.world_from_sensor, seed=job.seed, samples=job.samples, depth=job.depth, noise=job.noise
-    )
+    rendering = Rendering(job.samples, job.depth)
+    capture = simulated.capture(scene, job.world_from_sensor, seed=job.seed, rendering=rendering, noise=job.noise)
     capture.settings["deviation"] = asdict(job.deviation)
     capture.settings["many"] = {
         "digest": job.digest(),

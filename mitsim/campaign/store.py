@@ -32,7 +32,7 @@ from characterisation.datasets import check_dataset
 from characterisation.documents import Document, validate
 from mitsim.campaign.plan import Shot
 from mitsim.capture.capture import Capture
-from mitsim.capture.folder import packed
+from mitsim.capture.packed_files import packed
 from mitsim.errors import InputError, MissingEnvironmentError
 from mitsim.version import __version__
 

@@ -19,13 +19,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-import platform
-import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,18 +30,16 @@ from characterisation.atomic_io import FULL, write_folder
 from characterisation.checked_files import content_checksum, is_inside, read_bounded
 from characterisation.documents import validate
 from characterisation.errors import InputError
-from mitsim.capture.calibration import CalibrationDocument, PoseDocument, calibration_table, pose_table, rig_of
+from mitsim.capture.calibration import CalibrationDocument, PoseDocument, rig_of
 from mitsim.capture.capture import DERIVED_UNITS, SOURCES, Capture
-from mitsim.capture.capture_document import FRAME, SCHEMA_VERSION, UNITS, CaptureDocument, FileEntry
-from mitsim.capture.npy import decode_npy, encode_npy
-from mitsim.capture.png import LONGEST_SIDE_PX, decode_png, encode_png
+from mitsim.capture.capture_document import SCHEMA_VERSION, CaptureDocument, FileEntry
+from mitsim.capture.npy import decode_npy
+from mitsim.capture.packed_files import SAFE_NAME, check_image, files_of, packed
+from mitsim.capture.png import decode_png
 from mitsim.sensor.transforms import Transform
-from mitsim.version import __version__
 
 #: the largest capture that is believed [bytes]
 LARGEST_CAPTURE = 8 * 1024**3
-
-_SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 def write_capture(
@@ -80,25 +75,6 @@ def write_capture(
     return write_packed(packed(capture, folder, vendor=vendor, truth=truth), folder, overwrite=overwrite)
 
 
-def packed(
-    capture: Capture,
-    folder: str | Path,
-    *,
-    vendor: Mapping[str, bytes] | None = None,
-    truth: Mapping[str, bytes] | None = None,
-) -> dict[str, bytes]:
-    """Every file of a capture's folder by its path in it; ``folder`` is named in complaints.
-
-    Raises
-    ------
-    InputError
-        If something in the capture has no place in a file.
-    """
-    beside = {("vendor", name): data for name, data in (vendor or {}).items()}
-    beside |= {("truth", f"{camera}.exr"): data for camera, data in (truth or {}).items()}
-    return _files_of(capture, beside, Path(folder))
-
-
 def write_packed(files: Mapping[str, bytes], folder: str | Path, *, overwrite: bool = False) -> Path:
     """Write what :func:`packed` gives, all of it or nothing.
 
@@ -131,7 +107,7 @@ def is_written(capture: Capture, folder: str | Path, vendor: Mapping[str, bytes]
     folder = Path(folder).absolute()
     if not (folder / "capture.json").is_file():
         return False
-    files = _files_of(capture, {("vendor", name): data for name, data in (vendor or {}).items()}, folder)
+    files = files_of(capture, {("vendor", name): data for name, data in (vendor or {}).items()}, folder)
     mine = json.loads(files["capture.json"])
     there = _read_index(folder)[0].model_dump(mode="json")
     paths = [{entry["path"]: entry["sha256"] for entry in index["files"]} for index in (mine, there)]
@@ -193,7 +169,7 @@ def read_capture(folder: str | Path) -> Capture:
             raise InputError(
                 where, f"files.{number}", f"{entry.dtype} {entry.shape}", f"{image.dtype} {image.shape}, as in the file"
             )
-        _check_image(image, stack, document.bits, folder / entry.path)
+        check_image(image, stack, document.bits, folder / entry.path)
         stack.append(image)
     source = next((known for known in SOURCES if known == document.source), None)
     if source is None:
@@ -233,15 +209,6 @@ def read_settings_and_pose(folder: str | Path) -> tuple[str, dict[str, Any], Tra
     return document.sensor, read["settings"], pose.transform()
 
 
-def _check_image(
-    image: NDArray[np.unsignedinteger[Any]], before: list[NDArray[np.unsignedinteger[Any]]], bits: int, where: Path
-) -> None:
-    if before and before[0].dtype != image.dtype:
-        raise InputError(where, "dtype", image.dtype, f"{before[0].dtype}, as the first frame")
-    if image.max() > 2**bits - 1:
-        raise InputError(where, "pixel value", image.max(), f"0 to {2**bits - 1}, since bits is {bits}")
-
-
 def _derived_map(data: bytes, entry: FileEntry, field: str, where: Path, file: Path) -> NDArray[np.float32]:
     """A map as float32 in its unit, NaN where invalid, from whatever numbers it is stored in."""
     assert entry.name is not None
@@ -261,92 +228,6 @@ def _derived_map(data: bytes, entry: FileEntry, field: str, where: Path, file: P
     if np.isinf(values).any():
         raise InputError(file, "", "infinite numbers", "finite ones, or NaN")
     return values
-
-
-def _files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder: Path) -> dict[str, bytes]:
-    """Every file of the folder, by path; ``capture.json`` last. What could not be read back is refused."""
-    calibration = calibration_table(capture.rig)
-    pose = pose_table(capture.world_from_sensor, capture.pose_covariance)
-    validate(folder / "calibration.json", calibration, CalibrationDocument)
-    validate(folder / "pose.json", pose, PoseDocument)
-    files = {
-        "calibration.json": _json(calibration, folder, "calibration"),
-        "settings.json": _json(capture.settings, folder, "settings"),
-        "pose.json": _json(pose, folder, "pose"),
-    }
-    entries: list[dict[str, Any]] = [{"path": path, "role": path.removesuffix(".json")} for path in files]
-    for camera, stack in capture.images.items():
-        _check_name(camera, folder, "images", "the name of a camera")
-        if stack.dtype not in (np.uint8, np.uint16) or stack.size == 0 or len(stack) > 1000:
-            raise InputError(
-                folder, f"images.{camera}", f"{stack.dtype} {stack.shape}", "1 to 1000 uint8 or uint16 images"
-            )
-        for frame, image in enumerate(stack):
-            path = f"images/{camera}_{frame:03d}.png"
-            _check_image(image, [], capture.bits, folder / path)
-            files[path] = encode_png(image)
-            entries.append(
-                {"path": path, "role": "image", "camera": camera, "frame": frame}
-                | {"dtype": str(image.dtype), "shape": list(image.shape), "unit": "DN", "scale": 1.0, "invalid": None}
-            )
-    for name, values in capture.derived.items():
-        if np.isinf(values).any() or values.size == 0 or max(values.shape) > LONGEST_SIDE_PX:
-            raise InputError(
-                folder, f"derived.{name}", f"{values.shape}, or infinite", "a map of finite numbers or NaN"
-            )
-        path = f"derived/{name}.npy"
-        files[path] = encode_npy(values)
-        entries.append(
-            {"path": path, "role": "derived", "name": name, "dtype": str(values.dtype), "shape": list(values.shape)}
-            | {"unit": DERIVED_UNITS[name], "scale": 1.0, "invalid": "nan"}
-        )
-    for (role, name), data in beside.items():
-        parts = PurePosixPath(name).parts
-        for part in parts or ("",):
-            _check_name(part, folder, role, "the name of a file")
-        path = "/".join([role, *parts])
-        files[path] = data
-        entries.append({"path": path, "role": role})
-    for entry in entries:
-        entry["sha256"] = hashlib.sha256(files[entry["path"]]).hexdigest()
-    index = {
-        "schema_version": SCHEMA_VERSION,
-        "sensor": capture.sensor,
-        "technology": capture.technology,
-        "source": capture.source,
-        "serial": capture.serial,
-        "bits": capture.bits,
-        "units": UNITS,
-        "frame": FRAME,
-        "software": {
-            "mitsim": __version__,
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "opencv": cv2.__version__,
-        },
-        "files": entries,
-    }
-    index["checksum"] = content_checksum(index)
-    validate(folder / "capture.json", index, CaptureDocument)
-    files["capture.json"] = _json(index, folder, "capture")
-    return files
-
-
-def _check_name(name: str, folder: Path, field: str, what: str) -> None:
-    if not _SAFE_NAME.fullmatch(name):
-        raise InputError(folder, field, repr(name), f"{what} of letters, digits, dot, dash, underscore")
-
-
-def _json(value: Any, folder: Path, field: str) -> bytes:
-    try:
-        text = json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False)
-        if field == "settings" and json.loads(text) != value:
-            raise ValueError("tuples, or keys that are not text")
-        return (text + "\n").encode()
-    except (TypeError, ValueError, RecursionError) as error:
-        raise InputError(
-            folder, field, f"a value that JSON cannot hold ({error})", "texts, finite numbers, lists, tables, null"
-        ) from None
 
 
 def _parse(data: bytes, where: Path) -> dict[str, Any]:
@@ -380,7 +261,7 @@ def _read_index(folder: Path) -> tuple[CaptureDocument, Path]:
 
 def _read_checked(folder: Path, entry: FileEntry, field: str, where: Path) -> bytes:
     path = PurePosixPath(entry.path)
-    if path.is_absolute() or not path.parts or not all(_SAFE_NAME.fullmatch(part) for part in path.parts):
+    if path.is_absolute() or not path.parts or not all(SAFE_NAME.fullmatch(part) for part in path.parts):
         raise InputError(where, f"{field}.path", repr(entry.path), "a file inside the folder, of plain names")
     file = folder / path
     if not is_inside(file, folder):

@@ -79,9 +79,9 @@ def calibrate(
         say(f"simulating {check} calibrations")
         count = len([name for name in found.covariance.names if not name.startswith("path.")])
         names, sigma = found.covariance.names[:count], found.covariance.one_sigma[:count]
-        scores = coverage(
-            chosen.measuring_rig, found.eyes, found.board, found.views, names, sigma, check, np.random.default_rng(seed)
-        )
+        stated = dict(zip(names, sigma, strict=True))
+        rng = np.random.default_rng(seed)
+        scores = coverage(chosen.measuring_rig, found.eyes, found.board, found.views, stated, check, rng)
         print("\n" + coverage_table(names, scores), end="")
     write_rig_covariance(output, found.covariance, chosen.rig)
     say(f"calibration: {output}")

@@ -28,7 +28,7 @@ from mitsim.errors import InputError
 
 if TYPE_CHECKING:
     from mitsim.campaign.executor import Executor
-    from mitsim.campaign.many import Rendering
+    from mitsim.campaign.many import CommonSettings
 
 #: settings of an imported capture that the user should check
 SETTINGS_TO_CHECK = (
@@ -109,10 +109,10 @@ def render(
     start(variant)
     if many is not None:
         from mitsim.campaign.executor import executor_of
-        from mitsim.campaign.many import Rendering
+        from mitsim.campaign.many import CommonSettings
         from mitsim.sensor.imager import Noise
 
-        common = Rendering(definitions(define), deviation, seed, samples, depth, Noise.parse(noise), truth)
+        common = CommonSettings(definitions(define), deviation, seed, samples, depth, Noise.parse(noise), truth)
         _render_many(many, scene, sensor, common, output, executor_of(scheduler, processes))
         return
     assert position is not None
@@ -125,6 +125,7 @@ def render(
     from mitsim.progress import say
     from mitsim.sensor.imager import Noise
     from mitsim.simulation.render_residual import LIMIT, render_residual
+    from mitsim.simulation.rendering import Rendering
     from mitsim.simulation.truth import encode_exr, true_image
     from mitsim.surface.scatter import Deviation
 
@@ -156,7 +157,7 @@ def render(
     capture = interface.render(loaded, chosen, pose, seed=seed, samples=samples, depth=depth, noise=noise)
     simulated = interface.laid_out(chosen)
     first = next(iter(chosen.rig.cameras))
-    residual = render_residual(simulated, loaded, pose, first, samples=samples, depth=depth, seed=seed)
+    residual = render_residual(simulated, loaded, pose, first, Rendering(samples, depth), seed=seed)
     capture.settings["render_residual"] = asdict(residual) if isfinite(residual.noise) else None
     capture.settings["deviation"] = asdict(moved)
     capture.settings["render"] = {"digest": digest}
@@ -175,7 +176,7 @@ def render(
 
 
 def _render_many(
-    plan: Path, scene: Path, sensor: str, common: Rendering, output: Path, workers: Executor | None
+    plan: Path, scene: Path, sensor: str, common: CommonSettings, output: Path, workers: Executor | None
 ) -> None:
     """Simulate the missing captures of a plan, and report their number."""
     from mitsim.campaign.many import in_turn, missing_jobs, read_jobs, render_many, take_job

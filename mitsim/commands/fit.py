@@ -76,11 +76,12 @@ def finish(
     from mitsim.fit.run import fit_captures
     from mitsim.progress import say
     from mitsim.report.style import write_png
+    from mitsim.sensor.roi import Roi
 
     for file in (output, figure):
         if file is not None:
             check_file(file)
-    found = fit_captures(captures, sensor, scene, definitions(define), block, window)
+    found = fit_captures(captures, sensor, scene, definitions(define), block, Roi(*window) if window else None)
     print(fit_table(found), end="")
     for remark in remarks(found):
         say(remark)
@@ -123,6 +124,7 @@ def sensor_(
     start(variant)
     from mitsim.errors import InputError
     from mitsim.progress import say
+    from mitsim.sensor.roi import Roi
     from mitsim.twin.run import fit_sensor
     from mitsim.twin.write import fit_table, write_sensor
 
@@ -131,7 +133,8 @@ def sensor_(
     if output.suffix != ".toml":
         raise InputError("--output", "", str(output), "a .toml file")
     check_file(output)
-    found = fit_sensor(captures or [], sensor, off=off or [], dark=dark or [], window=window, seed=seed)
+    roi = Roi(*window) if window else None
+    found = fit_sensor(captures or [], sensor, off=off or [], dark=dark or [], roi=roi, seed=seed)
     write_sensor(found, sensor, output)
     print(fit_table(found), end="")
     say(f"sensor: {output}, {len(found.estimates)} fitted parameters, {len(found.untold)} not determined")

@@ -55,7 +55,8 @@ def check(
     from mitsim.report.scene_preview import preview_figure
     from mitsim.report.scene_table import as_data, as_text
     from mitsim.report.style import write_png
-    from mitsim.scene.inspect import inspect, look
+    from mitsim.scene.first_hits import look
+    from mitsim.scene.inspect import inspect
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
     from mitsim.sensor.working_volume import pose_at, usual_place
@@ -184,7 +185,8 @@ def _edit(scene: Path, sensor: str | None, port: int) -> None:
     from mitsim.progress import say
     from mitsim.report.author_page import Authored, author_page, findings_data
     from mitsim.report.author_server import AuthorServer
-    from mitsim.scene.inspect import inspect, look
+    from mitsim.scene.first_hits import look
+    from mitsim.scene.inspect import inspect
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
     from mitsim.sensor.working_volume import pose_at, usual_place

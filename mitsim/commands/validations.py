@@ -350,6 +350,7 @@ def captures(
     """
     start(variant)
     from mitsim.progress import say
+    from mitsim.sensor.roi import Roi
     from mitsim.validation.captures_run import validate_captures
 
     if projector not in (None, "on", "off"):
@@ -359,7 +360,8 @@ def captures(
         real = _imported(real, output / "recorded", frame, calibration)
     elif frame is not None or calibration is not None:
         raise InputError("--frame" if frame is not None else "--calibration", "", "a capture folder", "a recording")
-    found = validate_captures(real, simulated, output, sensor, window, projector, seed)
+    roi = Roi(*window) if window else None
+    found = validate_captures(real, simulated, output, sensor, roi, projector, seed)
     print(found.table, end="")
     say(f"page: {found.page}")
     if not found.comparison.agrees:

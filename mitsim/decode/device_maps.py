@@ -19,9 +19,10 @@ from pydantic import Field, model_validator
 from characterisation.documents import Document
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.decode.roi import Window, checked_window, inside, placed_cloud
+from mitsim.decode.grid_cloud import placed_cloud
 from mitsim.decode.structured_light.geometry import camera_grid
 from mitsim.sensor.camera import Rectification, Rig
+from mitsim.sensor.roi import Roi, checked_roi
 
 
 class DeviceMapSettings(Document):
@@ -84,7 +85,7 @@ def decode_depth_map(
     *,
     sensor: str,
     source: str,
-    window: Window | None = None,
+    roi: Roi | None = None,
 ) -> PointCloud:
     """Put depths on their view rays.
 
@@ -96,8 +97,8 @@ def decode_depth_map(
         Depths between which points are accepted [mm].
     sensor, source
         Carried into the cloud.
-    window
-        (column0, row0, column1, row1) of the grid, ends not included: only this part.
+    roi
+        Region of the grid: decode only this.
 
     Raises
     ------
@@ -107,11 +108,11 @@ def decode_depth_map(
     grid = geometry.grid
     if depth.shape != (grid.height, grid.width):
         raise _wrong_size("depth", depth.shape, grid)
-    window = checked_window(window, grid.width, grid.height, "decode_depth_map")
-    rows, columns = np.mgrid[window[1] : window[3], window[0] : window[2]]
-    z, ray = depth[inside(window)].astype(np.float64), grid.rays_at(columns, rows)
+    roi = checked_roi(roi, grid.width, grid.height, "decode_depth_map")
+    columns, rows = roi.pixels()
+    z, ray = depth[roi.slices].astype(np.float64), grid.rays_at(columns, rows)
     points = grid.origin + ray * (z / (ray @ grid.rotation[:, 2]))[..., None]
-    return _within(points, z, geometry, (near_mm, far_mm), sensor, source, window)
+    return _within(points, z, geometry, (near_mm, far_mm), sensor, source, roi)
 
 
 def decode_disparity_map(
@@ -122,13 +123,13 @@ def decode_disparity_map(
     *,
     sensor: str,
     source: str,
-    window: Window | None = None,
+    roi: Roi | None = None,
 ) -> PointCloud:
     """Triangulate disparities (H, W) [px] of the rectified left image; the rest as :func:`decode_depth_map`."""
     assert geometry.rectification is not None  # disparity_map_geometry
     with np.errstate(divide="ignore"):
         depth = geometry.rectification.depth(disparity)
-    return decode_depth_map(depth, geometry, near_mm, far_mm, sensor=sensor, source=source, window=window)
+    return decode_depth_map(depth, geometry, near_mm, far_mm, sensor=sensor, source=source, roi=roi)
 
 
 def decode_point_map(
@@ -139,38 +140,37 @@ def decode_point_map(
     *,
     sensor: str,
     source: str,
-    window: Window | None = None,
+    roi: Roi | None = None,
 ) -> PointCloud:
     """Take points (H, W, 3) [mm] of the sensor frame as they are; the rest as :func:`decode_depth_map`."""
     grid = geometry.grid
     if points.shape != (grid.height, grid.width, 3):
         raise _wrong_size("points", points.shape, grid)
-    window = checked_window(window, grid.width, grid.height, "decode_point_map")
-    shown = points[inside(window)].astype(np.float64)
+    roi = checked_roi(roi, grid.width, grid.height, "decode_point_map")
+    shown = points[roi.slices].astype(np.float64)
     depth = (shown - grid.origin) @ grid.rotation[:, 2]
-    return _within(shown, depth, geometry, (near_mm, far_mm), sensor, source, window)
+    return _within(shown, depth, geometry, (near_mm, far_mm), sensor, source, roi)
 
 
-def window_between(grid: ViewGrid, other: ViewGrid, window: Window, near_mm: float, far_mm: float) -> Window | None:
-    """Window of ``other`` that holds all that ``window`` of ``grid`` shows from near to far; None if it shows none.
+def roi_of_other_grid(grid: ViewGrid, other: ViewGrid, roi: Roi, near_mm: float, far_mm: float) -> Roi | None:
+    """Return the region of ``other`` that holds all that ``roi`` of ``grid`` shows from near to far; None if nothing.
 
-    The edge of the window is followed at both depths, so that bent rays are held too.
+    The edge of the region is projected at both depths, pixel by pixel, so that it also holds for bent rays.
     """
-    column0, row0, column1, row1 = window
-    columns, rows = np.arange(column0, column1), np.arange(row0, row1)
+    columns, rows = np.arange(roi.left, roi.right), np.arange(roi.top, roi.bottom)
     edge = np.concatenate(
-        [np.stack(np.broadcast_arrays(columns, row), axis=-1) for row in (row0, row1 - 1)]
-        + [np.stack(np.broadcast_arrays(column, rows), axis=-1) for column in (column0, column1 - 1)]
+        [np.stack(np.broadcast_arrays(columns, row), axis=-1) for row in (roi.top, roi.bottom - 1)]
+        + [np.stack(np.broadcast_arrays(column, rows), axis=-1) for column in (roi.left, roi.right - 1)]
     )
     ray = grid.rays_at(edge[:, 0], edge[:, 1])
     along = ray / (ray @ grid.rotation[:, 2])[:, None]
     seen = other.project(np.concatenate([grid.origin + along * depth for depth in (near_mm, far_mm)]))
     if not np.isfinite(seen).all():
-        return 0, 0, other.width, other.height
+        return Roi.whole(other.width, other.height)
     size = np.array([other.width, other.height])
     low = np.clip(np.floor(seen.min(axis=0)), 0, size).astype(int)
     high = np.clip(np.ceil(seen.max(axis=0)) + 1, 0, size).astype(int)
-    return None if (low >= high).any() else (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+    return None if (low >= high).any() else Roi.between(*low, *high)
 
 
 def _within(
@@ -180,7 +180,7 @@ def _within(
     range_mm: tuple[float, float],
     sensor: str,
     source: str,
-    window: Window,
+    roi: Roi,
 ) -> PointCloud:
     near_mm, far_mm = range_mm
     measured = np.isfinite(points).all(axis=-1)
@@ -188,7 +188,7 @@ def _within(
         accepted = measured & (depth >= near_mm) & (depth <= far_mm)
     status = np.select([accepted, measured], [Status.VALID, Status.OUT_OF_RANGE], Status.NO_SURFACE).astype(np.uint8)
     points = np.where(accepted[..., None], points, np.nan)
-    return placed_cloud(points, status, None, window, geometry, sensor, source)
+    return placed_cloud(points, status, None, roi, geometry, sensor, source)
 
 
 def _wrong_size(name: str, shape: tuple[int, ...], grid: ViewGrid) -> InputError:

@@ -1,20 +1,17 @@
-"""What a decoder is told of the images, beside the images themselves and the calibration."""
+"""Properties of the images that a decoder needs beside the images themselves and the calibration."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from mitsim.decode.grey_levels import MeasuredNoise
-from mitsim.decode.roi import Window
 from mitsim.sensor.imager import Imager
-
-#: parts (column0, row0, column1, row1) of the raw images of two cameras that were read out, None where all was
-Regions = tuple[Window | None, Window | None]
+from mitsim.sensor.roi import Roi
 
 
 @dataclass(frozen=True)
 class ImageContext:
-    """What a decoder is told of the images.
+    """Properties of the images of a capture.
 
     Attributes
     ----------
@@ -23,18 +20,17 @@ class ImageContext:
     full_scale
         Value of a saturated pixel [DN], ``2**bits - 1``.
     imager
-        Gain, read noise and black level, from which the expected noise follows; or the noise of grey levels that the
-        images have themselves (:mod:`mitsim.decode.structured_light.measured_noise`). None where neither is known.
-    window
-        (column0, row0, column1, row1) of the cloud's grid, ends not included: decode only this part. Pixels outside
-        are ``NO_SURFACE``.
+        Gain, read noise and black level, from which the expected noise follows; or the noise of grey levels measured
+        in the images themselves (:mod:`mitsim.decode.structured_light.measured_noise`). None where neither is known.
+    roi
+        Region of the cloud's grid: decode only this. Pixels outside are ``NO_SURFACE``.
     read_out
-        Parts of the raw images of the first and the second camera that hold anything; None is the whole.
+        Region of the raw image of the first and of the second camera that was read out; None is the whole image.
     """
 
     sensor: str
     source: str
     full_scale: float
     imager: Imager | MeasuredNoise | None = None
-    window: Window | None = None
-    read_out: Regions = (None, None)
+    roi: Roi | None = None
+    read_out: tuple[Roi | None, Roi | None] = (None, None)

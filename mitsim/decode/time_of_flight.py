@@ -23,7 +23,7 @@ the lamp at p from the camera,
 exactly, lens distortion being in d. sigma_L^2 = sum w_i^2 r_i^2 s_i^2 / (sum w_i r_i^2)^2 (c / f_a)^2, s_i the noise of
 phase i in turns, goes to the ray by dt/dL = (L^2 - 2 L d.p + p.p) / (2 (L - d.p)^2).
 
-Every pixel is decoded from its own grey levels, so a window may be decoded alone, up to its very edge.
+Every pixel is decoded from its own grey levels, so a region of interest may be decoded alone, up to its very edge.
 """
 
 from __future__ import annotations
@@ -39,13 +39,14 @@ from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.decode.blocks import in_blocks
 from mitsim.decode.grey_levels import check_full_scale
+from mitsim.decode.grid_cloud import placed_cloud
 from mitsim.decode.image_context import ImageContext
-from mitsim.decode.roi import checked_window, inside, placed_cloud
 from mitsim.decode.structured_light.geometry import camera_grid
 from mitsim.decode.structured_light.phase_shift import fit_phases, refusals
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import LIGHT_MM_S, AmplitudeModulation, TimeOfFlightSettings, sample_variance
+from mitsim.sensor.roi import checked_roi
 
 #: more turns of the highest frequency than this are not searched: 160 m of optical path at 120 MHz
 _MOST_TURNS = 64
@@ -125,7 +126,7 @@ def decode_time_of_flight(
     stack
         (P, H, W) differences of the taps [DN], all delays of the lowest frequency first.
     context
-        Of the images; its ``window`` is one of the image, ``read_out`` is not used. Without an imager (noise
+        Of the images; its ``roi`` is one of the image, ``read_out`` is not used. Without an imager (noise
         that was measured is none) ``sigma`` is None, and phases are compared with quantisation and ``systematic_rad``
         alone.
 
@@ -139,8 +140,8 @@ def decode_time_of_flight(
     Raises
     ------
     InputError
-        If the stack is not what the code says, the range is longer than the code can tell, or the window does not lie
-        in the images.
+        If the stack is not what the code says, the range is longer than the code can tell, or the region of interest
+        does not lie in the images.
     """
     eye, full_scale = geometry.camera, context.full_scale
     imager = context.imager if isinstance(context.imager, Imager) else None
@@ -158,8 +159,8 @@ def decode_time_of_flight(
             f"paths under {unambiguous_path(code):.0f} mm",
             "the frequencies repeat after that: take others",
         )
-    window = checked_window(context.window, eye.width, eye.height, "decode_time_of_flight")
-    part = inside(window)
+    roi = checked_roi(context.roi, eye.width, eye.height, "decode_time_of_flight")
+    part = roi.slices
     stack = np.ascontiguousarray(stack[:, *part])
     phases = fit_phases(stack, [code.delays] * len(code.frequencies_mhz))
     noise = np.empty_like(phases.phase)
@@ -175,7 +176,7 @@ def decode_time_of_flight(
     missing = status != Status.VALID
     points[missing], sigma[missing] = np.nan, np.nan
     told = None if imager is None else sigma
-    return placed_cloud(points, status, told, window, geometry, context.sensor, context.source)
+    return placed_cloud(points, status, told, roi, geometry, context.sensor, context.source)
 
 
 def joint_path(

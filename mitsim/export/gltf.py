@@ -9,6 +9,7 @@ principal point at the centre; the frustum has the sensor's own.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ def write_glb(scene: RunScene, path: str | Path) -> None:
     gltf = needed("pygltflib", "pygltflib", f"{path}: glTF")
     file = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator=f"mitsim {__version__}"))
     blob = bytearray()
+    glb = _Glb(gltf, file, blob)
     turn = Rotation.from_rotvec([-math.pi / 2, 0, 0]).as_quat()
     root = gltf.Node(name="part_frame", rotation=turn.tolist(), children=[])
     file.nodes.append(root)
@@ -47,20 +49,20 @@ def write_glb(scene: RunScene, path: str | Path) -> None:
         metal = gltf.PbrMetallicRoughness(baseColorFactor=colour, metallicFactor=0.2, roughnessFactor=0.6)
         file.materials.append(gltf.Material(name="part", pbrMetallicRoughness=metal, doubleSided=True))
         places, faces = np.asarray(scene.part.vertices), np.asarray(scene.part.faces)
-        mesh = _mesh(gltf, file, blob, "part", places, faces.ravel(), _TRIANGLES, 0)
-        _node(gltf, file, root, "part", mesh=mesh)
+        mesh = _mesh(glb, "part", places, faces.ravel(), _TRIANGLES, 0)
+        _node(glb, root, "part", mesh=mesh)
     lines = camera = None
     if scene.grid is not None:
         places, edges = frustum(scene.grid, FRUSTUM_MM)
-        lines = _mesh(gltf, file, blob, "frustum", places, np.array(edges).ravel(), _LINES, None)
-        camera = _camera(gltf, file, scene)
+        lines = _mesh(glb, "frustum", places, np.array(edges).ravel(), _LINES, None)
+        camera = _camera(glb, scene)
     for view in scene.views:
-        node = _node(gltf, file, root, view.name, view.part_from_sensor)
+        node = _node(glb, root, view.name, view.part_from_sensor)
         node.extras = {"view": view.number, "best_of": list(view.best_of), "sensor": scene.sensor}
         if scene.grid is not None:
             pose = sensor_from_grid(scene.grid)
-            _node(gltf, file, node, f"{view.name}_frustum", pose, mesh=lines)
-            _node(gltf, file, node, f"{view.name}_camera", pose @ OPENCV_FROM_OPENGL, camera=camera)
+            _node(glb, node, f"{view.name}_frustum", pose, mesh=lines)
+            _node(glb, node, f"{view.name}_camera", pose @ OPENCV_FROM_OPENGL, camera=camera)
     file.buffers = [gltf.Buffer(byteLength=len(blob))] if blob else []
     if blob:
         file.set_binary_blob(bytes(blob))
@@ -74,29 +76,37 @@ def field_of_view(grid: ViewGrid) -> tuple[float, float]:
     return 2 * math.atan(y / 2), x / y
 
 
-def _camera(gltf: Any, file: Any, scene: RunScene) -> int:
+@dataclass(frozen=True)
+class _Glb:
+    """A file that is made: the library ``gltf``, its ``file`` object, and the ``blob`` of its numbers."""
+
+    gltf: Any
+    file: Any
+    blob: bytearray
+
+
+def _camera(glb: _Glb, scene: RunScene) -> int:
     assert scene.grid is not None
+    gltf, file = glb.gltf, glb.file
     vertical, aspect = field_of_view(scene.grid)
     optics = gltf.Perspective(yfov=vertical, aspectRatio=aspect, znear=0.01)
     file.cameras.append(gltf.Camera(type="perspective", perspective=optics, name=scene.sensor))
     return len(file.cameras) - 1
 
 
-def _node(gltf: Any, file: Any, parent: Any, name: str, pose: Transform | None = None, **contents: Any) -> Any:
+def _node(glb: _Glb, parent: Any, name: str, pose: Transform | None = None, **contents: Any) -> Any:
     """Append a node to its parent; ``pose`` in mm."""
-    node = gltf.Node(name=name, children=[], **contents)
+    node = glb.gltf.Node(name=name, children=[], **contents)
     if pose is not None:
         node.translation = (pose.translation / 1000).tolist()
         node.rotation = Rotation.from_matrix(pose.rotation).as_quat(canonical=True).tolist()
-    parent.children.append(len(file.nodes))
-    file.nodes.append(node)
+    parent.children.append(len(glb.file.nodes))
+    glb.file.nodes.append(node)
     return node
 
 
 def _mesh(
-    gltf: Any,
-    file: Any,
-    blob: bytearray,
+    glb: _Glb,
     name: str,
     places: NDArray[np.float64],
     indices: NDArray[np.integer],
@@ -104,11 +114,10 @@ def _mesh(
     material: int | None,
 ) -> int:
     """Append places (n, 3) [mm] and indices as a mesh of one primitive."""
+    gltf, file = glb.gltf, glb.file
     metres = (places / 1000).astype("<f4")
     position = _accessor(
-        gltf,
-        file,
-        blob,
+        glb,
         metres.tobytes(),
         _ARRAY_BUFFER,
         gltf.Accessor(
@@ -120,9 +129,7 @@ def _mesh(
         ),
     )
     index = _accessor(
-        gltf,
-        file,
-        blob,
+        glb,
         indices.astype("<u4").tobytes(),
         _ELEMENT_BUFFER,
         gltf.Accessor(
@@ -138,8 +145,9 @@ def _mesh(
     return len(file.meshes) - 1
 
 
-def _accessor(gltf: Any, file: Any, blob: bytearray, data: bytes, target: int, accessor: Any) -> int:
-    file.bufferViews.append(gltf.BufferView(buffer=0, byteOffset=len(blob), byteLength=len(data), target=target))
+def _accessor(glb: _Glb, data: bytes, target: int, accessor: Any) -> int:
+    file, blob = glb.file, glb.blob
+    file.bufferViews.append(glb.gltf.BufferView(buffer=0, byteOffset=len(blob), byteLength=len(data), target=target))
     blob += data
     accessor.bufferView = len(file.bufferViews) - 1
     file.accessors.append(accessor)

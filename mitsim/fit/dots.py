@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import fourier_gaussian
 from scipy.optimize import brentq
 
-from mitsim.fit.observation import Bench, Floats, View, window_of
+from mitsim.fit.observation import Floats, View
+from mitsim.fit.white_coupon import Bench, coupon_roi
 
 #: blurs [px] that are tried
 _LARGEST_BLUR = 4.0
@@ -43,9 +44,9 @@ class Dots:
 def compare_dots(view: View, bench: Bench) -> Dots:
     """Hold the dots of a view (its ``unit`` light low-passed) against the first frame of the sensor's own pattern."""
     camera = bench.sensor.rig.cameras[view.camera]
-    part = window_of(camera, view.place)
-    spectrum = np.fft.fft2(bench.white(view.place, view.camera, part, "first") * view.exposure_s)
-    rows, columns = view.rows - part.row, view.columns - part.column
+    roi = coupon_roi(camera, view.place)
+    spectrum = np.fft.fft2(bench.white(view.place, view.camera, roi, "first") * view.exposure_s)
+    rows, columns = view.rows - roi.top, view.columns - roi.left
     pairs, none = _neighbours(view), np.zeros(len(view.unit))
 
     def own(blur: float) -> Floats:

@@ -1,26 +1,25 @@
-"""What a capture shows of a coupon, in blocks, beside what a white coupon would have shown.
+"""Blocks of pixels on a coupon in a capture, beside those that a white coupon would have shown.
 
 Signal chain: images [DN] -> photo-electrons, by the imager's curve undone -> mean of the images, less the scene's own
-light -> the pixels inside the coupon -> blocks. Beside it: mean of the patterns -> radiance L_1 of a Lambertian coupon
-at the same pose, through the same lenses -> electrons per unit of pi f and of relative power; directions toward camera
-and lamp at every pixel.
+light -> the pixels inside the coupon -> blocks. Beside it: radiance L_1 of a white coupon at the same pose, through the
+same lenses (:mod:`mitsim.fit.white_coupon`) -> electrons per unit of pi f and of relative power; directions toward
+camera and lamp at every pixel.
 
-**Low pass.** Only the mean over the images of a capture is compared. Where the projected pattern is not known to be
-the sensor file's (a device's), the pattern is replaced by its mean over the field, and its dots count as grain.
+**Low pass.** Only the mean over the images of a capture is compared.
 
 **Light of the room.** A simulated scene without an ambient image is dark. A device's is not: there the room adds a
 radiance that is the same all over the coupon, of unknown size, less the lens's loss toward the corners.
 
 **Censoring.** A block with a saturated pixel in any image is left out, and so are its eight neighbours: next to the
-limit, grain and noise cut off the bright half of what they do, and what is left is too dark.
+limit, saturation cuts off the bright half of grain and noise, so their mean would be too dark.
 
 The noise of a pixel is that of :mod:`mitsim.fit.electrons`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,32 +28,20 @@ from scipy import ndimage
 from mitsim.capture.capture import Capture
 from mitsim.errors import InputError
 from mitsim.fit.electrons import PixelNoise, chip_of, linearised, pixel_noise
-from mitsim.fit.place import Place, found_place, known_place
-from mitsim.fit.specimen import Part, specimen_place
-from mitsim.reconstruction.cloud import capture_cloud
-from mitsim.scene.differentiable import lambertian_coupon
-from mitsim.scene.light_transport.projector_light import LitPatterns
-from mitsim.scene.ray_casting.camera_rays import Window
-from mitsim.sensor.camera import Camera, Rig
+from mitsim.fit.place import Place
+from mitsim.fit.white_coupon import Bench, Pattern, coupon_roi
+from mitsim.sensor.camera import Camera
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import AmplitudeModulation
-from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
-from mitsim.sensor.projector import Projector
-from mitsim.simulation.simulate import SimulatedSensor, bounding_window
+from mitsim.sensor.roi import Roi
 
 Floats = NDArray[np.float64]
-
-#: one image instead of a sensor's patterns: the mean of all of them; their mean level, the same all over the field;
-#: the first alone
-Pattern = Literal["mean", "level", "first"]
 
 #: pixels beside the coupon's edge that its blur may reach
 _EDGE_PX = 5.0
 #: a block must have this share of its pixels inside the coupon
 _BLOCK_SHARE = 0.5
-#: pixels of the window around the coupon
-_MARGIN_PX = 12
 #: light of a pixel relative to the brightest under which the projector does not reach it
 _UNLIT = 1e-3
 
@@ -117,108 +104,30 @@ class View:
         return float(angle.min()), float(angle.max())
 
 
-class Bench:
-    """What is set up once for a sensor: its lenses, and its projector with one image instead of its patterns."""
+@dataclass(frozen=True)
+class CouponCapture:
+    """A capture of a coupon: its ``place``, the ``index`` of the capture among several, ``where`` it is in messages."""
 
-    def __init__(self, sensor: Sensor, samples: int = 16) -> None:
-        self.sensor, self.samples = sensor, samples
-        # the patterns come below, one by one: they are not laid on the device all together
-        self._simulated = SimulatedSensor(replace(sensor, pattern=RandomDots(kind="random_dots", run_length_px=10.0)))
-        self._lit: dict[Pattern, LitPatterns] = {}
-
-    def corner_loss(self, camera: str) -> NDArray[np.float32] | None:
-        """Loss of a camera's lens toward the corners (H, W) [1], None where there is none."""
-        return self._simulated.corner_loss[camera]
-
-    def white(self, place: Place, camera: str, part: Window, pattern: Pattern) -> Floats:
-        """Electrons per second (h, w) [e-/s] of a Lambertian coupon of reflectance 1, of a window."""
-        if pattern not in self._lit:
-            self._lit[pattern] = self._one(pattern)
-        self._simulated.patterns = self._lit[pattern]
-        scene = lambertian_coupon(*place.size, self.sensor.wavelength_nm)
-        radiance = self._simulated.radiance(
-            scene, place.world_from_sensor, camera, seed=0, samples=self.samples, depth=1, window=part
-        )
-        return np.asarray(radiance[0], np.float64) * self.sensor.electrons()
-
-    def _one(self, pattern: Pattern) -> LitPatterns:
-        projector = self.sensor.projector
-        frames = self.sensor.patterns()
-        sent = projector.emit(frames[:1]) if pattern == "first" else _mean_sent(frames, projector)
-        if pattern == "level":
-            sent = np.full_like(sent, sent.mean())
-        values = (sent - projector.black_level) / (1.0 - projector.black_level)
-        values = np.clip(values, 0.0, 1.0) ** (1.0 / projector.gamma)
-        return LitPatterns(values.astype(np.float32), projector)
-
-
-def _mean_sent(frames: NDArray[np.float32], projector: Projector) -> NDArray[np.float32]:
-    """Mean of what frames (P, H, W) send, (1, H, W), one after the other: many fill the memory."""
-    total = np.zeros(frames.shape[1:])
-    for frame in frames:
-        total += projector.emit(frame)
-    return np.asarray(total[None] / len(frames), np.float32)
-
-
-def pattern_is_known(capture: Capture, sensor: Sensor) -> bool:
-    """Whether the images of a capture were taken with the very pattern of the sensor file."""
-    return capture.settings.get("pattern") == sensor.pattern.model_dump(mode="json")
-
-
-def with_rig(sensor: Sensor, rig: Rig) -> Sensor:
-    """The sensor with the cameras of a capture; the projector, of which recordings say nothing, stays the file's."""
-    return replace(sensor, rig=replace(rig, projector=sensor.rig.projector))
-
-
-def place_of(
-    capture: Capture, sensor: Sensor, size: tuple[float, float], where: str, part: Part | None = None
-) -> Place:
-    """Where the coupon lies: by the ``part`` of the image that shows it, else by the pose of the capture, else by the
-    plane of its cloud.
-
-    Raises
-    ------
-    InputError
-        If neither is there, or the coupon shows its back.
-    """
-    if part is not None:
-        return specimen_place(capture, sensor.settings, part, where)
-    if capture.world_from_sensor is None:
-        imager = sensor.imager if sensor.imager.bits == capture.bits else None
-        return found_place(capture_cloud(capture, sensor.settings, imager=imager), where)
-    place = known_place(capture.world_from_sensor, *size)
-    if place.world_from_sensor.translation[2] <= 0:
-        raise InputError(where, "world_from_sensor", "a sensor behind the coupon", "a place with z over 0")
-    return place
-
-
-def window_of(camera: Camera, place: Place) -> Window:
-    """The part of a camera's image that holds a coupon and a little around it."""
-    return bounding_window(camera, place.corners(), _MARGIN_PX) or Window(0, 0, camera.width, camera.height)
+    capture: Capture
+    place: Place
+    index: int
+    where: str
 
 
 def observe(
-    capture: Capture,
-    index: int,
-    bench: Bench,
-    place: Place,
-    block_px: int,
-    where: str,
-    *,
-    pattern: Pattern,
-    lit_room: bool = False,
+    taken: CouponCapture, bench: Bench, block_px: int, *, pattern: Pattern, lit_room: bool = False
 ) -> list[View]:
     """Every camera's view of a coupon, at every exposure.
 
-    ``index`` of the capture, ``where`` its name in messages; ``pattern`` ``mean`` if it is the sensor's own, else
-    ``level``; ``lit_room`` if other light than the projector's is in the images.
+    ``pattern`` is ``mean`` if the capture has the sensor's own, else ``level``; ``lit_room`` if the images have other
+    light than the projector's.
 
     Raises
     ------
     InputError
         If the capture is of another kind than can be compared, or says too little of how it was taken.
     """
-    sensor = bench.sensor
+    sensor, capture, place, where = bench.sensor, taken.capture, taken.place, taken.where
     if isinstance(sensor.pattern, AmplitudeModulation):
         raise InputError(where, "technology", capture.technology, "images of light, not of its correlation")
     if not capture.images:
@@ -235,33 +144,32 @@ def observe(
                 where, "images", f"{len(stack)} of {name}", f"as many at each of {len(exposures)} exposures"
             )
         camera = sensor.rig.cameras[name]
-        part = window_of(camera, place)
-        white = bench.white(place, name, part, pattern)
+        roi = coupon_roi(camera, place)
+        white = bench.white(place, name, roi, pattern)
         loss = bench.corner_loss(name)
-        seen = _Seen.of(camera, place, sensor, part, _read_out(capture, name), white, loss)
+        seen = _Seen.of(camera, place, sensor, roi, _read_out(capture, name), white, loss)
         each = len(stack) // len(exposures)
-        window = stack[:, part.row : part.row + part.height, part.column : part.column + part.width]
+        shown = stack[:, *roi.slices]
         for number, seconds in enumerate(exposures):
-            images = window[number * each : (number + 1) * each]
+            images = shown[number * each : (number + 1) * each]
             chip = chip_of(capture, sensor.imager, where)
             noise = pixel_noise(sensor.imager, chip, each - ambient, float(seconds), ambient)
             blocks = _Blocks.of(seen, images, chip, block_px)
-            room = seen.loss * (seconds if lit_room and not ambient else 0.0)
-            views.append(
-                _view(seen, blocks, images, chip, noise, index, where, name, float(seconds), room, ambient, place)
-            )
+            lit, dark = (images[:-1], images[-1]) if ambient else (images, None)
+            frames = _Frames(lit, dark, chip, float(seconds), float(seconds) if lit_room and not ambient else 0.0)
+            views.append(_view(taken, name, seen, blocks, frames, noise))
     return views
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a window of a camera (h, w) sees of a coupon: which pixels are inside, where they meet the plane.
+    """A coupon in a region (h, w) of a camera's image: which pixels are inside, where they meet the plane.
 
     ``white`` (h, w) [e-/s] of a white coupon; ``loss`` (h, w) of the lens toward the corners; centres of camera and
     lamp in the coupon's frame [mm].
     """
 
-    part: Window
+    roi: Roi
     inside: NDArray[np.bool_]
     points: Floats
     white: Floats
@@ -275,14 +183,14 @@ class _Seen:
         camera: Camera,
         place: Place,
         sensor: Sensor,
-        part: Window,
-        read_out: Window | None,
+        roi: Roi,
+        read_out: Roi | None,
         white: Floats,
         corner_loss: NDArray[np.float32] | None,
     ) -> _Seen:
         pose = place.world_from_sensor
         centre, lamp = pose.points(camera.centre), pose.points(sensor.projector.optics.centre)
-        columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
+        columns, rows = roi.pixels()
         rays = camera.rays(np.stack([columns, rows], axis=-1).astype(float))
         rays = pose.directions(camera.sensor_from_camera.directions(rays))
         down = rays[..., 2] < -1e-6
@@ -293,10 +201,10 @@ class _Seen:
         inside = down & (white > _UNLIT * white.max())
         inside[inside] = place.holds(points[inside][:, :2], _EDGE_PX * footprint[inside])
         if read_out is not None:
-            inside &= (columns >= read_out.column) & (columns < read_out.column + read_out.width)
-            inside &= (rows >= read_out.row) & (rows < read_out.row + read_out.height)
+            inside &= (columns >= read_out.left) & (columns < read_out.right)
+            inside &= (rows >= read_out.top) & (rows < read_out.bottom)
         loss = np.ones(white.shape) if corner_loss is None else corner_loss[rows, columns].astype(float)
-        return cls(part, inside, points, white, loss, centre, lamp)
+        return cls(roi, inside, points, white, loss, centre, lamp)
 
     def toward(self, centre: Floats, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
         """Unit directions (N, 3) from the points of some pixels toward a place."""
@@ -306,7 +214,7 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _Blocks:
-    """The pixels of a window that are compared: ``rows``, ``columns`` (N,) in it, ``block`` (N,), ``grid`` (B, 2)."""
+    """The pixels of a region that are compared: ``rows``, ``columns`` (N,) in it, ``block`` (N,), ``grid`` (B, 2)."""
 
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
@@ -331,38 +239,41 @@ class _Blocks:
         return cls(rows[kept], columns[kept], block.reshape(-1), grid, width, int(held.sum()))
 
 
-def _view(
-    seen: _Seen,
-    blocks: _Blocks,
-    images: NDArray[np.unsignedinteger[Any]],
-    chip: Imager,
-    noise: PixelNoise,
-    index: int,
-    where: str,
-    camera: str,
-    seconds: float,
-    room: Floats,
-    ambient: bool,
-    place: Place,
-) -> View:
-    rows, columns = blocks.rows, blocks.columns
-    lit = images[:-1] if ambient else images
-    electrons = linearised(lit[:, rows, columns], chip).mean(axis=0)
-    if ambient:
-        electrons = electrons - linearised(images[-1, rows, columns], chip)
+@dataclass(frozen=True)
+class _Frames:
+    """Images of one camera at one exposure, of its region.
+
+    ``lit`` (F, h, w) [DN]; ``dark`` (h, w) with the projector off, None without such an image; ``chip`` that took them;
+    ``seconds`` of exposure, ``room_seconds`` in which light of the room is in them, 0 if there is none.
+    """
+
+    lit: NDArray[np.unsignedinteger[Any]]
+    dark: NDArray[np.unsignedinteger[Any]] | None
+    chip: Imager
+    seconds: float
+    room_seconds: float
+
+    def electrons(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
+        """Mean photo-electrons (N,) of some pixels, less those of the dark image."""
+        mean = linearised(self.lit[:, rows, columns], self.chip).mean(axis=0)
+        return np.asarray(mean if self.dark is None else mean - linearised(self.dark[rows, columns], self.chip))
+
+
+def _view(taken: CouponCapture, camera: str, seen: _Seen, blocks: _Blocks, frames: _Frames, noise: PixelNoise) -> View:
+    rows, columns, place = blocks.rows, blocks.columns, taken.place
     return View(
-        index,
-        where,
+        taken.index,
+        taken.where,
         camera,
-        seconds,
-        columns + seen.part.column,
-        rows + seen.part.row,
+        frames.seconds,
+        columns + seen.roi.left,
+        rows + seen.roi.top,
         blocks.block,
         blocks.width,
         blocks.grid,
-        electrons,
-        seen.white[rows, columns] * seconds,
-        room[rows, columns],
+        frames.electrons(rows, columns),
+        seen.white[rows, columns] * frames.seconds,
+        seen.loss[rows, columns] * frames.room_seconds,
         seen.toward(seen.camera_centre, rows, columns),
         seen.toward(seen.lamp_centre, rows, columns),
         noise,
@@ -388,7 +299,7 @@ def _why_nothing(seen: _Seen, place: Place, width: int) -> str:
     return f"its {inside} pixels, {_EDGE_PX:g} px inside the edge, fill half of no block of {width} x {width} px"
 
 
-def _read_out(capture: Capture, camera: str) -> Window | None:
-    """The part of a camera that was read out, None where all was."""
+def _read_out(capture: Capture, camera: str) -> Roi | None:
+    """Region of a camera's image that was read out, None for the whole image."""
     region = capture.settings.get("read_out", {}).get(camera)
-    return None if region is None else Window(*region)
+    return None if region is None else Roi(*region)

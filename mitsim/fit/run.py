@@ -21,16 +21,19 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.errors import InputError
 from mitsim.fit.dots import Dots, compare_dots
-from mitsim.fit.estimate import Fit, Parameter, Residual, fit_views
+from mitsim.fit.estimate import Fit, Parameter, fit_views
 from mitsim.fit.finish import MetalFinish, metal_finish
-from mitsim.fit.observation import Bench, View, observe, pattern_is_known, place_of, with_rig
+from mitsim.fit.observation import CouponCapture, View, observe
 from mitsim.fit.place import Place
-from mitsim.fit.specimen import Part
+from mitsim.fit.problem import Residual
+from mitsim.fit.specimen import place_of
+from mitsim.fit.white_coupon import Bench, pattern_is_known, with_rig
 from mitsim.progress import say, track
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, load_sensor, presets
+from mitsim.sensor.roi import Roi
 
 #: side of a block [px] where the pattern is known, and where its dots count as grain: several times as wide as the
 #: grain is long, under one pixel and about two
@@ -143,7 +146,7 @@ def fit_captures(
     scene: Path | None = None,
     parameters: dict[str, str] | None = None,
     block_px: int | None = None,
-    window: Part | None = None,
+    roi: Roi | None = None,
 ) -> CouponFit:
     """Fit a coupon's finish and the projector's power to captures of it.
 
@@ -156,9 +159,9 @@ def fit_captures(
         left out. ``parameters`` set its ``<default>``s.
     block_px
         Side of a block [px].
-    window
-        Part (column, row, width, height) of the first camera's image that shows the coupon and nothing else [px]: its
-        plane is that of its points, whatever pose the captures say.
+    roi
+        Region of the first camera's image that shows the coupon and nothing else: the plane is fitted to its points,
+        whatever pose the captures say.
 
     Raises
     ------
@@ -193,11 +196,10 @@ def fit_captures(
             ready = capture.rig, Bench(with_rig(chosen, capture.rig))
         bench, known = ready[1], pattern_is_known(capture, chosen)
         unknown |= not known
-        place = place_of(capture, bench.sensor, (sample.width, sample.height), str(folder), window)
+        place = place_of(capture, bench.sensor, (sample.width, sample.height), str(folder), roi)
         lit = capture.source != "simulated" or has_emitters(sample.scene)
-        seen = observe(
-            capture, index, bench, place, block, str(folder), pattern="mean" if known else "level", lit_room=lit
-        )
+        taken = CouponCapture(capture, place, index, str(folder))
+        seen = observe(taken, bench, block, pattern="mean" if known else "level", lit_room=lit)
         if not known and isinstance(chosen.pattern, DotPattern):
             dots += [compare_dots(view, bench) for view in seen if view.size]
         views += seen

@@ -1,6 +1,6 @@
 """Where the flat specimen of a capture lies, how it is bent, and which pixels show it.
 
-Signal chain: capture -> cloud, by its own decoder -> plane of the points in the part of the image that the user
+Signal chain: capture -> cloud, by its own decoder -> plane of the points in the region of the image that the user
 named, else of most points (:mod:`mitsim.fit.place`) -> its extent, and the bend of its points
 (:mod:`mitsim.fit.bend`) -> which pixels and view rays meet it.
 """
@@ -15,25 +15,21 @@ from numpy.typing import NDArray
 from characterisation.features.fits import fit_plane
 from characterisation.features.robust_fit import FitError
 from mitsim.capture.capture import Capture
-from mitsim.decode.roi import Window
 from mitsim.errors import InputError
 from mitsim.fit.bend import Bend, fit_bend
-from mitsim.fit.place import Place, found_place, plane_points
+from mitsim.fit.place import Place, found_place, known_place, plane_points
 from mitsim.reconstruction.cloud import Settings, capture_cloud, capture_geometry
-from mitsim.scene.ray_casting.camera_rays import Window as CameraWindow
 from mitsim.sensor.camera import Camera
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.roi import Roi, roi_around
 from mitsim.sensor.transforms import Transform
-from mitsim.simulation.simulate import bounding_window
 
 Floats = NDArray[np.float64]
-
-#: part of the reference image that holds the specimen: column, row, width, height [px]
-Part = tuple[int, int, int, int]
 
 #: pixels inside the specimen's outline that are not looked at: its edge is blurred, and matched with what is behind
 MARGIN_PX = 15.0
 
-#: points in the user's window without which there is no plane, and those at most that it is fitted to
+#: least points of a plane in the user's region, and most points that it is fitted to
 _FEWEST_POINTS, _PLANE_POINTS = 500, 20000
 
 #: cosine to the normal from which on a ray meets the plane
@@ -46,49 +42,49 @@ _CELLS = 120
 _NEAR_PLANE = 0.02
 
 
-def specimen_place(capture: Capture, settings: Settings, part: Part | None, where: str) -> Place:
-    """Plane of the specimen and which of it there is, from the capture's decoded cloud.
+def specimen_place(capture: Capture, settings: Settings, roi: Roi | None, where: str) -> Place:
+    """Estimate the plane and the outline of the specimen from the capture's decoded cloud.
 
-    ``part`` of the reference image: all of it is specimen, also where it has no points, and the plane is that of its
-    points (:func:`characterisation.features.fits.fit_plane`). Without one, it is the plane through most points of the
-    cloud, and what of it is dense with points (:func:`mitsim.fit.place.found_place`).
+    ``roi`` of the reference image: all of it is specimen, also where it has no points, and the plane is fitted to its
+    points (:func:`characterisation.features.fits.fit_plane`). Without a region, the plane is that of most points of the
+    cloud, and the outline is where points are dense (:func:`mitsim.fit.place.found_place`).
 
     Raises
     ------
     InputError
-        If the part is not in the image, or too few points lie in one plane.
+        If the region is not in the image, or too few points lie in one plane.
     """
     if not capture.images:
         raise InputError(where, "images", "none", "a capture with images, not a device's map alone")
-    if part is None:
+    if roi is None:
         cloud = capture_cloud(capture, settings)
         flat = found_place(cloud, where)
         return replace(flat, bend=_bend_of(flat, cloud.points[cloud.valid].astype(float)))
-    column, row, width, height = part
     camera, geometry = capture.rig.reference, capture_geometry(capture, settings)
-    if min(part) < 0 or width * height == 0 or column + width > camera.width or row + height > camera.height:
+    asked = [roi.left, roi.top, roi.width, roi.height]
+    if not roi.fits(camera.width, camera.height):
         allowed = f"COLUMN ROW WIDTH HEIGHT within {camera.width} x {camera.height} pixels"
-        raise InputError("--window", "", list(part), allowed)
+        raise InputError("--window", "", asked, allowed)
     grid = geometry.grid
-    low, high = np.array([column, row]), np.array([column + width, row + height])
+    low, high = np.array([roi.left, roi.top]), np.array([roi.right, roi.bottom])
 
     def shown(points: Floats) -> NDArray[np.bool_]:
         pixels = camera.project(points)
         return np.asarray(((pixels >= low) & (pixels < high)).all(axis=-1))
 
     inside = shown(grid.origin + 1000.0 * grid.rays())
-    cloud = capture_cloud(capture, settings, geometry, window=window_around(inside))
+    cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(inside))
     found = cloud.points[inside & cloud.valid].astype(float)
     # a decoder's stray points lie far off, along the rays: a fit that begins with them would be drawn onto the rays
     points = found[plane_points(found)]
     if len(points) < _FEWEST_POINTS:
-        told = f"{len(found)} points in {list(part)}" + (f", {len(points)} of them in one plane" if len(found) else "")
+        told = f"{len(found)} points in {asked}" + (f", {len(points)} of them in one plane" if len(found) else "")
         raise InputError("--window", "", told, f"{_FEWEST_POINTS} or more, to find its plane")
     try:
         plane = fit_plane(points[:: -(-len(points) // _PLANE_POINTS)], camera.centre)
     except FitError as error:
         hint = "name a part that shows a flat specimen, seen less obliquely"
-        raise InputError("--window", "", f"{list(part)}, where {error}", "a plane", hint) from None
+        raise InputError("--window", "", f"{asked}, where {error}", "a plane", hint) from None
     off = (points - plane.point) @ plane.normal
     across = np.array([1.0, 0.0, 0.0]) - plane.normal[0] * plane.normal
     across /= np.linalg.norm(across)
@@ -110,6 +106,26 @@ def specimen_place(capture: Capture, settings: Settings, part: Part | None, wher
     return replace(place, bend=_bend_of(place, points))
 
 
+def place_of(capture: Capture, sensor: Sensor, size: tuple[float, float], where: str, roi: Roi | None = None) -> Place:
+    """Place of the coupon: by the region of the image that shows it, else by the pose of the capture, else by the plane
+    of its cloud.
+
+    Raises
+    ------
+    InputError
+        If neither is there, or the coupon shows its back.
+    """
+    if roi is not None:
+        return specimen_place(capture, sensor.settings, roi, where)
+    if capture.world_from_sensor is None:
+        imager = sensor.imager if sensor.imager.bits == capture.bits else None
+        return found_place(capture_cloud(capture, sensor.settings, imager=imager), where)
+    place = known_place(capture.world_from_sensor, *size)
+    if place.world_from_sensor.translation[2] <= 0:
+        raise InputError(where, "world_from_sensor", "a sensor behind the coupon", "a place with z over 0")
+    return place
+
+
 def _bend_of(place: Place, points: Floats) -> Bend | None:
     """Bend of the points (n, 3) of the sensor frame that lie on a place's cells."""
     local = place.world_from_sensor.points(points)
@@ -117,14 +133,6 @@ def _bend_of(place: Place, points: Floats) -> Bend | None:
     inside = np.zeros(len(local), bool)
     inside[near] = place.holds(local[near, :2], np.zeros(int(near.sum())))
     return fit_bend(local[inside]) if inside.sum() >= _FEWEST_POINTS else None
-
-
-def window_around(mask: NDArray[np.bool_]) -> Window | None:
-    """Smallest window of a grid that holds all pixels of a mask (H, W); None if there are none."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not len(rows):
-        return None
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def on_specimen(place: Place, origin: Floats, rays: Floats, pitch: float, margin_px: float) -> NDArray[np.bool_]:
@@ -155,8 +163,8 @@ def feet_of(pose: Transform, origin: Floats, rays: Floats) -> tuple[Floats, Floa
 def image_mask(place: Place, camera: Camera, margin_px: float = 0.0) -> NDArray[np.bool_]:
     """Which pixels (H, W) of a camera's raw image show the specimen."""
     mask = np.zeros((camera.height, camera.width), bool)
-    part = bounding_window(camera, place.corners(), 1) or CameraWindow(0, 0, camera.width, camera.height)
-    columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
+    roi = roi_around(camera, place.corners(), 1) or Roi.whole(camera.width, camera.height)
+    columns, rows = roi.pixels()
     rays = camera.sensor_from_camera.directions(camera.rays(np.stack([columns, rows], axis=-1).astype(float)))
     pitch = 1.0 / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
     mask[rows, columns] = on_specimen(place, camera.centre, rays, pitch, margin_px)

@@ -21,6 +21,7 @@ from mitsim.sensor import preset
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.surface.scatter import NOMINAL, Deviation
 
@@ -160,7 +161,7 @@ def render(
             raise InputError("render", name, value, f"{low} to {high}")
     stands = as_pose(pose, "render")
     chosen = Noise.parse(noise, "render: noise")
-    taken = laid_out(sensor).capture(scene, stands, seed=seed, samples=samples, depth=depth, noise=chosen)
+    taken = laid_out(sensor).capture(scene, stands, seed=seed, rendering=Rendering(samples, depth), noise=chosen)
     return replace(taken, taken_by=sensor)
 
 

@@ -26,7 +26,8 @@ from characterisation.errors import InputError, nearest
 from characterisation.point_cloud import PointCloud
 from mitsim.measuring.request import named_numbers, named_once, window_of
 from mitsim.measuring.result import Result, failed
-from mitsim.measuring.windows import LEAST_POINTS, ImageWindow
+from mitsim.measuring.windows import LEAST_POINTS, window_points, window_slices
+from mitsim.sensor.roi import Roi
 
 Answer = TypeVar("Answer")
 
@@ -43,8 +44,8 @@ class Artefacts:
     window and diameter [mm]; ``spacings``: two spheres and the distance of their centres [mm].
     """
 
-    planes: Mapping[str, tuple[ImageWindow, float | None]]
-    spheres: Mapping[str, tuple[ImageWindow, float]]
+    planes: Mapping[str, tuple[Roi | None, float | None]]
+    spheres: Mapping[str, tuple[Roi | None, float]]
     spacings: Sequence[tuple[str, str, float]]
 
 
@@ -56,13 +57,13 @@ def read_artefacts(planes: Sequence[str], spheres: Sequence[str], spacings: Sequ
     InputError
         If one does not make sense; the option and what is allowed are named.
     """
-    flat: dict[str, tuple[ImageWindow, float | None]] = {}
+    flat: dict[str, tuple[Roi | None, float | None]] = {}
     for text in planes:
         name, numbers = named_numbers("--plane", text, (0, 1, 4, 5), _PLANE)
         named_once("--plane", name, flat)
         known = _length("--plane", text, numbers.pop(), _PLANE) if len(numbers) in (1, 5) else None
         flat[name] = window_of("--plane", text, numbers, _PLANE), known
-    balls: dict[str, tuple[ImageWindow, float]] = {}
+    balls: dict[str, tuple[Roi | None, float]] = {}
     for text in spheres:
         name, numbers = named_numbers("--sphere", text, (1, 5), _SPHERE)
         named_once("--sphere", name, {**flat, **balls})
@@ -96,7 +97,7 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
     for name, (window, distance) in artefacts.planes.items():
         out += _of_plane(name, cloud, window, distance, baseline_mm)
     for name, (window, diameter) in artefacts.spheres.items():
-        points, count = window.points(cloud, name), _pixels(cloud, window, name)
+        points, count = window_points(window, cloud, name), _pixels(cloud, window, name)
         error = _or_reason(probing_error, points, diameter)
         for label, field in ((f"{name} form error PF", "form"), (f"{name} size error PS", "size")):
             if isinstance(error, str):
@@ -104,7 +105,7 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
             else:
                 out.append(Result(label, "mm", getattr(error, field), points=len(points), points_given=count))
     for first, second, distance in artefacts.spacings:
-        one, other = (artefacts.spheres[name][0].points(cloud, name) for name in (first, second))
+        one, other = (window_points(artefacts.spheres[name][0], cloud, name) for name in (first, second))
         label = f"{first}-{second} spacing error SD"
         found = _or_reason(sphere_spacing_error, one, other, distance)
         count = len(one) + len(other)
@@ -125,7 +126,7 @@ def joint_figures(clouds: Sequence[PointCloud], artefacts: Artefacts) -> list[Re
     out: list[Result] = []
     noise = temporal_noise(clouds) if artefacts.planes else np.empty((0, 0))
     for name, (window, distance) in artefacts.planes.items():
-        inside = window.inside(clouds[0], name)
+        inside = window_slices(window, clouds[0], name)
         region, seen = _mask(clouds[0], inside), noise[inside][np.isfinite(noise[inside])]
         reason = "no pixel has a point in two clouds"
         out += [
@@ -144,9 +145,9 @@ def joint_figures(clouds: Sequence[PointCloud], artefacts: Artefacts) -> list[Re
 
 
 def _of_plane(
-    name: str, cloud: PointCloud, window: ImageWindow, distance: float | None, baseline_mm: float | None
+    name: str, cloud: PointCloud, window: Roi | None, distance: float | None, baseline_mm: float | None
 ) -> list[Result]:
-    region, points = _mask(cloud, window.inside(cloud, name)), window.points(cloud, name)
+    region, points = _mask(cloud, window_slices(window, cloud, name)), window_points(window, cloud, name)
     count = int(region.sum())
     truth = None if distance is None else _square(cloud, distance)
     quality = plane_quality(cloud, region, truth, baseline_mm)
@@ -196,8 +197,8 @@ def _mask(cloud: PointCloud, inside: tuple[slice, slice]) -> NDArray[np.bool_]:
     return mask
 
 
-def _pixels(cloud: PointCloud, window: ImageWindow, name: str) -> int:
-    return int(_mask(cloud, window.inside(cloud, name)).sum())
+def _pixels(cloud: PointCloud, window: Roi | None, name: str) -> int:
+    return int(_mask(cloud, window_slices(window, cloud, name)).sum())
 
 
 def _length(option: str, text: str, value: float, allowed: str) -> float:

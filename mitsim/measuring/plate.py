@@ -32,7 +32,8 @@ from characterisation.point_cloud import PointCloud, ViewGrid
 from mitsim.capture.capture import Capture
 from mitsim.decode.dot_centres import dot_centres, seen_on_grid
 from mitsim.measuring.result import Result, failed
-from mitsim.measuring.windows import ImageWindow
+from mitsim.measuring.windows import window_slices
+from mitsim.sensor.roi import Roi
 
 Array = NDArray[np.float64]
 
@@ -54,9 +55,12 @@ _LEAST_AROUND = 12
 
 @dataclass(frozen=True)
 class Plate:
-    """A plate of dots ``pitch`` [mm] apart in a window; ``dark`` dots on bright ground, or bright ones on dark."""
+    """A plate of dots ``pitch`` [mm] apart in a window, None for the whole grid.
 
-    window: ImageWindow
+    ``dark`` dots lie on bright ground; otherwise bright dots on dark ground.
+    """
+
+    window: Roi | None
     pitch: float
     dark: bool = True
 
@@ -122,7 +126,7 @@ def plate_dots(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.uin
     InputError
         If the window does not lie in the grid.
     """
-    rows, columns = plate.window.inside(cloud, name)
+    rows, columns = window_slices(plate.window, cloud, name)
     found = dot_centres(np.ascontiguousarray(image[rows, columns]), plate.dark)
     if len(found) < LEAST_DOTS:
         raise FitError(f"{len(found)} round dots in the image, at least {LEAST_DOTS} are asked for")

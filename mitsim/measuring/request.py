@@ -1,4 +1,4 @@
-"""What a command line asks to be measured without a task: windows, plates, a difference.
+"""Requests of the command line to measure without a task: windows, plates, a difference.
 
 Signal chain: texts of the options -> windows and plates, checked -> results and a picture of each cloud.
 """
@@ -26,8 +26,9 @@ from characterisation.errors import InputError
 from mitsim.measuring.clouds import GivenCloud
 from mitsim.measuring.plate import Plate, image_on_grid, measure_plate
 from mitsim.measuring.result import Result, failed
-from mitsim.measuring.windows import Between, ImageWindow, Shape, WindowPlan, measure_windows
+from mitsim.measuring.windows import Between, Shape, WindowPlan, measure_windows, window_slices
 from mitsim.report.measured_figures import difference_figure, distance_figure
+from mitsim.sensor.roi import Roi
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,12 +44,12 @@ _WINDOW, _PLATE = (
 
 @dataclass(frozen=True)
 class Asked:
-    """Features in windows, ``plates`` by name, and the difference from a reference ``by`` a way, in a ``part``."""
+    """Features in windows, ``plates`` by name, and the difference from a reference ``by`` a way, in a ``window``."""
 
     plan: WindowPlan
     plates: Mapping[str, Plate]
     by: str
-    part: ImageWindow
+    window: Roi | None
     differs: bool
 
     @property
@@ -82,27 +83,22 @@ class Asked:
         if reference is None:
             return results, lambda: distance_figure(cloud, boxes)
         values = self._difference(given, reference)
-        part = _box(self.part) if self.part.width else None
-        found = distribution(values, int(cloud.valid[self.part.inside(cloud, "difference")].sum()))
-        return results + _of_difference(found), lambda: difference_figure(values, found, boxes, part)
+        found = distribution(values, int(cloud.valid[window_slices(self.window, cloud, "difference")].sum()))
+        return results + _of_difference(found), lambda: difference_figure(values, found, boxes, self.window)
 
     def _difference(self, given: GivenCloud, reference: GivenCloud) -> NDArray[np.float64]:
         cloud, other = given.cloud, reference.cloud
         rays = self.by == "rays" or (self.by == "auto" and same_grid(cloud.grid, other.grid))
         values = difference_along_rays(cloud, other) if rays else difference_to_surface(cloud, other)
         out = np.full(values.shape, np.nan)
-        inside = self.part.inside(cloud, "difference")
+        inside = window_slices(self.window, cloud, "difference")
         out[inside] = values[inside]
         return out
 
-    def _boxes(self) -> dict[str, tuple[int, int, int, int]]:
+    def _boxes(self) -> dict[str, Roi]:
         windows = {name: window for name, (_, window) in self.plan.features.items()}
         windows |= {name: plate.window for name, plate in self.plates.items()}
-        return {name: _box(one) for name, one in windows.items() if one.width > 0}
-
-
-def _box(window: ImageWindow) -> tuple[int, int, int, int]:
-    return window.column, window.row, window.width, window.height
+        return {name: one for name, one in windows.items() if one is not None}
 
 
 def read_asked(
@@ -112,7 +108,7 @@ def read_asked(
     bright: bool,
     against: Path | None,
     by: str,
-    part: tuple[int, int, int, int] | None,
+    window: tuple[int, int, int, int] | None,
 ) -> Asked:
     """Read the texts of options: ``features`` by shape, ``between`` by angle or distance, ``plates``.
 
@@ -121,7 +117,7 @@ def read_asked(
     InputError
         If one does not make sense; the option and what is allowed are named.
     """
-    named: dict[str, tuple[Shape, ImageWindow]] = {}
+    named: dict[str, tuple[Shape, Roi | None]] = {}
     for shape, texts in features.items():
         for text in texts:
             name, numbers = named_numbers(f"--{shape}", text, (0, 4), _WINDOW)
@@ -143,16 +139,13 @@ def read_asked(
         known[name] = Plate(window_of("--dots", text, numbers[:-1], _PLATE), numbers[-1], not bright)
     if by not in WAYS:
         raise InputError("--by", "", repr(by), ", ".join(WAYS))
-    if against is None and (by != "auto" or part is not None):
-        raise InputError("--by" if part is None else "--window", "", "no --against", "--against CLOUD")
-    window = (
-        ImageWindow()
-        if part is None
-        else window_of("--window", str(part), list(map(float, part)), "COLUMN ROW WIDTH HEIGHT")
-    )
+    if against is None and (by != "auto" or window is not None):
+        raise InputError("--by" if window is None else "--window", "", "no --against", "--against CLOUD")
+    numbers = [] if window is None else list(map(float, window))
+    region = window_of("--window", str(window), numbers, "COLUMN ROW WIDTH HEIGHT")
     plan = WindowPlan(named, pairs)
     plan.check()
-    return Asked(plan, known, by, window, against is not None)
+    return Asked(plan, known, by, region, against is not None)
 
 
 def _of_difference(found: Difference) -> list[Result]:
@@ -193,8 +186,8 @@ def named_numbers(option: str, text: str, counts: tuple[int, ...], allowed: str)
         raise InputError(option, "", repr(name.strip()), str(error)) from None
 
 
-def window_of(option: str, text: str, numbers: Sequence[float], allowed: str) -> ImageWindow:
-    """Return the window of four numbers, the whole grid of none.
+def window_of(option: str, text: str, numbers: Sequence[float], allowed: str) -> Roi | None:
+    """Return the window of four numbers, None of no numbers: the whole grid.
 
     Raises
     ------
@@ -202,11 +195,11 @@ def window_of(option: str, text: str, numbers: Sequence[float], allowed: str) ->
         If they are no window.
     """
     if not numbers:
-        return ImageWindow()
+        return None
     column, row, width, height = (int(one) for one in numbers)
     if min(column, row) < 0 or min(width, height) < 1 or any(one != int(one) for one in numbers):
         raise InputError(option, "", repr(text), f"{allowed}: whole pixels, width and height over 0")
-    return ImageWindow(column, row, width, height)
+    return Roi(column, row, width, height)
 
 
 def named_once(option: str, name: str, known: Mapping[str, object]) -> None:

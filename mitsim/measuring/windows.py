@@ -43,6 +43,7 @@ from characterisation.tasks.definitions import (
 )
 from characterisation.tasks.evaluation import evaluate
 from mitsim.measuring.result import Result, failed
+from mitsim.sensor.roi import Roi
 
 Shape = Literal["plane", "sphere", "cylinder"]
 Between = Literal["angle", "distance"]
@@ -55,47 +56,43 @@ LEAST_SHARE = 0.5
 LEAST_POINTS = 30
 
 
-@dataclass(frozen=True)
-class ImageWindow:
-    """``width`` x ``height`` pixels of a cloud's grid from ``column``, ``row`` on; all of it where width is 0."""
+def window_slices(window: Roi | None, cloud: PointCloud, name: str) -> tuple[slice, slice]:
+    """Return rows and columns of a window of a cloud's grid; of the whole grid if there is none.
 
-    column: int = 0
-    row: int = 0
-    width: int = 0
-    height: int = 0
+    Raises
+    ------
+    InputError
+        If the window does not lie in the grid; ``name`` is that of its feature.
+    """
+    grid = cloud.grid
+    if window is None:
+        return slice(0, grid.height), slice(0, grid.width)
+    if not window.fits(grid.width, grid.height):
+        found = f"{window.left},{window.top},{window.width},{window.height}"
+        allowed = f"column,row,width,height within {grid.width} x {grid.height} pixels"
+        raise InputError("window", name, found, allowed, "--picture shows the cloud with its rows and columns")
+    return window.slices
 
-    def inside(self, cloud: PointCloud, name: str) -> tuple[slice, slice]:
-        """Rows and columns.
 
-        Raises
-        ------
-        InputError
-            If it does not lie in the cloud's grid.
-        """
-        grid = cloud.grid
-        if self.width == 0:
-            return slice(0, grid.height), slice(0, grid.width)
-        if self.column + self.width > grid.width or self.row + self.height > grid.height:
-            found = f"{self.column},{self.row},{self.width},{self.height}"
-            allowed = f"column,row,width,height within {grid.width} x {grid.height} pixels"
-            raise InputError("window", name, found, allowed, "--picture shows the cloud with its rows and columns")
-        return slice(self.row, self.row + self.height), slice(self.column, self.column + self.width)
-
-    def points(self, cloud: PointCloud, name: str) -> NDArray[np.float64]:
-        """Points (n, 3) [mm] in it, sensor frame."""
-        rows, columns = self.inside(cloud, name)
-        return np.asarray(cloud.points[rows, columns][cloud.valid[rows, columns]], np.float64)
+def window_points(window: Roi | None, cloud: PointCloud, name: str) -> NDArray[np.float64]:
+    """Return the valid points (n, 3) [mm] of a window; raises as :func:`window_slices`."""
+    inside = window_slices(window, cloud, name)
+    return np.asarray(cloud.points[inside][cloud.valid[inside]], float)
 
 
 @dataclass(frozen=True)
 class WindowPlan:
-    """What is measured in windows: ``features`` name -> shape and window; ``between`` pairs of features, by kind."""
+    """Features to measure in windows, and the angles and distances ``between`` them.
 
-    features: Mapping[str, tuple[Shape, ImageWindow]]
+    ``features`` name -> shape and window, None for the whole grid; each of ``between`` is a kind of measurement and the
+    names of two features.
+    """
+
+    features: Mapping[str, tuple[Shape, Roi | None]]
     between: Sequence[tuple[Between, str, str]] = ()
 
     def check(self) -> None:
-        """Refuse pairs of features that are not known, or between which there is no such measurement.
+        """Reject pairs of features that are not known, or that have no such measurement.
 
         Raises
         ------
@@ -130,7 +127,8 @@ def measure_windows(cloud: PointCloud, plan: WindowPlan) -> list[Result]:
     fits: dict[str, ShapeFit | FitError] = {}
     given: dict[str, int] = {}
     for name, (shape, window) in plan.features.items():
-        points = window.points(cloud, name)
+        part = window_slices(window, cloud, name)
+        points = np.asarray(cloud.points[part][cloud.valid[part]], np.float64)
         given[name] = len(points)
         fits[name] = fit = _fitted(points, shape, cloud.grid.origin)
         if isinstance(fit, FitError):

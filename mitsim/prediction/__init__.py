@@ -13,7 +13,7 @@ Not included: clusters of lost points, since the map has only their share F, and
 """
 
 from mitsim.prediction.perturbation import Effect, LookedAt, Perturbation, together
-from mitsim.prediction.point_statistics import expected_points, feature_statistics, performance
+from mitsim.prediction.point_statistics import ViewPoints, expected_points, feature_statistics, performance
 from mitsim.prediction.predictor import EDGE_MARGIN_PX, CharacterisedScene, Ideal, Predicted, Predictor
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "Perturbation",
     "Predicted",
     "Predictor",
+    "ViewPoints",
     "expected_points",
     "feature_statistics",
     "performance",

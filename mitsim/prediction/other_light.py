@@ -38,7 +38,7 @@ from mitsim.prediction.multipath_phase_bias import amplitude, finest_fringe, fri
 from mitsim.prediction.multipath_range_bias import path_amplitudes, path_bias, range_bias
 from mitsim.prediction.perturbation import LookedAt, Perturbation
 from mitsim.scene.light_transport.projector_light import LitPatterns, ModulatedLight
-from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
@@ -166,15 +166,13 @@ class OtherLightEffect:
         """Render the interreflections in a view."""
         given = scene, self.rays, self.light, world_from_sensor
         shape = shapes_met(scene, self.middles, world_from_sensor)
-        direct = trace(*given, samples=self.samples, seed=seed)
+        direct = trace(*given, LightPaths(samples=self.samples, seed=seed))
         later = [
             trace(
                 *given,
-                samples=self.samples,
-                seed=2 * seed + half,
-                depth=self.depth,
-                photons=self.photons,
-                only_later=True,
+                LightPaths(
+                    samples=self.samples, seed=2 * seed + half, depth=self.depth, photons=self.photons, only_later=True
+                ),
             )
             for half in range(1 if self.fringe is None else 2)
         ]

@@ -6,6 +6,8 @@ mean sigma of a feature's points, or the input of :mod:`characterisation.tasks.c
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,23 +43,33 @@ def performance(
     return fraction, sigma
 
 
+@dataclass(frozen=True)
+class ViewPoints:
+    """Ideal points of a view from a pose, and the ``labels`` (H, W) of the shapes that its rays show.
+
+    Each ray stands for ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart.
+    """
+
+    ideal: Ideal
+    labels: NDArray[np.int16]
+    world_from_sensor: Transform
+    thinning: float = 1.0
+    angular_pitch: float = np.nan
+
+
 def expected_points(
-    ideal: Ideal,
-    labels: NDArray[np.int16],
+    view: ViewPoints,
     scene: Scene,
     shape: int,
     performance_map: PerformanceMap,
-    world_from_sensor: Transform,
-    thinning: float = 1.0,
-    angular_pitch: float = np.nan,
     perturbation: Perturbation | None = None,
 ) -> ExpectedPoints:
     """Return the predicted points of one shape in the world frame, which is the part frame; one row per possible point.
 
-    Each ray represents ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart. If the map has no noise area,
-    it is that of independent points, 1/F, without persistent noise. ``perturbation`` are effects on the ideal points
-    outside the map (:mod:`mitsim.prediction.perturbation`).
+    Where the map has no noise area, the area is that of independent points, 1/F, and there is no persistent noise.
+    ``perturbation`` holds effects that flat coupons cannot show (:mod:`mitsim.prediction.perturbation`).
     """
+    ideal, labels, world_from_sensor = view.ideal, view.labels, view.world_from_sensor
     finish = scene.finishes[shape]
     mask = (labels.reshape(-1)[ideal.pixel] == shape) & (ideal.status == Status.VALID)
     if finish is None:
@@ -82,7 +94,7 @@ def expected_points(
     return ExpectedPoints(
         world_from_sensor.points(ideal.point[mask][possible]),
         ideal.ray[mask][possible] @ world_from_sensor.rotation.T,
-        np.rint(place[possible] * np.sqrt(thinning)).astype(np.int64),
+        np.rint(place[possible] * np.sqrt(view.thinning)).astype(np.int64),
         normal[possible],
         fraction,
         np.nan_to_num(fraction_error[possible]),
@@ -91,8 +103,8 @@ def expected_points(
         np.nan_to_num(persistent[possible]),
         displaced[possible],
         distance[possible],
-        thinning,
-        angular_pitch,
+        view.thinning,
+        view.angular_pitch,
         shared=None if perturbation is None else perturbation.shared[mask][possible],
     )
 

@@ -28,12 +28,12 @@ from mitsim.prediction.noise_field import correlated_noise
 from mitsim.reconstruction.cloud import Geometry
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
-from mitsim.scene.ray_casting.camera_rays import Window
 from mitsim.scene.ray_casting.mapped_scene import MappedScene, MappedView, ViewRays
 from mitsim.scene.ray_casting.raycast import PixelRays, Surfaces, cast, shapes_met
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 #: smallest margin at the edge of a feature whose pixels belong to no feature: a matching block there covers two
@@ -172,7 +172,7 @@ class Predictor:
         these pixels, so rays near a change of shape are cast again at that distance. Otherwise the wider margin would
         exclude the limb of a pillar, whose points have the largest errors and are in the cloud.
         """
-        return self._labels(scene, world_from_sensor, surfaces.shape, Window(0, 0, self.grid.width, self.grid.height))
+        return self._labels(scene, world_from_sensor, surfaces.shape, Roi.whole(self.grid.width, self.grid.height))
 
     def quick_labels(self, scene: Scene, world_from_sensor: Transform) -> NDArray[np.int16]:
         """Return :meth:`labels` for decoded points, at a tenth of the cost.
@@ -180,10 +180,10 @@ class Predictor:
         Back faces, which return no light, count as shapes.
         """
         shape = shapes_met(scene, self.rays, world_from_sensor)
-        return self._labels(scene, world_from_sensor, shape, Window(0, 0, self.grid.width, self.grid.height))
+        return self._labels(scene, world_from_sensor, shape, Roi.whole(self.grid.width, self.grid.height))
 
     def _labels(
-        self, scene: Scene, world_from_sensor: Transform, shape: NDArray[np.int16], window: Window
+        self, scene: Scene, world_from_sensor: Transform, shape: NDArray[np.int16], roi: Roi
     ) -> NDArray[np.int16]:
         """Return the labels of the shapes (h, w) in a window of the image."""
         labels = _away_from_edges(shape, self.margin)
@@ -195,8 +195,8 @@ class Predictor:
         row, column = (
             np.clip((start + one) * self.step + self.step // 2 + aside, 0, size - 1)
             for one, start, aside, size in (
-                (rows, window.row, beside[:, 0], self.every.height),
-                (columns, window.column, beside[:, 1], self.every.width),
+                (rows, roi.top, beside[:, 0], self.every.height),
+                (columns, roi.left, beside[:, 1], self.every.width),
             )
         )
         rays = PixelRays(self.every.origin, self.every.rays_at(column, row))
@@ -219,7 +219,7 @@ class Predictor:
             if ((seen.shape == index) & (seen.status == Status.VALID)).any():
                 raise error
         labels = np.full(self.seen.shape, -1, np.int16)
-        labels[seen.window.inside] = self._labels(characterised.scene, world_from_sensor, seen.shape, seen.window)
+        labels[seen.roi.slices] = self._labels(characterised.scene, world_from_sensor, seen.shape, seen.roi)
         return Predicted(seen, labels)
 
     def predict(
@@ -261,7 +261,7 @@ class Predictor:
             return out
 
         seen = MappedView(
-            Window(0, 0, size[1], size[0]),
+            Roi.whole(size[1], size[0]),
             image(ideal.status, Status.NO_SURFACE),
             image(ideal.shape, -1),
             image(ideal.distance, np.nan),
@@ -281,7 +281,7 @@ class Predictor:
         chance: NDArray[np.floating],
     ) -> PointCloud:
         """Return points with errors ``noise`` (h, w) in units of sigma, kept if ``chance``, R_U (h, w), is below F."""
-        part, size = seen.window.inside, (self.grid.height, self.grid.width)
+        part, size = seen.roi.slices, (self.grid.height, self.grid.width)
         visible = seen.status == Status.VALID
         known = np.isfinite(seen.fraction) & (np.isfinite(seen.sigma) | (seen.fraction == 0))
         kept = visible & known & (chance < seen.fraction)

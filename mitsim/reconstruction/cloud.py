@@ -2,8 +2,8 @@
 
 What a technology needs stands in :mod:`mitsim.reconstruction.decoder_registry`.
 
-Of a capture whose settings name a region that was read out (``read_out``: camera -> column, row, width, height), only
-that is merged and decoded: the rest of its images is absent.
+Where the settings of a capture name a region that was read out (``read_out``: camera -> left, top, width, height), only
+that region is merged and decoded: the rest of the image is absent.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from pydantic import Field, create_model
 from characterisation.documents import Document, validate
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
-from mitsim.decode.device_maps import DeviceMapGeometry, DeviceMapSettings, window_between
+from mitsim.decode.device_maps import DeviceMapGeometry, DeviceMapSettings, roi_of_other_grid
 from mitsim.decode.exposures import merge_exposures
 from mitsim.decode.grey_levels import MeasuredNoise
-from mitsim.decode.roi import Window, checked_window, inside, overlap, unseen_cloud
+from mitsim.decode.grid_cloud import unseen_cloud
 from mitsim.errors import InputError
 from mitsim.reconstruction.decoder_registry import (
     Geometry,
@@ -39,6 +39,7 @@ from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, presets
 from mitsim.sensor.recorded_rig import load_recorded_rig
+from mitsim.sensor.roi import Roi, checked_roi
 from mitsim.sensor.sensor_file import ImagerTable
 from mitsim.sensor.written_imager import imager_of
 
@@ -69,7 +70,7 @@ class _Coded(Document):
 
 
 class _Read(Document):
-    """The part of a capture's settings that says what was read out of each camera: column, row, width, height [px]."""
+    """The part of a capture's settings that says what was read out of each camera: left, top, width, height [px]."""
 
     read_out: dict[str, tuple[int, int, int, int]] = Field(default_factory=dict)
 
@@ -238,7 +239,7 @@ def capture_cloud(
     capture: Capture,
     settings: Settings,
     geometry: Geometry | None = None,
-    window: Window | None = None,
+    roi: Roi | None = None,
     imager: Imager | MeasuredNoise | None = None,
 ) -> PointCloud:
     """Decode a capture.
@@ -247,13 +248,13 @@ def capture_cloud(
     ----------
     geometry
         Saves preparing the capture's rig again. Of a device's own map, whose grid need not be that of its sensor, it
-        only says what ``window`` is of.
-    window
-        (column0, row0, column1, row1) of the cloud's grid, ends not included: decode only this part. Pixels outside
-        are ``NO_SURFACE``, and so are those that the capture says were not read out.
+        only says which grid ``roi`` belongs to.
+    roi
+        Region of the cloud's grid: decode only this. Pixels outside are ``NO_SURFACE``, and so are those that the
+        capture says were not read out.
     imager
-        Which took the capture, or the noise that it shows: with it each point is told the standard deviation that its
-        noise makes, where the decoder knows how. Of a bracket it is not told.
+        The imager that took the capture, or the noise measured in it. With it each point gets the standard deviation
+        that this noise causes, where the decoder can propagate it; points of a bracket get none.
 
     Raises
     ------
@@ -265,56 +266,55 @@ def capture_cloud(
         allowed = f"one that {type(settings).__name__} decodes"
         raise InputError("capture", "technology", repr(capture.technology), allowed)
     pattern = capture_pattern(capture)
-    if window is not None and geometry is not None:
-        window = checked_window(window, geometry.grid.width, geometry.grid.height, "capture_cloud")
+    if roi is not None and geometry is not None:
+        roi = checked_roi(roi, geometry.grid.width, geometry.grid.height, "capture_cloud")
     if technology.measured:
-        return _device_cloud(capture, technology, settings, geometry, window)
+        return _device_cloud(capture, technology, settings, geometry, roi)
     geometry = geometry or technology.geometry(capture.rig, settings, pattern)
-    if window is not None:
-        window = checked_window(window, geometry.grid.width, geometry.grid.height, "capture_cloud")
+    if roi is not None:
+        roi = checked_roi(roi, geometry.grid.width, geometry.grid.height, "capture_cloud")
     exposures, read_out = bracket_of(capture), read_out_of(capture)
     images, full_scale = capture.images, 2.0**capture.bits - 1
     if exposures is not None and not isinstance(settings, DeviceMapSettings):
         images, full_scale = _merged(capture, exposures, read_out)
         # levels are those of the shortest exposure, and what can be told from noise is known from the longest
         settings, imager = settings.at_exposure(min(exposures) / max(exposures)), None
-    return technology.decode(Images(capture, images, full_scale, imager, window, read_out), geometry, settings, pattern)
+    return technology.decode(Images(capture, images, full_scale, imager, roi, read_out), geometry, settings, pattern)
 
 
-def read_out_of(capture: Capture) -> dict[str, Window]:
-    """Part (column, row, right, bottom) of the image of each camera that was not read out whole, by camera.
+def read_out_of(capture: Capture) -> dict[str, Roi]:
+    """Return the region that was read out of each camera, by camera; cameras that were read out whole are left out.
 
     Raises
     ------
     InputError
-        If the capture names a camera that it does not have, or a part that is not in the image.
+        If the capture names a camera that it does not have, or a region that is not in the image.
     """
     where = f"capture of {capture.sensor}: settings.json"
     table = validate(where, {"read_out": capture.settings.get("read_out", {})}, _Read).read_out
-    out: dict[str, Window] = {}
-    for name, (column, row, width, height) in table.items():
+    out: dict[str, Roi] = {}
+    for name, numbers in table.items():
         if name not in capture.rig.cameras:
             raise InputError(where, "read_out", repr(name), ", ".join(capture.rig.cameras))
         camera = capture.rig.cameras[name]
-        part = (column, row, column + width, row + height)
-        if overlap(part, (0, 0, camera.width, camera.height)) != part:
-            allowed = f"[column, row, width, height] within {camera.width} x {camera.height} pixels"
-            raise InputError(where, f"read_out.{name}", [column, row, width, height], allowed)
-        out[name] = part
+        out[name] = Roi(*numbers)
+        if not out[name].fits(camera.width, camera.height):
+            allowed = f"[left, top, width, height] within {camera.width} x {camera.height} pixels"
+            raise InputError(where, f"read_out.{name}", list(numbers), allowed)
     return out
 
 
 def _device_cloud(
-    capture: Capture, technology: Technology, settings: Settings, geometry: Geometry | None, window: Window | None
+    capture: Capture, technology: Technology, settings: Settings, geometry: Geometry | None, roi: Roi | None
 ) -> PointCloud:
-    """Cloud of a device's own map, on the map's own grid; ``window`` is of that of ``geometry``, if there is one."""
+    """Return the cloud of a device's own map, on the map's own grid; ``roi`` is of the grid of ``geometry``, if any."""
     prepared = isinstance(geometry, DeviceMapGeometry)
     own = geometry if prepared and geometry else technology.geometry(capture.rig, settings, None)
-    if window is not None and geometry is not None and not prepared:
-        window = window_between(geometry.grid, own.grid, window, settings.near_mm, settings.far_mm)
-        if window is None:
+    if roi is not None and geometry is not None and not prepared:
+        roi = roi_of_other_grid(geometry.grid, own.grid, roi, settings.near_mm, settings.far_mm)
+        if roi is None:
             return unseen_cloud(own, capture.sensor, capture.source)
-    return technology.decode(Images(capture, {}, 1.0, None, window, {}), own, settings, None)
+    return technology.decode(Images(capture, {}, 1.0, None, roi, {}), own, settings, None)
 
 
 def bracket_of(capture: Capture) -> list[float] | None:
@@ -324,7 +324,7 @@ def bracket_of(capture: Capture) -> list[float] | None:
 
 
 def _merged(
-    capture: Capture, exposures: list[float], read_out: dict[str, Window]
+    capture: Capture, exposures: list[float], read_out: dict[str, Roi]
 ) -> tuple[dict[str, NDArray[np.unsignedinteger[Any]]], float]:
     """Images of every camera, 0 where they were not read out, and their full scale [DN]."""
     full_scale = 2**capture.bits - 1
@@ -334,7 +334,7 @@ def _merged(
         if len(stack) % len(exposures):
             where = f"capture of {capture.sensor}"
             raise InputError(where, "images", f"{len(stack)} of {name}", f"a multiple of {len(exposures)} exposures")
-        part = inside(read_out.get(name, (0, 0, stack.shape[2], stack.shape[1])))
+        part = read_out.get(name, Roi.whole(stack.shape[2], stack.shape[1])).slices
         result = merge_exposures(
             stack.reshape(len(exposures), -1, *stack.shape[1:])[:, :, *part],
             exposures,

@@ -27,10 +27,10 @@ from mitsim.decode.device_maps import (
     disparity_map_geometry,
 )
 from mitsim.decode.grey_levels import MeasuredNoise
+from mitsim.decode.grid_cloud import unseen_cloud
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.reference_matching import ReferenceGeometry, decode_reference, reference_geometry
 from mitsim.decode.matching.stereo import StereoGeometry, decode_stereo, stereo_geometry
-from mitsim.decode.roi import Window, overlap, unseen_cloud
 from mitsim.decode.structured_light.decoder import decode_structured_light
 from mitsim.decode.structured_light.geometry import StructuredLightGeometry, structured_light_geometry
 from mitsim.decode.structured_light.two_cameras import decode_structured_light_stereo
@@ -44,6 +44,7 @@ from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, LightCode, Ph
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
+from mitsim.sensor.roi import Roi
 
 #: searched where neither a preset nor the recording says how near and far the sensor looks [mm]
 DEFAULT_RANGE_MM = (300.0, 2000.0)
@@ -58,39 +59,39 @@ Pattern = DotPattern | LightCode | AmplitudeModulation
 
 @dataclass(frozen=True)
 class Images:
-    """What a decoder is given of a capture.
+    """The images of a capture, ready to be decoded.
 
     ``stacks`` of every camera (images, H, W) [DN], the reference camera's first, a bracket's already merged;
-    ``full_scale`` [DN]; ``imager`` that took them, or the noise that they have, None where nobody knows it; ``window``
-    (column, row, right, bottom) of the cloud's grid to which a decoder keeps, and ``read_out``, such a part of the
-    image of each camera that was not read out whole.
+    ``full_scale`` [DN]; ``imager`` that took them, or the noise measured in them, None where neither is known; ``roi``
+    of the cloud's grid that is decoded, None for all; ``read_out``, the region of the image of each camera that was not
+    read out whole.
     """
 
     capture: Capture
     stacks: dict[str, NDArray[np.unsignedinteger[Any]]]
     full_scale: float
     imager: Imager | MeasuredNoise | None
-    window: Window | None
-    read_out: dict[str, Window]
+    roi: Roi | None
+    read_out: dict[str, Roi]
 
     @property
     def first(self) -> tuple[str, NDArray[np.unsignedinteger[Any]]]:
         """Name and stack of the reference camera."""
         return next(iter(self.stacks.items()))
 
-    def context(self, window: Window | None) -> ImageContext:
-        """What a decoder is told of the images, if it is to decode a window of the cloud's grid, None for the whole."""
+    def context(self, roi: Roi | None) -> ImageContext:
+        """Properties of the images for a decoder of a region of the cloud's grid, None for the whole grid."""
         parts = [self.read_out.get(name) for name in list(self.stacks)[:2]]
         read_out = (parts[0], parts[-1] if len(parts) > 1 else None)
         about = self.capture
-        return ImageContext(about.sensor, about.source, self.full_scale, self.imager, window, read_out)
+        return ImageContext(about.sensor, about.source, self.full_scale, self.imager, roi, read_out)
 
-    def of_pixels(self) -> tuple[Window | None, bool]:
-        """Window of a grid that is the raw image of the first camera, and whether anything of it was read out."""
+    def of_pixels(self) -> tuple[Roi | None, bool]:
+        """Region of the raw image of the first camera to decode, and whether any of it was read out."""
         region = self.read_out.get(self.first[0])
-        if region is None or self.window is None:
-            return region or self.window, True
-        shared = overlap(region, self.window)
+        if region is None or self.roi is None:
+            return region or self.roi, True
+        shared = region.overlap(self.roi)
         return shared, shared is not None
 
     def counted(self, count: int, camera: str | None = None) -> NDArray[np.unsignedinteger[Any]]:
@@ -136,7 +137,7 @@ def _stereo(images: Images, geometry: StereoGeometry, settings: MatcherSettings,
     left, right = (stack[: len(stack) - ambient] for stack in list(images.stacks.values())[:2])
     if settings.method == "sgbm":
         left, right = left[:1], right[:1]
-    return decode_stereo(left, right, geometry, settings, images.context(images.window))
+    return decode_stereo(left, right, geometry, settings, images.context(images.roi))
 
 
 def _reference_geometry(rig: Rig, settings: MatcherSettings, pattern: DotPattern) -> ReferenceGeometry:
@@ -154,7 +155,7 @@ def _reference_geometry(rig: Rig, settings: MatcherSettings, pattern: DotPattern
 def _reference(
     images: Images, geometry: ReferenceGeometry, settings: MatcherSettings, pattern: DotPattern
 ) -> PointCloud:
-    return decode_reference(images.counted(1), geometry, settings, images.context(images.window))
+    return decode_reference(images.counted(1), geometry, settings, images.context(images.roi))
 
 
 class _Projected(Document):
@@ -194,13 +195,13 @@ def _structured_light(
     count = len(roles(code, *size))
     if isinstance(geometry, StereoGeometry):
         left, right = (images.counted(count, name) for name in list(images.stacks)[:2])
-        context = images.context(images.window)
+        context = images.context(images.roi)
         return decode_structured_light_stereo(left, right, geometry, code, settings, size, context)
     stack = images.counted(count)
-    window, anything = images.of_pixels()
+    roi, anything = images.of_pixels()
     if not anything:
         return unseen_cloud(geometry, images.capture.sensor, images.capture.source)
-    return decode_structured_light(stack, geometry, images.first[0], code, settings, images.context(window))
+    return decode_structured_light(stack, geometry, images.first[0], code, settings, images.context(roi))
 
 
 def _time_of_flight_geometry(
@@ -213,10 +214,10 @@ def _time_of_flight(
     images: Images, geometry: TimeOfFlightGeometry, settings: TimeOfFlightSettings, code: AmplitudeModulation
 ) -> PointCloud:
     stack = images.counted(code.count)
-    window, anything = images.of_pixels()
+    roi, anything = images.of_pixels()
     if not anything:
         return unseen_cloud(geometry, images.capture.sensor, images.capture.source)
-    return decode_time_of_flight(stack, geometry, code, settings, images.context(window))
+    return decode_time_of_flight(stack, geometry, code, settings, images.context(roi))
 
 
 Decoded = Callable[..., PointCloud]
@@ -241,7 +242,7 @@ def _of_map(name: str, decode: Decoded) -> Callable[[Images, DeviceMapGeometry, 
             settings.far_mm,
             sensor=capture.sensor,
             source=capture.source,
-            window=images.window,
+            roi=images.roi,
         )
 
     return decoded

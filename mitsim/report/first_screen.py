@@ -78,7 +78,7 @@ def of_run(run: Run, stand: Stand | None) -> FirstScreen:
             )
         )
         rows.append(
-            row(
+            RowValues(
                 name,
                 one.unit,
                 one.verdict,
@@ -88,7 +88,7 @@ def of_run(run: Run, stand: Stand | None) -> FirstScreen:
                 one.share_of_tolerance,
                 None if decision is None else decision.accepted,
                 None if decision is None else decision.false_accept,
-            )
+            ).texts()
         )
     asked = {
         name: (run.about.measurements[name].features, one.verdict)
@@ -122,7 +122,7 @@ def of_choice(choice: ChoiceDocument, stand: Stand | None) -> FirstScreen:
 def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[Row]:
     """Return the rows for the measurements of one sensor."""
     return [
-        row(
+        RowValues(
             name,
             choice.measurements[name].unit,
             cell.verdict,
@@ -132,34 +132,41 @@ def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[Row]:
             cell.share_of_tolerance,
             cell.accepted,
             cell.false_accept,
-        )
+        ).texts()
         for name, cell in one.measurements.items()
     ]
 
 
-def row(
-    name: str,
-    unit: str,
-    verdict: str,
-    uncertainty: float | None,
-    needed: float | None,
-    tolerance: float | None,
-    share: float | None,
-    accepted: tuple[float | None, float] | None,
-    false_accept: float | None,
-) -> Row:
-    """Return one row, as texts."""
-    return Row(
-        name,
-        _quantity(uncertainty, unit),
-        _quantity(needed, unit),
-        NONE if share is None else percent(share),
-        _quantity(tolerance, unit),
-        accepted_words(accepted, unit, tolerance),
-        NONE if false_accept is None else percent(false_accept),
-        verdict,
-        VERDICTS.get(verdict, "#9a9fa8"),
-    )
+@dataclass(frozen=True)
+class RowValues:
+    """Values of one measurement, in ``unit``; None where a value is not known or there is no tolerance.
+
+    ``share`` of the tolerance that the uncertainty takes; ``accepted`` lowest and highest reading.
+    """
+
+    name: str
+    unit: str
+    verdict: str
+    uncertainty: float | None
+    needed: float | None
+    tolerance: float | None
+    share: float | None
+    accepted: tuple[float | None, float] | None
+    false_accept: float | None
+
+    def texts(self) -> Row:
+        """Return the row of the table, as texts."""
+        return Row(
+            self.name,
+            _quantity(self.uncertainty, self.unit),
+            _quantity(self.needed, self.unit),
+            NONE if self.share is None else percent(self.share),
+            _quantity(self.tolerance, self.unit),
+            accepted_words(self.accepted, self.unit, self.tolerance),
+            NONE if self.false_accept is None else percent(self.false_accept),
+            self.verdict,
+            VERDICTS.get(self.verdict, "#9a9fa8"),
+        )
 
 
 def accepted_words(accepted: tuple[float | None, float] | None, unit: str, tolerance: float | None) -> str:

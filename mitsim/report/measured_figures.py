@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 from characterisation.acceptance.cloud_difference import Difference
 from characterisation.point_cloud import PointCloud
 from mitsim.report.style import BLUE, FIELD, INK, SEQUENTIAL, VERMILION, drawing
-
-#: (column, row, width, height) [px] of a window
-Box = tuple[int, int, int, int]
+from mitsim.sensor.roi import Roi
 
 #: ends of the colours: this percentile of |difference|, or this many robust deviations from the median if that is less
 _PERCENTILE, _DEVIATIONS = 98.0, 6.0
 
 
-def distance_figure(cloud: PointCloud, windows: Mapping[str, Box]) -> Figure:
+def distance_figure(cloud: PointCloud, windows: Mapping[str, Roi]) -> Figure:
     """Draw the distance from the sensor along each view ray [mm] over rows and columns, with the named windows."""
     distance = np.linalg.norm(cloud.points.astype(float) - cloud.grid.origin, axis=-1)
     known = distance[np.isfinite(distance)]
@@ -36,25 +34,25 @@ def distance_figure(cloud: PointCloud, windows: Mapping[str, Box]) -> Figure:
 
 
 def difference_figure(
-    difference: NDArray[np.float64], found: Difference, windows: Mapping[str, Box], part: Box | None = None
+    difference: NDArray[np.float64], found: Difference, windows: Mapping[str, Roi], part: Roi | None = None
 ) -> Figure:
     """Draw the signed difference [mm] of every pixel, in the whole image or a part, and its histogram."""
-    column, row, width, height = part or (0, 0, difference.shape[1], difference.shape[0])
+    part = part or Roi.whole(difference.shape[1], difference.shape[0])
     known = difference[np.isfinite(difference)]
     reach = float(np.percentile(np.abs(known), _PERCENTILE)) if len(known) else 1.0
     if found.robust_deviation > 0:
         reach = min(reach, abs(found.median) + _DEVIATIONS * found.robust_deviation)
     reach = max(reach, 1e-6)
     with drawing():
-        tall = min(max(7.4 * height / width, 2.0), 7.0)
+        tall = min(max(7.4 * part.height / part.width, 2.0), 7.0)
         figure = Figure((9.0, tall + 1.9), layout="constrained")
         axes, histogram = figure.subplots(2, 1, height_ratios=[tall, 1.2])
         drawn = axes.imshow(difference, cmap="RdBu_r", vmin=-reach, vmax=reach)
         axes.set_facecolor(FIELD)
         axes.set_xlabel("column [px]")
         axes.set_ylabel("row [px]")
-        axes.set_xlim(column - 0.5, column + width - 0.5)
-        axes.set_ylim(row + height - 0.5, row - 0.5)
+        axes.set_xlim(part.left - 0.5, part.right - 0.5)
+        axes.set_ylim(part.bottom - 0.5, part.top - 0.5)
         bar = figure.colorbar(drawn, ax=axes, label="farther than the reference by [mm]", extend="both", pad=0.01)
         bar.outline.set_visible(False)  # type: ignore[operator]
         _outline(axes, windows)
@@ -75,9 +73,9 @@ def _picture(shape: tuple[int, ...]) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _outline(axes: Axes, windows: Mapping[str, Box]) -> None:
-    for name, (column, row, width, height) in windows.items():
-        corner = (column - 0.5, row - 0.5)
-        axes.add_patch(Rectangle(corner, width, height, fill=False, edgecolor=VERMILION, linewidth=1.2))
+def _outline(axes: Axes, windows: Mapping[str, Roi]) -> None:
+    for name, window in windows.items():
+        corner = (window.left - 0.5, window.top - 0.5)
+        axes.add_patch(Rectangle(corner, window.width, window.height, fill=False, edgecolor=VERMILION, linewidth=1.2))
         label = {"facecolor": "white", "edgecolor": VERMILION, "boxstyle": "square,pad=0.2"}
         axes.text(*corner, name, color=INK, va="bottom", fontsize=8.0, bbox=label, clip_on=True)

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from mitsim.report.numbers import finish_name
 from mitsim.report.style import FIELD, INK, MUTED, drawing
-from mitsim.scene.inspect import SceneFacts, ShapeFacts, Sight, trace
+from mitsim.scene.first_hits import Sight, trace
+from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.load import Scene
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from mitsim.authoring.check import Finding
-from mitsim.scene.inspect import SceneFacts, ShapeFacts, Sight
+from mitsim.scene.first_hits import Sight
+from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.text_table import aligned
 
 _NONE = "-"

@@ -11,8 +11,8 @@ reflectance 1 would send there: projector, pattern, lenses and pose are in it, a
 
 That holds as far as f does not vary inside a pixel and across the two apertures. Forward mode, because there is one
 variable and a value for every pixel. The lobes are ``roughconductor`` under a ``blendbsdf`` and a
-``coherent_blend``, as :func:`mitsim.scene.materials.metal_bsdf` makes them, but never fewer: the tree must not change
-with the variable.
+``coherent_blend``, as :func:`mitsim.scene.bsdf_descriptions.metal_bsdf` makes them, but never fewer: the tree must not
+change with the variable.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""Facts about a scene's shapes: what they are made of, how large they are, which way they face, what a sensor sees.
+"""Facts about a scene's shapes: their material, their size, and the side that faces outward.
 
-Signal chain: scene XML -> Mitsuba's shapes -> triangles, areas, boxes, material of each; rays from all around ->
-whether its front or its back is seen; rays of a camera -> how much of it. What the facts mean is said in
-:mod:`mitsim.authoring.check`.
+Signal chain: scene XML -> Mitsuba's shapes -> triangles (:mod:`mitsim.scene.mesh_facts`), areas, boxes, material of
+each; rays from all around (:mod:`mitsim.scene.first_hits`) -> whether they meet its front or its back.
+:mod:`mitsim.authoring.check` judges the facts.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import sphere_directions
-from mitsim.scene.backend import dr, mi
+from mitsim.scene.backend import mi
+from mitsim.scene.first_hits import trace
 from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.materials import Finish
-from mitsim.scene.ray_casting.raycast import PixelRays, cast
-from mitsim.sensor.camera import Rig
-from mitsim.sensor.transforms import Transform
+from mitsim.scene.mesh_facts import MeshFacts, mesh_facts
 
 Floats = NDArray[np.float64]
 
@@ -30,33 +29,6 @@ _SAMPLES, _ROW = 2048, 96
 
 #: vertices nearer than this share of the scene's size are one
 _MERGE = 1e-6
-
-
-@dataclass(frozen=True)
-class MeshFacts:
-    """A shape's triangles, in the world frame.
-
-    ``vertices`` (n, 3) [mm], those at one place merged; ``triangles`` (m, 3); ``open_edges`` that belong to one
-    triangle only, and their ends ``border`` (open_edges, 2, 3) [mm]; ``crowded_edges`` to more than two; ``volume``
-    [mm^3], signed, 0 unless closed; ``degenerate`` and ``duplicate`` triangles; ``texture`` and ``smooth``: whether
-    there are u, v and normals at the vertices.
-    """
-
-    vertices: Floats
-    triangles: NDArray[np.int64]
-    open_edges: int
-    crowded_edges: int
-    volume: float
-    degenerate: int
-    duplicate: int
-    texture: bool
-    smooth: bool
-    border: Floats = field(default_factory=lambda: np.empty((0, 2, 3)), repr=False)
-
-    @property
-    def closed(self) -> bool:
-        """Whether every edge belongs to two triangles."""
-        return self.open_edges == self.crowded_edges == 0
 
 
 @dataclass(frozen=True)
@@ -104,77 +76,6 @@ class SceneFacts:
     bounds: Floats
     together: MeshFacts | None
     emitters: tuple[tuple[str, float], ...]
-
-
-@dataclass(frozen=True)
-class Sight:
-    """What the reference camera's own pixels see, (H, W) each.
-
-    ``shape`` index of the first shape met, -1 for none, backs included; ``front`` whether its reflecting side is seen;
-    ``normal`` (H, W, 3) toward the camera and ``point`` (H, W, 3) [mm], both in the sensor frame; ``everyone`` whether
-    every other eye has a free line to it.
-    """
-
-    shape: NDArray[np.int16]
-    front: NDArray[np.bool_]
-    normal: Floats
-    point: Floats
-    everyone: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Hits:
-    """First surfaces met by n rays.
-
-    ``shape`` (n,), -1 for none; ``front`` (n,) whether its reflecting side is met; ``normal`` (n, 3) toward the ray's
-    origin and ``distance`` (n,) [mm], NaN where nothing is met.
-    """
-
-    shape: NDArray[np.int16]
-    front: NDArray[np.bool_]
-    normal: Floats
-    distance: Floats
-
-
-def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.floating]) -> Hits:
-    """Follow n rays, (n, 3) each [mm, unit], world frame, to the first surface, whichever side it shows."""
-    start, along = (np.asarray(a, np.float32).reshape(-1, 3).T for a in (origins, directions))
-    ray = mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
-    surface = scene.mitsuba.ray_intersect(ray)
-    behind = dr.dot(surface.n, ray.d) > 0
-    two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
-    front = ~behind | two_sided
-    normal = dr.select(behind, -surface.n, surface.n)
-    number = dr.select(surface.is_valid(), dr.reinterpret_array(mi.UInt32, surface.shape), 0)
-    distance = dr.select(surface.is_valid(), surface.t, dr.nan)
-    dr.eval(front, normal, number, distance)
-    numbers = np.array(number)
-    lookup = np.full(int(numbers.max(initial=0)) + 1, -1, np.int16)
-    for index, one in enumerate(scene.shapes):
-        own = int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(one))))[0])
-        if own < len(lookup):
-            lookup[own] = index
-    lookup[0] = -1
-    shape = lookup[numbers]
-    vectors = np.where((shape >= 0)[:, None], np.array(normal, float).T, np.nan)
-    return Hits(shape, np.array(front, bool) & (shape >= 0), vectors, np.array(distance, float))
-
-
-def look(scene: Scene, rig: Rig, world_from_sensor: Transform) -> Sight:
-    """What the reference camera of a rig sees from one pose."""
-    camera = rig.reference
-    eyes = [*list(rig.cameras.values())[1:], *([rig.projector] if rig.projector else [])]
-    directions = camera.sensor_from_camera.directions(camera.rays(camera.pixel_grid()))
-    size = directions.shape[:2]
-    origin = world_from_sensor.points(camera.centre)
-    world = world_from_sensor.directions(directions.reshape(-1, 3))
-    hits = trace(scene, np.broadcast_to(origin, world.shape), world)
-    rays = PixelRays(camera.centre, directions)  # PixelRays.of_camera, without undistorting all pixels once more
-    seen = cast(scene, rays, world_from_sensor, np.array([eye.centre for eye in eyes])).seen
-    normal = world_from_sensor.inverse().directions(hits.normal).reshape(*size, 3)
-    point = camera.centre + directions * hits.distance.reshape(*size, 1)
-    everyone = np.asarray(hits.front.reshape(size) & seen.all(axis=0))
-    return Sight(hits.shape.reshape(size), hits.front.reshape(size), normal, point, everyone)
 
 
 def inspect(scene: Scene) -> SceneFacts:
@@ -264,38 +165,6 @@ def _mesh(shape: Any, merge: float) -> MeshFacts | None:
         triangles = triangles[:, ::-1]
     smooth = bool(shape.has_vertex_normals()) and not shape.has_face_normals()
     return mesh_facts(vertices, triangles, merge, bool(shape.has_vertex_texcoords()), smooth)
-
-
-def mesh_facts(
-    vertices: Floats, triangles: NDArray[np.int64], merge: float, texture: bool = False, smooth: bool = False
-) -> MeshFacts:
-    """Count what is wrong with triangles (m, 3) on vertices (n, 3) [mm]; those within ``merge`` [mm] are one."""
-    _, first, inverse = np.unique(np.round(vertices / merge), axis=0, return_index=True, return_inverse=True)
-    vertices, triangles = vertices[first], inverse.reshape(-1)[triangles]
-    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    longest = np.max([np.linalg.norm(side, axis=1) for side in (b - a, c - b, a - c)], axis=0, initial=0.0)
-    degenerate = area <= merge * longest
-    sound = triangles[~degenerate]
-    duplicate = len(sound) - len(np.unique(np.sort(sound, axis=1), axis=0)) if len(sound) else 0
-    edges = np.sort(sound[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges, count = np.unique(edges, axis=0, return_counts=True) if len(edges) else (edges, np.empty(0, int))
-    open_edges, crowded = int((count == 1).sum()), int((count > 2).sum())
-    middle = vertices.mean(axis=0) if len(vertices) else np.zeros(3)
-    volume = float(np.einsum("ij,ij->", a - middle, np.cross(b - middle, c - middle)) / 6)
-    closed = open_edges == crowded == 0 and len(sound) > 0
-    return MeshFacts(
-        vertices,
-        triangles,
-        open_edges,
-        crowded,
-        volume if closed else 0.0,
-        int(degenerate.sum()),
-        duplicate,
-        texture,
-        smooth,
-        vertices[edges[count == 1]],
-    )
 
 
 def _together(shapes: tuple[ShapeFacts, ...], merge: float) -> MeshFacts | None:

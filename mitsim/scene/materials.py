@@ -3,11 +3,11 @@
 Four BSDF types are added to Mitsuba. ``machined_metal`` becomes stock ``roughconductor`` lobes and a wide-angle
 share, ``gloss_paint`` a ``roughplastic``, ``powder_coat`` a ``diffuse`` under a dielectric lobe, ``matt_white`` a
 ``diffuse``. The mirror-like lobe of a metal has a share that grows with the angle of incidence, which no stock BSDF can
-say: :mod:`mitsim.scene.coherent_blend`. What they do with light is decided in :mod:`mitsim.surface`; here it is only
-written down in Mitsuba's words. A factory *returns* such an object, so a scene loads with plain ``mi.load_file`` once
-this module is imported.
+express: :mod:`mitsim.scene.coherent_blend`. :mod:`mitsim.surface` decides how they reflect light;
+:mod:`mitsim.scene.bsdf_descriptions` describes that in Mitsuba's words. A factory *returns* such an object, so a scene
+loads with plain ``mi.load_file`` once this module is imported.
 
-What a BSDF was made from is remembered as a :class:`Finish`, by which performance maps are looked up.
+Each BSDF has a :class:`Finish`, the material it was made from; performance maps are looked up by it.
 """
 
 from __future__ import annotations
@@ -21,49 +21,27 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from characterisation.maps.light import Light
-from mitsim.errors import InputError, nearest
-from mitsim.scene.coherent_blend import NAME, NUMBERS, register_coherent_blend
-from mitsim.surface.coherence import LARGEST_INCIDENCE
+from mitsim.errors import InputError
+from mitsim.scene.bsdf_descriptions import diffuse_bsdf, gloss_paint_bsdf, metal_bsdf, powder_coat_bsdf
+from mitsim.scene.bsdf_properties import choice, number_within, only_known
 from mitsim.surface.machined import Face, machined
 from mitsim.surface.measured import HeightMap, Profile, read_height_map, read_profile
 from mitsim.surface.metals import CONSTANTS, refractive_index
-from mitsim.surface.microfacet import GGX_PER_BECKMANN, fresnel
-from mitsim.surface.paint import ALPHA_RANGE, INDEX, matt_white, paint, surface_share
+from mitsim.surface.microfacet import fresnel
+from mitsim.surface.paint import ALPHA_RANGE, matt_white, paint
 from mitsim.surface.processes import PROCESSES
 from mitsim.surface.scatter import NOMINAL, Deviation, Scatter
 from mitsim.surface.seen import USUAL_REFLECTANCE, light_seen
 
-#: a coherent share that stays under this at every angle at which its law holds is not rendered
-_LEAST_COHERENT = 0.005
-
-#: weight of a powder coat's surface lobe in its blend; its reflectance is divided by it, so it shapes nothing
-_COAT_WEIGHT = 0.1
-
-#: alpha -> by what the base of Mitsuba's ``roughplastic`` (Beckmann, 1.5, linear) must be multiplied for a white base
-#: to return all light at 30 deg; measured on Mitsuba 3.9.1
-_PLASTIC_BASE = np.array(
-    [
-        (0.003, 1.0195),
-        (0.01, 1.0212),
-        (0.02, 1.0220),
-        (0.05, 1.0247),
-        (0.1, 1.0350),
-        (0.15, 1.0529),
-        (0.2, 1.0786),
-    ]
-)
-
 
 @dataclass(frozen=True)
 class Finish:
-    """What a surface is made of, as far as a performance map cares.
+    """Material of a surface, as performance maps distinguish it.
 
     ``name`` is the family (``matt_white``, ``aluminium/ground``); ``roughness`` Ra [um], NaN where it has no meaning;
-    ``scatter`` what it does with light at the sensor's wavelength, ``light`` what a map keeps of that, and
-    ``description`` the BSDF in Mitsuba's words, which are no part of its identity.
+    ``scatter`` how it reflects light at the sensor's wavelength, ``light`` the part of it that a map stores, and
+    ``description`` the BSDF in Mitsuba's words; the three are no part of its identity.
     """
 
     name: str
@@ -78,7 +56,7 @@ class Finish:
 
 @dataclass
 class Loading:
-    """What is going on while one scene loads: for which wavelength, from where, and what came of it.
+    """State of the loading of one scene: its wavelength and file, and the finishes found so far.
 
     ``folder`` holds the files that a material names; ``deviation`` of a finish from its best guess, by its BSDF's id;
     ``finishes`` by BSDF id; ``fault`` the first thing that the author got wrong, because Mitsuba turns an exception of
@@ -142,14 +120,14 @@ _METAL_KEYS = (
 
 def _machined_metal(props: Any) -> Any:
     where = _where(props)
-    _only(props, where, _METAL_KEYS)
+    only_known(props, where, _METAL_KEYS)
 
     def number(key: str, low: float, high: float, unit: str) -> float | None:
-        return _number(props, where, key, None, low, high, unit) if key in props else None
+        return number_within(props, where, key, None, low, high, unit) if key in props else None
 
     face = Face(
-        metal=_choice(props, where, "metal", "aluminium", list(CONSTANTS)),
-        process=_choice(props, where, "process", "ground", list(PROCESSES)) if "process" in props else None,
+        metal=choice(props, where, "metal", "aluminium", list(CONSTANTS)),
+        process=choice(props, where, "process", "ground", list(PROCESSES)) if "process" in props else None,
         Ra=number("Ra", 0.005, 10.0, "um"),
         Rq=number("Rq", 0.005, 20.0, "um"),
         Rdq=number("Rdq", 0.001, 1.0, ""),
@@ -161,12 +139,12 @@ def _machined_metal(props: Any) -> Any:
         alpha=number("alpha", 0.002, 0.5, ""),
         alpha_u=number("alpha_u", 0.002, 0.5, ""),
         alpha_v=number("alpha_v", 0.002, 0.5, ""),
-        lay=_choice(props, where, "lay", "none", ["u", "v", "none"]) if "lay" in props else None,  # type: ignore[arg-type]
+        lay=choice(props, where, "lay", "none", ["u", "v", "none"]) if "lay" in props else None,  # type: ignore[arg-type]
         nose_radius=number("nose_radius_mm", 0.05, 10.0, "mm"),
-        feed_marks=_choice(props, where, "feed_marks", "blurred", ["blurred", "resolved"])
+        feed_marks=choice(props, where, "feed_marks", "blurred", ["blurred", "resolved"])
         if "feed_marks" in props
         else None,
-        alpha_factor=_number(props, where, "alpha_factor", 1.0, 0.1, 10.0, ""),
+        alpha_factor=number_within(props, where, "alpha_factor", 1.0, 0.1, 10.0, ""),
         wide_angle=number("wide_angle_share", 0.0, 1.0, ""),
     )
     deviation = _now.deviation(props.id())
@@ -180,103 +158,23 @@ def _machined_metal(props: Any) -> Any:
     return _remember(props, metal_bsdf(index, scatter, reflected), finish)
 
 
-def metal_bsdf(index: tuple[float, float], scatter: Scatter, reflected: float = 1.0) -> dict[str, Any]:
-    """Mitsuba description of a machined metal: up to two incoherent lobes, a coherent one, a wide-angle share.
-
-    ``index`` (n, k). All lobes have the same, and no child is a delta, so blending them keeps the energy.
-    ``reflected`` is a factor on all of the light [1].
-    """
-
-    def lobe(distribution: str, alphas: tuple[float, float], factor: float) -> dict[str, Any]:
-        return {
-            "type": "roughconductor",
-            "distribution": distribution,
-            "alpha_u": alphas[0],
-            "alpha_v": alphas[1],
-            "eta": index[0],
-            "k": index[1],
-            "specular_reflectance": {"type": "uniform", "value": factor * reflected},
-        }
-
-    ggx, beckmann = scatter.energy_factor
-    incoherent = _blend(
-        lobe("ggx", scatter.ggx_alpha, ggx),
-        lobe("beckmann", (scatter.alpha_u, scatter.alpha_v), beckmann),
-        scatter.beckmann,
-    )
-    mirror = lobe("beckmann", scatter.coherent_alpha, 1.0)
-    specular = incoherent
-    if scatter.coherent_at(LARGEST_INCIDENCE) > _LEAST_COHERENT:
-        register_coherent_blend()
-        specular = {
-            "type": NAME,
-            "phase_variance": scatter.phase_variance,
-            "mirror": mirror,
-            "lobe": incoherent,
-            **dict(zip(NUMBERS, scatter.lobe_numbers, strict=True)),
-        }
-    return _blend(specular, _diffuse(reflected * float(fresnel(1.0, *index))), scatter.wide_angle)
-
-
-def gloss_paint_bsdf(reflectance: float, scatter: Scatter) -> dict[str, Any]:
-    """Mitsuba description of a gloss paint on a base of that reflectance [1]."""
-    return {
-        "type": "roughplastic",
-        "distribution": "beckmann",
-        "alpha": scatter.alpha_u,
-        "int_ior": INDEX[0],
-        "ext_ior": 1.0,
-        "nonlinear": False,
-        "diffuse_reflectance": {
-            "type": "uniform",
-            "value": reflectance * float(np.interp(scatter.alpha_u, *_PLASTIC_BASE.T)),
-        },
-    }
-
-
-def powder_coat_bsdf(reflectance: float, scatter: Scatter) -> dict[str, Any]:
-    """Mitsuba description of a powder coat: a conductor without absorption (k = 0) has a dielectric's Fresnel curve."""
-    alpha = scatter.ggx_alpha[0]
-    body = reflectance * (1 - surface_share(GGX_PER_BECKMANN * scatter.alpha_u, "ggx"))
-    coat = {
-        "type": "roughconductor",
-        "distribution": "ggx",
-        "alpha": alpha,
-        "eta": INDEX[0],
-        "k": 0.0,
-        "specular_reflectance": {"type": "uniform", "value": scatter.energy_factor[0] / _COAT_WEIGHT},
-    }
-    return _blend(_diffuse(body / (1 - _COAT_WEIGHT)), coat, _COAT_WEIGHT)
-
-
-def _blend(first: dict[str, Any], second: dict[str, Any], weight: float) -> dict[str, Any]:
-    """``blendbsdf`` gives its weight to the second child."""
-    if weight < 1e-3:
-        return first
-    if weight > 1 - 1e-3:
-        return second
-    return {"type": "blendbsdf", "weight": weight, "first": first, "second": second}
-
-
-def _diffuse(reflectance: float) -> dict[str, Any]:
-    return {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}}
-
-
 def _matt_white(props: Any) -> Any:
     where = _where(props)
-    _only(props, where, ("reflectance",))
-    reflectance = _number(props, where, "reflectance", USUAL_REFLECTANCE["matt_white"], 0.01, 0.99, "")
+    only_known(props, where, ("reflectance",))
+    reflectance = number_within(props, where, "reflectance", USUAL_REFLECTANCE["matt_white"], 0.01, 0.99, "")
     reflectance *= _now.deviation(props.id()).reflected(reflectance)
-    return _remember(props, _diffuse(reflectance), _finish("matt", reflectance, matt_white(), "matt_white", math.nan))
+    return _remember(
+        props, diffuse_bsdf(reflectance), _finish("matt", reflectance, matt_white(), "matt_white", math.nan)
+    )
 
 
 def _paint(kind: str, greatest: float, describe: Callable[[float, Scatter], dict[str, Any]]) -> Callable[[Any], Any]:
     def make(props: Any) -> Any:
         where = _where(props)
-        _only(props, where, ("reflectance", "gloss", "alpha"))
-        reflectance = _number(props, where, "reflectance", USUAL_REFLECTANCE[kind], 0.01, greatest, "")
-        gloss = _number(props, where, "gloss", None, 0.5, 100.0, "GU") if "gloss" in props else None
-        alpha = _number(props, where, "alpha", None, *ALPHA_RANGE[kind], "") if "alpha" in props else None
+        only_known(props, where, ("reflectance", "gloss", "alpha"))
+        reflectance = number_within(props, where, "reflectance", USUAL_REFLECTANCE[kind], 0.01, greatest, "")
+        gloss = number_within(props, where, "gloss", None, 0.5, 100.0, "GU") if "gloss" in props else None
+        alpha = number_within(props, where, "alpha", None, *ALPHA_RANGE[kind], "") if "alpha" in props else None
         deviation = _now.deviation(props.id())
         scatter = paint(kind, reflectance, gloss, alpha, where, deviation)
         reflectance = min(reflectance * deviation.reflected(reflectance), greatest)
@@ -334,7 +232,7 @@ def _height_map(props: Any, where: str) -> HeightMap | None:
         if "spacing_um" in props:
             raise InputError(where, "spacing_um", "spacing_um without height_map", "both or neither")
         return None
-    spacing = _number(props, where, "spacing_um", None, 0.01, 50.0, "um")
+    spacing = number_within(props, where, "spacing_um", None, 0.01, 50.0, "um")
     return read_height_map(path, spacing, where)
 
 
@@ -345,28 +243,3 @@ def _path(props: Any, where: str, key: str, allowed: str) -> Path | None:
     if not isinstance(value, str) or not value:
         raise InputError(where, key, repr(value), allowed, f'write <string name="{key}" value="..."/>')
     return _now.folder / value
-
-
-def _only(props: Any, where: str, known: tuple[str, ...]) -> None:
-    for key in props.keys():  # noqa: SIM118 - not a dict
-        if key not in known:
-            raise InputError(where, str(key), "an unknown property", ", ".join(known), nearest(str(key), list(known)))
-
-
-def _choice(props: Any, where: str, key: str, default: str, known: list[str]) -> str:
-    value = props.get(key, default)
-    if value not in known:
-        raise InputError(where, key, repr(value), ", ".join(known), nearest(str(value), known))
-    return str(value)
-
-
-def _number(props: Any, where: str, key: str, default: float | None, low: float, high: float, unit: str) -> float:
-    allowed = f"a number from {low:g} to {high:g} {unit}".rstrip()
-    value = props.get(key, default)
-    if value is None:
-        raise InputError(where, key, "nothing", allowed)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(where, key, repr(value), allowed, f'write <float name="{key}" value="..."/>')
-    if not low <= value <= high:
-        raise InputError(where, key, f"{value:g}", allowed)
-    return float(value)

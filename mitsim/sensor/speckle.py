@@ -65,53 +65,67 @@ def speckle_size_um(wavelength_nm: float, f_number: float) -> float:
     return wavelength_nm * 1e-3 * f_number
 
 
-def contrast(
-    height_um: float,
-    coherent_share: float,
-    wavelength_nm: float,
-    linewidth_nm: float,
-    u_illumination: float,
-    u_observation: float,
-    pixel_um: float,
-    f_number: float,
-    depolarising: bool,
-) -> float:
-    """Return the speckle contrast C in a pixel: standard deviation over mean of its brightness [1], 0 to 1.
+@dataclass(frozen=True)
+class SpeckleSurface:
+    """Properties of a surface that decide on its speckle.
 
-    Parameters
+    Attributes
     ----------
     height_um
         Rq of a metal [um]. For a paint, the spread of path lengths inside it [*assumed* by the caller].
     coherent_share
-        A, share of specularly reflected light [1]; 1 gives no speckle.
+        A, share of the light reflected as by a mirror [1]; 1 leaves no speckle.
+    depolarising
+        Whether the surface scrambles polarisation, as white paint does and metal does not.
+    """
+
+    height_um: float
+    coherent_share: float
+    depolarising: bool
+
+    def __post_init__(self) -> None:
+        _check("height_um", self.height_um, self.height_um >= 0, "0 or more")
+        _check("coherent_share", self.coherent_share, 0 <= self.coherent_share <= 1, "0 to 1")
+
+
+@dataclass(frozen=True)
+class SpeckleOptics:
+    """Properties of light and lenses that decide on speckle.
+
+    Attributes
+    ----------
     wavelength_nm, linewidth_nm
-        Of the light source; the linewidth is its full width at half maximum, 0 for an ideal laser [nm].
+        Of the light; the linewidth is its full width at half maximum, 0 for an ideal laser [nm].
     u_illumination, u_observation
         Half-angles of the projector's and the camera's aperture, seen from the surface [rad].
     pixel_um, f_number
         Pitch of the imager [um], and the working f-number of its lens [1].
-    depolarising
-        Whether the surface depolarises, as white paint does and metal does not.
-
-    Raises
-    ------
-    InputError
-        For a value outside its range.
     """
-    _check("height_um", height_um, height_um >= 0, "0 or more")
-    _check("coherent_share", coherent_share, 0 <= coherent_share <= 1, "0 to 1")
-    _check("wavelength_nm", wavelength_nm, wavelength_nm > 0, "over 0")
-    _check("linewidth_nm", linewidth_nm, linewidth_nm >= 0, "0 or more")
-    _check("u_illumination", u_illumination, u_illumination >= 0, "0 or more")
-    _check("u_observation", u_observation, u_observation > 0, "over 0")
-    _check("pixel_um", pixel_um, pixel_um > 0, "over 0")
-    _check("f_number", f_number, f_number > 0, "over 0")
+
+    wavelength_nm: float
+    linewidth_nm: float
+    u_illumination: float
+    u_observation: float
+    pixel_um: float
+    f_number: float
+
+    def __post_init__(self) -> None:
+        _check("wavelength_nm", self.wavelength_nm, self.wavelength_nm > 0, "over 0")
+        _check("linewidth_nm", self.linewidth_nm, self.linewidth_nm >= 0, "0 or more")
+        _check("u_illumination", self.u_illumination, self.u_illumination >= 0, "0 or more")
+        _check("u_observation", self.u_observation, self.u_observation > 0, "over 0")
+        _check("pixel_um", self.pixel_um, self.pixel_um > 0, "over 0")
+        _check("f_number", self.f_number, self.f_number > 0, "over 0")
+
+
+def contrast(surface: SpeckleSurface, optics: SpeckleOptics) -> float:
+    """Return the speckle contrast C of a pixel: standard deviation over mean of its brightness [1], 0 to 1."""
     # sqrt(1 + 2 r) / (1 + r) with r = A / (1 - A), written so that A = 1 gives 0
-    roughness = np.sqrt(1 - coherent_share**2)
-    bandwidth = bandwidth_contrast(height_um, wavelength_nm, linewidth_nm)
-    illumination = 1 / np.sqrt(1 + (u_illumination / u_observation) ** 2)
-    pixel = 1 / np.sqrt(1 + (pixel_um / speckle_size_um(wavelength_nm, f_number)) ** 2)
-    polarisation = np.sqrt(0.5) if depolarising else 1.0
+    roughness = np.sqrt(1 - surface.coherent_share**2)
+    bandwidth = bandwidth_contrast(surface.height_um, optics.wavelength_nm, optics.linewidth_nm)
+    illumination = 1 / np.sqrt(1 + (optics.u_illumination / optics.u_observation) ** 2)
+    pixel = 1 / np.sqrt(1 + (optics.pixel_um / speckle_size_um(optics.wavelength_nm, optics.f_number)) ** 2)
+    polarisation = np.sqrt(0.5) if surface.depolarising else 1.0
     return float(roughness * bandwidth * illumination * pixel * polarisation)
 
 

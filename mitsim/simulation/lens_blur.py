@@ -19,10 +19,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.scene.ray_casting.camera_rays import Window
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.point_spread import point_spread
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.vignetting import off_axis_squared
 
 #: columns that are filtered together
@@ -32,14 +32,12 @@ _BLOCK_PX = 64
 _STEPS = 6
 
 
-def through_point_spread(
-    image: NDArray[np.float32], imager: Imager, camera: Camera, part: Window
-) -> NDArray[np.float32]:
-    """A part (h, w) of a camera's image as the point spread of its lens leaves it."""
+def through_point_spread(image: NDArray[np.float32], imager: Imager, camera: Camera, roi: Roi) -> NDArray[np.float32]:
+    """Blur the image (h, w) of a region by the point spread of a camera's lens."""
     middle, corner = imager.blur_px, imager.corner_blur_px
     if corner is None or corner == middle:
         return blurred(image, middle) if middle > 0 else image
-    along = off_axis_squared(camera)[part.inside] * _STEPS
+    along = off_axis_squared(camera)[roi.slices] * _STEPS
     variances = np.linspace(middle**2, corner**2, _STEPS + 1)
     first, last = int(np.floor(along.min())), min(int(np.ceil(along.max())), _STEPS)
     out = np.zeros(image.shape, np.float32)

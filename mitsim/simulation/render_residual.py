@@ -12,7 +12,7 @@ sensor's if it were not small.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 from mitsim.progress import say
 from mitsim.scene.load import Scene
 from mitsim.sensor.imager import Imager
+from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
-from mitsim.simulation.simulate import SimulatedSensor, bounding_window
+from mitsim.simulation.rendering import Rendering
+from mitsim.simulation.simulate import SimulatedSensor
 
 #: share of the sensor's noise that a render's own may reach before a command says so
 LIMIT = 0.2
@@ -60,9 +62,8 @@ def render_residual(
     scene: Scene,
     world_from_sensor: Transform,
     camera: str,
+    rendering: Rendering,
     *,
-    samples: int,
-    depth: int,
     seed: int,
     around: NDArray[np.floating] | None = None,
 ) -> RenderResidual:
@@ -71,20 +72,20 @@ def render_residual(
     ``around`` are points (n, 3) in the sensor frame [mm] to whose part of the images it keeps; all of them if None.
     """
     sensor = simulated.sensor
-    window = None if around is None else bounding_window(sensor.rig.cameras[camera], around, 0)
+    roi = None if around is None else roi_around(sensor.rig.cameras[camera], around, 0)
     scale = sensor.electrons()
     # the first pattern is often the coarsest and the last the finest
     chosen = np.unique(np.linspace(0, simulated.patterns.count - 1, IMAGES).astype(int))
 
     def electrons_per_s(number: int, places: int) -> NDArray[np.float32]:
-        images = simulated.radiance(
-            scene, world_from_sensor, camera, seed=seed + number, samples=places, depth=depth, window=window
-        )
+        own = replace(rendering, samples=places)
+        images = simulated.radiance(scene, world_from_sensor, camera, own, seed=seed + number, roi=roi)
         some: NDArray[np.float32] = images[chosen]
         del images  # all images of a sensor of 3 megapixels are 164 MB
         some *= np.float32(scale)
         return some
 
+    samples = rendering.samples
     one, other, finer = electrons_per_s(0, samples), electrons_per_s(1, samples), electrons_per_s(2, 4 * samples)
     exposure = sensor.exposure.exposures(finer[np.argmax(finer.mean(axis=(1, 2)))], sensor.imager.full_well)[0]
     lit = (finer > 0) & (finer * np.float32(exposure) < sensor.imager.full_well)

@@ -2,22 +2,20 @@
 
 Signal chain: scene and pose -> speckle of the surfaces -> radiance per camera and image
 (:mod:`mitsim.scene.light_transport.transport`), and that of the sensor's own [room] -> blur and corner loss of the lens
--> exposures, by the sensor's rule -> photo-electrons -> grey levels with noise (:mod:`mitsim.sensor.imager`) ->
+-> exposures, by the sensor's rule -> grey levels with noise (:mod:`mitsim.simulation.exposing`) ->
 :class:`~mitsim.capture.capture.Capture`.
 
 One seed goes in; every camera draws from streams of its own for the render, the speckle and the noise. Speckle is one
-draw for all images of a pose; the imager's noise has a stream for each image. The fixed pattern of an imager belongs to
-the device, not to the capture, and follows from the sensor's name.
+draw for all images of a pose; the imager's noise has a stream for each image.
 
-Where only a part of the world matters, only its window of each image is traced and exposed, and the capture says so: a
-region of interest that is read out, as cameras have. The rest of such an image is not dark but absent, at grey level 0.
+Where only a part of the world matters, only its region of each image is traced and exposed, as cameras read out a
+region of interest, and the capture says so. The rest of such an image is not dark but absent, at grey level 0.
 """
 
 from __future__ import annotations
 
 import copy
-import zlib
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -29,54 +27,30 @@ from mitsim.errors import InputError
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.scene.light_transport.projector_light import Light, LitPatterns, ModulatedLight
 from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
-from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.imager import FixedPattern, Noise, converter, expose, fixed_pattern
-from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed, expose_taps
+from mitsim.sensor.imager import Noise, converter
+from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.roi import Roi, roi_around
 from mitsim.sensor.speckle import SpeckleField
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.vignetting import camera_illumination
 from mitsim.sensor.written_imager import written_imager
+from mitsim.simulation.exposing import LightOnImagers, UnitPatterns, brightest, exposed
 from mitsim.simulation.indirect_light import IndirectLight, smoothed
 from mitsim.simulation.lens_blur import through_point_spread
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.surface_speckle import draw_speckle
 
 #: pixels traced around what must be seen, for the blur of the lens and the reach of the matcher
 _MARGIN_PX = 12
 
-
-@dataclass(frozen=True)
-class LightOnImagers:
-    """What reaches the imagers from one pose: all that a capture needs but the noise of the imagers.
-
-    ``radiance`` (P, h, w) of every camera [W / (mm^2 sr)] in its ``parts``; the ``exposures`` [s]; which ``noise`` is
-    on; ``rendered`` how: scene, samples_per_pixel, light_path_depth, and indirect_light where that is apart.
-    """
-
-    radiance: dict[str, NDArray[np.float32]]
-    parts: dict[str, Window]
-    exposures: tuple[float, ...]
-    noise: Noise
-    world_from_sensor: Transform
-    rendered: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class LaterLight:
-    """Light by way of other surfaces, rendered before: :meth:`SimulatedSensor.later_light` of every camera.
-
-    ``images`` (P, h, w) [W / (mm^2 sr)] of the ``parts`` of the images, before the lens; ``how`` they were rendered,
-    and over how many surfaces, ``depth``.
-    """
-
-    images: dict[str, NDArray[np.float32]]
-    parts: dict[str, Window]
-    how: IndirectLight
-    depth: int
+#: direct light at 16 samples per pixel
+_USUAL = Rendering()
 
 
 class SimulatedSensor:
@@ -88,8 +62,7 @@ class SimulatedSensor:
         self.rays = {name: _camera_rays(sensor, camera) for name, camera in cameras.items()}
         self.middles = {name: PixelRays.of_camera(camera) for name, camera in cameras.items()}
         self.patterns = _light(sensor)
-        self.fixed = {name: _fixed(sensor, index, name) for index, name in enumerate(cameras)}
-        self.delays = {name: _delays(sensor, index, name) for index, name in enumerate(cameras)}
+        self.units = {name: UnitPatterns.of(sensor, index, name) for index, name in enumerate(cameras)}
         corner = sensor.imager.corner_illumination
         self.corner_loss = {name: camera_illumination(corner, camera) for name, camera in cameras.items()}
 
@@ -110,14 +83,9 @@ class SimulatedSensor:
         other.patterns = copy.copy(self.patterns)
         other.patterns.projector = projector
         if unit is not None:
-            steps = dict(
-                zip(rig.cameras, np.random.default_rng(unit).integers(1, 10_000, (len(rig.cameras), 2)), strict=True)
-            )
-            other.fixed = {name: _shifted(pattern, *steps[name]) for name, pattern in self.fixed.items()}
-            other.delays = {
-                name: pattern if pattern is None else np.roll(pattern, steps[name], (0, 1))
-                for name, pattern in self.delays.items()
-            }
+            steps = np.random.default_rng(unit).integers(1, 10_000, (len(rig.cameras), 2))
+            moves = dict(zip(rig.cameras, steps, strict=True))
+            other.units = {name: patterns.moved(*moves[name]) for name, patterns in self.units.items()}
         return other
 
     def later_light(
@@ -129,27 +97,18 @@ class SimulatedSensor:
         *,
         seed: int,
         depth: int,
-        window: Window | None = None,
+        roi: Roi | None = None,
     ) -> NDArray[np.float32]:
         """Radiance (P, h, w) that comes by way of other surfaces alone, smoothed, before the lens.
 
         With one image more, of the scene's own light, where the sensor takes one or the author lit the scene.
         """
         rays = self.rays[camera]
-        part = window or rays.whole
-        images = trace(
-            scene,
-            rays,
-            self.patterns,
-            world_from_sensor,
-            samples=indirect.samples,
-            seed=seed,
-            depth=depth,
-            window=part,
-            with_ambient=self.sensor.ambient_image or has_emitters(scene),
-            only_later=True,
-        )
-        shape = shapes_met(scene, self.middles[camera], world_from_sensor)[part.inside]
+        roi = roi or rays.whole
+        ambient = self.sensor.ambient_image or has_emitters(scene)
+        paths = LightPaths(indirect.samples, seed, depth, only_later=True, with_ambient=ambient)
+        images = trace(scene, rays, self.patterns, world_from_sensor, paths, roi)
+        shape = shapes_met(scene, self.middles[camera], world_from_sensor)[roi.slices]
         return smoothed(images, shape, indirect.smoothing_px)
 
     def radiance(
@@ -157,47 +116,35 @@ class SimulatedSensor:
         scene: Scene,
         world_from_sensor: Transform,
         camera: str,
+        rendering: Rendering,
         *,
         seed: int,
-        samples: int,
-        depth: int,
-        window: Window | None = None,
+        roi: Roi | None = None,
         speckle: SpeckleField | None = None,
-        indirect: IndirectLight | NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """Radiance (P, h, w) [W / (mm^2 sr)] that reaches a camera's imager, of the window: the whole image if none.
+        """Radiance (P, h, w) [W / (mm^2 sr)] that reaches a camera's imager, of a region, else of the whole image.
 
-        One image more, of the scene's own light alone, where the sensor takes one. ``speckle`` is of the window.
-        Without ``indirect`` light by way of other surfaces is rendered as direct light is; an array is that light of
-        the window as :meth:`later_light` rendered it before.
+        One image more, of the scene's own light alone, where the sensor takes one. ``speckle`` is of the region.
         """
         rays, ambient_image = self.rays[camera], self.sensor.ambient_image
-        part = window or rays.whole
+        roi = roi or rays.whole
         separate = ambient_image or (speckle is not None and has_emitters(scene))
-        direct_alone = indirect is not None and depth > 1
-        images = trace(
-            scene,
-            rays,
-            self.patterns,
-            world_from_sensor,
-            samples=samples,
-            seed=seed,
-            depth=1 if direct_alone else depth,
-            window=part,
-            with_ambient=separate,
-            shift=None if speckle is None else speckle.shift,
-        )
-        if direct_alone:
+        indirect, depth = rendering.indirectly, rendering.surfaces
+        apart = indirect is not None and depth > 1
+        paths = LightPaths(rendering.samples, seed, 1 if apart else depth, with_ambient=separate)
+        shift = None if speckle is None else speckle.shift
+        images = trace(scene, rays, self.patterns, world_from_sensor, paths, roi, shift)
+        if apart:
             assert indirect is not None
-            if isinstance(indirect, IndirectLight):
-                indirect = self.later_light(
-                    scene, world_from_sensor, camera, indirect, seed=seed, depth=depth, window=part
-                )
-            images += indirect[: len(images)]
+            if rendering.before is not None:
+                later = rendering.before.images[camera]
+            else:
+                later = self.later_light(scene, world_from_sensor, camera, indirect, seed=seed, depth=depth, roi=roi)
+            images += later[: len(images)]
         lit, others = images[: self.patterns.count], images[self.patterns.count :]
 
         def through_lens(image: NDArray[np.float32]) -> None:  # in place: a large stack must not exist twice
-            image[:] = self.through_lens(image, camera, part)
+            image[:] = self.through_lens(image, camera, roi)
 
         def of_projector(image: NDArray[np.float32]) -> None:
             through_lens(image)
@@ -212,26 +159,26 @@ class SimulatedSensor:
             through_lens(image)
         in_threads(of_projector, lit)
         if self.sensor.room is not None:
-            images += self.room_light(scene, world_from_sensor, camera, part)
+            images += self.room_light(scene, world_from_sensor, camera, roi)
         return images[: self.patterns.count + ambient_image]
 
-    def room_light(self, scene: Scene, world_from_sensor: Transform, camera: str, part: Window) -> NDArray[np.float32]:
+    def room_light(self, scene: Scene, world_from_sensor: Transform, camera: str, roi: Roi) -> NDArray[np.float32]:
         """Radiance (h, w) [W / (mm^2 sr)] of the sensor's own [room], behind the lens.
 
         Its gradient is that along the sensor frame's axes at the middle of the working range, whatever the camera.
         """
-        lit = room_radiance(scene, directional_albedos(scene), self.middles[camera], world_from_sensor)[part.inside]
+        lit = room_radiance(scene, directional_albedos(scene), self.middles[camera], world_from_sensor)[roi.slices]
         eye, depth = self.sensor.rig.cameras[camera], float(np.mean(self.sensor.working_range_mm))
-        columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
-        rays = eye.sensor_from_camera.directions(eye.rays(np.stack([columns, rows], axis=-1).astype(float)))
+        pixels = np.stack(roi.pixels(), axis=-1).astype(float)
+        rays = eye.sensor_from_camera.directions(eye.rays(pixels))
         points = eye.centre + rays * ((depth - eye.centre[2]) / rays[..., 2:])
-        return self.through_lens(np.asarray(lit * self.sensor.room_irradiance(points), np.float32), camera, part)
+        return self.through_lens(np.asarray(lit * self.sensor.room_irradiance(points), np.float32), camera, roi)
 
-    def through_lens(self, image: NDArray[np.float32], camera: str, part: Window) -> NDArray[np.float32]:
-        """A part (h, w) of a camera's image as its lens passes it on: blurred, and darker toward the corners."""
+    def through_lens(self, image: NDArray[np.float32], camera: str, roi: Roi) -> NDArray[np.float32]:
+        """Blur the image (h, w) of a region by a camera's lens, and darken it toward the corners."""
         loss = self.corner_loss[camera]
-        out = through_point_spread(image, self.sensor.imager, self.sensor.rig.cameras[camera], part)
-        return out if loss is None else np.asarray(out * loss[part.inside], np.float32)
+        out = through_point_spread(image, self.sensor.imager, self.sensor.rig.cameras[camera], roi)
+        return out if loss is None else np.asarray(out * loss[roi.slices], np.float32)
 
     def light(
         self,
@@ -239,11 +186,9 @@ class SimulatedSensor:
         world_from_sensor: Transform,
         *,
         seed: int,
-        samples: int = 16,
-        depth: int = 1,
+        rendering: Rendering = _USUAL,
         around: NDArray[np.floating] | None = None,
         noise: Noise | None = None,
-        indirect: IndirectLight | LaterLight | None = None,
     ) -> LightOnImagers:
         """What reaches the imagers from one pose, ready to be exposed: :meth:`expose`.
 
@@ -253,45 +198,39 @@ class SimulatedSensor:
             Of the render and of the speckle, which belongs to the surface and to the pose.
         around
             (n, 3) points in the *sensor* frame [mm]: of each image, only their bounding box and 12 px more are read
-            out. The rest is at grey level 0, and ``settings["read_out"]`` names the part of every camera that has one
-            as [column, row, width, height].
+            out. The rest is at grey level 0, and ``settings["read_out"]`` gives the region of every camera that has one
+            as [left, top, width, height].
         noise
             Which sources of noise are on; all by default.
-        indirect
-            How light by way of other surfaces is rendered, if otherwise than direct light; or that light of the same
-            scene from a pose near by, rendered before, whose parts and depth then hold.
         """
-        noise, sensor = noise or Noise(), self.sensor
-        before, how = (indirect, indirect.how) if isinstance(indirect, LaterLight) else (None, indirect)
-        depth = before.depth if before is not None else depth
-        light, parts = {}, {}
+        noise, sensor, before = noise or Noise(), self.sensor, rendering.before
+        light, rois = {}, {}
         for index, (name, camera) in enumerate(sensor.rig.cameras.items()):
-            window = None if around is None else bounding_window(camera, around, _MARGIN_PX)
-            part = parts[name] = before.parts[name] if before is not None else window or self.rays[name].whole
+            near = None if around is None else roi_around(camera, around, _MARGIN_PX)
+            roi = rois[name] = before.rois[name] if before is not None else near or self.rays[name].whole
             render, _, grain = np.random.SeedSequence([seed, index]).spawn(3)
             speckle = None
             if noise.speckle:
                 rng = np.random.default_rng(grain)
-                speckle = draw_speckle(scene, sensor, camera, self.middles[name], world_from_sensor, part, rng)
+                speckle = draw_speckle(scene, sensor, camera, self.middles[name], world_from_sensor, roi, rng)
             light[name] = self.radiance(
                 scene,
                 world_from_sensor,
                 name,
+                rendering,
                 seed=int(render.generate_state(1)[0]),
-                samples=samples,
-                depth=depth,
-                window=part,
+                roi=roi,
                 speckle=speckle,
-                indirect=how if before is None else before.images[name],
             )
         for name, stack in light.items():
             self._check_finite(stack, f"camera {name}", "radiance")
-        exposures = sensor.exposure.exposures(self._brightest(light), sensor.imager.full_well)
+        exposures = sensor.exposure.exposures(brightest(sensor, light), sensor.imager.full_well)
         self._check_finite(np.array(exposures) * sensor.electrons(), "imager", "electrons per radiance")
-        rendered: dict[str, Any] = {"scene": scene.where, "samples_per_pixel": samples, "light_path_depth": depth}
-        if how is not None:
-            rendered["indirect_light"] = asdict(how)
-        return LightOnImagers(light, parts, exposures, noise, world_from_sensor, rendered)
+        rendered: dict[str, Any] = {"scene": scene.where, "samples_per_pixel": rendering.samples}
+        rendered["light_path_depth"] = rendering.surfaces
+        if rendering.indirectly is not None:
+            rendered["indirect_light"] = asdict(rendering.indirectly)
+        return LightOnImagers(light, rois, exposures, noise, world_from_sensor, rendered)
 
     def _check_finite(self, values: NDArray[np.floating], where: str, what: str) -> None:
         """Refuse light that is no number before it becomes an image of zeros."""
@@ -307,9 +246,9 @@ class SimulatedSensor:
         """Expose the imagers to light: every seed is another capture from the same pose, of the same speckle."""
         noise, sensor, exposures = light.noise, self.sensor, light.exposures
         images = {}
-        for index, (name, part) in enumerate(light.parts.items()):
+        for index, name in enumerate(light.rois):
             _, draw, _ = np.random.SeedSequence([seed, index]).spawn(3)
-            images[name] = self._expose(light.radiance[name], part, exposures, name, noise, draw)
+            images[name] = exposed(sensor, light, name, self.units[name], draw)
         settings: dict[str, Any] = {
             "exposure_s": exposures[0] if len(exposures) == 1 else list(exposures),
             "exposure_rule": sensor.exposure.rule,
@@ -323,9 +262,9 @@ class SimulatedSensor:
         settings |= {"black_level_dn": chip.black_level, "gamma": chip.gamma}
         settings |= {"decoder": sensor.settings.model_dump(mode="json"), "imager": written_imager(sensor.imager)}
         read_out = {
-            name: [part.column, part.row, part.width, part.height]
-            for name, part in light.parts.items()
-            if part != self.rays[name].whole
+            name: [roi.left, roi.top, roi.width, roi.height]
+            for name, roi in light.rois.items()
+            if roi != self.rays[name].whole
         }
         if read_out:
             settings["read_out"] = read_out
@@ -346,80 +285,13 @@ class SimulatedSensor:
         world_from_sensor: Transform,
         *,
         seed: int,
-        samples: int = 16,
-        depth: int = 1,
+        rendering: Rendering = _USUAL,
         around: NDArray[np.floating] | None = None,
         noise: Noise | None = None,
-        indirect: IndirectLight | None = None,
     ) -> Capture:
         """Take one capture: :meth:`light`, exposed once. Same seed, same bytes; give every capture its own."""
-        light = self.light(
-            scene,
-            world_from_sensor,
-            seed=seed,
-            samples=samples,
-            depth=depth,
-            around=around,
-            noise=noise,
-            indirect=indirect,
-        )
+        light = self.light(scene, world_from_sensor, seed=seed, rendering=rendering, around=around, noise=noise)
         return self.expose(light, seed)
-
-    def _brightest(self, light: dict[str, NDArray[np.float32]]) -> NDArray[np.float32] | None:
-        """Electrons per second of the brightest image of every camera, flat, if the exposure depends on them."""
-        if self.sensor.exposure.base_s is not None:
-            return None
-        brightest = []
-        for name, stack in light.items():
-            camera, image = self.sensor.rig.cameras[name], stack[np.argmax(stack.mean(axis=(1, 2)))]
-            # the rule asks for shares of the whole image: what is not read out counts as dark
-            brightest += [image.ravel(), np.zeros(camera.width * camera.height - image.size, np.float32)]
-        return np.concatenate(brightest) * np.float32(self.sensor.electrons())
-
-    def _expose(
-        self,
-        light: NDArray[np.float32],
-        part: Window,
-        exposures: tuple[float, ...],
-        camera: str,
-        noise: Noise,
-        stream: np.random.SeedSequence,
-    ) -> NDArray[np.unsignedinteger[Any]]:
-        """Grey levels of every image at every exposure: all images at the shortest first; 0 outside the part."""
-        imager, scale, inside = self.sensor.imager, self.sensor.electrons(), part.inside
-        device, eye = self.fixed[camera], self.sensor.rig.cameras[camera]
-        fixed = FixedPattern(device.offset[inside], device.response[inside], device.column[inside[1]])
-        code, pattern = self.sensor.pattern, self.delays[camera]
-        levels = np.uint8 if converter(imager, noise).bits <= 8 else np.uint16
-        count = len(light) if isinstance(code, AmplitudeModulation) else len(exposures) * len(light)
-        out = np.zeros((count, eye.height, eye.width), levels)  # memory that is not written to costs nothing
-        if isinstance(code, AmplitudeModulation):
-            seconds = exposures[0]
-            light = light if pattern is None or not noise.dsnu else delayed(light, code, pattern[inside])
-            electrons = light * np.float32(scale * seconds)
-            rng = np.random.default_rng(stream)
-            out[:, *inside] = expose_taps(electrons, code, imager, fixed, noise, rng, seconds)
-            return out
-
-        def one(numbered: tuple[int, np.random.SeedSequence]) -> None:
-            index, own = numbered
-            seconds = exposures[index // len(light)]
-            electrons = light[index % len(light)] * np.float32(scale * seconds)
-            rng = np.random.Generator(np.random.SFC64(own))  # a quarter faster than the default
-            out[index][inside] = expose(electrons, imager, fixed, noise, rng, seconds)
-
-        in_threads(one, enumerate(stream.spawn(count)))  # every image has a stream of its own
-        return out
-
-
-def bounding_window(camera: Camera, points: NDArray[np.floating], margin: int) -> Window | None:
-    """Part of a camera's image that holds points (n, 3) of the sensor frame; the whole image if one is behind it."""
-    pixels = camera.project(points)
-    if not np.isfinite(pixels).all():
-        return None
-    low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - margin, 0, [camera.width - 1, camera.height - 1])
-    high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + margin + 1, low + 1, [camera.width, camera.height])
-    return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
 
 
 def _camera_rays(sensor: Sensor, camera: Camera) -> CameraRays:
@@ -433,26 +305,3 @@ def _light(sensor: Sensor) -> Light:
     if isinstance(sensor.pattern, AmplitudeModulation):
         return ModulatedLight(sensor.projector, *sensor.pattern.images())
     return LitPatterns(sensor.patterns(), sensor.projector)
-
-
-def _delays(sensor: Sensor, index: int, name: str) -> NDArray[np.float32] | None:
-    """What the pixels of a time-of-flight camera add to the optical path [mm], if anything."""
-    code, camera = sensor.pattern, sensor.rig.cameras[name]
-    if not isinstance(code, AmplitudeModulation) or code.delay_pattern_mm == 0:
-        return None
-    device = np.random.SeedSequence([zlib.crc32(sensor.name.encode()), index, 1])
-    return delay_pattern(code, (camera.height, camera.width), np.random.default_rng(device))
-
-
-def _fixed(sensor: Sensor, index: int, name: str) -> FixedPattern:
-    camera = sensor.rig.cameras[name]
-    device = np.random.SeedSequence([zlib.crc32(sensor.name.encode()), index])
-    return fixed_pattern(sensor.imager, (camera.height, camera.width), np.random.default_rng(device))
-
-
-def _shifted(pattern: FixedPattern, rows: int, columns: int) -> FixedPattern:
-    return FixedPattern(
-        np.roll(pattern.offset, (rows, columns), (0, 1)),
-        np.roll(pattern.response, (rows, columns), (0, 1)),
-        np.roll(pattern.column, columns),
-    )

@@ -17,11 +17,19 @@ from numpy.typing import NDArray
 
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
-from mitsim.scene.ray_casting.camera_rays import Window
 from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import Sensor
-from mitsim.sensor.speckle import SpeckleField, contrast, lateral_shift_std, speckle_field, speckle_size_um
+from mitsim.sensor.roi import Roi
+from mitsim.sensor.speckle import (
+    SpeckleField,
+    SpeckleOptics,
+    SpeckleSurface,
+    contrast,
+    lateral_shift_std,
+    speckle_field,
+    speckle_size_um,
+)
 from mitsim.sensor.transforms import Transform
 
 #: spread of the path lengths inside white paint [um], in the place of a metal's Rq. Assumed
@@ -41,17 +49,15 @@ def finish_contrast(finish: Finish | None, sensor: Sensor, camera: Camera) -> fl
         depolarising = scatter.depolarising
         coherent = scatter.coherent * (1.0 - scatter.wide_angle)
         height = PAINT_DEPTH_UM if math.isnan(scatter.height_um) else scatter.height_um
-    return contrast(
-        height_um=height,
-        coherent_share=coherent,
-        wavelength_nm=sensor.wavelength_nm,
-        linewidth_nm=sensor.linewidth_nm,
+    optics = SpeckleOptics(
+        sensor.wavelength_nm,
+        sensor.linewidth_nm,
         u_illumination=sensor.projector.aperture_mm,
         u_observation=sensor.pupil_mm(camera),
         pixel_um=sensor.imager.pixel_um,
         f_number=sensor.imager.f_number,
-        depolarising=depolarising,
     )
+    return contrast(SpeckleSurface(height, coherent, depolarising), optics)
 
 
 def shift_angle(sensor: Sensor, camera: Camera) -> float:
@@ -76,16 +82,16 @@ def draw_speckle(
     camera: Camera,
     rays: PixelRays,
     world_from_sensor: Transform,
-    window: Window,
+    roi: Roi,
     rng: np.random.Generator,
 ) -> SpeckleField | None:
-    """Gain (h, w) and shift (2, h, w) [rad] in a window of one camera, for one pose; None where there is no speckle."""
+    """Draw gain (h, w) and shift (2, h, w) [rad] of a region of one camera, for one pose; None without speckle."""
     values = contrast_map(scene, sensor, camera, rays, world_from_sensor)
     if not np.any(values):
         return None
     if isinstance(values, np.ndarray):
-        values = values[window.row : window.row + window.height, window.column : window.column + window.width]
+        values = values[roi.slices]
     size_px = speckle_size_um(sensor.wavelength_nm, sensor.imager.f_number) / sensor.imager.pixel_um
-    field = speckle_field((window.height, window.width), values, size_px, rng)
+    field = speckle_field((roi.height, roi.width), values, size_px, rng)
     angle = np.asarray(values * shift_angle(sensor, camera), np.float32)
     return SpeckleField(field.gain, field.shift * angle)

@@ -18,7 +18,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from mitsim.scene.light_transport.projector_light import LitPatterns
-from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.transforms import Transform
@@ -89,10 +89,7 @@ def true_image(
             simulated.rays[camera],
             white,
             world_from_sensor,
-            samples=samples,
-            seed=seed,
-            depth=surfaces_on_path,
-            with_ambient=True,
+            LightPaths(samples=samples, seed=seed, depth=surfaces_on_path, with_ambient=True),
         )
         return np.asarray(lit - ambient)
 

@@ -11,6 +11,7 @@ a nominal incidence of 30 deg, because E falls slowly up to 60 deg.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -62,20 +63,24 @@ def facets(
     sy = alpha_v * radius[:, None] * np.sin(turn)
     # an isotropic lobe needs one azimuth; an elongated one is symmetric in both its axes
     views = [0.0] if alpha_u == alpha_v else np.pi / 2 * (np.arange(several) + 0.5) / several
-    seen = [_facets_from(incidence, view, sx, sy, alpha_u, alpha_v, distribution, index) for view in views]
+    lobe = _Lobe(alpha_u, alpha_v, distribution, index)
+    seen = [_facets_from(incidence, view, sx, sy, lobe) for view in views]
     weights, cosines = (np.concatenate([one[k].ravel() for one in seen]) for k in (0, 1))
     return weights / weights.size, cosines
 
 
+@dataclass(frozen=True)
+class _Lobe:
+    """A microfacet lobe: widths along u and v, distribution of its slopes, (n, k) or None for a perfect mirror."""
+
+    alpha_u: float
+    alpha_v: float
+    distribution: Distribution
+    index: tuple[float, float] | None
+
+
 def _facets_from(
-    incidence: float,
-    azimuth: float,
-    sx: NDArray[np.float64],
-    sy: NDArray[np.float64],
-    alpha_u: float,
-    alpha_v: float,
-    distribution: Distribution,
-    index: tuple[float, float] | None,
+    incidence: float, azimuth: float, sx: NDArray[np.float64], sy: NDArray[np.float64], lobe: _Lobe
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     x, y = np.sin(incidence) * np.cos(azimuth), np.sin(incidence) * np.sin(azimuth)
     z = np.cos(incidence)
@@ -84,11 +89,11 @@ def _facets_from(
     scale = 2 * facing / steepness
     out_x, out_y, out_z = -sx * scale - x, -sy * scale - y, scale - z
     seen = (facing > 0) & (out_z > 0)
-    tangent_out = np.hypot(alpha_u * out_x, alpha_v * out_y) / np.where(seen, out_z, 1.0)
-    weight = np.where(seen, facing / z, 0.0) * shadowing(tangent_out, distribution)
-    if index is not None:
-        weight = weight * fresnel(np.clip(facing / np.sqrt(steepness), 0, 1), *index)
-    weight = weight * shadowing(np.hypot(alpha_u * x, alpha_v * y) / z, distribution)
+    tangent_out = np.hypot(lobe.alpha_u * out_x, lobe.alpha_v * out_y) / np.where(seen, out_z, 1.0)
+    weight = np.where(seen, facing / z, 0.0) * shadowing(tangent_out, lobe.distribution)
+    if lobe.index is not None:
+        weight = weight * fresnel(np.clip(facing / np.sqrt(steepness), 0, 1), *lobe.index)
+    weight = weight * shadowing(np.hypot(lobe.alpha_u * x, lobe.alpha_v * y) / z, lobe.distribution)
     return weight, np.where(seen, out_z, 0.0)
 
 

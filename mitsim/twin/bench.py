@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from mitsim.fit.place import Place
 from mitsim.scene.light_transport.projector_light import LitPatterns
 from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.camera_rays import Window
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.imager import Noise, electrons_per_radiance, expose, fixed_pattern
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.vignetting import camera_illumination
 from mitsim.simulation.lens_blur import through_point_spread
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.simulation.surface_speckle import draw_speckle
 from mitsim.validation.plate import REFLECTANCE, plate
@@ -40,19 +41,16 @@ MARGIN_PX = 12
 class Bench:
     """The reference camera of a sensor in front of a specimen; ``part`` is the evaluated window of its image."""
 
-    def __init__(self, sensor: Sensor, place: Place, part: Window) -> None:
+    def __init__(self, sensor: Sensor, place: Place, roi: Roi) -> None:
         name, camera = next(iter(sensor.rig.cameras.items()))
         self.name, self.camera, self.place = name, camera, place
-        self.part = _wider(part, camera.width, camera.height)
-        self.inner = np.s_[
-            part.row - self.part.row : part.row - self.part.row + part.height,
-            part.column - self.part.column : part.column - self.part.column + part.width,
-        ]
+        self.roi = _wider(roi, camera.width, camera.height)
+        self.inner = Roi(roi.left - self.roi.left, roi.top - self.roi.top, roi.width, roi.height).slices
         self._scene: Scene = plate(place, sensor, None)
         self._kept: dict[Any, NDArray[np.float32]] = {}
         self._room: NDArray[np.float32] | None = None
         self._device: SimulatedSensor | None = None
-        self._slopes = _slopes(self.camera, self.part)
+        self._slopes = _slopes(self.camera, self.roi)
 
     def levels(self, sensor: Sensor, seed: int, *, projector_on: bool = True) -> NDArray[Any]:
         """Return the grey levels (h, w) of the part in the first image of a capture by a sensor."""
@@ -75,16 +73,16 @@ class Bench:
     def room(self, sensor: Sensor) -> NDArray[np.float32]:
         """Return the radiance of the room behind the lens, in the wider part."""
         if sensor.room is None:
-            return np.zeros((self.part.height, self.part.width), np.float32)
+            return np.zeros((self.roi.height, self.roi.width), np.float32)
         if self._room is None:
-            self._room = np.float32(REFLECTANCE / np.pi) * np.ones((self.part.height, self.part.width), np.float32)
+            self._room = np.float32(REFLECTANCE / np.pi) * np.ones((self.roi.height, self.roi.width), np.float32)
         irradiance = sensor.room_irradiance(self._slopes)
         return self._through(sensor, np.asarray(self._room * irradiance, np.float32))
 
     def _through(self, sensor: Sensor, image: NDArray[np.float32]) -> NDArray[np.float32]:
         loss = camera_illumination(sensor.imager.corner_illumination, self.camera)
-        out = through_point_spread(image, sensor.imager, self.camera, self.part)
-        return out if loss is None else np.asarray(out * loss[self.part.inside], np.float32)
+        out = through_point_spread(image, sensor.imager, self.camera, self.roi)
+        return out if loss is None else np.asarray(out * loss[self.roi.slices], np.float32)
 
     def _lit(self, sensor: Sensor, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the light of the projector at 1 W before the lens, and the gain of speckle behind it."""
@@ -117,10 +115,16 @@ class Bench:
             simulated = self._of(one)
             pose = self.place.world_from_sensor
             rng = np.random.default_rng(np.random.SeedSequence([seed, 2]))
-            speckle = draw_speckle(self._scene, one, self.camera, simulated.middles[self.name], pose, self.part, rng)
+            speckle = draw_speckle(self._scene, one, self.camera, simulated.middles[self.name], pose, self.roi, rng)
             still = None if speckle is None else replace(speckle, gain=np.ones_like(speckle.gain))
             radiance = simulated.radiance(
-                self._scene, pose, self.name, seed=seed, samples=_SAMPLES, depth=1, window=self.part, speckle=still
+                self._scene,
+                pose,
+                self.name,
+                Rendering(samples=_SAMPLES, depth=1),
+                seed=seed,
+                roi=self.roi,
+                speckle=still,
             )[0]
             gain = np.ones_like(radiance) if speckle is None else np.asarray(speckle.gain, np.float32)
             self._kept[key] = np.stack([radiance, gain])
@@ -138,14 +142,11 @@ class Bench:
         return other
 
 
-def _wider(part: Window, width: int, height: int) -> Window:
-    left, top = max(part.column - MARGIN_PX, 0), max(part.row - MARGIN_PX, 0)
-    right = min(part.column + part.width + MARGIN_PX, width)
-    bottom = min(part.row + part.height + MARGIN_PX, height)
-    return Window(left, top, right - left, bottom - top)
+def _wider(roi: Roi, width: int, height: int) -> Roi:
+    left, top = max(roi.left - MARGIN_PX, 0), max(roi.top - MARGIN_PX, 0)
+    return Roi.between(left, top, min(roi.right + MARGIN_PX, width), min(roi.bottom + MARGIN_PX, height))
 
 
-def _slopes(camera: Any, part: Window) -> Floats:
-    columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
-    rays = camera.rays(np.stack([columns, rows], axis=-1).astype(float))
+def _slopes(camera: Any, roi: Roi) -> Floats:
+    rays = camera.rays(np.stack(roi.pixels(), axis=-1).astype(float))
     return np.asarray(camera.sensor_from_camera.directions(rays))

@@ -22,9 +22,9 @@ from mitsim.capture.capture import Capture
 from mitsim.errors import InputError
 from mitsim.fit.place import Place
 from mitsim.fit.specimen import MARGIN_PX, image_mask
-from mitsim.scene.ray_casting.camera_rays import Window
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.roi import Roi
 from mitsim.twin.bench import Bench
 from mitsim.twin.estimate import scaled, unscaled
 from mitsim.twin.figures import TERMS, Field, field_figures
@@ -98,6 +98,18 @@ def built(sensor: Sensor, parameters: Sequence[Parameter], theta: Floats) -> Sen
     return sensor
 
 
+@dataclass(frozen=True)
+class DotDraws:
+    """Simulated dots that a fit compares with: how many ``number``, their ``seed``, and patches of ``patch_px``."""
+
+    number: int = 3
+    seed: int = 1
+    patch_px: int = PATCH_PX
+
+
+_DRAWS = DotDraws()
+
+
 def fit_dots(
     capture: Capture,
     sensor: Sensor,
@@ -106,9 +118,7 @@ def fit_dots(
     where: str,
     *,
     room: Sequence[float] | None = None,
-    seed: int = 1,
-    draws: int = 3,
-    patch_px: int = PATCH_PX,
+    draws: DotDraws = _DRAWS,
 ) -> DotsFit:
     """Fit parameters to one capture of dots.
 
@@ -127,15 +137,16 @@ def fit_dots(
         If too little of the sheet is visible.
     """
     name, camera = next(iter(capture.rig.cameras.items()))
+    seed, patch_px = draws.seed, draws.patch_px
     field = Field.of(camera, image_mask(place, camera, MARGIN_PX if patch_px >= PATCH_PX else 2.0), patch_px)
     if len(field.corners) < FEWEST_PATCHES:
         seen = f"{len(field.corners)} patches of {patch_px} px of it"
         raise InputError(where, "specimen", seen, f"{FEWEST_PATCHES} or more", "a larger --window, or a nearer view")
-    part = Window(field.column, field.row, *field.there.shape[::-1])
+    roi = Roi(field.column, field.row, *field.there.shape[::-1])
     window = int(np.clip(np.nan_to_num(_RUNS * run_length(capture, place), nan=_WINDOWS[1]), *_WINDOWS)) // 2 * 2 + 1
     black = sensor.imager.black_level
-    real = field_figures(capture.images[name][0][part.inside].astype(float), field, window, black)
-    bench = Bench(sensor, place, part)
+    real = field_figures(capture.images[name][0][roi.slices].astype(float), field, window, black)
+    bench = Bench(sensor, place, roi)
     unit = bench.projector_irradiance(sensor, seed)
     own = list(parameters)
     if room is None:
@@ -161,10 +172,10 @@ def fit_dots(
     for index, parameter in enumerate(own):
         if parameter.key == "projector.flux_w":
             start[index] += wanted[0] - simulate(start, 0)[0][0]
-    found = match_moments(wanted, covariance, simulate, _prior(own, start), draws, where)
+    found = match_moments(wanted, covariance, simulate, _prior(own, start), draws.number, where)
     uneven = 0.0
     if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)) and spatial.sum() > 0:
-        off = wanted - np.mean([simulate(found.values, number)[0] for number in range(draws)], axis=0)
+        off = wanted - np.mean([simulate(found.values, number)[0] for number in range(draws.number)], axis=0)
         excess = float(np.mean(off[spatial] ** 2 - np.diag(covariance)[spatial]))
         uneven = float(np.sqrt(max(excess, 0.0)))
         covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
@@ -177,7 +188,7 @@ def fit_dots(
     if uneven > 0 or untold:
         own = [parameter for parameter, is_kept in zip(own, kept, strict=True) if is_kept]
         again = _prior(own, start[kept], found.values[kept])
-        found = match_moments(wanted, covariance, simulate, again, draws, f"{where}, once more")
+        found = match_moments(wanted, covariance, simulate, again, draws.number, f"{where}, once more")
     if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)):
         wider = found.covariance * found.chi_square / max(found.freedom, 1)
         found = replace(found, covariance=wider)

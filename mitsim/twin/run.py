@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 
 from mitsim.errors import InputError
 from mitsim.fit.place import Place
-from mitsim.fit.specimen import Part, specimen_place
+from mitsim.fit.specimen import specimen_place
 from mitsim.progress import say
 from mitsim.reconstruction.cloud import decoder_settings
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, load_sensor
-from mitsim.twin.dots import DotsFit, fit_dots
+from mitsim.sensor.roi import Roi
+from mitsim.twin.dots import DotDraws, DotsFit, fit_dots
 from mitsim.twin.estimate import Estimate, Untold, combined, pooled, scaled, unscaled
 from mitsim.twin.noise import ImagerFit, fit_imager
 from mitsim.twin.parameters import (
@@ -71,7 +72,7 @@ def fit_sensor(
     *,
     off: Sequence[Path] = (),
     dark: Sequence[Path] = (),
-    window: Part | None = None,
+    roi: Roi | None = None,
     seed: int = 1,
     draws: int = 3,
 ) -> SensorFit:
@@ -85,8 +86,8 @@ def fit_sensor(
         Preset or file that starts the fit.
     off, dark
         Folders of captures with the projector off, and with all light off.
-    window
-        Part of the first camera's image that shows the specimen in all captures; by default the whole flat area.
+    roi
+        Region of the first camera's image that shows the specimen, in all of them; all that is flat if left out.
 
     Raises
     ------
@@ -105,7 +106,7 @@ def fit_sensor(
     places: dict[str, Place] = {}
     for group in groups:
         if group[0].kind != "dark":
-            places[group[0].name] = _place(group[0], window)
+            places[group[0].name] = _place(group[0], roi)
     imager = fit_imager(groups, base, places)
     estimates = list(imager.estimates)
     base = replace(base, imager=imager.imager)
@@ -150,9 +151,9 @@ def _seconds(sensor: Sensor, take: Take) -> Sensor:
     return sensor
 
 
-def _place(take: Take, window: Part | None) -> Place:
+def _place(take: Take, roi: Roi | None) -> Place:
     settings, _ = decoder_settings(take.capture)
-    place = specimen_place(take.capture, settings, window, take.name)
+    place = specimen_place(take.capture, settings, roi, take.name)
     distance = float(np.linalg.norm(place.world_from_sensor.translation))
     bend = "flat" if place.bend is None else f"bent by {place.bend.rms:.2g} mm rms"
     say(f"{take.name}: a sheet at {distance:.0f} mm, {bend}")
@@ -186,8 +187,7 @@ def _dots(
             parameters,
             take.name,
             room=None if room is None else room.terms,
-            seed=seed,
-            draws=draws,
+            draws=DotDraws(draws, seed),
         )
         say(
             f"{take.name}: {out[take.name].patches} patches, chi-square {out[take.name].found.chi_square:.1f} of "

@@ -20,12 +20,13 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.errors import InputError
 from mitsim.fit.place import Place
-from mitsim.fit.specimen import MARGIN_PX, Part, image_mask, specimen_place, window_around
+from mitsim.fit.specimen import MARGIN_PX, image_mask, specimen_place
 from mitsim.progress import say
 from mitsim.reconstruction.cloud import decoder_settings
 from mitsim.report.capture_page import Shown, write_capture_page
 from mitsim.report.numbers import NONE, rounded, two_digits
 from mitsim.sensor.preset import load_sensor, presets
+from mitsim.sensor.roi import Roi
 from mitsim.validation.compare_captures import Comparison, Row, compare_captures
 from mitsim.validation.plain_image import plain_image
 from mitsim.validation.rebuild import projector_was_on, rebuild
@@ -49,7 +50,7 @@ def validate_captures(
     simulated: Path | None,
     output: Path,
     sensor: str | None,
-    window: Part | None,
+    roi: Roi | None,
     projector: str | None,
     seed: int,
 ) -> CaptureValidation:
@@ -71,7 +72,7 @@ def validate_captures(
             "name SIMULATED to compare two simulations",
         )
     settings, _ = decoder_settings(recorded)
-    place = specimen_place(recorded, settings, window, str(real))
+    place = specimen_place(recorded, settings, roi, str(real))
     on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector), str(real))
     say(f"specimen: a plane at {_distance(place):.0f} mm, with {place.off_plane:.2g} mm rms deviation")
     if simulated is None:
@@ -170,8 +171,7 @@ def _shown(name: str, capture: Capture, place: Place, seen: SpecimenPatches) -> 
         slice(max(int(rows[0]) - _BORDER_PX, 0), int(rows[-1]) + _BORDER_PX),
         slice(max(int(columns[0]) - _BORDER_PX, 0), int(columns[-1]) + _BORDER_PX),
     )
-    part = window_around(seen.on_grid)
-    left, top, right, bottom = part if part is not None else (0, 0, 1, 1)
+    roi = Roi.around(seen.on_grid) or Roi(0, 0, 1, 1)
     totals = seen.status.sum(axis=0)
     shares = {status: float(totals[status] / totals.sum()) for status in Status if totals[status] > 0}
     return Shown(
@@ -179,6 +179,6 @@ def _shown(name: str, capture: Capture, place: Place, seen: SpecimenPatches) -> 
         capture.source,
         image[cut],
         seen.levels.sum(axis=0),
-        seen.residual[top:bottom, left:right],
+        seen.residual[roi.slices],
         shares,
     )

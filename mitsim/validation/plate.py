@@ -24,7 +24,7 @@ from mitsim.scene import backend
 from mitsim.scene.load import Scene, scene_from_dict
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import Sensor
-from mitsim.simulation.simulate import LightOnImagers
+from mitsim.simulation.exposing import LightOnImagers
 from mitsim.validation.plain_image import PlainImage
 
 Floats = NDArray[np.float64]
@@ -87,8 +87,8 @@ def texture_of(place: Place, camera: Camera, electrons: Floats, light: LightOnIm
     It is the ratio of the recorded image to that of a white plate. Outside the image of the reference camera, the value
     of the nearest pixel is repeated.
     """
-    part = light.parts[name]
-    inside = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
+    roi = light.rois[name]
+    inside = roi.slices
     white = light.radiance[name][0].astype(float)
     lit = white > 0.05 * np.percentile(white, 99)
     ratio = denoised(electrons[inside], lit) / np.where(lit, white, np.nan)
@@ -101,7 +101,7 @@ def texture_of(place: Place, camera: Camera, electrons: Floats, light: LightOnIm
     y = place.low[1] + (np.arange(rows) + 0.5) / rows * extent[1]
     xs, ys = np.meshgrid(x, y)
     points = place.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1))
-    pixels = np.nan_to_num(camera.project(points)) - [part.column, part.row]
+    pixels = np.nan_to_num(camera.project(points)) - [roi.left, roi.top]
     sharp = ratio - _APERTURE_PX2 / 2 * laplace(ratio, mode="nearest")
     return np.asarray(map_coordinates(sharp, [pixels[..., 1], pixels[..., 0]], order=3, mode="nearest")).clip(0.0)
 
@@ -110,8 +110,7 @@ def printed(
     light: LightOnImagers, place: Place, camera: Camera, electrons: Floats, name: str, plain: PlainImage
 ) -> LightOnImagers:
     """Return light with the print of the recorded plain image on the specimen of its only camera."""
-    part, radiance = light.parts[name], light.radiance[name]
-    inside = slice(part.row, part.row + part.height), slice(part.column, part.column + part.width)
+    inside, radiance = light.rois[name].slices, light.radiance[name]
     there = image_mask(place, camera)[inside]
     white = radiance[list(plain.images)].max(axis=0).astype(float)
     ratio = np.where(there & (white > 0), denoised(electrons[inside], there) / np.where(white > 0, white, 1.0), 0.0)

@@ -40,7 +40,9 @@ from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
-from mitsim.simulation.simulate import LightOnImagers, SimulatedSensor
+from mitsim.simulation.exposing import LightOnImagers
+from mitsim.simulation.rendering import Rendering
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.validation.plain_image import PlainImage, plain_image
 from mitsim.validation.plate import REFLECTANCE, plate, printed, texture_of
 
@@ -100,7 +102,7 @@ def rebuild(
 
     def lit(texture: Floats | None) -> LightOnImagers:
         scene = plate(place, own, texture)
-        return simulated.light(scene, pose, seed=seed, samples=SAMPLES, around=around, noise=noise)
+        return simulated.light(scene, pose, rendering=Rendering(samples=SAMPLES), seed=seed, around=around, noise=noise)
 
     light, with_print = lit(None), projector_on and not plain.has_dots and len(real.rig.cameras) == 1
     with_print &= not isinstance(own.pattern, AmplitudeModulation)
@@ -110,7 +112,7 @@ def rebuild(
     if not projector_on:
         texture = texture_of(place, real.rig.cameras[name], electrons, light, name)
         light = lit(texture / texture.max())
-    scale = _scale(simulated, light, place, real, name, plain, seed, where)
+    scale = _scale(simulated, light, place, _Recording(real, name, plain, where), seed)
     scaled = replace(light, radiance={key: values * np.float32(scale) for key, values in light.radiance.items()})
     capture = simulated.expose(scaled, seed)
     power = scale * sensor.projector.flux * REFLECTANCE
@@ -165,22 +167,24 @@ def like(real: Capture, sensor: Sensor, where: str) -> Sensor:
     )
 
 
-def _scale(
-    simulated: SimulatedSensor,
-    light: LightOnImagers,
-    place: Place,
-    real: Capture,
-    name: str,
-    plain: PlainImage,
-    seed: int,
-    where: str,
-) -> float:
-    """Return the factor of the light that reproduces the specimen's median level in the plain image, by bisection.
+@dataclass(frozen=True)
+class _Recording:
+    """The ``capture`` to rebuild: its reference ``camera``, that camera's ``plain`` image, ``where`` in messages."""
 
-    Levels are compared with their noise. Where a pattern has two levels, few pixels are near their median, and noise
-    shifts it.
+    capture: Capture
+    camera: str
+    plain: PlainImage
+    where: str
+
+
+def _scale(simulated: SimulatedSensor, light: LightOnImagers, place: Place, recording: _Recording, seed: int) -> float:
+    """Factor of the light that makes the specimen's median level the recorded one, in the plain image; by bisection.
+
+    The levels are compared with their noise: where a pattern has two levels, few pixels are near the median, and noise
+    moves it.
     """
-    part, there = light.parts[name], image_mask(place, real.rig.cameras[name], MARGIN_PX)
+    real, name, plain, where = recording.capture, recording.camera, recording.plain, recording.where
+    roi, there = light.rois[name], image_mask(place, real.rig.cameras[name], MARGIN_PX)
     if not there.any():
         raise InputError(
             "REAL", "specimen", "no pixels", "a specimen in the image", "use a larger --window, or a nearer view"
@@ -198,7 +202,7 @@ def _scale(
 
     def too_bright(scale: float) -> bool:
         some = light.radiance[name][needed] * np.float32(scale)
-        seen = simulated.expose(replace(light, radiance={name: some}, parts={name: part}), seed).images[name]
+        seen = simulated.expose(replace(light, radiance={name: some}, rois={name: roi}), seed).images[name]
         seen = seen[[needed.index(number) for number in plain.images]].max(axis=0)
         return median_level(np.bincount(seen[there])) > wanted
 

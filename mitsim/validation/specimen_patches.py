@@ -29,8 +29,9 @@ from mitsim.decode.matching.row_error import row_error
 from mitsim.decode.matching.stereo import StereoGeometry
 from mitsim.fit.fine_detail import finest_detail
 from mitsim.fit.place import Place
-from mitsim.fit.specimen import MARGIN_PX, image_mask, on_specimen, window_around
+from mitsim.fit.specimen import MARGIN_PX, image_mask, on_specimen
 from mitsim.reconstruction.cloud import Geometry, Settings, capture_cloud
+from mitsim.sensor.roi import Roi
 from mitsim.validation.plain_image import plain_image
 
 Floats = NDArray[np.float64]
@@ -103,7 +104,7 @@ def specimen_patches(
     crossings = of_image(np.pad(across.astype(float), ((0, 0), (1, 0))))
     grid = geometry.grid
     on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
-    cloud = capture_cloud(capture, settings, geometry, window=window_around(on_grid))
+    cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(on_grid))
     places = _corners(on_grid)
     status = _tiles(np.where(on_grid, cloud.status.astype(float), np.nan), places)
     points = np.where(on_grid[..., None], cloud.points, np.nan).astype(float) - grid.origin
@@ -144,7 +145,7 @@ def patch_rows(
     """
     grid = geometry.grid
     on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
-    cloud = capture_cloud(capture, settings, geometry, window=window_around(on_grid))
+    cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(on_grid))
     places = _corners(on_grid)
     valid = _tiles(np.where(on_grid, cloud.valid.astype(float), np.nan), places)
     known = np.nansum(valid, axis=-1) >= _LEAST_FOR_ROWS * np.isfinite(valid).sum(axis=-1)

@@ -17,11 +17,12 @@ from mitsim.campaign.plan import sensor_checksum
 from mitsim.errors import InputError
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.simulation.indirect_light import IndirectLight
+from mitsim.simulation.rendering import Rendering
 from mitsim.study import RaceTable, Study
 from mitsim.version import __version__
 from mitsim.virtual.mapped import MappedMeasurements
 from mitsim.virtual.race import RaceRules
-from mitsim.virtual.rendered import RenderedMeasurements, Rendering
+from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.world import BEYOND, Unknowns
 
 #: part of the digest of a trial; increased if the same world gives a different measurement

@@ -34,9 +34,11 @@ from mitsim.scene.load import Scene, load_scene, share_kernels
 from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.scene.ray_casting.triangles import outermost
 from mitsim.sensor.exposure import PlannedExposure
+from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
-from mitsim.simulation.indirect_light import IndirectLight
-from mitsim.simulation.simulate import LaterLight, LightOnImagers, SimulatedSensor, bounding_window
+from mitsim.simulation.exposing import LightOnImagers
+from mitsim.simulation.rendering import LaterLight, Rendering
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import View
 from mitsim.virtual.form import form_deviation
@@ -53,17 +55,8 @@ _PLACEMENTS = 3.0
 
 
 @dataclass(frozen=True)
-class Rendering:
-    """Settings of the renderer: ``samples`` per pixel, ``depth`` surfaces on a light path, ``indirect`` light."""
-
-    samples: int
-    depth: int
-    indirect: IndirectLight
-
-
-@dataclass(frozen=True)
 class _SharedLight:
-    """Light of a view that is the same in all worlds of one finish."""
+    """What of a view's light is the same in all worlds of one finish."""
 
     view: int
     finish: int
@@ -178,14 +171,7 @@ class RenderedMeasurements:
             before = self._render_shared_light(sensor, true, view, world.finish, world.seed)
         else:
             before = self._shared_with(view, world.finish)
-        light = sensor.light(
-            scene,
-            true,
-            seed=world.seed,
-            samples=self.rendering.samples,
-            depth=self.rendering.depth,
-            indirect=before.later,
-        )
+        light = sensor.light(scene, true, seed=world.seed, rendering=replace(self.rendering, indirect=before.later))
         return Lit(sensor, light, before.room, world, told)
 
     def exposed(self, lit: Lit, planned: PlannedExposure | None, seed: int, keep: bool = False) -> Capture:
@@ -254,26 +240,23 @@ class RenderedMeasurements:
     ) -> _SharedLight:
         """Render interreflections and room light from a pose of a view, with the draws of a seed."""
         scene, albedos = self._scene(finish)
+        how = self.rendering.indirectly
+        assert how is not None  # rendering_of a study
         around = view.world_from_sensor.inverse().points(self.corners)
-        images, parts, room = {}, {}, {}
+        images, rois, room = {}, {}, {}
         for index, (name, camera) in enumerate(simulated.sensor.rig.cameras.items()):
-            part = bounding_window(camera, around, _MARGIN_PX) or simulated.rays[name].whole
+            roi = roi_around(camera, around, _MARGIN_PX) or simulated.rays[name].whole
             stream = np.random.SeedSequence([seed, view.number, finish + 1, index])
             if self.rendering.depth > 1:
+                seed_of_render = int(stream.generate_state(1)[0])
                 images[name] = simulated.later_light(
-                    scene,
-                    pose,
-                    name,
-                    self.rendering.indirect,
-                    seed=int(stream.generate_state(1)[0]),
-                    depth=self.rendering.depth,
-                    window=part,
+                    scene, pose, name, how, seed=seed_of_render, depth=self.rendering.depth, roi=roi
                 )
             else:
-                images[name] = np.zeros((0, part.height, part.width), np.float32)
-            lit = room_radiance(scene, albedos, simulated.middles[name], pose)[part.inside]
-            parts[name], room[name] = part, simulated.through_lens(lit, name, part)
-        later = LaterLight(images, parts, self.rendering.indirect, self.rendering.depth)
+                images[name] = np.zeros((0, roi.height, roi.width), np.float32)
+            lit = room_radiance(scene, albedos, simulated.middles[name], pose)[roi.slices]
+            rois[name], room[name] = roi, simulated.through_lens(lit, name, roi)
+        later = LaterLight(images, rois, how, self.rendering.depth)
         return _SharedLight(view.number, finish, later, room)
 
 

@@ -23,6 +23,7 @@ from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform, look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import read_map
 
@@ -63,7 +64,7 @@ def main(map_file: str = SENSOR, repeats: int = 6) -> None:
     characterised = CharacterisedScene(scene, performance_map)
 
     def rendered(seed: int) -> PointCloud:
-        capture = simulated.capture(scene, POSE, seed=seed, samples=16)
+        capture = simulated.capture(scene, POSE, rendering=Rendering(samples=16), seed=seed)
         return predictor.labelled(capture_cloud(capture, sensor.settings, geometry), scene, POSE)
 
     ways = {

@@ -38,6 +38,7 @@ from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import Sensor, load_sensor, presets
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.rendering import Rendering
 
 COUPON = Path(__file__).parents[2] / "scenes/coupon/coupon.xml"
 SIZE_MM = 120.0
@@ -135,7 +136,7 @@ class Bench:
         """A capture around the coupon."""
         pose, coupon = self.coupon(normal)
         return self.simulated.capture(
-            self.scene, pose.inverse(), seed=seed, samples=self.samples, around=coupon.corners()
+            self.scene, pose.inverse(), rendering=Rendering(samples=self.samples), seed=seed, around=coupon.corners()
         )
 
     def cloud(self, capture: Capture, normal: np.ndarray) -> PointCloud:

@@ -18,6 +18,7 @@ import os
 import time
 
 from mitsim.scene import backend
+from mitsim.simulation.rendering import Rendering
 
 ROW = "| {:<25} | {:>8} | {:>8} | {:>9} | {:>9} | {:>9} |"
 
@@ -31,7 +32,7 @@ def cost(name: str) -> tuple[float, float, int, int, int]:
 
     from characterisation.cloud_files import write_ply
     from mitsim.capture.capture import Capture
-    from mitsim.capture.folder import packed
+    from mitsim.capture.packed_files import packed
     from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
@@ -48,7 +49,7 @@ def cost(name: str) -> tuple[float, float, int, int, int]:
     clock = time.perf_counter if "cuda" in backend.activate() else time.process_time
 
     def take(seed: int, samples: int) -> Capture:
-        return simulated.capture(scene, pose, seed=seed, samples=samples, depth=3)
+        return simulated.capture(scene, pose, rendering=Rendering(samples=samples, depth=3), seed=seed)
 
     take(1, 1)
     began = clock()

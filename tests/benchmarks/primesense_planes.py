@@ -28,6 +28,7 @@ from mitsim.scene import backend
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 Floats = NDArray[np.float64]
@@ -67,7 +68,9 @@ def simulated(sensor: Sensor, distance: float, tilt: float = 12.0) -> Floats:
     scene = scene_from_dict({"plate": {"type": "rectangle", "to_world": size, "bsdf": white}}, sensor.wavelength_nm)
     slope = np.radians(tilt)
     eye = (0.8 * distance * np.sin(slope), 0.6 * distance * np.sin(slope), distance * np.cos(slope))
-    capture = SimulatedSensor(sensor).capture(scene, look_at(eye, (0, 0, 0), (0, 1, 0), 0.0), seed=1, samples=16)
+    capture = SimulatedSensor(sensor).capture(
+        scene, look_at(eye, (0, 0, 0), (0, 1, 0), 0.0), rendering=Rendering(samples=16), seed=1
+    )
     return capture_cloud(capture, sensor.matcher, imager=sensor.imager).points.astype(float)
 
 

@@ -28,7 +28,6 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.decode.triangulate import triangulate
 from mitsim.measuring.plate import Plate, image_on_grid, plate_dots, plate_scale
-from mitsim.measuring.windows import ImageWindow
 from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
 from mitsim.recordings.ensenso import read_ensenso
 from mitsim.sensor.camera import Rig
@@ -37,6 +36,7 @@ from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import moved, parameter_names
+from mitsim.sensor.roi import Roi
 
 Floats = NDArray[np.float64]
 PITCH, DRAWS = 18.75, 400
@@ -63,7 +63,7 @@ def main(data: Path) -> None:
     sheet = read_ensenso(data / "ensenso" / "colorized_point_cloud" / "stereo.zip")
     settings, imager = decoder_settings(sheet)
     cloud = capture_cloud(sheet, settings, imager=imager)
-    plane_rows("N35-604, sheet", cloud, baseline(sheet.rig), ImageWindow(360, 270, 560, 340), "ensenso-n35")
+    plane_rows("N35-604, sheet", cloud, baseline(sheet.rig), Roi(360, 270, 560, 340), "ensenso-n35")
 
 
 def baseline(rig: Rig) -> Floats:
@@ -77,7 +77,7 @@ def plate_row(name: str, path: Path, dynamic: bool, preset: str, window: tuple[i
     capture = read_ensenso(path, dynamic=dynamic, frame=0)
     settings, imager = decoder_settings(capture)
     cloud = capture_cloud(capture, settings, imager=imager)
-    where = ImageWindow(*(window or (0, 0, cloud.grid.width, cloud.grid.height)))
+    where = Roi(*(window or (0, 0, cloud.grid.width, cloud.grid.height)))
     dots = plate_dots(name, Plate(where, PITCH), cloud, image_on_grid(capture, cloud.grid))
     scale, scatter, _ = plate_scale(dots, PITCH)
     parts = contributions(capture, preset, dots.centres)
@@ -133,11 +133,9 @@ def smooth_residuals(points: Floats) -> Floats:
     return np.asarray(-off / inverse * np.linalg.norm(points, axis=1))
 
 
-def plane_rows(name: str, cloud: PointCloud, across: Floats, window: ImageWindow, preset: str) -> None:
+def plane_rows(name: str, cloud: PointCloud, across: Floats, window: Roi, preset: str) -> None:
     """Scatter of the means of cells of one flat thing against what the map says of it."""
-    part = cloud.points[window.row : window.row + window.height, window.column : window.column + window.width].astype(
-        float
-    )
+    part = cloud.points[window.slices].astype(float)
     there = np.isfinite(part).all(axis=-1)
     off = np.full(there.shape, np.nan)
     off[there] = smooth_residuals(part[there])

@@ -20,11 +20,12 @@ import numpy as np
 
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport.projector_light import LitPatterns
-from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import load_scene
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.eye import Eye
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import look_at, mitsuba_to_world
 
 SCENE = Path(__file__).parents[2] / "scenes/two_pillars/two_pillars.xml"
@@ -44,22 +45,22 @@ def main() -> None:
     for depth in (1, 3):
         for count in (1, 24, 48):
             jobs[f"{count} patterns, depth {depth}"] = lambda pose, seed, c=count, d=depth: trace(
-                scene, rays, lit[c], pose, samples=SAMPLES, seed=seed, depth=d
+                scene, rays, lit[c], pose, LightPaths(samples=SAMPLES, seed=seed, depth=d)
             )
         if depth > 1:
             jobs[f"24 patterns, depth {depth}, no photons"] = lambda pose, seed, d=depth: trace(
-                scene, rays, lit[24], pose, samples=SAMPLES, seed=seed, depth=d, photons=0
+                scene, rays, lit[24], pose, LightPaths(samples=SAMPLES, seed=seed, depth=d, photons=0)
             )
         stock = stock_scene(scene, sensor, stack[0], depth)
         jobs[f"stock Mitsuba, 1 pattern, depth {depth}"] = lambda pose, seed, s=stock: np.array(
             mi.render(s, spp=SAMPLES, seed=seed)
         )
     jobs["later light of 24, depth 3"] = lambda pose, seed: trace(
-        scene, rays, lit[24], pose, samples=SAMPLES, seed=seed, depth=3, only_later=True
+        scene, rays, lit[24], pose, LightPaths(samples=SAMPLES, seed=seed, depth=3, only_later=True)
     )
     jobs["all of 24 less direct, depth 3"] = lambda pose, seed: (
-        trace(scene, rays, lit[24], pose, samples=SAMPLES, seed=seed, depth=3)
-        - trace(scene, rays, lit[24], pose, samples=SAMPLES, seed=seed)
+        trace(scene, rays, lit[24], pose, LightPaths(samples=SAMPLES, seed=seed, depth=3))
+        - trace(scene, rays, lit[24], pose, LightPaths(samples=SAMPLES, seed=seed))
     )
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for turn in range(ROUNDS + 1):
@@ -103,10 +104,10 @@ def from_pose_to_pose(scene, rays, lit) -> None:  # type: ignore[no-untyped-def]
             dr.set_flag(dr.JitFlag.KernelHistory, True)
             for turn in range(12):
                 pose = look_at([150 + 3 * turn, -400, 280], [0, 0, 30], [0, 0, 1])
-                part = None if window is None else Window(window[0] + turn, *window[1:3], window[3] - turn)
+                part = None if window is None else Roi(window[0] + turn, *window[1:3], window[3] - turn)
                 dr.kernel_history_clear()
                 start = time.perf_counter()
-                trace(scene, rays, lit, pose, samples=SAMPLES, seed=turn, depth=depth, window=part)
+                trace(scene, rays, lit, pose, LightPaths(samples=SAMPLES, seed=turn, depth=depth), roi=part)
                 taken = time.perf_counter() - start
                 history = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
                 if turn >= 2:

@@ -158,7 +158,8 @@ def test_simulated_calibrations_lie_within_the_stated_interval(name, board, rng)
     rig, eyes, board, views = setting(name, board=board)
     found = linearise(rig, eyes, board, views)
     count = 60
-    scores = coverage(rig, eyes, board, views, found.names, np.sqrt(np.diag(found.covariance())), count, rng)
+    stated = dict(zip(found.names, np.sqrt(np.diag(found.covariance())), strict=True))
+    scores = coverage(rig, eyes, board, views, stated, count, rng)
     inside = np.abs(scores) <= stats.norm.ppf(0.975)
     # every parameter by itself, all of them together at one in a thousand
     least, most = stats.binom.ppf([0.0005 / len(found.names), 1 - 0.0005 / len(found.names)], count, 0.95)

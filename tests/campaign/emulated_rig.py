@@ -22,6 +22,7 @@ from ptu_emulator import RESOLUTION
 from characterisation.stage.calibration import BoardCalibration
 from characterisation.stage.turning_axes import TurningAxes
 from mitsim.sensor.camera import stereo_rectification
+from mitsim.simulation.rendering import Rendering
 
 SCENE = Path(__file__).resolve().parents[2] / "scenes/coupon/matt_white.xml"
 SERIAL = "emulated-n10"
@@ -81,8 +82,8 @@ def rendering_camera(counts_now):
         capture = made["sensor"].capture(
             sample.scene,
             pose.inverse(),
+            rendering=Rendering(samples=1),
             seed=10_000_000 + 3000 * counts[0] + counts[1],
-            samples=1,
             around=sample.at(pose).corners(),
         )
         return capture.images["left"], capture.images["right"]

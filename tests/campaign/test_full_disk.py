@@ -31,6 +31,7 @@ from mitsim.errors import InputError
 from mitsim.report.style import write_png
 from mitsim.scene.load import load_scene
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 KNOWN = [sys.executable, Path(__file__).with_name("known_command.py"), "characterise"]
@@ -175,7 +176,7 @@ def captured(tmp_path, scenes, n10):
     view = look_at(at, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.0) @ n10.rig.reference.sensor_from_camera.inverse()
     sensor = SimulatedSensor(n10)
     loaded = load_scene(scene, n10.wavelength_nm)
-    write_capture(sensor.capture(loaded, view, seed=1, samples=1, depth=1), tmp_path / "capture")
+    write_capture(sensor.capture(loaded, view, rendering=Rendering(samples=1, depth=1), seed=1), tmp_path / "capture")
     return tmp_path / "capture", [scene, "--position", *at, "--samples", 1, "--depth", 1]
 
 

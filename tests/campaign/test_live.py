@@ -27,6 +27,7 @@ from mitsim.commands.devices import mount
 from mitsim.errors import DeviceError, InputError
 from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.sensor.preset import load_sensor
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 nxlib = pytest.importorskip("nxlib", reason="pip install ensenso-nxlib: live Ensenso cameras")
@@ -285,7 +286,9 @@ def test_a_capture_is_decoded_with_its_own_calibration(planned, n10):
     plan = planned(distances_mm=[500], samples=[{"scene": "matt_white.xml"}])
     shot = plan.shot(plan.series[0], np.array([0.2, 0.1, np.sqrt(0.95)]))
     pose, sample = shot.sensor_from_coupon, shot.series.sample
-    capture = device.capture(sample.scene, pose.inverse(), seed=1, around=sample.at(pose).corners(), samples=1)
+    capture = device.capture(
+        sample.scene, pose.inverse(), rendering=Rendering(samples=1), seed=1, around=sample.at(pose).corners()
+    )
     geometry = sensor_geometry(n10)
     patches = measured(capture, shot, geometry, n10, False).patches
     assert patches["recovered_fraction"].mean() > 0.99

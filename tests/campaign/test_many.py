@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from mitsim.campaign.many import ManyFile, Rendering, read_jobs
+from mitsim.campaign.many import CommonSettings, ManyFile, read_jobs
 from mitsim.capture.folder import read_capture
 from mitsim.cli import app
 from mitsim.errors import InputError
@@ -34,7 +34,7 @@ name = "wide"
 parameters = { plane_Ra = 0.8 }
 deviation = "alpha=1"
 """
-COMMON = Rendering({"pillar_Ra": "0.6"}, "", 3, 1, 1, Noise(), False)
+COMMON = CommonSettings({"pillar_Ra": "0.6"}, "", 3, 1, 1, Noise(), False)
 OPTIONS = ["--samples", "1", "--depth", "1", "--seed", "3"]
 
 

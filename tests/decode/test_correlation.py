@@ -15,6 +15,7 @@ from mitsim.decode.matching.correlation import correlate_both_ways
 from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 240, 90, 400.0, 80.0
@@ -130,7 +131,7 @@ def decoded(frames, settings=SETTINGS, **options):
 
 def test_a_window_is_a_part_of_the_whole():
     frames = drawn(2, 20.4)
-    whole, part = decoded(frames), decoded(frames, window=(80, 20, 200, 70))
+    whole, part = decoded(frames), decoded(frames, roi=Roi(80, 20, 120, 50))
     assert part.valid[25:65, 90:190].mean() > 0.98
     both = whole.valid & part.valid
     np.testing.assert_allclose(part.points[both], whole.points[both], rtol=1e-4)

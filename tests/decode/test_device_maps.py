@@ -14,9 +14,10 @@ from mitsim.decode.device_maps import (
     decode_disparity_map,
     decode_point_map,
     disparity_map_geometry,
-    window_between,
+    roi_of_other_grid,
 )
 from mitsim.sensor.camera import Camera, Rectification, Rig
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT = 60, 40
@@ -100,9 +101,9 @@ def test_points_are_taken_as_they_are(distortion, model):
 def test_a_window_is_cut_out_of_the_whole(distortion, model):
     camera = Camera(K, distortion, WIDTH, HEIGHT, PLACE, model)
     geometry, depth = camera_map_geometry(Rig({"camera": camera})), plane_depths(camera)
-    window = (7, 11, 33, 29)
+    roi = Roi.between(7, 11, 33, 29)
     whole = decode_depth_map(depth, geometry, 1.0, 1e5, sensor="s", source="device")
-    part = decode_depth_map(depth, geometry, 1.0, 1e5, sensor="s", source="device", window=window)
+    part = decode_depth_map(depth, geometry, 1.0, 1e5, sensor="s", source="device", roi=roi)
     inside = np.zeros((HEIGHT, WIDTH), bool)
     inside[11:29, 7:33] = True
     np.testing.assert_array_equal(part.points[inside], whole.points[inside])
@@ -122,8 +123,8 @@ def test_a_window_of_another_grid_holds_all_that_it_shows(rng):
     one = ViewGrid(70.0, 72.0, 31.0, 18.0, WIDTH, HEIGHT)
     turn = Rotation.from_euler("xyz", [5, -8, 30], degrees=True).as_matrix()
     other = ViewGrid(150.0, 150.0, 80.0, 60.0, 160, 120, turn, np.array([30.0, -10.0, 5.0]))
-    window = (20, 10, 35, 22)
-    found = window_between(one, other, window, 300.0, 900.0)
+    roi = Roi.between(20, 10, 35, 22)
+    found = roi_of_other_grid(one, other, roi, 300.0, 900.0)
     columns, rows = rng.uniform(20, 34, 2000), rng.uniform(10, 21, 2000)
     depth = rng.uniform(300, 900, 2000)
     points = np.stack([(columns - 31) / 70 * depth, (rows - 18) / 72 * depth, depth], axis=-1)
@@ -131,19 +132,19 @@ def test_a_window_of_another_grid_holds_all_that_it_shows(rng):
     within = ((seen >= 0) & (seen <= [159, 119])).all(axis=-1)
     assert within.any()
     low, high = np.floor(seen[within].min(axis=0)), np.ceil(seen[within].max(axis=0))
-    assert (low >= found[:2]).all() and (high < found[2:]).all()
+    assert (low >= [found.left, found.top]).all() and (high < [found.right, found.bottom]).all()
 
 
 def test_a_window_of_the_same_grid_is_the_window():
     grid = ViewGrid(70.0, 72.0, 31.0, 18.0, WIDTH, HEIGHT)
-    found = window_between(grid, grid, (20, 10, 35, 22), 300.0, 900.0)
+    found = roi_of_other_grid(grid, grid, Roi.between(20, 10, 35, 22), 300.0, 900.0)
     # rounding may take one pixel more
-    assert found[0] in (19, 20) and found[1] in (9, 10) and found[2] in (35, 36) and found[3] in (22, 23)
+    assert found.left in (19, 20) and found.top in (9, 10) and found.right in (35, 36) and found.bottom in (22, 23)
 
 
 def test_a_window_that_the_other_grid_does_not_see_is_none():
     one = ViewGrid(70.0, 72.0, 31.0, 18.0, WIDTH, HEIGHT)
     aside = ViewGrid(700.0, 720.0, 31.0, 18.0, WIDTH, HEIGHT, origin=np.array([500.0, 0, 0]))
-    assert window_between(one, aside, (20, 10, 35, 22), 300.0, 400.0) is None
+    assert roi_of_other_grid(one, aside, Roi.between(20, 10, 35, 22), 300.0, 400.0) is None
     behind = ViewGrid(70.0, 72.0, 31.0, 18.0, WIDTH, HEIGHT, origin=np.array([0.0, 0, 350.0]))
-    assert window_between(one, behind, (20, 10, 35, 22), 300.0, 400.0) == (0, 0, WIDTH, HEIGHT)
+    assert roi_of_other_grid(one, behind, Roi.between(20, 10, 35, 22), 300.0, 400.0) == Roi.whole(WIDTH, HEIGHT)

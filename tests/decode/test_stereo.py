@@ -15,6 +15,7 @@ from mitsim.decode.matching.sgbm import search_range
 from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 320, 240, 420.0, 80.0
@@ -170,10 +171,10 @@ def test_twelve_bits_give_the_same_disparity_as_eight():
 def test_window_gives_what_the_whole_image_gives():
     rig, surface = real_rig(), plane([0.3, 0.2, 1], 470)
     images = pair(rig, surface)
-    column0, row0, column1, row1 = window = (170, 60, 270, 150)
-    whole, part = decode(rig, images), decode(rig, images, window=window)
+    roi = Roi(170, 60, 100, 90)
+    whole, part = decode(rig, images), decode(rig, images, roi=roi)
     inside = np.zeros(part.status.shape, bool)
-    inside[row0:row1, column0:column1] = True
+    inside[roi.slices] = True
     assert whole.valid[inside].mean() > 0.99
     assert np.mean(whole.status[inside] == part.status[inside]) > 0.999
     both = whole.valid & part.valid
@@ -182,22 +183,21 @@ def test_window_gives_what_the_whole_image_gives():
     assert not part.valid[~inside].any()
 
 
-@pytest.mark.parametrize("window", [(0, 0, 40, 40), (WIDTH - 40, HEIGHT - 40, WIDTH, HEIGHT), (200, 100, 201, 101)])
-def test_window_may_touch_the_edge_or_be_one_pixel(window):
+@pytest.mark.parametrize("roi", [Roi(0, 0, 40, 40), Roi(WIDTH - 40, HEIGHT - 40, 40, 40), Roi(200, 100, 1, 1)])
+def test_window_may_touch_the_edge_or_be_one_pixel(roi):
     rig, surface = ideal_rig(), plane([0, 0, 1], 470)
-    cloud = decode(rig, pair(rig, surface), window=window)
-    column0, row0, column1, row1 = window
-    if column0 == 0:  # x - d lies outside the right image
-        assert (cloud.status[row0:row1, column0:column1] == Status.NO_SURFACE).all()
+    cloud = decode(rig, pair(rig, surface), roi=roi)
+    if roi.left == 0:  # x - d lies outside the right image
+        assert (cloud.status[roi.slices] == Status.NO_SURFACE).all()
     else:
-        assert cloud.valid[row0:row1, column0:column1].mean() > 0.99
+        assert cloud.valid[roi.slices].mean() > 0.99
 
 
-@pytest.mark.parametrize("window", [(-1, 0, 10, 10), (0, 0, 0, 10), (5, 5, WIDTH + 1, 10), (30, 9, 20, 19)])
-def test_window_outside_the_grid_is_refused(window):
+@pytest.mark.parametrize("roi", [Roi(-1, 0, 11, 10), Roi(0, 0, 0, 10), Roi(5, 5, WIDTH - 4, 5), Roi(30, 9, -10, 10)])
+def test_window_outside_the_grid_is_refused(roi):
     rig, surface = ideal_rig(), plane([0, 0, 1], 470)
-    with pytest.raises(InputError, match="window"):
-        decode(rig, pair(rig, surface), window=window)
+    with pytest.raises(InputError, match="region of interest"):
+        decode(rig, pair(rig, surface), roi=roi)
 
 
 # Why a pixel has no point, each reason provoked on its own. The ideal rig sees a plane at depth 480 with 70 px between

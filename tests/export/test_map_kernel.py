@@ -88,7 +88,7 @@ def test_image_is_what_predict_predicts(tmp_path, scenes):
     pose = look_at([150.0, -200.0, 480.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 20.0)
     seen = predictor.look_up(CharacterisedScene(scene, performance_map), pose).seen
     kernel = exported(performance_map, tmp_path, sensor.rig.baseline_direction)
-    rows, columns = seen.window.inside
+    rows, columns = seen.roi.slices
     rays = grid.rays()
     normal = pose.rotation.T @ [0.0, 0.0, 1.0]  # of the coupon, z of the world
     with np.errstate(invalid="ignore"):

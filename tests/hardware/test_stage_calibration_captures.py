@@ -11,7 +11,7 @@ from characterisation.stage.calibration import axis_deviations, calibrate_with_b
 from characterisation.stage.turning_axes import TurningAxes
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.projector_light import LitPatterns
-from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.transforms import Transform
@@ -51,7 +51,7 @@ def test_the_axes_come_back_from_rendered_captures_of_a_board(n10):
     read = np.round(calibration_angles(np.radians([[-35, 35], [-30, 30]]), 3) / STEP) * STEP
     poses, covariances = [], []
     for pose in axes.motion(read) @ zero:
-        light = trace(scene, rays, white, Transform.from_matrix(pose).inverse(), samples=16, seed=1)[0]
+        light = trace(scene, rays, white, Transform.from_matrix(pose).inverse(), LightPaths(samples=16, seed=1))[0]
         light = blurred(light, n10.imager.blur_px)
         electrons = light / np.percentile(light, 99.9) * 0.9 * n10.imager.full_well
         noisy = [rng.poisson(electrons) + rng.normal(0, n10.imager.read_noise, light.shape) for _ in range(4)]

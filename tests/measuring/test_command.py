@@ -14,6 +14,7 @@ from mitsim.errors import InputError
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 
@@ -116,7 +117,10 @@ def test_a_task_by_its_scene_and_the_pose_of_the_capture(scenes, tmp_path):
     sensor = load_sensor("ensenso-n10")
     scene = load_scene(folder / "matt_white.xml", sensor.wavelength_nm, {})
     pose = look_at([0, -450, 250], [0, 0, 0], [0, 0, 1]) @ sensor.rig.reference.sensor_from_camera.inverse()
-    write_capture(SimulatedSensor(sensor).capture(scene, pose, seed=1, samples=4, depth=1), tmp_path / "capture")
+    write_capture(
+        SimulatedSensor(sensor).capture(scene, pose, rendering=Rendering(samples=4, depth=1), seed=1),
+        tmp_path / "capture",
+    )
     done = run(tmp_path / "capture", "--task", folder / "task.toml", "--scene", folder / "matt_white.xml", "--json")
     found = {one["name"]: one for one in json.loads(done.stdout)["clouds"][0]["measurements"]}
     gap = found["pillar1_pillar2_distance"]

@@ -10,7 +10,6 @@ from characterisation.features.fits import FitError
 from characterisation.point_cloud import ViewGrid
 from mitsim.decode.dot_centres import dot_centres
 from mitsim.measuring.plate import Plate, PlateDots, measure_plate, plate_dots, plate_scale
-from mitsim.measuring.windows import ImageWindow
 
 GRID = ViewGrid(900.0, 900.0, 319.5, 239.5, 640, 480)
 PITCH, COUNT = 18.75, 7
@@ -38,7 +37,7 @@ def test_the_pitch_is_that_of_the_cloud(angles, rng):
     results = {}
     for scale in (1.0, 1.01):
         cloud = cloud_of(scale * distance, 0.1, rng, GRID)
-        results[scale] = measure_plate("plate", Plate(ImageWindow(), PITCH), cloud, image)[0]
+        results[scale] = measure_plate("plate", Plate(None, PITCH), cloud, image)[0]
         assert results[scale].points == 49
         # a hundredth of a pixel is 0.006 mm here; the centre of an ellipse is not that of its circle
         assert results[scale].value == pytest.approx(scale * PITCH, abs=0.004)
@@ -52,7 +51,7 @@ def test_points_on_the_rims_of_dots_alone_are_enough(rng):
     distance = np.where(edge, distance, np.nan)
     wrong = edge & (rng.random(edge.shape) < 0.2)
     cloud = cloud_of(np.where(wrong, rng.uniform(200, 3000, edge.shape), distance), 0.2, rng, GRID)
-    pitch, *_ = measure_plate("plate", Plate(ImageWindow(), PITCH), cloud, image)
+    pitch, *_ = measure_plate("plate", Plate(None, PITCH), cloud, image)
     assert pitch.points >= 45
     assert abs(pitch.value - PITCH) < 0.01
 
@@ -60,7 +59,7 @@ def test_points_on_the_rims_of_dots_alone_are_enough(rng):
 def test_rows_and_columns_are_those_of_the_plate():
     image, normal = drawn(Rotation.from_euler("xyz", (10, 20, 30), degrees=True).as_matrix())
     cloud = cloud_of(plane([0, 0, 500], normal, GRID), grid=GRID)
-    dots = plate_dots("plate", Plate(ImageWindow(), PITCH), cloud, image)
+    dots = plate_dots("plate", Plate(None, PITCH), cloud, image)
     assert np.array_equal(np.ptp(dots.places, axis=0), [6, 6])
     assert len({tuple(place) for place in dots.places}) == 49
     assert len(dots.distances) == 2 * 7 * 6
@@ -84,8 +83,8 @@ def test_another_pitch_is_told_with_the_one_that_is_there():
     image, normal = drawn(np.eye(3))
     cloud = cloud_of(plane([0, 0, 500], normal, GRID), grid=GRID)
     with pytest.raises(FitError, match=r"median of 18\.[78]\d+ mm, not about 30 mm"):
-        plate_dots("plate", Plate(ImageWindow(), 30.0), cloud, image)
-    found = measure_plate("plate", Plate(ImageWindow(), 30.0), cloud, image)
+        plate_dots("plate", Plate(None, 30.0), cloud, image)
+    found = measure_plate("plate", Plate(None, 30.0), cloud, image)
     assert not any(one.possible for one in found)
 
 

@@ -10,10 +10,11 @@ from characterisation.errors import InputError
 from characterisation.features.fits import fit_cylinder
 from characterisation.features.starts import cylinder_start
 from mitsim.measuring.result import repeated
-from mitsim.measuring.windows import ImageWindow, WindowPlan, measure_windows
+from mitsim.measuring.windows import WindowPlan, measure_windows
+from mitsim.sensor.roi import Roi
 
 #: left half a plane, right half one that leans by 30 deg against it; below them a ball and a pin
-LEFT, RIGHT = (ImageWindow(5, 5, 85, 60), ImageWindow(110, 5, 85, 60))
+LEFT, RIGHT = (Roi(5, 5, 85, 60), Roi(110, 5, 85, 60))
 LEAN = np.deg2rad(30)
 
 
@@ -49,7 +50,7 @@ def test_the_distance_of_parallel_planes_is_their_offset():
 def test_balls_and_pins_without_noise_are_as_they_were_made():
     ball, pin = sphere([-30, 0, 450], 20), cylinder([40, 0, 470], [0.1, 1, 0.05], 15)
     cloud = cloud_of(np.where(np.arange(GRID.width) < 100, ball, pin))
-    whole = ImageWindow(0, 0, 100, 160), ImageWindow(100, 0, 100, 160)
+    whole = Roi(0, 0, 100, 160), Roi(100, 0, 100, 160)
     found = by_name(measure_windows(cloud, WindowPlan({"ball": ("sphere", whole[0]), "pin": ("cylinder", whole[1])})))
     assert found["ball diameter"].value == pytest.approx(40, abs=1e-3)
     assert found["ball distance"].value == pytest.approx(np.hypot(30, 450), abs=1e-3)
@@ -61,9 +62,9 @@ def test_balls_and_pins_without_noise_are_as_they_were_made():
 def trials():
     """Sixty clouds of a corner, and of a ball, with noise of 0.2 mm along the rays."""
     rng = np.random.default_rng(24)
-    small = ImageWindow(30, 20, 40, 40), ImageWindow(120, 20, 40, 40)
+    small = Roi(30, 20, 40, 40), Roi(120, 20, 40, 40)
     plan = WindowPlan({"a": ("plane", small[0]), "b": ("plane", small[1])}, [("angle", "a", "b")])
-    ball = WindowPlan({"ball": ("sphere", ImageWindow(60, 45, 80, 70))})
+    ball = WindowPlan({"ball": ("sphere", Roi(60, 45, 80, 70))})
     return [
         measure_windows(cloud_of(corner(), 0.2, rng), plan)
         + measure_windows(cloud_of(sphere([0, 0, 450], 20), 0.2, rng), ball)
@@ -101,7 +102,7 @@ def test_a_window_that_shows_something_else_has_no_value_and_says_so(rng):
 
 def test_a_window_outside_the_grid_is_refused():
     with pytest.raises(InputError, match="within 200 x 160 pixels"):
-        measure_windows(cloud_of(corner()), WindowPlan({"a": ("plane", ImageWindow(150, 5, 80, 60))}))
+        measure_windows(cloud_of(corner()), WindowPlan({"a": ("plane", Roi(150, 5, 80, 60))}))
 
 
 def test_pairs_that_cannot_be_measured_are_refused():

@@ -372,11 +372,11 @@ deviation = "alpha=1"
 
 
 def _read_many(path):
-    from mitsim.campaign.many import Rendering, read_jobs
+    from mitsim.campaign.many import CommonSettings, read_jobs
     from mitsim.sensor.imager import Noise
     from mitsim.sensor.preset import load_sensor
 
-    common = Rendering({}, "", 1, 1, 1, Noise(), False)
+    common = CommonSettings({}, "", 1, 1, 1, Noise(), False)
     read_jobs(path, SCENES / "two_pillars" / "two_pillars.xml", load_sensor("ensenso-n10"), common)
 
 

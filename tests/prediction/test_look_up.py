@@ -88,7 +88,7 @@ def test_a_view_from_one_kernel_is_that_of_the_reference(predictors, sensor, wha
 
     def whole(image: np.ndarray, missing: float) -> np.ndarray:
         out = np.full(size, missing, image.dtype)
-        out[seen.window.inside] = image
+        out[seen.roi.slices] = image
         return out.reshape(-1)
 
     status = np.full(size, Status.NO_SURFACE, np.uint8)
@@ -114,10 +114,10 @@ def test_a_window_has_every_pixel_that_shows_a_shape_alone(predictors, part, sen
     predictor, alone = predictors[sensor], part.only("pillar1")
     predicted = predictor.look_up(CharacterisedScene(alone, map_of(sensor)), POSES[number])
     met = predictor.surfaces(alone, POSES[number]).shape
-    window = predicted.seen.window
+    window = predicted.seen.roi
     assert window.width * window.height < (1.0 if number == 2 else 0.2) * met.size
     out = np.full(met.shape, -1)
-    out[window.inside] = predicted.seen.shape
+    out[window.slices] = predicted.seen.shape
     assert np.array_equal(out, met)
     assert number == 3 or (met >= 0).sum() > 1000
 

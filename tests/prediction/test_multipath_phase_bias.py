@@ -16,6 +16,7 @@ from mitsim.sensor.imager import Noise
 from mitsim.sensor.light_code import PhaseShift
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 SIZE = (40, 60)
@@ -145,7 +146,9 @@ def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david):
     predicted = finest_fringe(david).range_bias(light.displaced, ideal)
     around = pose.inverse().points(np.array([[x, 30, z] for x in (-5.0, 5) for z in (0.0, 12)]))
     noise = Noise(**dict.fromkeys(Noise.__dataclass_fields__, False))
-    capture = SimulatedSensor(david).capture(scene, pose, seed=1, samples=64, depth=2, around=around, noise=noise)
+    capture = SimulatedSensor(david).capture(
+        scene, pose, rendering=Rendering(samples=64, depth=2), seed=1, around=around, noise=noise
+    )
     cloud = capture_cloud(capture, david.settings, geometry, imager=david.imager)
     decoded = ((cloud.points.reshape(-1, 3)[ideal.pixel] - ideal.point) * ideal.ray).sum(axis=1)
 

@@ -18,6 +18,7 @@ from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import LIGHT_MM_S
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 SIZE = (20, 30)
@@ -112,7 +113,9 @@ def test_a_white_corner_is_lengthened_as_the_full_render_is(kinect):
     noise = Noise(**dict.fromkeys(Noise.__dataclass_fields__, False))
     sensor = replace(kinect, pattern=kinect.pattern.model_copy(update={"delay_pattern_mm": 0.0}))
     around = pose.inverse().points(np.array([[x, y, z] for x in (-60.0, 60) for y in (0, 150) for z in (0.0, 60)]))
-    capture = SimulatedSensor(sensor).capture(scene, pose, seed=1, samples=64, depth=2, around=around, noise=noise)
+    capture = SimulatedSensor(sensor).capture(
+        scene, pose, rendering=Rendering(samples=64, depth=2), seed=1, around=around, noise=noise
+    )
     cloud = capture_cloud(capture, sensor.settings, geometry, imager=sensor.imager)
     decoded = ((cloud.points.reshape(-1, 3)[ideal.pixel] - ideal.point) * ideal.ray).sum(axis=1)
     world = pose.points(ideal.point)

@@ -14,6 +14,7 @@ from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform, look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 REFLECTANCE = 0.6
@@ -82,7 +83,8 @@ def test_coarse_and_cheap_it_is_what_the_full_render_shows(n10, scenes):
     sensor.patterns = OtherLightEffect(n10).light
     name = next(iter(n10.rig.cameras))
     direct, both = (
-        sensor.radiance(scene, pose, name, seed=3, samples=16, depth=depth)[0].astype(float) for depth in (1, 2)
+        sensor.radiance(scene, pose, name, Rendering(samples=16, depth=depth), seed=3)[0].astype(float)
+        for depth in (1, 2)
     )
     x, y, z = np.random.default_rng(1).uniform([-80, -50, 0], [80, -25, 0], (400, 3)).T
     points = pose.inverse().points(np.stack([x, y, z], axis=-1))

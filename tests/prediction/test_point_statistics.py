@@ -10,7 +10,7 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from mitsim.prediction import Predictor
 from mitsim.prediction.perturbation import Perturbation, together
-from mitsim.prediction.point_statistics import expected_points
+from mitsim.prediction.point_statistics import ViewPoints, expected_points
 from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import load_sensor
@@ -47,7 +47,7 @@ def test_two_perturbations_are_one():
 @pytest.mark.parametrize("name", ["ensenso-n10", "david-sls-3", "kinect-v2"])
 def test_the_bias_of_flat_faces_is_the_map_s(name, scenes):
     _, given, known = white_view(name, scenes, "plane")
-    structure = noise_structure(given[4], "matt_white", math.nan, known.distance, known.normal)
+    structure = noise_structure(given[3], "matt_white", math.nan, known.distance, known.normal)
     assert np.abs(known.displaced).max() > 0
     assert known.displaced == pytest.approx(structure.bias_share * known.sigma)
 
@@ -60,5 +60,5 @@ def white_view(name, scenes, shape):
     pose = look_at([0, -0.8 * away, 0.6 * away], [0, 0, 20], [0, 0, 1])
     surfaces = predictor.surfaces(scene, pose)
     ideal, labels = predictor.ideal(surfaces), predictor.labels(scene, pose, surfaces)
-    given = ideal, labels, scene, scene.names.index(shape), performance_map, pose
+    given = ViewPoints(ideal, labels, pose), scene, scene.names.index(shape), performance_map
     return ideal, given, expected_points(*given)

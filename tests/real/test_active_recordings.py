@@ -20,7 +20,9 @@ from mitsim.recordings.stereo_pair import read_stereo_pair
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import mean_run_length
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.rendering import Rendering
 
 pytestmark = pytest.mark.real
 
@@ -153,9 +155,9 @@ def recording(real_data):
 
 def sheet_cloud(capture, rig):
     settings = MatcherSettings(near_mm=292.3, far_mm=530.3)
-    window = (COLUMNS[0], ROWS[0], COLUMNS[1], ROWS[1])
+    roi = Roi.between(COLUMNS[0], ROWS[0], COLUMNS[1], ROWS[1])
     left, right = capture.images["left"][0], capture.images["right"][0]
-    return decode_stereo(left, right, rig, settings, ImageContext("n35", "device", 255, window=window))
+    return decode_stereo(left, right, rig, settings, ImageContext("n35", "device", 255, roi=roi))
 
 
 def sheet_sigma(cloud) -> float:
@@ -251,7 +253,10 @@ def simulated_sheet(recording, tmp_path_factory):
         )
         simulated = SimulatedSensor(changed)
         here = Transform.identity()
-        return [simulated.capture(scene, here, seed=seed, samples=samples, around=vertices) for seed in seeds]
+        return [
+            simulated.capture(scene, here, rendering=Rendering(samples=samples), seed=seed, around=vertices)
+            for seed in seeds
+        ]
 
     seconds, black = 8e-5, 0.4
     for _ in range(2):

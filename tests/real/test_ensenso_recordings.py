@@ -19,6 +19,7 @@ from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.recordings.ensenso import ensenso_originals, read_ensenso
 from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 pytestmark = pytest.mark.real
@@ -39,13 +40,13 @@ def sheet(real_data, tmp_path_factory):
     assert capture.settings["exposure_s"] == pytest.approx(0.153e-3, rel=0.01)
     settings = MatcherSettings(near_mm=capture.settings["near_mm"], far_mm=capture.settings["far_mm"])
     left, right = capture.images["left"][0], capture.images["right"][0]
-    window = (COLUMNS[0], ROWS[0], COLUMNS[1], ROWS[1])
+    roi = Roi.between(COLUMNS[0], ROWS[0], COLUMNS[1], ROWS[1])
     return decode_stereo(
         left,
         right,
         capture.rig,
         settings,
-        ImageContext(capture.sensor, capture.source, 2**capture.bits - 1, window=window),
+        ImageContext(capture.sensor, capture.source, 2**capture.bits - 1, roi=roi),
     )
 
 

@@ -19,6 +19,7 @@ from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.stereo import decode_stereo
 from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
 from mitsim.recordings.recognise import Given, read_recording
+from mitsim.sensor.roi import Roi
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recordings"))
 
@@ -163,10 +164,10 @@ def test_an_imported_ensenso_is_the_recording(real_data, tmp_path):
     found = read_recording(path, Given())
     capture = read_capture(write_capture(found.capture, tmp_path / "capture", vendor=found.originals))
     settings, _ = decoder_settings(capture)
-    window = (500, 400, 560, 440)
-    cloud = capture_cloud(capture, settings, window=window)
+    roi = Roi(500, 400, 60, 40)
+    cloud = capture_cloud(capture, settings, roi=roi)
     left, right = (capture.images[side][0] for side in ("left", "right"))
-    context = ImageContext(capture.sensor, "device", 255, window=window)
+    context = ImageContext(capture.sensor, "device", 255, roi=roi)
     expected = decode_stereo(left, right, capture.rig, settings, context)
     np.testing.assert_array_equal(cloud.points, expected.points)
     assert cloud.valid[400:440, 500:560].mean() > 0.99

@@ -4,9 +4,10 @@ import pytest
 
 from mitsim.measuring.clouds import cloud_paths, read_cloud
 from mitsim.measuring.plate import Plate, image_on_grid, measure_plate
-from mitsim.measuring.windows import ImageWindow, WindowPlan, measure_windows
+from mitsim.measuring.windows import WindowPlan, measure_windows
 from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
 from mitsim.recordings.ensenso import read_ensenso
+from mitsim.sensor.roi import Roi
 
 pytestmark = pytest.mark.real
 
@@ -25,7 +26,7 @@ def test_the_pitch_of_plates(folder, window, published, real_data):
     capture = read_ensenso(real_data / "ensenso" / folder / "camera.zip", frame=0)
     settings, imager = decoder_settings(capture)
     cloud = capture_cloud(capture, settings, imager=imager)
-    plate = Plate(ImageWindow(*window), 18.75)
+    plate = Plate(Roi(*window), 18.75)
     pitch, *_ = measure_plate("plate", plate, cloud, image_on_grid(capture, cloud.grid))
     assert pitch.points >= 45
     assert pitch.value == pytest.approx(published, abs=0.02)
@@ -34,7 +35,7 @@ def test_the_pitch_of_plates(folder, window, published, real_data):
 def test_a_wall_in_a_cloud_of_another_program(real_data):
     """Figures of docs/how-to/measure.md."""
     (path,) = cloud_paths([real_data / "primesense_pcl" / "capture0001.pcd"])
-    plan = WindowPlan({"wall": ("plane", ImageWindow(420, 60, 150, 100))})
+    plan = WindowPlan({"wall": ("plane", Roi(420, 60, 150, 100))})
     found = {one.name: one for one in measure_windows(read_cloud(path).cloud, plan)}
     assert found["wall distance"].value == pytest.approx(2485.53, abs=0.01)
     assert found["wall noise"].value == pytest.approx(14.90, abs=0.01)

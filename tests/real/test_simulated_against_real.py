@@ -13,6 +13,7 @@ import pytest
 
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.recordings.recognise import Given, read_recording
+from mitsim.sensor.roi import Roi
 from mitsim.validation.captures_run import validate_captures
 
 pytestmark = pytest.mark.real
@@ -24,7 +25,7 @@ def held_against(real_data, tmp_path, recording, sensor, window, projector=None)
     if not path.exists():
         pytest.skip(f"no recording {recording}")
     write_capture(read_recording(str(path), Given(sensor=None)).capture, tmp_path / "real")
-    found = validate_captures(tmp_path / "real", None, tmp_path / "out", sensor, window, projector, 1)
+    found = validate_captures(tmp_path / "real", None, tmp_path / "out", sensor, window and Roi(*window), projector, 1)
     return {row.quantity: row for row in found.comparison.rows}
 
 
@@ -82,7 +83,7 @@ def test_a_recorded_gray_code_against_its_twin(real_data, tmp_path):
         shutil.copy(file, tmp_path)
     sensor = str(tmp_path / rig.name)
     write_capture(read_recording(str(recording / "capture_0"), Given(sensor=sensor)).capture, tmp_path / "real")
-    found = validate_captures(tmp_path / "real", None, tmp_path / "out", sensor, (320, 280, 560, 400), None, 1)
+    found = validate_captures(tmp_path / "real", None, tmp_path / "out", sensor, Roi(320, 280, 560, 400), None, 1)
     rows = {row.quantity: row for row in found.comparison.rows}
     assert rows["distance"].real == pytest.approx(
         3650, rel=0.005

@@ -17,6 +17,7 @@ from mitsim.reconstruction.depth_range import _coarse, agreement, depths_of, sur
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.camera import Rig, stereo_rectification
 from mitsim.sensor.preset import load_sensor
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 NAMES = ["ensenso-n10", "david-sls-3", "kinect-v2"]
@@ -39,7 +40,7 @@ def taken(request):
     distance = middle_of(sensor)
     pose = coupon_pose(np.array([0.1, 0.0, 0.995]), distance, np.array([0, 0, 1.0]))
     scene = plate(0.6 * distance, "matt white", sensor.wavelength_nm)
-    return sensor, SimulatedSensor(sensor).capture(scene, pose.inverse(), seed=3, samples=4)
+    return sensor, SimulatedSensor(sensor).capture(scene, pose.inverse(), rendering=Rendering(samples=4), seed=3)
 
 
 def test_a_surface_nearer_or_farther_than_the_range_is_found(taken):
@@ -82,7 +83,7 @@ def test_two_images_of_other_things_are_no_surface(n10):
     distance = middle_of(n10)
     pose = coupon_pose(np.array([0.1, 0.0, 0.995]), distance, np.array([0, 0, 1.0]))
     capture = SimulatedSensor(n10).capture(
-        plate(2 * distance, "matt white", n10.wavelength_nm), pose.inverse(), seed=3, samples=4
+        plate(2 * distance, "matt white", n10.wavelength_nm), pose.inverse(), rendering=Rendering(samples=4), seed=3
     )
     mixed = {"left": capture.images["left"], "right": capture.images["right"][:, ::-1, ::-1].copy()}
     strange = replace(capture, images=mixed)
@@ -100,8 +101,8 @@ def test_fewer_pixels_look_along_the_same_rays(n10, binned):
     capture = SimulatedSensor(n10).capture(
         plate(100, "matt white", 850),
         coupon_pose(np.array([0, 0, 1.0]), 500, np.array([0, 0, 1.0])).inverse(),
+        rendering=Rendering(samples=1),
         seed=1,
-        samples=1,
     )
     capture = replace(
         capture,
@@ -136,7 +137,7 @@ def test_decode_warns_in_one_line(n10, tmp_path):
     distance = middle_of(n10)
     pose = coupon_pose(np.array([0, 0, 1.0]), distance, np.array([0, 0, 1.0]))
     capture = SimulatedSensor(n10).capture(
-        plate(0.6 * distance, "matt white", n10.wavelength_nm), pose.inverse(), seed=3, samples=4
+        plate(0.6 * distance, "matt white", n10.wavelength_nm), pose.inverse(), rendering=Rendering(samples=4), seed=3
     )
     settings = {"near_mm": 1000.0, "far_mm": 2000.0}
     far = write_capture(replace(capture, sensor="MINE", settings=settings), tmp_path / "far")

@@ -17,7 +17,9 @@ from mitsim.reconstruction.cloud import capture_cloud, read_out_of, sensor_geome
 from mitsim.scene.load import load_scene
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 ROOT = Path(__file__).parents[2]
@@ -88,10 +90,12 @@ class Shown:
     @cache  # noqa: B019 the tests of one sensor share its captures
     def capture(self, around: bool = False, noise: Noise | None = None):
         corners = self.corners if around else None
-        return self.simulated.capture(self.scene, self.pose, seed=4, samples=1, around=corners, noise=noise)
+        return self.simulated.capture(
+            self.scene, self.pose, rendering=Rendering(samples=1), seed=4, around=corners, noise=noise
+        )
 
-    def cloud(self, capture, window=None):
-        return capture_cloud(capture, self.sensor.settings, self.geometry, window, self.sensor.imager)
+    def cloud(self, capture, roi=None):
+        return capture_cloud(capture, self.sensor.settings, self.geometry, roi, self.sensor.imager)
 
 
 @pytest.fixture(scope="module", params=SENSORS)
@@ -116,7 +120,7 @@ def test_a_window_has_the_bytes_of_the_whole_image(shown):
     for _ in range(3):
         (top, bottom), (left, right) = (np.sort(rng.choice(each, 2, replace=False)) for each in (rows, columns))
         bottom, right = max(bottom, top + 24), max(right, left + 24)
-        part = shown.cloud(capture, (int(left), int(top), int(right), int(bottom)))
+        part = shown.cloud(capture, Roi.between(left, top, right, bottom))
         m = shown.margin
         inner = (slice(top + m, bottom - m), slice(left + m, right - m))
         compared += int(whole.valid[inner].sum())
@@ -137,11 +141,11 @@ def test_a_capture_around_the_coupon_is_read_out_and_decoded_there_only(shown, t
     parts = read_out_of(capture)
     assert set(parts) == set(shown.sensor.rig.cameras)
     sharp, whole = shown.capture(True, none), shown.capture(False, none)
-    for name, (left, top, right, bottom) in parts.items():
+    for name, roi in parts.items():
         images = capture.images[name].copy()
-        inner = np.s_[:, top + 3 : bottom - 3, left + 3 : right - 3]  # the blur reaches 2 px
+        inner = np.s_[:, roi.top + 3 : roi.bottom - 3, roi.left + 3 : roi.right - 3]  # the blur reaches 2 px
         np.testing.assert_array_equal(sharp.images[name][inner], whole.images[name][inner])
-        images[:, top:bottom, left:right] = 0
+        images[:, *roi.slices] = 0
         assert not images.any()
     cloud = shown.cloud(capture)
     corners = shown.geometry.grid.project(shown.corners)
@@ -181,8 +185,8 @@ def test_noise_within_the_part_is_that_of_the_imager(phase):
     imager = phase.sensor.imager
     noise = Noise.only("read", "quantisation")
     images = phase.capture(True, noise).images["camera"].astype(float)
-    (left, top, _, _) = read_out_of(phase.capture(True))["camera"]
-    corner = images[:, top : top + 8, left : left + 40]  # beside the coupon, which stands askew
+    roi = read_out_of(phase.capture(True))["camera"]
+    corner = images[:, roi.top : roi.top + 8, roi.left : roi.left + 40]  # beside the coupon, which stands askew
     most = imager.black_level + 12 * imager.gain * imager.read_noise
     dark = corner[:, corner.max(axis=0) < most]
     expected = np.sqrt((imager.gain * imager.read_noise) ** 2 + 1 / 12)
@@ -201,14 +205,15 @@ def test_an_automatic_exposure_is_that_of_the_whole_image(tmp_path):
     corners = pose.inverse().points(60.0 * np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)]))
     none = Noise.none()
     whole, part = (
-        simulated.capture(scene, pose, seed=1, samples=1, noise=none, **given) for given in ({}, {"around": corners})
+        simulated.capture(scene, pose, rendering=Rendering(samples=1), seed=1, noise=none, **given)
+        for given in ({}, {"around": corners})
     )
     assert part.settings["exposure_s"] == pytest.approx(whole.settings["exposure_s"], rel=1e-6)
 
 
 def test_a_window_beside_what_was_read_out_shows_nothing(shown):
     capture = shown.capture(True)
-    cloud = shown.cloud(capture, (0, 0, 30, 20))
+    cloud = shown.cloud(capture, Roi(0, 0, 30, 20))
     assert (cloud.status == Status.NO_SURFACE).all()
     assert not cloud.valid.any()
 
@@ -231,7 +236,7 @@ def test_a_region_that_cannot_be_is_refused(phase, read_out, named):
         phase.cloud(wrong)
 
 
-@pytest.mark.parametrize("window", [(0, 0, 641, 10), (10, 0, 10, 10), (-1, 0, 10, 10)])
-def test_a_window_outside_the_grid_is_refused(phase, window):
-    with pytest.raises(InputError, match="window"):
-        phase.cloud(phase.capture(True), window)
+@pytest.mark.parametrize("roi", [Roi(0, 0, 641, 10), Roi(10, 0, 0, 10), Roi(-1, 0, 11, 10)])
+def test_a_window_outside_the_grid_is_refused(phase, roi):
+    with pytest.raises(InputError, match="region of interest"):
+        phase.cloud(phase.capture(True), roi)

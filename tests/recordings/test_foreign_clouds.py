@@ -30,6 +30,7 @@ from mitsim.recordings.recognise import Given, read_recording
 from mitsim.recordings.stereo_pair import read_stereo_pair
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 CLOUD = pinhole_cloud()
@@ -287,8 +288,8 @@ def test_a_campaigns_window_of_the_sensor_holds_the_coupon_in_the_devices_own_gr
     centre = np.array([10.0, -20.0, 500.0])
     corners = centre + np.array([[x, y, 0] for x in (-30, 30) for y in (-30, 30)])
     pixels = geometry.grid.project(corners)
-    window = (*np.floor(pixels.min(axis=0)).astype(int), *np.ceil(pixels.max(axis=0)).astype(int))
-    cloud = capture_cloud(capture, n10.settings, geometry, window)
+    roi = Roi.between(*np.floor(pixels.min(axis=0)), *np.ceil(pixels.max(axis=0)))
+    cloud = capture_cloud(capture, n10.settings, geometry, roi)
     whole = capture_cloud(capture, n10.settings)
     on_coupon = np.abs(whole.points[..., :2] - centre[:2]).max(axis=-1) < 30
     assert on_coupon.sum() > 1000

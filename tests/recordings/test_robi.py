@@ -22,6 +22,7 @@ from mitsim.sensor.camera import Rig
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 #: the disparity at this distance is a whole number, to which SGBM draws what lies between
@@ -69,7 +70,9 @@ def scene(request, tmp_path_factory):
     preset = load_sensor("ensenso-n35")
     assert isinstance(preset.pattern, RandomDots)
     taker = replace(preset, rig=Rig(rig.cameras, preset.rig.projector, rig.rectification))
-    taken = SimulatedSensor(taker).capture(plate(400, "matt white", 550), pose, seed=2, samples=4, depth=1)
+    taken = SimulatedSensor(taker).capture(
+        plate(400, "matt white", 550), pose, rendering=Rendering(samples=4, depth=1), seed=2
+    )
     write_view(folder, "view_0", taken.images["left"][0], taken.images["right"][0], depth, pose.matrix())
     return folder
 

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.bsdf_descriptions import metal_bsdf
 from mitsim.scene.coherent_blend import NAME, register_coherent_blend
-from mitsim.scene.materials import metal_bsdf
 from mitsim.surface.energy import directional_albedo, energy_factors
 from mitsim.surface.machined import Face, machined
 

@@ -7,8 +7,10 @@ import pytest
 import trimesh
 
 from mitsim.errors import InputError
-from mitsim.scene.inspect import inspect, look, mesh_facts, trace
+from mitsim.scene.first_hits import look, trace
+from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
+from mitsim.scene.mesh_facts import mesh_facts
 from mitsim.sensor.transforms import look_at
 
 WHITE = '<bsdf type="matt_white"/>'

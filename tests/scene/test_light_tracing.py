@@ -10,11 +10,12 @@ import pytest
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_tracing import Photons, add_photons
 from mitsim.scene.light_transport.projector_light import LitPatterns, ModulatedLight
-from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform, look_at
 
 BESIDE = Transform.from_degrees([0, -4.15, 0], [50.4, 0, 3.7])
@@ -83,7 +84,9 @@ def test_camera_lamp_and_both_have_one_mean(corner, eyes, depth):
     rays, light = eyes()
 
     def seen(seed, depth, photons, samples=64):
-        return trace(corner, rays, light, POSE, samples=samples, seed=seed, depth=depth, jitter=True, photons=photons)
+        return trace(
+            corner, rays, light, POSE, LightPaths(samples=samples, seed=seed, depth=depth, jitter=True, photons=photons)
+        )
 
     def lamp_alone(seed):
         images = seen(1000 + seed, 1, 0)
@@ -119,17 +122,17 @@ def test_photons_are_the_same_whatever_is_looked_at(corner):
     """Same seed, same bytes; a window and a band of rows get what they get in the whole image."""
     rays, light = real_eyes()
 
-    def seen(seed, window=None):
-        return trace(corner, rays, light, POSE, samples=4, seed=seed, depth=3, window=window)
+    def seen(seed, roi=None):
+        return trace(corner, rays, light, POSE, LightPaths(samples=4, seed=seed, depth=3), roi=roi)
 
     whole = seen(3)
     assert whole.tobytes() == seen(3).tobytes()
     assert not np.array_equal(whole, seen(4))
-    window = Window(31, 17, 40, 21)
+    window = Roi(31, 17, 40, 21)
     assert np.array_equal(seen(3, window), whole[:, 17:38, 31:71])
     assert np.array_equal(
-        trace(corner, rays, light, POSE, samples=4, seed=3),
-        trace(corner, rays, light, POSE, samples=4, seed=3, photons=10**4),
+        trace(corner, rays, light, POSE, LightPaths(samples=4, seed=3)),
+        trace(corner, rays, light, POSE, LightPaths(samples=4, seed=3, photons=10**4)),
     )
 
 
@@ -141,7 +144,7 @@ def test_photons_calm_interreflections_on_metal(n10, scenes):
 
     def noise(photons):
         one, other = (
-            trace(scene, rays, light, pose, samples=4, seed=s, depth=3, photons=photons)[0].astype(float)
+            trace(scene, rays, light, pose, LightPaths(samples=4, seed=s, depth=3, photons=photons))[0].astype(float)
             for s in (1, 2)
         )
         return np.sqrt(np.mean((one - other) ** 2) / 2)

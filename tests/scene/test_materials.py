@@ -10,8 +10,9 @@ import pytest
 
 from mitsim.errors import InputError
 from mitsim.scene import backend
+from mitsim.scene.bsdf_descriptions import gloss_paint_bsdf, metal_bsdf, powder_coat_bsdf
 from mitsim.scene.load import load_scene
-from mitsim.scene.materials import Finish, gloss_paint_bsdf, metal_bsdf, powder_coat_bsdf
+from mitsim.scene.materials import Finish
 from mitsim.surface.energy import directional_albedo, energy_factors
 from mitsim.surface.machined import Face, machined
 from mitsim.surface.metals import normal_reflectance, refractive_index

@@ -12,11 +12,12 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport import transport
 from mitsim.scene.light_transport.aperture_samples import aperture_samples
 from mitsim.scene.light_transport.projector_light import LIGHT_MM_S, LitPatterns, ModulatedLight, ProjectorLight
-from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform, look_at, mitsuba_to_world
 
 
@@ -71,7 +72,7 @@ def test_the_camera_sees_as_opencv_does(kind):
     columns, rows = np.meshgrid(np.arange(800) / 800.0, np.arange(600) / 600.0)
     ramps = LitPatterns(np.stack([columns, rows, np.ones_like(rows)]), Projector(optics, 1.0))
     pose = look_at([100, -80, 500], [0, 0, 0], [0, 1, 0])
-    u, v, white = trace(plate(), CameraRays(camera), ramps, pose, samples=64, seed=1)
+    u, v, white = trace(plate(), CameraRays(camera), ramps, pose, LightPaths(samples=64, seed=1))
     rays = camera.rays(camera.pixel_grid())
     normal, height = pose.inverse().directions(np.array([0, 0, 1.0])), pose.translation[2]
     points = rays * (-height / (rays @ normal))[..., None]
@@ -93,8 +94,7 @@ def test_beyond_its_image_a_projector_sends_nothing():
         CameraRays(camera),
         LitPatterns(np.ones((1, 200, 300)), Projector(optics, 1.0)),
         facing(300.0),
-        samples=1,
-        seed=1,
+        LightPaths(samples=1, seed=1),
     )[0]
     pixels = optics.project(camera.rays(camera.pixel_grid()) * 300)
     radius = np.linalg.norm((camera.pixel_grid() - [59.5, 39.5]) / 20.0, axis=-1)
@@ -155,8 +155,7 @@ def test_camera_defocus_is_that_of_a_thin_lens():
             CameraRays(camera, aperture, focus),
             LitPatterns(pattern, Projector(optics, 1.0)),
             facing(distance),
-            samples=1024,
-            seed=1,
+            LightPaths(samples=1024, seed=1),
         )[0, 15]
         for aperture in (0.0, diameter)
     )
@@ -184,7 +183,7 @@ def test_camera_defocus_equals_stock_thinlens():
     rays = CameraRays(camera, diameter, focus)
     ours = np.stack(
         [
-            trace(scene, rays, LitPatterns(pattern, projector), pose, samples=64, seed=s, jitter=True)[0]
+            trace(scene, rays, LitPatterns(pattern, projector), pose, LightPaths(samples=64, seed=s, jitter=True))[0]
             for s in range(8)
         ]
     )
@@ -243,7 +242,9 @@ def test_projector_defocus_grows_with_the_distance_from_its_focus():
     point = LitPatterns(edge, Projector(optics, 1.0))
 
     def spread(lit, distance):
-        profile = np.diff(trace(plate(), CameraRays(camera), lit, facing(distance), samples=1024, seed=1)[0, 10])
+        profile = np.diff(
+            trace(plate(), CameraRays(camera), lit, facing(distance), LightPaths(samples=1024, seed=1))[0, 10]
+        )
         profile = profile / profile.sum()
         place = np.arange(400)
         middle = (place * profile).sum()
@@ -272,8 +273,8 @@ def test_an_aperture_makes_a_penumbra():
     optics = pinhole(300, 200, 150.0)
     camera = pinhole(201, 41, 500.0, Transform.from_degrees([0, 0, 0], [60, 0, 0]))
     lit = LitPatterns(np.ones((1, 200, 300)), Projector(optics, 1.0, aperture_mm=20.0, focus_mm=500.0))
-    image = trace(scene, CameraRays(camera), lit, facing(500.0), samples=256, seed=1)[0, 20]
-    white = trace(plate(), CameraRays(camera), lit, facing(500.0), samples=256, seed=1)[0, 20]
+    image = trace(scene, CameraRays(camera), lit, facing(500.0), LightPaths(samples=256, seed=1))[0, 20]
+    white = trace(plate(), CameraRays(camera), lit, facing(500.0), LightPaths(samples=256, seed=1))[0, 20]
     # the screen ends at x = 0, half way down: light from the lens place x' reaches floor points x > -x'
     x = np.arange(201) - 100 + 60.0  # the camera stands at x = 60, one pixel is 1 mm
     side = np.clip(x / 10.0, -1, 1)
@@ -292,8 +293,7 @@ def test_vignetting_is_the_cosine_law_where_it_is_told_so():
             CameraRays(camera),
             LitPatterns(np.ones((1, 200, 300)), Projector(optics, 1.0, corner_illumination=c)),
             facing(500.0),
-            samples=1,
-            seed=1,
+            LightPaths(samples=1, seed=1),
         )[0]
         for c in (1.0, corner)
     )
@@ -311,8 +311,7 @@ def test_a_pixel_gap_is_dark_and_keeps_the_flux():
             CameraRays(camera),
             LitPatterns(np.ones((1, 20, 30)), Projector(optics, 1.0, pixel_gap=gap)),
             facing(500.0),
-            samples=4,
-            seed=1,
+            LightPaths(samples=4, seed=1),
         )[0]
         for gap in (0.0, 0.1)
     )
@@ -326,7 +325,11 @@ def test_the_response_curve_is_a_power_above_the_black_level():
     values = np.linspace(0, 1, 5)
     steps = np.full((5, 20, 30), values[:, None, None])
     images = trace(
-        plate(), CameraRays(pinhole(12, 8, 12.0)), LitPatterns(steps, projector), facing(500.0), samples=1, seed=1
+        plate(),
+        CameraRays(pinhole(12, 8, 12.0)),
+        LitPatterns(steps, projector),
+        facing(500.0),
+        LightPaths(samples=1, seed=1),
     )
     assert np.allclose(images[:, 4, 6] / images[-1, 4, 6], 0.2 + 0.8 * values**2.2, rtol=1e-5)
 
@@ -339,7 +342,9 @@ def test_time_of_flight_phase_is_the_path_length(distance):
     optics = pinhole(300, 200, 120.0, Transform.from_degrees([0, 0, 0], [40.0, 0, 0]))
     camera = pinhole(60, 40, 50.0)
     light = ModulatedLight(Projector(optics, 1.0), frequencies, deltas, 0.8)
-    images = trace(plate(size=2e4), CameraRays(camera), light, facing(distance), samples=1, seed=1).astype(float)
+    images = trace(plate(size=2e4), CameraRays(camera), light, facing(distance), LightPaths(samples=1, seed=1)).astype(
+        float
+    )
     rays = camera.rays(camera.pixel_grid())
     points = rays * (distance / rays[..., 2:])
     length = np.linalg.norm(points, axis=-1) + np.linalg.norm(points - optics.centre, axis=-1)
@@ -371,7 +376,7 @@ def test_a_second_bounce_makes_the_path_longer():
     light = ModulatedLight(Projector(pinhole(200, 150, 100.0), 1.0), [16e6] * 4, np.arange(4) * np.pi / 2, 1.0)
 
     def path(depth):
-        images = trace(scene, CameraRays(camera), light, facing(1500.0), samples=64, seed=1, depth=depth)
+        images = trace(scene, CameraRays(camera), light, facing(1500.0), LightPaths(samples=64, seed=1, depth=depth))
         phase = np.arctan2(images[1] - images[3], images[0] - images[2])
         return np.mod(phase, 2 * np.pi) / (2 * np.pi) * LIGHT_MM_S / 16e6
 
@@ -393,15 +398,15 @@ def test_speckle_reads_the_code_beside_the_point():
     shift = np.zeros((2, 40, 60))
     shift[0] = 1e-3
     still, moved = (
-        trace(scene, CameraRays(camera), lit, facing(500.0), samples=1, seed=1, shift=s)[0] for s in (None, shift)
+        trace(scene, CameraRays(camera), lit, facing(500.0), LightPaths(samples=1, seed=1), shift=s)[0]
+        for s in (None, shift)
     )
     white = trace(
         scene,
         CameraRays(camera),
         LitPatterns(np.ones((1, 300, 400)), Projector(optics, 1.0)),
         facing(500.0),
-        samples=1,
-        seed=1,
+        LightPaths(samples=1, seed=1),
     )[0]
     cosine = camera.rays(camera.pixel_grid())[..., 2]  # the angle is taken along the ray
     assert np.allclose((moved - still) / white * 400 * cosine, 0.5 * 300.0 / 500.0, rtol=2e-3)
@@ -413,13 +418,15 @@ def test_bands_and_windows_change_nothing(n10, scenes, monkeypatch, depth):
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
     rays, patterns = CameraRays(n10.rig.cameras["left"], 2.0, 500.0), LitPatterns(n10.patterns(), n10.projector)
     pose = look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
-    window = Window(300, 200, 80, 60)
+    window = Roi(300, 200, 80, 60)
 
     def look(window):
-        return trace(scene, rays, patterns, pose, samples=4, seed=1, depth=depth, window=window, with_ambient=True)
+        return trace(
+            scene, rays, patterns, pose, LightPaths(samples=4, seed=1, depth=depth, with_ambient=True), roi=window
+        )
 
     whole = look(window)
-    part = look(Window(310, 220, 30, 20))
+    part = look(Roi(310, 220, 30, 20))
     assert np.array_equal(part, whole[:, 20:40, 10:40])
     monkeypatch.setattr(transport, "LARGEST_LAUNCH", 80 * 2 * 7)  # seven rows at a time
     assert np.array_equal(look(window), whole)
@@ -431,8 +438,8 @@ def test_from_pose_to_pose_nothing_recompiles(n10, scenes):
 
     def look(turn):
         pose = look_at([100 + turn, -350, 250], [0, 0, 30], [0, 0, 1])
-        window = Window(300 + turn, 200, 80 + turn, 60)
-        trace(scene, rays, patterns, pose, samples=4, seed=turn, depth=3, window=window)
+        window = Roi(300 + turn, 200, 80 + turn, 60)
+        trace(scene, rays, patterns, pose, LightPaths(samples=4, seed=turn, depth=3), roi=window)
 
     look(0)
     dr.set_flag(dr.JitFlag.KernelHistory, True)

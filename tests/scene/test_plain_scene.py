@@ -14,7 +14,7 @@ from mitsim.scene.backend import mi
 from mitsim.scene.light_transport import transport
 from mitsim.scene.light_transport.plain_scene import lone_bsdf, lone_plane
 from mitsim.scene.light_transport.projector_light import LitPatterns, independent
-from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
@@ -71,10 +71,10 @@ def test_the_short_way_finds_the_light_of_the_long_way(kind, depth, light, monke
     assert (lone_plane(scene) is not None) == (len(scene.names) == 1)
     assert lone_bsdf(scene) is not None
     rays = CameraRays(pinhole(96, 64, 240.0), 4.0, 430.0)
-    short = trace(scene, rays, light, POSE, samples=16, seed=1, depth=depth)
+    short = trace(scene, rays, light, POSE, LightPaths(samples=16, seed=1, depth=depth))
     monkeypatch.setattr(transport, "lone_plane", lambda scene: None)
     monkeypatch.setattr(transport, "lone_bsdf", lambda scene: None)
-    long = trace(scene, rays, light, POSE, samples=16, seed=1, depth=depth)
+    long = trace(scene, rays, light, POSE, LightPaths(samples=16, seed=1, depth=depth))
     assert (long > 0).mean() > 0.2
     # roundings in single precision; of interreflections now and then a ray takes the other side of an edge
     same = np.isclose(short, long, rtol=2e-5, atol=2e-6 * long.max())
@@ -107,9 +107,9 @@ def test_an_image_of_many_does_not_differ_from_the_same_image_alone(axis, along_
     stack = patterns(PhaseShift(periods_px=[140, 15], steps=4, axis=axis), 200, 140)
     lit = LitPatterns(stack, light.projector)
     assert (lit.count, lit.codes, lit.along_row) == (8, 5, along_row)
-    together = trace(scene, rays, lit, POSE, samples=16, seed=1)
+    together = trace(scene, rays, lit, POSE, LightPaths(samples=16, seed=1))
     for image, pattern in zip(together, stack, strict=True):
-        alone = trace(scene, rays, LitPatterns(pattern[None], light.projector), POSE, samples=16, seed=1)[0]
+        alone = trace(scene, rays, LitPatterns(pattern[None], light.projector), POSE, LightPaths(samples=16, seed=1))[0]
         np.testing.assert_allclose(image, alone, rtol=1e-5, atol=2e-6 * together.max())
 
 
@@ -122,7 +122,7 @@ def test_a_lookup_along_the_row_is_that_in_both_directions(light):
         projector = replace(light.projector, pixel_gap=gap)
         one, two = LitPatterns(row, projector), LitPatterns(speck, projector)
         assert (one.along_row, two.along_row) == (True, False)
-        images = [trace(scene, rays, lit, POSE, samples=16, seed=1) for lit in (one, two)]
+        images = [trace(scene, rays, lit, POSE, LightPaths(samples=16, seed=1)) for lit in (one, two)]
         np.testing.assert_allclose(*images, rtol=1e-5, atol=1e-6 * images[0].max())
 
 

@@ -9,11 +9,12 @@ from characterisation.features.fits import fit_sphere
 from mitsim.decode.triangulate import triangulate
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.projector_light import LitPatterns
-from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import load_scene, scene_from_dict
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import FILM_OFFSET_PX, Transform, look_at, mitsuba_to_world
 
 BESIDE = Transform.from_degrees([0, -4.15, 0], [50.4, 0, 3.7])
@@ -39,8 +40,7 @@ def test_lambertian_plate_has_its_closed_form_radiance(distance):
         CameraRays(pinhole(60, 40, 60.0)),
         LitPatterns(np.ones((1, 200, 300)), projector),
         look_at([0, 0, distance], [0, 0, 0], [0, 1, 0]),
-        samples=4,
-        seed=1,
+        LightPaths(samples=4, seed=1),
     )[0]
     expected = 0.85 / np.pi * projector.plane_irradiance / distance**2
     assert np.allclose(image, expected, rtol=2e-5)
@@ -55,8 +55,7 @@ def test_flux_of_a_white_frame_is_the_flux():
         CameraRays(camera),
         LitPatterns(np.ones((1, 200, 300)), projector),
         look_at([0, 0, 500], [0, 0, 0], [0, 1, 0]),
-        samples=64,
-        seed=1,
+        LightPaths(samples=64, seed=1),
     )[0]
     pixel_area = (500 / 100.0) ** 2
     assert np.isclose(image.sum() * pixel_area * np.pi / 0.85, 1.7, rtol=2e-3)
@@ -70,8 +69,7 @@ def test_black_level_and_patterns_are_linear():
         CameraRays(pinhole(12, 8, 12.0)),
         LitPatterns(half, projector),
         look_at([0, 0, 500], [0, 0, 0], [0, 1, 0]),
-        samples=1,
-        seed=1,
+        LightPaths(samples=1, seed=1),
     )
     assert np.allclose(images[0] / images[2], 0.2, rtol=1e-5)
     assert np.allclose(images[1] / images[2], 0.6, rtol=1e-5)
@@ -81,9 +79,9 @@ def test_a_window_shows_what_the_whole_image_shows_there(n10, scenes):
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
     rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
     pose = look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
-    whole = trace(scene, rays, patterns, pose, samples=256, seed=1)[0]
-    window = Window(300, 200, 120, 80)
-    part = trace(scene, rays, patterns, pose, samples=256, seed=2, window=window)[0]
+    whole = trace(scene, rays, patterns, pose, LightPaths(samples=256, seed=1))[0]
+    window = Roi(300, 200, 120, 80)
+    part = trace(scene, rays, patterns, pose, LightPaths(samples=256, seed=2), roi=window)[0]
     same = whole[200:280, 300:420]
     assert part.shape == (80, 120)
     # other random numbers, the same places: the difference is sub-pixel jitter at 256 samples
@@ -98,7 +96,12 @@ def test_same_seed_same_bytes_and_other_seed_other_noise(n10, scenes, depth, jit
     pose = look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
     one, again, other = (
         trace(
-            scene, rays, patterns, pose, samples=4, seed=s, depth=depth, window=Window(300, 200, 80, 60), jitter=jitter
+            scene,
+            rays,
+            patterns,
+            pose,
+            LightPaths(samples=4, seed=s, depth=depth, jitter=jitter),
+            roi=Roi(300, 200, 80, 60),
         )
         for s in (1, 1, 2)
     )
@@ -111,10 +114,10 @@ def test_direct_light_has_no_noise_and_a_small_quadrature_error(n10, scenes):
     scene = load_scene(scenes / "coupon/matt_white.xml", 850)
     rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
     pose = look_at([100, -350, 450], [0, 0, 0], [0, 0, 1])
-    window = Window(340, 210, 60, 50)
-    one, two = (trace(scene, rays, patterns, pose, samples=16, seed=s, window=window)[0] for s in (1, 2))
+    window = Roi(340, 210, 60, 50)
+    one, two = (trace(scene, rays, patterns, pose, LightPaths(samples=16, seed=s), roi=window)[0] for s in (1, 2))
     assert one.tobytes() == two.tobytes()
-    reference = trace(scene, rays, patterns, pose, samples=1024, seed=1, window=window, jitter=True)[0]
+    reference = trace(scene, rays, patterns, pose, LightPaths(samples=1024, seed=1, jitter=True), roi=window)[0]
     # a full well of 20000 e- filled to a fifth has shot noise of 1.6 %: a fifth of that is 0.3 %
     assert (one - reference).std() < 0.003 * reference.mean()
 
@@ -123,13 +126,14 @@ def test_later_light_is_all_light_less_direct_light(n10, scenes):
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
     rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
     given = scene, rays, patterns, look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
-    how = {"samples": 16, "seed": 4, "window": Window(300, 200, 120, 80)}
+    roi = Roi(300, 200, 120, 80)
     direct, both, later = (
-        trace(*given, **how, depth=depth, only_later=only) for depth, only in ((1, False), (2, False), (2, True))
+        trace(*given, LightPaths(16, 4, depth, only_later=only), roi)
+        for depth, only in ((1, False), (2, False), (2, True))
     )
     assert later.mean() > 0.01 * direct.mean()
     np.testing.assert_allclose(direct + later, both, atol=1e-5 * both.max())
-    assert not trace(*given, **how, only_later=True).any()
+    assert not trace(*given, LightPaths(16, 4, only_later=True), roi).any()
 
 
 @pytest.mark.parametrize("depth", [1, 3])
@@ -148,7 +152,10 @@ def test_equal_to_stock_mitsuba(scenes, depth):
     repeats, samples = 12, 64
     rays, lit = CameraRays(camera), LitPatterns(pattern, projector)
     ours = np.stack(
-        [trace(scene, rays, lit, pose, samples=samples, seed=s, depth=depth, jitter=True)[0] for s in range(repeats)]
+        [
+            trace(scene, rays, lit, pose, LightPaths(samples=samples, seed=s, depth=depth, jitter=True))[0]
+            for s in range(repeats)
+        ]
     )
 
     stock = _stock_scene(scene, camera, projector, pattern[0], pose, depth)
@@ -193,7 +200,9 @@ def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
     rays, lit = CameraRays(camera), LitPatterns(np.ones((1, 140, 200)), projector)
     ours = np.stack(
         [
-            trace(scene, rays, lit, pose, samples=samples, seed=s, depth=depth, jitter=True, with_ambient=True)
+            trace(
+                scene, rays, lit, pose, LightPaths(samples=samples, seed=s, depth=depth, jitter=True, with_ambient=True)
+            )
             for s in range(repeats)
         ]
     )
@@ -214,7 +223,7 @@ def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
     assert abs(z.mean()) < 4 * np.sqrt(1.22 / len(z))
     assert np.sqrt((z**2).mean()) < np.sqrt(1.22) * (1 + 4 / np.sqrt(2 * len(z)))
     dark = LitPatterns(np.zeros((1, 140, 200)), projector)
-    alone = trace(scene, rays, dark, pose, samples=samples, seed=3, depth=depth, with_ambient=True)
+    alone = trace(scene, rays, dark, pose, LightPaths(samples=samples, seed=3, depth=depth, with_ambient=True))
     assert np.array_equal(alone[0], alone[1])
     assert 0 < alone[1].mean() < ours[0, 0].mean()
 
@@ -229,7 +238,13 @@ def test_later_light_of_the_scene_is_all_of_it_less_its_direct_light(lamp):
     direct, both, later = (
         np.stack(
             [
-                trace(scene, rays, dark, pose, samples=64, seed=s, depth=depth, with_ambient=True, only_later=only)[-1]
+                trace(
+                    scene,
+                    rays,
+                    dark,
+                    pose,
+                    LightPaths(samples=64, seed=s, depth=depth, with_ambient=True, only_later=only),
+                )[-1]
                 .reshape(4, 8, 6, 8)
                 .sum(axis=(1, 3))
                 .ravel()
@@ -309,7 +324,7 @@ def test_sphere_through_an_ideal_code(n10):
     projector = Projector(optics, n10.projector.flux)  # no black level
     camera = n10.rig.cameras["left"]
     pose = look_at([40, -590, 100], [0, 0, 0], [0, 0, 1])
-    u, v, white = trace(scene, CameraRays(camera), LitPatterns(ramps, projector), pose, samples=64, seed=1)
+    u, v, white = trace(scene, CameraRays(camera), LitPatterns(ramps, projector), pose, LightPaths(samples=64, seed=1))
     facing = white > 0.5 * white.max()  # away from the limb, where a pixel averages over a steep slope
     with np.errstate(invalid="ignore", divide="ignore"):
         projector_pixels = np.stack([u / white * optics.width, v / white * optics.height], axis=-1)[facing]

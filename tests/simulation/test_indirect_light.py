@@ -12,6 +12,7 @@ from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.indirect_light import IndirectLight, smoothed
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 ROOT = Path(__file__).parents[2]
@@ -40,9 +41,9 @@ def test_a_corner_is_as_bright_as_many_light_paths_make_it_and_less_noisy():
     simulated = SimulatedSensor(sensor)
     around = pose.inverse().points(scene.centre + np.array([[x, y, 0] for x in (-20, 20) for y in (-20, 20)]))
 
-    def light(seed, samples, depth=2, **how):
-        how |= {"depth": depth, "around": around, "noise": Noise(speckle=False)}
-        return simulated.light(scene, pose, seed=seed, samples=samples, **how).radiance
+    def light(seed, samples, depth=2, indirect=None):
+        rendering, noise = Rendering(samples, depth, indirect), Noise(speckle=False)
+        return simulated.light(scene, pose, seed=seed, rendering=rendering, around=around, noise=noise).radiance
 
     direct = light(1, 16, depth=1)["left"]
     truth = np.mean([light(seed, 64)["left"] for seed in (1, 2)], axis=0) - direct
@@ -59,8 +60,10 @@ def test_direct_light_alone_is_not_touched():
     pose = look_at([0, 0, 500], [0, 0, 0], [0, 1, 0])
     simulated = SimulatedSensor(sensor)
     around = pose.inverse().points(np.array([[-5.0, -5, 0], [5, 5, 0]]))
-    kept = simulated.capture(scene, pose, seed=1, samples=4, around=around)
-    with_rule = simulated.capture(scene, pose, seed=1, samples=4, around=around, indirect=IndirectLight(4, 2.0))
+    kept = simulated.capture(scene, pose, rendering=Rendering(samples=4), seed=1, around=around)
+    with_rule = simulated.capture(
+        scene, pose, rendering=Rendering(samples=4, indirect=IndirectLight(4, 2.0)), seed=1, around=around
+    )
     for name, images in kept.images.items():
         np.testing.assert_array_equal(images, with_rule.images[name])
     assert with_rule.settings["indirect_light"] == {"samples": 4, "smoothing_px": 2.0}

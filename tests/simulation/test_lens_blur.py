@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.scene.ray_casting.camera_rays import Window
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.imager import Imager
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 from mitsim.simulation.lens_blur import blurred, through_point_spread
 
@@ -15,7 +15,7 @@ WIDTH, HEIGHT = 201, 161
 CAMERA = Camera(
     np.array([[300.0, 0, 100.0], [0, 300.0, 80.0], [0, 0, 1.0]]), np.zeros(5), WIDTH, HEIGHT, Transform.identity()
 )
-WHOLE = Window(0, 0, WIDTH, HEIGHT)
+WHOLE = Roi(0, 0, WIDTH, HEIGHT)
 
 
 def chip(middle: float, corner: float | None) -> Imager:
@@ -56,8 +56,8 @@ def test_without_a_corner_it_is_the_even_blur_to_the_last_bit():
 
 def test_a_part_is_that_of_the_whole():
     image = np.random.default_rng(2).random((HEIGHT, WIDTH)).astype(np.float32)
-    part = Window(110, 20, 70, 90)
+    part = Roi(110, 20, 70, 90)
     inner = np.s_[15:-15, 15:-15]
-    whole = through_point_spread(image, chip(0.5, 2.0), CAMERA, WHOLE)[part.inside]
-    alone = through_point_spread(np.ascontiguousarray(image[part.inside]), chip(0.5, 2.0), CAMERA, part)
+    whole = through_point_spread(image, chip(0.5, 2.0), CAMERA, WHOLE)[part.slices]
+    alone = through_point_spread(np.ascontiguousarray(image[part.slices]), chip(0.5, 2.0), CAMERA, part)
     assert np.allclose(whole[inner], alone[inner], atol=1e-6)

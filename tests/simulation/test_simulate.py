@@ -17,6 +17,7 @@ from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.lens_blur import blurred
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 ROOT = Path(__file__).parents[2]
@@ -51,8 +52,8 @@ def test_the_bytes_of_a_seed_do_not_depend_on_the_number_of_threads(path, monkey
     taken = {}
     for threads in (1, 3):
         monkeypatch.setenv("OMP_NUM_THREADS", str(threads))
-        taken[threads] = simulated.capture(scene, pose, seed=5, samples=1, around=corners).images
-    other = simulated.capture(scene, pose, seed=6, samples=1, around=corners).images
+        taken[threads] = simulated.capture(scene, pose, rendering=Rendering(samples=1), seed=5, around=corners).images
+    other = simulated.capture(scene, pose, rendering=Rendering(samples=1), seed=6, around=corners).images
     for name, images in taken[1].items():
         assert images.tobytes() == taken[3][name].tobytes()
         assert images.tobytes() != other[name].tobytes()
@@ -72,7 +73,8 @@ def test_the_light_of_a_plate_falls_off_toward_the_corners_as_cosines_do(name):
     pose = look_at([0, 0, sum(sensor.working_range_mm) / 2], [0, 0, 0], [0, 1, 0])
     camera = next(iter(sensor.rig.cameras))
     seen, flat = (
-        SimulatedSensor(each).radiance(scene, pose, camera, seed=1, samples=1, depth=1)[0] for each in (sensor, even)
+        SimulatedSensor(each).radiance(scene, pose, camera, Rendering(samples=1, depth=1), seed=1)[0]
+        for each in (sensor, even)
     )
     (fx, _, cx), (_, fy, cy), _ = sensor.rig.cameras[camera].matrix
     rows, columns = np.mgrid[: seen.shape[0], : seen.shape[1]]

@@ -16,6 +16,7 @@ from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 
@@ -39,9 +40,8 @@ def test_rendered_plates_come_out_where_drawn_rigs_put_them(name, floor_mm):
         capture = SimulatedSensor(one).capture(
             plate(size, "matt white", sensor.wavelength_nm),
             pose.inverse(),
+            rendering=Rendering(samples=16, depth=1),
             seed=1,
-            samples=16,
-            depth=1,
             around=pose.points(size * np.array([[a, b, 0.0] for a in (-0.5, 0.5) for b in (-0.5, 0.5)])),
             noise=Noise.none(),
         )

@@ -16,7 +16,8 @@ from mitsim.errors import InputError
 from mitsim.report.scene_preview import preview_figure
 from mitsim.report.scene_table import as_data, as_text
 from mitsim.report.style import write_png
-from mitsim.scene.inspect import inspect, look
+from mitsim.scene.first_hits import look
+from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 from mitsim.sensor.working_volume import common_view, field_of_view, in_image, in_working_volume, pose_at, usual_place
 

@@ -23,14 +23,18 @@ from mitsim.fit.dots import compare_dots
 from mitsim.fit.electrons import PixelNoise, linearised, pixel_noise
 from mitsim.fit.estimate import fit_views
 from mitsim.fit.finish import ALPHA_RANGE, metal_finish
-from mitsim.fit.observation import Bench, View, observe, place_of
+from mitsim.fit.observation import CouponCapture, View, observe
 from mitsim.fit.place import found_place, known_place
 from mitsim.fit.run import KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX, fit_captures
+from mitsim.fit.specimen import place_of
+from mitsim.fit.white_coupon import Bench
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
 from mitsim.sensor.imager import Imager, Noise, expose
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.speckle import speckle_field
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.surface.machined import Face, machined
 
@@ -69,7 +73,7 @@ def captures(n10, coupon, tmp_path_factory):
     for number, (tilt, azimuth) in enumerate([(14, 210), (22, 60), (40, 300)]):
         pose = pose_at(tilt, azimuth)
         around = pose.inverse().points(CORNERS)
-        capture = simulated.capture(scene, pose, seed=number, samples=4, around=around)
+        capture = simulated.capture(scene, pose, rendering=Rendering(samples=4), seed=number, around=around)
         write_capture(capture, folder / f"pose_{number}")
     return sorted(folder.iterdir())
 
@@ -316,13 +320,15 @@ def test_alpha_and_power_are_recovered_from_noisy_captures(captures, tmp_path):
 def test_a_saturated_block_and_its_neighbours_are_left_out(n10, bench, captures):
     capture = read_capture(captures[1])
     place = known_place(capture.world_from_sensor, 120.0, 120.0)
-    whole = observe(capture, 0, bench, place, KNOWN_BLOCK_PX, "capture", pattern="mean")[0]
+    whole = observe(CouponCapture(capture, place, 0, "capture"), bench, KNOWN_BLOCK_PX, pattern="mean")[0]
     assert whole.censored == 0.0
     middle = np.flatnonzero((whole.grid == np.median(whole.grid, axis=0).astype(int)).all(axis=1))[0]
     pixel = np.flatnonzero(whole.block == middle)[0]
     images = {name: stack.copy() for name, stack in capture.images.items()}
     images["left"][0, whole.rows[pixel], whole.columns[pixel]] = 255
-    left = observe(replace(capture, images=images), 0, bench, place, KNOWN_BLOCK_PX, "capture", pattern="mean")[0]
+    left = observe(
+        CouponCapture(replace(capture, images=images), place, 0, "capture"), bench, KNOWN_BLOCK_PX, pattern="mean"
+    )[0]
     assert left.size == whole.size - 9
     assert left.censored == pytest.approx(9 / whole.size)
     assert (np.abs(left.grid - whole.grid[middle]).max(axis=1) > 1).all()
@@ -332,7 +338,9 @@ def test_nothing_but_saturation_is_refused(captures, ground, bench):
     capture = read_capture(captures[0])
     white = {name: np.full_like(stack, 255) for name, stack in capture.images.items()}
     place = known_place(capture.world_from_sensor, 120.0, 120.0)
-    views = observe(replace(capture, images=white), 0, bench, place, KNOWN_BLOCK_PX, "capture", pattern="mean")
+    views = observe(
+        CouponCapture(replace(capture, images=white), place, 0, "capture"), bench, KNOWN_BLOCK_PX, pattern="mean"
+    )
     with pytest.raises(InputError, match=r"0 of \d+ blocks on the coupon free of saturation"):
         fit_views(views, ground)
 
@@ -349,7 +357,7 @@ def test_a_coupon_without_a_block_says_why(captures, bench, spoil, why):
     """It was "0 of 0 blocks on the coupon free of saturation", whatever the cause."""
     capture = read_capture(captures[0])
     place = spoil(known_place(capture.world_from_sensor, 120.0, 120.0))
-    views = observe(capture, 0, bench, place, UNKNOWN_BLOCK_PX, "capture", pattern="mean")
+    views = observe(CouponCapture(capture, place, 0, "capture"), bench, UNKNOWN_BLOCK_PX, pattern="mean")
     assert {view.whole for view in views} == {0}
     assert all(why in view.nothing for view in views)
 
@@ -361,11 +369,11 @@ def test_a_window_names_the_coupon_whatever_the_pose_says(captures, bench):
     known = known_place(capture.world_from_sensor, 120.0, 120.0)
     low, high = (f(camera.project(known.corners()), axis=0).astype(int) for f in (np.min, np.max))
     middle, half = (low + high) // 2, (high - low) // 5
-    part = (*(middle - half).tolist(), *(2 * half).tolist())
+    part = Roi(*(middle - half).tolist(), *(2 * half).tolist())
     place = place_of(replace(capture, world_from_sensor=None), bench.sensor, (120.0, 120.0), "capture", part)
     there = capture.world_from_sensor.points(place.world_from_sensor.inverse().points(np.zeros((1, 3))))
     assert abs(there[0, 2]) < 0.3
-    views = observe(capture, 0, bench, place, KNOWN_BLOCK_PX, "capture", pattern="mean")
+    views = observe(CouponCapture(capture, place, 0, "capture"), bench, KNOWN_BLOCK_PX, pattern="mean")
     assert views[0].whole > 20
     pixels = np.stack([views[0].columns, views[0].rows], axis=-1)
     assert (pixels >= part[:2]).all()
@@ -381,10 +389,15 @@ def test_dots_of_another_pattern_are_as_bright_and_sharp_as_the_file_says(n10, b
     other = replace(n10, pattern=n10.pattern.model_copy(update={"seed": 11}))
     scene, pose = load_scene(scenes / "coupon" / "matt_white.xml", 850.0), pose_at(12, 200)
     capture = SimulatedSensor(other).capture(
-        scene, pose, seed=4, samples=4, around=pose.inverse().points(CORNERS), noise=Noise.without("speckle")
+        scene,
+        pose,
+        rendering=Rendering(samples=4),
+        seed=4,
+        around=pose.inverse().points(CORNERS),
+        noise=Noise.without("speckle"),
     )
     place = known_place(pose, 120.0, 120.0)
-    views = observe(capture, 0, bench, place, UNKNOWN_BLOCK_PX, "sheet", pattern="level")
+    views = observe(CouponCapture(capture, place, 0, "sheet"), bench, UNKNOWN_BLOCK_PX, pattern="level")
     for view in views:
         dots = compare_dots(view, bench)
         assert dots.power == pytest.approx(0.873, abs=0.042)
@@ -404,8 +417,8 @@ def test_a_capture_without_a_pose_is_placed_by_its_cloud(n10, scenes, tmp_path):
     capture = SimulatedSensor(n10).capture(
         load_scene(scenes / "coupon" / "matt_white.xml", 850.0),
         pose,
+        rendering=Rendering(samples=4),
         seed=4,
-        samples=4,
         around=pose.inverse().points(CORNERS),
     )
     write_capture(replace(capture, world_from_sensor=None), tmp_path / "lost")

@@ -16,6 +16,7 @@ from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 FRINGES = (Path(__file__).parents[1] / "data/fringes.toml").read_text(encoding="utf-8")
@@ -73,7 +74,9 @@ def test_a_rig_renders_and_its_images_come_back_through_import(tmp_path):
     shape = {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "matt_white"}}
     scene = scene_from_dict({"plate": shape}, sensor.wavelength_nm)
     pose = look_at([0, 0, 600], [0, 0, 0], [0, 1, 0])
-    capture = SimulatedSensor(sensor).capture(scene, pose, seed=1, samples=9, noise=Noise.only("quantisation"))
+    capture = SimulatedSensor(sensor).capture(
+        scene, pose, rendering=Rendering(samples=9), seed=1, noise=Noise.only("quantisation")
+    )
     images = capture.images["camera"]
     assert len(images) == 14
     means = images.mean(axis=(1, 2))

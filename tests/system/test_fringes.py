@@ -20,6 +20,7 @@ from mitsim.sensor.imager import Noise
 from mitsim.sensor.light_code import PhaseShift
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 FRINGES = Path(__file__).parents[1] / "data/fringes.toml"
@@ -81,7 +82,7 @@ def test_phase_noise_is_the_closed_form_over_a_decade_of_exposure(sensor, steps,
     simulated, scene, pose = SimulatedSensor(own), plate(), look_at([0, 0, 600], [0, 0, 0], [0, 1, 0])
     sources = Noise.only("shot", "read", "quantisation")
     per_radiance = own.electrons() * own.exposure.base_s
-    light = simulated.radiance(scene, pose, "camera", seed=1, samples=16, depth=1) * per_radiance
+    light = simulated.radiance(scene, pose, "camera", Rendering(samples=16, depth=1), seed=1) * per_radiance
     lit = light.min(axis=0) > 0
     assert lit.sum() > 100000
     shifts = [2 * np.pi * np.arange(steps) / steps]

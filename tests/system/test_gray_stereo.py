@@ -12,6 +12,7 @@ from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 FRINGES = (Path(__file__).parents[1] / "data/fringes.toml").read_text(encoding="utf-8")
@@ -38,7 +39,7 @@ def sensor_of(stripe, tmp_path):
 
 def cloud_of(sensor, shape, pose):
     scene = scene_from_dict({"shape": {**shape, "bsdf": {"type": "matt_white"}}}, sensor.wavelength_nm)
-    capture = SimulatedSensor(sensor).capture(scene, pose, seed=1, samples=16)
+    capture = SimulatedSensor(sensor).capture(scene, pose, rendering=Rendering(samples=16), seed=1)
     return capture_cloud(capture, sensor.settings, sensor_geometry(sensor), imager=sensor.imager)
 
 

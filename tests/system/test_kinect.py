@@ -18,7 +18,7 @@ from mitsim.errors import InputError
 from mitsim.reconstruction.cloud import capture_cloud, decoder_settings, sensor_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.projector_light import ModulatedLight
-from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
@@ -27,6 +27,7 @@ from mitsim.sensor.modulation import LIGHT_MM_S
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.transforms import Transform, look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 ROOT = Path(__file__).parents[2]
@@ -133,7 +134,7 @@ def test_noise_on_matt_white_is_the_published_one(kinect, simulated, geometry, d
     scene = plate(size)
     clouds = [
         capture_cloud(
-            simulated.capture(scene, pose, seed=seed, samples=9, around=corners(size, pose)),
+            simulated.capture(scene, pose, rendering=Rendering(samples=9), seed=seed, around=corners(size, pose)),
             kinect.settings,
             geometry,
             imager=kinect.imager,
@@ -176,7 +177,7 @@ def test_multipath_pushes_the_corner_of_two_white_walls_away(kinect, simulated, 
     row = (np.abs(place[..., 2]) < 100) & (off_edge < 700)
     error = {}
     for depth in (1, 2, 3):
-        capture = simulated.capture(scene, pose, seed=1, depth=depth, noise=Noise.none())
+        capture = simulated.capture(scene, pose, rendering=Rendering(depth=depth), seed=1, noise=Noise.none())
         cloud = capture_cloud(capture, kinect.settings, geometry)
         assert cloud.valid[row].mean() > 0.99
         error[depth] = np.linalg.norm(cloud.points, axis=-1) - distance
@@ -213,7 +214,7 @@ def test_path_lengths_of_two_bounces_are_those_of_an_independent_integration():
     assert len(chosen) >= 20
 
     one, two = (
-        trace(scene, CameraRays(camera), light, pose, samples=1024, seed=5, depth=depth).astype(float)
+        trace(scene, CameraRays(camera), light, pose, LightPaths(samples=1024, seed=5, depth=depth)).astype(float)
         for depth in (1, 2)
     )
     bounced = (two - one)[:, chosen[:, 0], chosen[:, 1]].reshape(3, 4, -1)

@@ -17,6 +17,7 @@ from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.render_residual import render_residual, temporal_noise
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.simulation.surface_speckle import finish_contrast
 
@@ -169,7 +170,7 @@ def test_the_light_s_own_noise_is_none_at_depth_1_and_falls_with_samples_at_dept
     pose = look_at([0, -400, 300], [0, 0, 20], [0, 0, 1])
 
     def residual(samples, depth):
-        return render_residual(simulated, scene, pose, "left", samples=samples, depth=depth, seed=5)
+        return render_residual(simulated, scene, pose, "left", Rendering(samples=samples, depth=depth), seed=5)
 
     coarse, fine = residual(16, 1), residual(36, 1)
     assert coarse.noise == fine.noise == 0
@@ -178,7 +179,7 @@ def test_the_light_s_own_noise_is_none_at_depth_1_and_falls_with_samples_at_dept
     assert few.noise > 0
     assert np.isclose(few.noise / many.noise, 3, rtol=0.15)
     part = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
-    assert render_residual(simulated, part, pose, "left", samples=16, depth=1, seed=5).worst < 0.2
+    assert render_residual(simulated, part, pose, "left", Rendering(samples=16, depth=1), seed=5).worst < 0.2
 
 
 def test_temporal_noise_is_what_the_imager_adds(n10, rng):

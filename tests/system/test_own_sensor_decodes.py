@@ -21,6 +21,7 @@ from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.sensor_file import ImagerTable
 from mitsim.sensor.transforms import look_at
 from mitsim.sensor.written_imager import imager_of, written_imager
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 ROOT = Path(__file__).parents[2]
@@ -64,7 +65,9 @@ class Taken:
         assert self.sensor.name not in presets()
         scene = load_scene(ROOT / "scenes/coupon/matt_white.xml", self.sensor.wavelength_nm)
         pose = look_at([150, -100, 560], [0, 0, 0], [0, 1, 0])
-        write_capture(SimulatedSensor(self.sensor).capture(scene, pose, seed=4, samples=1), self.folder)
+        write_capture(
+            SimulatedSensor(self.sensor).capture(scene, pose, rendering=Rendering(samples=1), seed=4), self.folder
+        )
 
     def cloud(self, name: str, sensor: str | None = None):
         decode(self.folder, self.folder.parent / name, sensor)

@@ -27,6 +27,7 @@ from mitsim.sensor.pattern import mean_run_length
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.render_residual import LIMIT, RenderResidual, told, worst_of
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import read_study
 
@@ -53,7 +54,7 @@ def facing(tilt_deg, azimuth_deg=0.0):
 
 def test_matt_white_is_as_bright_as_the_exposure_rule_says(n10, simulated, samples):
     pose = coupon_pose(facing(0), 600, AXIS)
-    capture = simulated.capture(samples[0].scene, pose.inverse(), seed=1, samples=16)
+    capture = simulated.capture(samples[0].scene, pose.inverse(), rendering=Rendering(samples=16), seed=1)
     image = capture.images["left"][0].astype(float)
     middle = image[200:280, 340:400]
     bright = (np.percentile(middle, 97) - n10.imager.black_level) / (255 - n10.imager.black_level)
@@ -78,7 +79,9 @@ def test_the_pattern_in_the_image_is_like_the_recorded_one(simulated, samples):
 
 def test_same_seed_same_bytes_and_cameras_do_not_share_noise(simulated, samples):
     pose = coupon_pose(facing(10), 600, AXIS)
-    one, again, other = (simulated.capture(samples[0].scene, pose.inverse(), seed=s, samples=4) for s in (5, 5, 6))
+    one, again, other = (
+        simulated.capture(samples[0].scene, pose.inverse(), rendering=Rendering(samples=4), seed=s) for s in (5, 5, 6)
+    )
     for camera in ("left", "right"):
         assert one.images[camera].tobytes() == again.images[camera].tobytes()
         assert one.images[camera].tobytes() != other.images[camera].tobytes()
@@ -88,7 +91,9 @@ def test_same_seed_same_bytes_and_cameras_do_not_share_noise(simulated, samples)
 
 def test_the_dark_is_read_noise_and_fixed_pattern(n10, simulated, samples):
     pose = coupon_pose(facing(0), 600, AXIS)
-    captures = [simulated.capture(samples[0].scene, pose.inverse(), seed=s, samples=1) for s in range(8)]
+    captures = [
+        simulated.capture(samples[0].scene, pose.inverse(), rendering=Rendering(samples=1), seed=s) for s in range(8)
+    ]
     dark = np.stack([c.images["left"][0][:100, :150] for c in captures]).astype(float)
     imager = n10.imager
     temporal = np.sqrt((imager.read_noise * imager.gain) ** 2 + 1 / 12)
@@ -100,7 +105,8 @@ def test_render_noise_is_a_small_part_of_the_sensor_noise(n10, simulated, sample
     """With interreflections the render has noise of its own: on a coupon there are none, so there is none."""
     pose = coupon_pose(facing(20, 30), 600, AXIS)
     radiance = [
-        simulated.radiance(samples[0].scene, pose.inverse(), "left", seed=s, samples=16, depth=3)[0] for s in (1, 2)
+        simulated.radiance(samples[0].scene, pose.inverse(), "left", Rendering(samples=16, depth=3), seed=s)[0]
+        for s in (1, 2)
     ]
     assert np.abs(radiance[0] - radiance[1]).max() == 0
 
@@ -111,7 +117,9 @@ def test_a_matt_white_plate_lies_where_it_stands(n10, simulated, samples, distan
     geometry = stereo_geometry(n10.rig)
     pose = coupon_pose(facing(12, 40), distance, AXIS)
     coupon = samples[0].at(pose)
-    capture = simulated.capture(samples[0].scene, pose.inverse(), seed=2, samples=16, around=coupon.corners())
+    capture = simulated.capture(
+        samples[0].scene, pose.inverse(), rendering=Rendering(samples=16), seed=2, around=coupon.corners()
+    )
     cloud = coupon_cloud(capture, coupon, geometry, n10)
     patches = measure_patches(cloud, coupon)
     assert patches.recovered_fraction.mean() > 0.99
@@ -132,7 +140,9 @@ def test_a_shiny_plate_blinds_the_sensor_that_faces_it(n10, simulated, samples):
     for tilt in (2, 12, 60):
         pose = coupon_pose(facing(tilt, 90 if tilt > 2 else 0), 600, AXIS)
         coupon = shiny.at(pose)
-        capture = simulated.capture(shiny.scene, pose.inverse(), seed=3, samples=9, around=coupon.corners())
+        capture = simulated.capture(
+            shiny.scene, pose.inverse(), rendering=Rendering(samples=9), seed=3, around=coupon.corners()
+        )
         cloud = coupon_cloud(capture, coupon, geometry, n10)
         fraction[tilt] = float(measure_patches(cloud, coupon).recovered_fraction.mean())
         if tilt == 2:
@@ -302,7 +312,7 @@ def test_a_rendered_part_is_measured(n10, simulated, scenes):
     geometry = stereo_geometry(n10.rig)
     predictor = Predictor(n10.rig, geometry.grid, geometry.seen_left, n10.name)
     pose = look_at([0, -400, 290], [0, 0, 30], [0, 0, 1])
-    capture = simulated.capture(scene, pose, seed=4, samples=16)
+    capture = simulated.capture(scene, pose, rendering=Rendering(samples=16), seed=4)
     cloud = predictor.labelled(capture_cloud(capture, n10.matcher, geometry), scene, pose)
     task = read_task(scenes / "two_pillars/task.toml")
     result = measure(cloud, task, pose.inverse().matrix())

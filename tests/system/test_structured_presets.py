@@ -16,6 +16,7 @@ from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 NAMES = ["photoneo-phoxi-s", "david-sls-3", "zivid-2-m70"]
@@ -94,7 +95,9 @@ def off_plane(cloud, sensor_from_plate):
 def test_a_plane_comes_back_flat_and_where_it_is(sensor, simulated, geometry):
     for tilt in (0, 20):
         place = pose(middle(sensor), tilt)
-        capture = simulated.capture(plate(sensor), place.inverse(), seed=1, samples=9, noise=Noise.none())
+        capture = simulated.capture(
+            plate(sensor), place.inverse(), rendering=Rendering(samples=9), seed=1, noise=Noise.none()
+        )
         cloud = capture_cloud(capture, sensor.settings, geometry)
         off = off_plane(cloud, place)
         floor = FLOORS[sensor.name][0]
@@ -108,7 +111,7 @@ def test_a_sphere_keeps_its_radius(sensor, simulated, geometry):
     radius = middle(sensor) / 10
     place = pose(middle(sensor) + radius)
     scene = scene_from_dict({"s": {"type": "sphere", "radius": radius, "bsdf": WHITE}}, sensor.wavelength_nm)
-    capture = simulated.capture(scene, place.inverse(), seed=1, samples=9, noise=Noise.none())
+    capture = simulated.capture(scene, place.inverse(), rendering=Rendering(samples=9), seed=1, noise=Noise.none())
     cloud = capture_cloud(capture, sensor.settings, geometry)
     fit = fit_sphere(cloud.points[cloud.valid].astype(float), viewpoint=np.zeros(3))
     _, radius_floor, residual_floor = FLOORS[sensor.name]
@@ -128,7 +131,7 @@ def test_noise_lies_where_the_maker_s_figure_does_and_grows_with_distance(sensor
     sigmas = []
     for each in (near, distance, far):
         place = pose(each)
-        capture = simulated.capture(plate(sensor), place.inverse(), seed=2, samples=4)
+        capture = simulated.capture(plate(sensor), place.inverse(), rendering=Rendering(samples=4), seed=2)
         off = off_plane(capture_cloud(capture, sensor.settings, geometry), place)
         assert off.size > 100000
         sigmas.append(float(off.std()))
@@ -143,7 +146,7 @@ def test_metal_is_lost_to_glare_or_darkness_and_to_nothing_else(sensor, simulate
     scene = plate(sensor, metal)
     shares = []
     for tilt in (0, 20, 40):
-        capture = simulated.capture(scene, pose(middle(sensor), tilt).inverse(), seed=3, samples=4)
+        capture = simulated.capture(scene, pose(middle(sensor), tilt).inverse(), rendering=Rendering(samples=4), seed=3)
         cloud = capture_cloud(capture, sensor.settings, geometry)
         lost = cloud.status[~cloud.valid]
         shares.append(cloud.valid.mean())

@@ -17,6 +17,7 @@ from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 FRINGES = (Path(__file__).parents[1] / "data/fringes.toml").read_text(encoding="utf-8")
@@ -45,7 +46,7 @@ def simulated(sensor):
 
 def cloud_of(sensor, simulated, shape, pose):
     scene = scene_from_dict({"shape": {**shape, "bsdf": {"type": "matt_white"}}}, sensor.wavelength_nm)
-    capture = simulated.capture(scene, pose, seed=1, samples=9, noise=Noise.none())
+    capture = simulated.capture(scene, pose, rendering=Rendering(samples=9), seed=1, noise=Noise.none())
     return capture, capture_cloud(capture, sensor.settings, sensor_geometry(sensor))
 
 

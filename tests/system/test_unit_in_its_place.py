@@ -12,6 +12,7 @@ from mitsim.sensor.imager import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor_file import MisalignmentTable, RoomTable
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
 SHEET = {"sheet": {"type": "rectangle", "to_world": None, "bsdf": {"type": "matt_white", "reflectance": 0.5}}}
@@ -35,7 +36,7 @@ POSE = look_at((0.0, 0.0, 600.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 0.0)
 
 def radiance(sensor, camera="left"):
     simulated = SimulatedSensor(sensor)
-    return simulated.radiance(sheet(sensor.wavelength_nm), POSE, camera, seed=1, samples=1, depth=1)[0]
+    return simulated.radiance(sheet(sensor.wavelength_nm), POSE, camera, Rendering(samples=1, depth=1), seed=1)[0]
 
 
 def test_the_room_adds_irradiance_times_reflectance_over_pi(n10):
@@ -66,7 +67,9 @@ def test_a_turned_camera_moves_its_rows_and_the_capture_keeps_its_calibration(n1
         costs.append(float(((moved - ideal[part]) ** 2).mean()))
     assert shifts[int(np.argmin(costs))] == pytest.approx(627.2 * 2e-3, abs=0.13)
     simulated = SimulatedSensor(off)
-    taken = simulated.capture(sheet(off.wavelength_nm), POSE, seed=1, samples=1, noise=Noise.none())
+    taken = simulated.capture(
+        sheet(off.wavelength_nm), POSE, rendering=Rendering(samples=1), seed=1, noise=Noise.none()
+    )
     right = taken.rig.cameras["right"].sensor_from_camera.rotation
     np.testing.assert_array_equal(right, n10.rig.cameras["right"].sensor_from_camera.rotation)
 

@@ -19,7 +19,7 @@ from mitsim.calibration.corner_noise import corner_noise
 from mitsim.calibration.simulated import SimulatedCorners, estimate
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.projector_light import LitPatterns
-from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.rig_parameters import parameter_differences
@@ -68,7 +68,9 @@ def corners(n10):
     found = {name: [] for name in rays}
     for pose in poses():
         for name in rays:
-            light = blurred(trace(scene, rays[name], white, pose, samples=36, seed=1)[0], n10.imager.blur_px)
+            light = blurred(
+                trace(scene, rays[name], white, pose, LightPaths(samples=36, seed=1))[0], n10.imager.blur_px
+            )
             electrons = light / np.percentile(light, 99.9) * 0.9 * n10.imager.full_well
             noisy = [
                 rng.poisson(electrons) + rng.normal(0, n10.imager.read_noise, electrons.shape) for _ in range(EXPOSURES)

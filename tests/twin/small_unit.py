@@ -14,8 +14,9 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.sensor_file import RoomTable
 from mitsim.sensor.transforms import Transform, look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
-from mitsim.twin.dots import DotsFit, fit_dots
+from mitsim.twin.dots import DotDraws, DotsFit, fit_dots
 from mitsim.twin.estimate import scaled
 from mitsim.twin.parameters import (
     FLUX,
@@ -112,7 +113,7 @@ def sheet():
 
 def capture_of(sensor: Sensor, seed: int) -> Capture:
     one = replace(sensor, rig=Rig({"left": sensor.rig.cameras["left"]}, sensor.rig.projector))
-    return SimulatedSensor(one).capture(sheet(), POSE, seed=seed, samples=16)
+    return SimulatedSensor(one).capture(sheet(), POSE, rendering=Rendering(samples=16), seed=seed)
 
 
 def parameters(smoothing: bool = False) -> list[Parameter]:
@@ -137,9 +138,7 @@ def standard_errors(seed: int, draws: int = 3) -> tuple[DotsFit, dict[str, float
         place(),
         parameters(),
         "unit",
-        seed=7 + seed,
-        draws=draws,
-        patch_px=PATCH_PX,
+        draws=DotDraws(draws, 7 + seed, PATCH_PX),
     )
     values, spreads = found.in_file_units()
     errors = {}

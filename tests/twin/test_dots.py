@@ -14,7 +14,7 @@ from small_unit import capture_of, place, small_sensor, standard_errors, unit
 
 from mitsim.errors import InputError
 from mitsim.fit.place import known_place
-from mitsim.twin.dots import fit_dots
+from mitsim.twin.dots import DotDraws, fit_dots
 from mitsim.twin.parameters import FLUX
 
 
@@ -33,7 +33,7 @@ def test_intervals_of_dots_hold_the_truth_as_often_as_they_say():
 def test_what_an_image_shows_is_found_whatever_the_file_says():
     """Power and room are wrong by a factor in the file, and come out near the truth."""
     truth = unit(7)
-    found = fit_dots(capture_of(truth, 7), small_sensor(), place(), [FLUX], "unit", seed=3, draws=1, patch_px=24)
+    found = fit_dots(capture_of(truth, 7), small_sensor(), place(), [FLUX], "unit", draws=DotDraws(1, 3, 24))
     values, spreads = found.in_file_units()
     assert found.parameters[0] is FLUX and spreads[0] > 0
     # full well, dots and corners are held at the file's, up to a third off: the power's share is what is left
@@ -45,4 +45,4 @@ def test_a_sheet_that_is_too_small_is_one_message():
     capture = capture_of(unit(1), 1)
     tiny = known_place(place().world_from_sensor, 30.0, 30.0)
     with pytest.raises(InputError, match=r"unit: specimen: found \d+ patches .* allowed: 8 or more"):
-        fit_dots(capture, small_sensor(), tiny, [FLUX], "unit", patch_px=24)
+        fit_dots(capture, small_sensor(), tiny, [FLUX], "unit", draws=DotDraws(patch_px=24))

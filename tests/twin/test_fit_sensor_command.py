@@ -16,6 +16,7 @@ from mitsim.errors import InputError
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.twin.run import sensor_path
 from mitsim.twin.sensor_text import Entry, moved_paths, with_cameras, with_entries, with_exposure
@@ -65,7 +66,7 @@ def recorded(tmp_path_factory):
     scene = scene_from_dict({"sheet": sheet}, preset.wavelength_nm)
     pose = look_at((0.0, 0.0, 500.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 0.0)
     simulated = SimulatedSensor(lit)
-    light = simulated.light(scene, pose, seed=1, samples=4)
+    light = simulated.light(scene, pose, rendering=Rendering(samples=4), seed=1)
     for number in range(3):
         write_capture(simulated.expose(light, 10 + number), folder / f"on_{number}")
     none = replace(light, radiance={name: 0 * values for name, values in light.radiance.items()})

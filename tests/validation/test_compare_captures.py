@@ -16,7 +16,9 @@ from mitsim.errors import InputError
 from mitsim.fit.electrons import linearised, pixel_noise
 from mitsim.fit.specimen import image_mask, specimen_place
 from mitsim.scene.test_targets import plate
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.validation import compare_captures as compare_module
 from mitsim.validation.captures_run import validate_captures
@@ -44,7 +46,9 @@ def taken(sensor, seed):
     corners = SIZE / 2 * np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)])
     around = pose(sensor).inverse().points(corners)
     scene = plate(SIZE, "matt white", sensor.wavelength_nm)
-    return SimulatedSensor(sensor).capture(scene, pose(sensor), seed=seed, samples=4, around=around)
+    return SimulatedSensor(sensor).capture(
+        scene, pose(sensor), rendering=Rendering(samples=4), seed=seed, around=around
+    )
 
 
 def as_recorded(capture):
@@ -126,7 +130,7 @@ def test_a_plate_is_found_where_it_stands(n10_module, place):
 
 
 def test_all_of_a_named_window_is_specimen(n10_module, real, place):
-    part = (250, 150, 200, 150)
+    part = Roi(250, 150, 200, 150)
     named = specimen_place(real, n10_module.settings, part, "real")
     mask = image_mask(named, real.rig.reference)
     wanted = np.zeros_like(mask)
@@ -271,8 +275,8 @@ def folder(real, tmp_path_factory):
     [
         ((None, None, None, None), r"--sensor: found none, and .* comes from MY-SENSOR"),
         ((None, "kinect-v2", None, None), "--sensor: technology: found kinect-v2 of time_of_flight"),
-        ((None, "ensenso-n10", (700, 0, 200, 100), None), r"--window: found \[700, 0, 200, 100\]"),
-        ((None, "ensenso-n10", (0, 0, 20, 20), None), r"--window: found 0 points in \[0, 0, 20, 20\]"),
+        ((None, "ensenso-n10", Roi(700, 0, 200, 100), None), r"--window: found \[700, 0, 200, 100\]"),
+        ((None, "ensenso-n10", Roi(0, 0, 20, 20), None), r"--window: found 0 points in \[0, 0, 20, 20\]"),
         (("itself", None, None, None), "source: found device; allowed: simulated"),
     ],
 )
@@ -296,7 +300,9 @@ def test_a_pair_of_which_nobody_says_whether_dots_were_on_is_asked_about(real):
 def test_a_capture_that_mitsim_rendered_needs_another_to_compare_with(n10_module, tmp_path):
     pose = look_at([0, 0, 500], [0, 0, 0], [0, 1, 0])
     around = 20.0 * np.array([[0, 0, 25], [1, 0, 25], [0, 1, 25]])
-    capture = SimulatedSensor(n10_module).capture(plate(80, "matt white", 850), pose, seed=1, samples=1, around=around)
+    capture = SimulatedSensor(n10_module).capture(
+        plate(80, "matt white", 850), pose, rendering=Rendering(samples=1), seed=1, around=around
+    )
     path = write_capture(capture, tmp_path / "ours")
     with pytest.raises(InputError, match=r"a simulation of mitsim; .* name SIMULATED"):
         validate_captures(path, None, tmp_path, None, None, None, 1)

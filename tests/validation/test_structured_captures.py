@@ -18,6 +18,8 @@ from mitsim.sensor.camera import Rig
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, patterns
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.roi import Roi
+from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.validation.captures_run import validate_captures
 from mitsim.validation.plain_image import plain_image
@@ -54,7 +56,7 @@ def recorded(sensor, pattern, flux=1.0):
     pose = coupon_pose(np.array([0.1, 0.0, 0.995]), DISTANCE, np.array([0, 0, 1.0]))
     corners = SIZE / 2 * np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)])
     around = pose.inverse().points(corners)
-    capture = taker.capture(plate(SIZE, "matt white", 550), pose, seed=1, samples=4, around=around)
+    capture = taker.capture(plate(SIZE, "matt white", 550), pose, rendering=Rendering(samples=4), seed=1, around=around)
     kept = {key: capture.settings[key] for key in ("exposure_s", "read_out", "pattern")}
     return replace(capture, source="device", settings=kept, world_from_sensor=None)
 
@@ -148,4 +150,4 @@ def test_a_window_without_a_plane_that_can_be_seen_is_one_message(david, folder,
     )
     monkeypatch.setattr(specimen, "capture_cloud", lambda *args, **kwargs: cloud)
     with pytest.raises(InputError, match=r"--window: found .* points are seen at grazing incidence; allowed: a plane"):
-        specimen.specimen_place(capture, david.settings, (20, 20, 300, 200), "real")
+        specimen.specimen_place(capture, david.settings, Roi(20, 20, 300, 200), "real")

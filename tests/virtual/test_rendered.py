@@ -10,14 +10,16 @@ from characterisation.documents import read_toml
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.scene.light_transport.room_light import directional_albedos
 from mitsim.scene.load import load_scene, share_kernels
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window
+from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.self_view import sees_itself
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.rig_parameters import moved
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.simulation.indirect_light import IndirectLight
-from mitsim.simulation.simulate import LaterLight, SimulatedSensor
+from mitsim.simulation.rendering import LaterLight, Rendering
+from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import StudyFile, open_study
 from mitsim.virtual.plan import measurements_of, trial_digest
 from mitsim.virtual.race import Job
@@ -131,9 +133,9 @@ def test_sharing_kernels_changes_no_image():
     pose = look_at((0.0, -300.0, 450.0), (0.0, 0.0, 20.0), (0.0, 0.0, 1.0))
     parameters = {"plane_Ra": "0.37", "pillar_Ra": "0.37"}
     plain, shared = (load_scene(SCENES / "two_pillars.xml", 850.0, parameters) for _ in range(2))
-    window = Window(300, 180, 120, 100)
+    window = Roi(300, 180, 120, 100)
     images = [
-        sensor.radiance(scene, pose, "left", seed=1, samples=4, depth=2, window=window)
+        sensor.radiance(scene, pose, "left", Rendering(samples=4, depth=2), seed=1, roi=window)
         for scene in (plain, share_kernels(shared))
     ]
     np.testing.assert_allclose(images[1], images[0], rtol=2e-3, atol=1e-3 * images[0].max())
@@ -144,13 +146,13 @@ def test_light_that_was_rendered_before_is_the_same_light():
     scene = load_scene(SCENES / "two_pillars.xml", 850.0, {"plane_Ra": "0.37", "pillar_Ra": "0.37"})
     pose = look_at((0.0, -300.0, 450.0), (0.0, 0.0, 20.0), (0.0, 0.0, 1.0))
     how = IndirectLight(4, 1.5)
-    at_once = sensor.light(scene, pose, seed=5, samples=4, depth=2, indirect=how)
+    at_once = sensor.light(scene, pose, rendering=Rendering(samples=4, depth=2, indirect=how), seed=5)
     images = {}
     for index, name in enumerate(sensor.sensor.rig.cameras):
         seed = int(np.random.SeedSequence([5, index]).spawn(3)[0].generate_state(1)[0])
         images[name] = sensor.later_light(scene, pose, name, how, seed=seed, depth=2)
     before = LaterLight(images, {name: sensor.rays[name].whole for name in images}, how, 2)
-    again = sensor.light(scene, pose, seed=5, samples=4, indirect=before)
+    again = sensor.light(scene, pose, rendering=Rendering(samples=4, indirect=before), seed=5)
     for name, image in at_once.radiance.items():
         np.testing.assert_allclose(again.radiance[name], image, rtol=1e-6, atol=1e-15)
 
@@ -173,11 +175,12 @@ def test_rays_of_a_moved_camera(name):
 def test_another_unit_has_another_fixed_pattern_of_the_same_size():
     sensor = SimulatedSensor(load_sensor("ensenso-n10"))
     other = sensor.moved(sensor.sensor.rig, unit=3)
-    for name, pattern in sensor.fixed.items():
-        assert not np.array_equal(other.fixed[name].offset, pattern.offset)
-        assert np.std(other.fixed[name].offset) == pytest.approx(np.std(pattern.offset))
-        assert abs(np.corrcoef(other.fixed[name].response.ravel(), pattern.response.ravel())[0, 1]) < 0.02
-    assert sensor.moved(sensor.sensor.rig).fixed is sensor.fixed
+    for name, patterns in sensor.units.items():
+        pattern, moved = patterns.fixed, other.units[name].fixed
+        assert not np.array_equal(moved.offset, pattern.offset)
+        assert np.std(moved.offset) == pytest.approx(np.std(pattern.offset))
+        assert abs(np.corrcoef(moved.response.ravel(), pattern.response.ravel())[0, 1]) < 0.02
+    assert sensor.moved(sensor.sensor.rig).units is sensor.units
 
 
 def test_a_path_that_is_read_too_long_moves_points_along_their_rays(fringes):

@@ -26,6 +26,8 @@ by disparity, where a block costs the same whatever its size.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -95,9 +97,8 @@ def correlate_both_ways(
         reach = settings.block_size // 2
         around = slice(max(chunk.start - reach, 0), min(chunk.stop + reach, height))
         inner = slice(chunk.start - around.start, chunk.stop - around.start)
-        return _match_disparities(
-            left[:, around], right[:, around], inner, columns, first, count, settings, noisy_right
-        )
+        search = _Search(columns, first, count)
+        return _match_disparities(left[:, around], right[:, around], inner, search, settings, noisy_right)
 
     parts = in_threads(part, range(0, height, rows))
     found, back = (np.concatenate(each) for each in zip(*parts, strict=True))
@@ -121,18 +122,21 @@ def _match_products(pair: Pair, rows: slice, uniqueness_percent: int, noisy_righ
     return _best(own, 2, pair.variance[rows], pair.lag[rows], uniqueness_percent, noisy_right), back
 
 
+@dataclass(frozen=True)
+class _Search:
+    """Left ``columns``, the first and one past the last, and the ``count`` disparities from ``first`` on to try."""
+
+    columns: tuple[int, int]
+    first: int
+    count: int
+
+
 def _match_disparities(
-    left: Floats,
-    right: Floats,
-    inner: slice,
-    columns: tuple[int, int],
-    first: int,
-    count: int,
-    settings: MatcherSettings,
-    noisy_right: bool,
+    left: Floats, right: Floats, inner: slice, search: _Search, settings: MatcherSettings, noisy_right: bool
 ) -> tuple[Floats, Floats]:
     """The same of strips (F, h, W), disparity by disparity, of their ``inner`` rows."""
-    (begin, end), block, frames = columns, settings.block_size, len(left)
+    (begin, end), first, count = search.columns, search.first, search.count
+    block, frames = settings.block_size, len(left)
     reach, blank = block // 2, np.float32(frames * BLANK_VARIANCE)
     # right pixels look for their partner left of `begin` and right of `end` too
     low, high = max(begin - count, 0), min(end + count, left.shape[2])

@@ -155,7 +155,7 @@ def decode_reference(
     Raises
     ------
     InputError
-        If the image is not what the calibration says, or the window does not lie in the grid.
+        If the image is not what the calibration says, or the region of interest does not lie in the grid.
     """
     stored = np.rint(geometry.reference * (_REFERENCE_LEVEL * context.full_scale)).astype(images.dtype)
     alone = replace(context, read_out=(context.read_out[0], None))

@@ -10,8 +10,8 @@ filtered or smoothed: the recovered fraction is that of the matcher. There is on
 and uniqueness: SGBM's smoothness term readily paints a disparity over a blank area, so a pixel whose block has less
 contrast than ``minimum_contrast_dn`` is no point, and its reason is ``LOW_MODULATION``.
 
-A window is matched with :data:`WINDOW_MARGIN_PX` around it. By correlation its points are those of the whole image up
-to its very edge; SGBM's smoothness carries what happens at the cut some pixels into it where the pattern is faint.
+A region of interest is matched with :data:`ROI_MARGIN_PX` around it. By correlation its points are those of the whole
+image up to its very edge; SGBM's smoothness lets the cut change points some pixels into it where the pattern is faint.
 """
 
 from __future__ import annotations
@@ -25,18 +25,20 @@ from numpy.typing import NDArray
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from mitsim.decode.grid_cloud import placed_cloud
 from mitsim.decode.image_context import ImageContext
+from mitsim.decode.interpolated import has_been_read, reach
 from mitsim.decode.matching.correlation import correlate_both_ways
 from mitsim.decode.matching.evidence import at_right, block_deviation, block_saturated, nearest_value, reasons
 from mitsim.decode.matching.sgbm import local_contrast, match_both_ways, search_range
-from mitsim.decode.roi import Window, checked_window, has_been_read, inside, placed_cloud, reach
 from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
 from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.roi import Roi, checked_roi
 
 Raw = NDArray[np.uint8] | NDArray[np.uint16]
 Strips = list[NDArray[Any]]
-#: pixels matched beyond a window on each side, so that SGBM's paths forget the cut before they reach it
-WINDOW_MARGIN_PX = 16
+#: pixels matched beyond a region of interest on each side, so that SGBM's paths forget the cut before they reach it
+ROI_MARGIN_PX = 16
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ def decode_stereo(
     settings
         Search range and limits of the matcher.
     context
-        Of the images; its ``window`` is one of the rectified left grid.
+        Of the images; its ``roi`` is one of the rectified left grid.
     noisy_right
         False where the right image is a reference without noise.
 
@@ -138,11 +140,11 @@ def decode_stereo(
     ------
     InputError
         If the images are not what the calibration says, the method takes one frame and there are several, or the
-        window does not lie in the grid.
+        region of interest does not lie in the grid.
     """
     geometry = rig if isinstance(rig, StereoGeometry) else stereo_geometry(rig)
     grid, rectification = geometry.grid, geometry.rectification
-    full_scale, window, read_out = context.full_scale, context.window, context.read_out
+    full_scale, roi, read_out = context.full_scale, context.roi, context.read_out
     left, right = (each[None] if each.ndim == 2 else each for each in (left, right))
     _check_images("left", left, geometry.raw_size[0], full_scale)
     _check_images("right", right, geometry.raw_size[1], full_scale)
@@ -155,12 +157,12 @@ def decode_stereo(
             allowed,
             'several frames are matched by method = "correlation"',
         )
-    if window is None and read_out[0] is not None:
-        window = shown_part(geometry, read_out[0])
-    column0, row0, column1, row1 = window = checked_window(window, grid.width, grid.height, "decode_stereo")
-    # the part to be matched: the window and a margin, whole rows of both images
-    begin, end = max(column0 - WINDOW_MARGIN_PX, 0), min(column1 + WINDOW_MARGIN_PX, grid.width)
-    rows = slice(max(row0 - WINDOW_MARGIN_PX, 0), min(row1 + WINDOW_MARGIN_PX, grid.height))
+    if roi is None and read_out[0] is not None:
+        roi = rectified_roi(geometry, read_out[0])
+    roi = checked_roi(roi, grid.width, grid.height, "decode_stereo")
+    # matched are the region and a margin, whole rows of both images
+    begin, end = max(roi.left - ROI_MARGIN_PX, 0), min(roi.right + ROI_MARGIN_PX, grid.width)
+    rows = slice(max(roi.top - ROI_MARGIN_PX, 0), min(roi.bottom + ROI_MARGIN_PX, grid.height))
 
     left_strips, left_full = _rectified(left, geometry.map_left[:, rows], full_scale, settings.method)
     right_strips, right_full = _rectified(right, geometry.map_right[:, rows], full_scale, settings.method)
@@ -216,28 +218,24 @@ def decode_stereo(
     ]
     status = reasons(valid, evidence, Status.AMBIGUOUS)
 
-    inner = (slice(row0 - rows.start, row1 - rows.start), slice(column0 - begin, column1 - begin))
-    points = _points(np.where(valid, depth, np.nan)[inner], column0, row0, grid)
-    return placed_cloud(points, status[inner], None, window, geometry, context.sensor, context.source)
+    inner = Roi(roi.left - begin, roi.top - rows.start, roi.width, roi.height).slices
+    points = _points(np.where(valid, depth, np.nan)[inner], roi, grid)
+    return placed_cloud(points, status[inner], None, roi, geometry, context.sensor, context.source)
 
 
-def shown_part(geometry: StereoGeometry, read_out: Window) -> Window | None:
-    """Window of the rectified left grid that holds what was read out of the raw left image; None if nothing is."""
-    shown = geometry.seen_left & _read(geometry.map_left, read_out, geometry.raw_size[0])
-    rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
-    if rows.size == 0:
-        return None
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+def rectified_roi(geometry: StereoGeometry, read_out: Roi) -> Roi | None:
+    """Return the region of the rectified left grid that a region of the raw left image fills; None if it fills none."""
+    return Roi.around(geometry.seen_left & _read(geometry.map_left, read_out, geometry.raw_size[0]))
 
 
-def _read(positions: NDArray[np.float32], read_out: Window, raw_size: tuple[int, int]) -> NDArray[np.bool_]:
+def _read(positions: NDArray[np.float32], read_out: Roi, raw_size: tuple[int, int]) -> NDArray[np.bool_]:
     return has_been_read(positions, read_out, raw_size[1], raw_size[0])
 
 
-def _points(depth: NDArray[np.float64], column0: int, row0: int, grid: ViewGrid) -> NDArray[np.float64]:
-    """Points (h, w, 3) in the sensor frame of depths (h, w) along the grid's axis, first pixel at (column0, row0)."""
-    x = (np.arange(column0, column0 + depth.shape[1]) - grid.cx) / grid.fx
-    y = (np.arange(row0, row0 + depth.shape[0]) - grid.cy) / grid.fy
+def _points(depth: NDArray[np.float64], roi: Roi, grid: ViewGrid) -> NDArray[np.float64]:
+    """Points (h, w, 3) in the sensor frame of the depths (h, w) of a region, along the grid's axis."""
+    x = (np.arange(roi.left, roi.right) - grid.cx) / grid.fx
+    y = (np.arange(roi.top, roi.bottom) - grid.cy) / grid.fy
     local = np.stack([x[None, :] * depth, y[:, None] * depth, depth], axis=-1)
     return local @ grid.rotation.T + grid.origin
 
@@ -260,10 +258,10 @@ def _rectifying_map(
     return np.stack([column, row]), unfolded & exists
 
 
-def _centred(strips: Strips, raw: Raw, read_out: Window | None, full_scale: float) -> NDArray[np.float32]:
-    """Strips (F, h, W) less the mean of each raw frame, or of what was read out of it, whatever part the strips are."""
-    part = raw if read_out is None else raw[:, *inside(read_out)]
-    mean = part.mean(axis=(1, 2)) * (255.0 / full_scale)
+def _centred(strips: Strips, raw: Raw, read_out: Roi | None, full_scale: float) -> NDArray[np.float32]:
+    """Strips (F, h, W) less the mean of each whole raw frame, or of what was read out of it."""
+    seen = raw if read_out is None else raw[:, *read_out.slices]
+    mean = seen.mean(axis=(1, 2)) * (255.0 / full_scale)
     return np.asarray(np.stack(strips) - mean.astype(np.float32)[:, None, None])
 
 
@@ -282,9 +280,9 @@ def _rectified(
     """
     strips: Strips = []
     blown = []
-    column, row, right, bottom = reach(positions, raw.shape[2], raw.shape[1])
-    positions = positions - np.array([column, row], np.float32)[:, None, None]  # exact: they are whole numbers
-    for frame in raw[:, row:bottom, column:right]:
+    needed = reach(positions, raw.shape[2], raw.shape[1])
+    positions = positions - np.array([needed.left, needed.top], np.float32)[:, None, None]  # exact: whole numbers
+    for frame in raw[:, *needed.slices]:
         full = frame >= full_scale
         shown = np.zeros(positions.shape[1:], np.uint8)
         blown.append(_remapped(full.astype(np.uint8) * np.uint8(255), positions) if full.any() else shown)

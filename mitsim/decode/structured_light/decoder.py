@@ -7,8 +7,8 @@ and the noise along the ray to expect.
 Nothing is rectified or undistorted before the phase is known: interpolated images have blurred phases. The rays are
 those of the camera as it is, so the cloud's grid carries them (:class:`ViewGrid`, ``normalised``).
 
-Every pixel is decoded from its own grey levels, so a window may be decoded alone, up to its very edge. Only a gamma
-that is estimated from the images (``correct_gamma``) is then one of the window.
+Every pixel is decoded from its own grey levels, so a region of interest may be decoded alone, up to its very edge. Only
+a gamma estimated from the images (``correct_gamma``) is then that of the region.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.decode.blocks import in_blocks
 from mitsim.decode.grey_levels import MeasuredNoise
+from mitsim.decode.grid_cloud import placed_cloud
 from mitsim.decode.image_context import ImageContext
-from mitsim.decode.roi import checked_window, inside, placed_cloud
 from mitsim.decode.structured_light.geometry import StructuredLightGeometry, evaluate, structured_light_geometry
 from mitsim.decode.structured_light.gray_code import decode_gray_code, decode_gray_code_phase_shift
 from mitsim.decode.structured_light.image_sequence import decode_image_sequence
@@ -33,6 +33,7 @@ from mitsim.sensor.image_role import Axis
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import GrayCode, LightCode, PhaseShift, axes
+from mitsim.sensor.roi import checked_roi
 
 
 def decode_coordinates(
@@ -89,7 +90,7 @@ def decode_structured_light(
     settings
         Range and limits.
     context
-        Of the images; its ``window`` is one of the image. ``read_out`` is not used.
+        Of the images; its ``roi`` is one of the image. ``read_out`` is not used.
 
     Returns
     -------
@@ -102,7 +103,7 @@ def decode_structured_light(
     Raises
     ------
     InputError
-        If the images are not what code and calibration say, or the window does not lie in them.
+        If the images are not what code and calibration say, or the region of interest does not lie in them.
     """
     if isinstance(rig, StructuredLightGeometry):
         geometry = rig
@@ -117,8 +118,8 @@ def decode_structured_light(
     eye, projector = geometry.camera, geometry.projector
     if stack.shape[1:] != (eye.height, eye.width):
         raise InputError(f"images of {camera}", "shape", stack.shape, f"(images, {eye.height}, {eye.width})")
-    window = checked_window(context.window, eye.width, eye.height, "decode_structured_light")
-    part = inside(window)
+    roi = checked_roi(context.roi, eye.width, eye.height, "decode_structured_light")
+    part = roi.slices
     found = decode_coordinates(
         np.ascontiguousarray(stack[:, *part]),
         code,
@@ -139,7 +140,7 @@ def decode_structured_light(
     missing = status != Status.VALID
     points[missing], sigma[missing] = np.nan, np.nan
     told = sigma if np.isfinite(sigma).any() else None
-    return placed_cloud(points, status, told, window, geometry, context.sensor, context.source)
+    return placed_cloud(points, status, told, roi, geometry, context.sensor, context.source)
 
 
 def _points(

@@ -223,23 +223,28 @@ def decode_gray_code_phase_shift(
     return decode_gray_fringes(
         stack,
         every,
-        code.axis,
-        stripes(code, extent)[1],
+        CodedAxis(code.axis, extent, stripes(code, extent)[1]),
         fringes,
-        extent,
         settings,
         full_scale=full_scale,
         imager=imager,
     )
 
 
+@dataclass(frozen=True)
+class CodedAxis:
+    """An axis of the projector: ``extent`` pixels along it, ``stripe`` width of the finest stripe [projector px]."""
+
+    axis: Axis
+    extent: int
+    stripe: float
+
+
 def decode_gray_fringes(
     stack: NDArray[np.generic],
     every: list[Role],
-    axis: Axis,
-    stripe: float,
+    along: CodedAxis,
     fringes: Fringes,
-    extent: int,
     settings: DecoderSettings,
     *,
     full_scale: float,
@@ -258,11 +263,8 @@ def decode_gray_fringes(
     stack, every
         (P, H, W) raw images [DN] of one camera and their roles; those of the other axis are left out of account, and
         the fringes come period after period, the longest first.
-    stripe
-        Width of the finest stripe [projector px].
-    extent
-        Pixels of the projector along ``axis``.
     """
+    axis, extent, stripe = along.axis, along.extent, along.stripe
     own = [index for index, role in enumerate(every) if role.kind == "phase" and role.axis == axis]
     images = stack[own[0] : own[-1] + 1] if own == list(range(own[0], own[-1] + 1)) else stack[own]
     phases = fit_phases(images, fringes.shifts)

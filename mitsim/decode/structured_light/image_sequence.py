@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mitsim.decode.grey_levels import MeasuredNoise, check_full_scale
 from mitsim.decode.structured_light.gray_code import (
+    CodedAxis,
     between_stripes,
     decode_gray_fringes,
     decode_stripes,
@@ -75,8 +76,9 @@ def decode_image_sequence(
             continue
         stripe = gray[0].stripes(extent)[1]
         if groups:
+            along = CodedAxis(axis, extent, stripe)
             out[axis] = decode_gray_fringes(
-                images, part, axis, stripe, fringes, extent, settings, full_scale=full_scale, imager=imager
+                images, part, along, fringes, settings, full_scale=full_scale, imager=imager
             )
         else:
             found = decode_stripes(images, part, axis, settings.bit_share)

@@ -17,8 +17,8 @@ The noise of a disparity is that of the two coordinates that are set equal, over
 an interpolated coordinate is a weighted mean of some, so g is the sum of the squares of their weights: four pixels on
 the left; on the right those of two neighbouring rectified pixels, some of which are the same.
 
-A window is decoded up to its very edge, with the whole of its rows on the right: what a row shows twice is ambiguous
-wherever it shows it.
+A region of interest is decoded up to its very edge, with whole rows on the right: a coordinate that a row shows twice
+is ambiguous wherever the row shows it.
 """
 
 from __future__ import annotations
@@ -31,14 +31,16 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
+from mitsim.decode.grid_cloud import placed_cloud
 from mitsim.decode.image_context import ImageContext
-from mitsim.decode.matching.stereo import StereoGeometry, shown_part, stereo_geometry
-from mitsim.decode.roi import Window, checked_window, has_been_read, inside, overlap, placed_cloud, reach
+from mitsim.decode.interpolated import has_been_read, reach
+from mitsim.decode.matching.stereo import StereoGeometry, rectified_roi, stereo_geometry
 from mitsim.decode.structured_light.decoder import decode_coordinates
 from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import LightCode, axes, has_fringes
+from mitsim.sensor.roi import Roi, checked_roi
 
 #: neighbours whose coordinates differ by more than this [projector px] lie on the two sides of an edge
 LARGEST_STEP_PX = 8.0
@@ -66,7 +68,7 @@ def decode_structured_light_stereo(
     projector_size
         Width and height of the pattern [px].
     context
-        Of the images; its ``window`` is one of the rectified left grid.
+        Of the images; its ``roi`` is one of the rectified left grid.
 
     Returns
     -------
@@ -79,35 +81,37 @@ def decode_structured_light_stereo(
     Raises
     ------
     InputError
-        If the code does not run along the columns, the images are not what code and calibration say, or the window
-        does not lie in the grid.
+        If the code does not run along the columns, the images are not what code and calibration say, or the region
+        of interest does not lie in the grid.
     """
     if "columns" not in axes(code):
         raise InputError(
             "pattern", "axis", ", ".join(axes(code)), "'columns' or 'both', for cameras that stand side by side"
         )
     geometry = rig if isinstance(rig, StereoGeometry) else stereo_geometry(rig)
-    window, read_out = context.window, context.read_out
+    roi, read_out = context.roi, context.read_out
     for name, stack, size in zip(("left", "right"), (left, right), geometry.raw_size, strict=True):
         if stack.shape[1:] != size:
             raise InputError(f"{name} images", "shape", stack.shape, f"(images, {size[0]}, {size[1]})")
     grid, rectification = geometry.grid, geometry.rectification
-    if window is None and read_out[0] is not None:
-        window = shown_part(geometry, read_out[0])
-    window = checked_window(window, grid.width, grid.height, "decode_structured_light_stereo")
-    part = rows, columns = inside(window)
+    if roi is None and read_out[0] is not None:
+        roi = rectified_roi(geometry, read_out[0])
+    roi = checked_roi(roi, grid.width, grid.height, "decode_structured_light_stereo")
+    part = rows, columns = roi.slices
 
-    def eye(stack: NDArray[np.generic], positions: NDArray[np.float32], region: Window | None) -> _Eye:
-        whole = (0, 0, stack.shape[2], stack.shape[1])
-        asked = overlap(reach(positions, *whole[2:]), region or whole)
-        if asked is None:
+    def eye(stack: NDArray[np.generic], positions: NDArray[np.float32], region: Roi | None) -> _Eye:
+        size = stack.shape[2], stack.shape[1]
+        region = region or Roi.whole(*size)
+        needed = reach(positions, *size).overlap(region)
+        if needed is None:
             return _Eye.blind(positions)
-        images = np.ascontiguousarray(stack[:, *inside(asked)])
+        images = np.ascontiguousarray(stack[:, *needed.slices])
         found = decode_coordinates(
             images, code, projector_size, settings, full_scale=context.full_scale, imager=context.imager, between=True
         )
-        seen = has_been_read(positions, region or whole, *whole[2:])
-        return _Eye.of(found["columns"], positions - np.array(asked[:2], np.float32)[:, None, None], seen)
+        seen = has_been_read(positions, region, *size)
+        first = np.array([needed.left, needed.top], np.float32)[:, None, None]
+        return _Eye.of(found["columns"], positions - first, seen)
 
     # whole rows on the right: a coordinate may lie anywhere in them
     at_left = eye(left, geometry.map_left[:, *part], read_out[0])
@@ -126,7 +130,7 @@ def decode_structured_light_stereo(
     status = np.where(found, np.where(in_range, np.uint8(Status.VALID), np.uint8(Status.OUT_OF_RANGE)), status)
     status[several] = Status.AMBIGUOUS
     status[~(geometry.seen_left[part] & at_left.seen)] = Status.NO_SURFACE
-    along, down = np.meshgrid(np.arange(columns.start, columns.stop), np.arange(rows.start, rows.stop))
+    along, down = roi.pixels()
     local = grid.rays_at(along, down) @ grid.rotation
     points = (local / local[..., 2:] * depth[..., None]) @ grid.rotation.T + grid.origin
     sigma = None
@@ -135,7 +139,7 @@ def decode_structured_light_stereo(
         sigma = _disparity_noise(place, at_left, at_right, u_right) * reach_mm
         sigma[status != Status.VALID] = np.nan
     points[status != Status.VALID] = np.nan
-    return placed_cloud(points, status, sigma, window, geometry, context.sensor, context.source)
+    return placed_cloud(points, status, sigma, roi, geometry, context.sensor, context.source)
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,9 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport.low_discrepancy import evenly, z_order
 from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
 from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window, pixel_area
+from mitsim.scene.ray_casting.camera_rays import CameraRays, pixel_area
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 #: photons in one launch; each takes 24 bytes for every surface after its first
@@ -72,20 +73,20 @@ def add_photons(
     light: Light,
     world_from_sensor: Transform,
     photons: Photons,
-    window: Window,
+    roi: Roi,
 ) -> None:
     """Add to ``images`` what photons bring of light that has met 2 to ``photons.depth`` surfaces.
 
     Parameters
     ----------
     images
-        (P, height, width) of the window [W / (mm^2 sr)]. Photons do not depend on the window: each pixel gets what it
-        gets in the whole image.
+        (P, height, width) of the region [W / (mm^2 sr)]. Photons do not depend on the region: each pixel gets the same
+        light as in the whole image.
     """
-    sums = np.zeros((light.codes, window.height * window.width))
+    sums = np.zeros((light.codes, roi.height * roi.width))
     for first in range(0, photons.count, LARGEST_LAUNCH):
         some = range(first, min(first + LARGEST_LAUNCH, photons.count))
-        pixel, radiance, uv, length = _launch(scene, rays, light, world_from_sensor, photons, some, window)
+        pixel, radiance, uv, length = _launch(scene, rays, light, world_from_sensor, photons, some, roi)
         if not len(pixel):
             continue
         values = light.values(uv, length, mi.Bool(True))
@@ -107,9 +108,9 @@ def _launch(
     world_from_sensor: Transform,
     photons: Photons,
     some: range,
-    window: Window,
+    roi: Roi,
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], Any, Any]:
-    """What ``some`` of the photons bring to a window, in order: its pixels, radiance, (u, v), L."""
+    """Follow ``some`` of the photons to a region; return in their order its pixels, radiance, (u, v), L."""
     first, count, depth, seed = some.start, len(some), photons.depth, photons.seed
     camera = Eye(world_from_sensor @ rays.camera.sensor_from_camera)
     lamp = ProjectorLight(world_from_sensor, light.projector, scene.bounds)
@@ -131,23 +132,23 @@ def _launch(
     pixels, radiances = dr.zeros(mi.UInt32, count * records), dr.zeros(mi.Float, count * records)
     lengths = dr.zeros(mi.Float, count * records)
     slot = dr.arange(mi.UInt32, count) * records
-    state = (
-        flux > 0,
-        mi.UInt32(dr.zeros(mi.UInt32, count)),
-        mi.Point3f(origin + dr.zeros(mi.Point3f, count)),
-        direction,
-        mi.Float(flux),
-        dr.zeros(mi.Float, count),
-        dr.zeros(mi.Float, count),
-        random,
+    sent = _Flight(
+        active=flux > 0,
+        bounce=mi.UInt32(dr.zeros(mi.UInt32, count)),
+        origin=mi.Point3f(origin + dr.zeros(mi.Point3f, count)),
+        direction=direction,
+        weight=mi.Float(flux),
+        odds=dr.zeros(mi.Float, count),
+        length=dr.zeros(mi.Float, count),
+        random=random,
     )
 
-    def running(active: Any, *_: Any) -> Any:
-        return active
+    def running(flight: _Flight) -> Any:
+        return flight.active
 
-    def step(
-        active: Any, bounce: Any, origin: Any, direction: Any, weight: Any, odds: Any, length: Any, random: Any
-    ) -> Any:
+    def step(flight: _Flight) -> tuple[_Flight]:
+        active, bounce, origin, direction = flight.active, flight.bounce, flight.origin, flight.direction
+        weight, odds, length, random = flight.weight, flight.odds, flight.length, flight.random
         # odds: n_C p_C over n_L p_L of the surfaces so far, but for what the next direction will tell
         fresh = bounce == 0
         surface = scene.mitsuba.ray_intersect(mi.Ray3f(origin, direction), active)
@@ -205,17 +206,14 @@ def _launch(
         weight = weight * reflected * outward / (further.pdf * inward)
         odds = odds * dr.select(fresh, 1.0, onward) * outward / further.pdf
         ray = surface.spawn_ray(away)
-        return alive, bounce + 1, ray.o, ray.d, weight, odds, length, random
+        return (_Flight(alive, bounce + 1, ray.o, ray.d, weight, odds, length, random),)
 
-    labels = ("active", "bounce", "origin", "direction", "weight", "odds", "length", "random")
-    dr.while_loop(state, running, step, labels=labels, label="photons")
+    dr.while_loop((sent,), running, step, labels=("flight",), label="photons")
     dr.eval(pixels, radiances, lengths, uv)
-    left, top, width, height = (
-        dr.opaque(mi.UInt32, n) for n in (window.column, window.row, window.width, window.height)
-    )
+    left, top, width, height = (dr.opaque(mi.UInt32, n) for n in (roi.left, roi.top, roi.width, roi.height))
     column, row = pixels % rays.camera.width - left, pixels // rays.camera.width - top
-    in_window = (column < width) & (row < height)  # unsigned: what is before it is far behind it
-    kept = dr.compress((radiances > 0) & in_window)
+    inside = (column < width) & (row < height)  # unsigned: pixels before the region become very large
+    kept = dr.compress((radiances > 0) & inside)
     if not len(kept):
         return np.empty(0, np.int32), np.empty(0), uv, lengths
     place = mi.Int32(dr.gather(mi.UInt32, row * width + column, kept))
@@ -223,6 +221,24 @@ def _launch(
     uv = dr.gather(mi.Point2f, uv, kept // records)
     dr.eval(place, radiance, length, uv)
     return np.asarray(place), np.asarray(radiance, np.float64), uv, length
+
+
+@dataclass
+class _Flight:
+    """State of the photons of one launch, a lane each, as Dr.Jit's loop carries it.
+
+    ``active`` until a photon ends; ``bounce`` it is at; ``origin`` and ``direction`` of the next ray; ``weight`` of its
+    light; ``odds`` of paths of the camera against photons; optical ``length`` so far; ``random`` numbers.
+    """
+
+    active: Any
+    bounce: Any
+    origin: Any
+    direction: Any
+    weight: Any
+    odds: Any
+    length: Any
+    random: Any
 
 
 def _toward_lamp(bsdf: Any, surface: Any, outgoing: Any, lampward: Any, active: Any) -> tuple[Any, Any]:

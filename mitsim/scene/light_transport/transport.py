@@ -33,8 +33,9 @@ from mitsim.scene.light_transport.low_discrepancy import evenly, z_order
 from mitsim.scene.light_transport.plain_scene import lone_bsdf, lone_plane, meet
 from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
 from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.camera_rays import CameraRays, Window, between, pixel_area
+from mitsim.scene.ray_casting.camera_rays import CameraRays, between, pixel_area
 from mitsim.scene.ray_casting.eye import Eye
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 #: floats that the images of one launch may fill; a larger capture is traced in bands of rows. 64 MiB, and the device
@@ -48,21 +49,58 @@ PHOTONS_PER_SAMPLE = 0.25
 _CERTAIN = 1e30
 
 
+@dataclass(frozen=True)
+class LightPaths:
+    """Which light paths :func:`trace` follows.
+
+    Attributes
+    ----------
+    samples
+        Per pixel; rounded up to a square number, because they stand on a raster.
+    seed
+        Of the directions of later bounces, and of the jitter; give every camera and pose its own.
+    depth
+        Surfaces on a light path: 1 is direct light, 3 adds two interreflections.
+    jitter
+        Place the samples at random within their cells and lenses, rather than at fixed places.
+    photons
+        That the projector sends for light of two and more surfaces; by default in proportion to the samples of the
+        *whole* image, whatever the region; rounded up to a square number. 0 leaves all of it to paths from the camera.
+    only_later
+        Leave out direct light, and render light that has met two surfaces or more, on the same paths.
+    with_ambient
+        Give one more image, the last: the light of the scene's own emitters alone, with the projector off.
+    """
+
+    samples: int
+    seed: int
+    depth: int = 1
+    jitter: bool = False
+    photons: int | None = None
+    only_later: bool = False
+    with_ambient: bool = False
+
+    @property
+    def side(self) -> int:
+        """Samples along one side of a pixel's raster."""
+        return int(np.ceil(np.sqrt(self.samples)))
+
+    def sent(self, pixels: int) -> int:
+        """Photons to send for an image of so many pixels; a square number."""
+        if self.depth == 1:
+            return 0
+        photons = int(PHOTONS_PER_SAMPLE * self.side**2 * pixels) if self.photons is None else self.photons
+        return int(np.ceil(np.sqrt(photons))) ** 2
+
+
 def trace(
     scene: Scene,
     rays: CameraRays,
     light: Light,
     world_from_sensor: Transform,
-    *,
-    samples: int,
-    seed: int,
-    depth: int = 1,
-    window: Window | None = None,
-    jitter: bool = False,
-    with_ambient: bool = False,
+    paths: LightPaths,
+    roi: Roi | None = None,
     shift: NDArray[np.floating] | None = None,
-    photons: int | None = None,
-    only_later: bool = False,
 ) -> NDArray[np.float32]:
     """Radiance that one camera sees in each image of a capture.
 
@@ -71,62 +109,31 @@ def trace(
     light
         The projector with its codes: :class:`~mitsim.scene.light_transport.projector_light.LitPatterns` or
         :class:`~mitsim.scene.light_transport.projector_light.ModulatedLight`.
-    samples
-        Per pixel; rounded up to a square number, because they stand on a raster.
-    seed
-        Of the directions of later bounces, and of the jitter; give every camera and pose its own.
-    depth
-        Surfaces on a light path: 1 is direct light, 3 adds two interreflections.
-    window
-        Trace only this part of the image. Its pixels come out as they would in the whole image.
-    jitter
-        Place the samples at random within their cells and lenses, rather than at fixed places.
-    with_ambient
-        Give one more image, the last: the light of the scene's own emitters alone, with the projector off.
+    roi
+        Trace only this region of the image. Its pixels come out as they would in the whole image.
     shift
-        (2, height, width) [rad] of the window, along the camera's x and y: how far beside the surface point, seen from
+        (2, height, width) [rad] of the region, along the camera's x and y: how far beside the surface point, seen from
         the camera, its direct light is read from the code. Speckle does that.
-    photons
-        That the projector sends for light of two and more surfaces; by default in proportion to the samples of the
-        *whole* image, whatever the window; rounded up to a square number. 0 leaves all of it to paths from the camera.
-    only_later
-        Leave out direct light, and render what has met two surfaces or more, on the same paths.
 
     Returns
     -------
     numpy.ndarray
-        (P, height, width), or (P + 1, height, width), of the window, float32 [W / (mm^2 sr)].
+        (P, height, width), or (P + 1, height, width), of the region, float32 [W / (mm^2 sr)].
     """
-    window = window or rays.whole
-    side = int(np.ceil(np.sqrt(samples)))
-    if photons is None:
-        photons = int(PHOTONS_PER_SAMPLE * side**2 * rays.camera.width * rays.camera.height)
-    photons = int(np.ceil(np.sqrt(photons))) ** 2 if depth > 1 else 0
-    images = np.empty((light.count + with_ambient, window.height, window.width), np.float32)
-    paths = _Paths(side, depth, seed, jitter, photons, only_later)
-    rows = max(1, LARGEST_LAUNCH // (window.width * (light.count + 1)))
-    for first in range(0, window.height, rows):
-        band = Window(window.column, window.row + first, window.width, min(rows, window.height - first))
+    roi = roi or rays.whole
+    photons = paths.sent(rays.camera.width * rays.camera.height)
+    images = np.empty((light.count + paths.with_ambient, roi.height, roi.width), np.float32)
+    rows = max(1, LARGEST_LAUNCH // (roi.width * (light.count + 1)))
+    for first in range(0, roi.height, rows):
+        band = Roi(roi.left, roi.top + first, roi.width, min(rows, roi.height - first))
         moved = None if shift is None else shift[:, first : first + band.height]
         traced = _launch(scene, rays, light, world_from_sensor, paths, band, moved)
         for image, values in zip(images, traced, strict=False):  # the ambient image is the last, wanted or not
             image[first : first + band.height] = np.asarray(values).reshape(band.height, band.width)
     if photons:
-        sent = Photons(photons, depth, seed, side**2)
-        add_photons(images[: light.count], scene, rays, light, world_from_sensor, sent, window)
+        sent = Photons(photons, paths.depth, paths.seed, paths.side**2)
+        add_photons(images[: light.count], scene, rays, light, world_from_sensor, sent, roi)
     return images
-
-
-@dataclass(frozen=True)
-class _Paths:
-    """Which paths :func:`trace` follows from each pixel: ``side * side`` of them; the rest as there."""
-
-    side: int
-    depth: int
-    seed: int
-    jitter: bool
-    photons: int
-    only_later: bool
 
 
 def _launch(
@@ -134,20 +141,21 @@ def _launch(
     rays: CameraRays,
     light: Light,
     world_from_sensor: Transform,
-    paths: _Paths,
-    window: Window,
+    paths: LightPaths,
+    roi: Roi,
     shift: NDArray[np.floating] | None,
 ) -> list[Any]:
-    """All images, and the ambient one, of a window, as arrays on the device; one kernel."""
-    side, depth, seed, jitter, photons = paths.side, paths.depth, paths.seed, paths.jitter, paths.photons
+    """All images, and the ambient one, of a region, as arrays on the device; one kernel."""
+    side, depth, seed, jitter = paths.side, paths.depth, paths.seed, paths.jitter
+    photons = paths.sent(rays.camera.width * rays.camera.height)
     camera = Eye(world_from_sensor @ rays.camera.sensor_from_camera)
     lamp = ProjectorLight(world_from_sensor, light.projector, scene.bounds)
 
-    count = window.width * window.height
+    count = roi.width * roi.height
     index = dr.arange(mi.UInt32, count)
-    width = dr.opaque(mi.UInt32, window.width)
-    column = index % width + dr.opaque(mi.UInt32, window.column)
-    row = index // width + dr.opaque(mi.UInt32, window.row)
+    width = dr.opaque(mi.UInt32, roi.width)
+    column = index % width + dr.opaque(mi.UInt32, roi.left)
+    row = index // width + dr.opaque(mi.UInt32, roi.top)
     pixel = row * rays.camera.width + column
     x, y = rays.corners(column, row)
     displacement = None if shift is None else _displacement(shift, camera, index)
@@ -166,34 +174,25 @@ def _launch(
     rival = dr.opaque(mi.Float, photons / side**2)
     area = pixel_area(x, y)
     sums = [dr.zeros(mi.Float, count) for _ in range(light.codes + 1)]  # the last: ambient light
-    state = (
-        mi.UInt32(dr.zeros(mi.UInt32, count)),
-        mi.UInt32(dr.zeros(mi.UInt32, count)),
-        dr.zeros(mi.Point3f, count),
-        dr.zeros(mi.Vector3f, count),
-        dr.ones(mi.Float, count),
-        dr.ones(mi.Float, count),
-        dr.zeros(mi.Float, count),
-        dr.zeros(mi.Float, count),
-        random,
-        sums,
+    start_of_all = _Path(
+        sample=mi.UInt32(dr.zeros(mi.UInt32, count)),
+        bounce=mi.UInt32(dr.zeros(mi.UInt32, count)),
+        origin=dr.zeros(mi.Point3f, count),
+        direction=dr.zeros(mi.Vector3f, count),
+        weight=dr.ones(mi.Float, count),
+        pdf=dr.ones(mi.Float, count),
+        length=dr.zeros(mi.Float, count),
+        odds=dr.zeros(mi.Float, count),
+        random=random,
+        sums=sums,
     )
 
-    def running(sample: Any, *_: Any) -> Any:
-        return sample < total
+    def running(path: _Path) -> Any:
+        return path.sample < total
 
-    def step(
-        sample: Any,
-        bounce: Any,
-        origin: Any,
-        direction: Any,
-        weight: Any,
-        pdf: Any,
-        length: Any,
-        odds: Any,
-        random: Any,
-        sums: Any,
-    ) -> Any:
+    def step(path: _Path) -> tuple[_Path]:
+        sample, bounce, origin, direction = path.sample, path.bounce, path.origin, path.direction
+        weight, pdf, length, odds, random, sums = path.weight, path.pdf, path.length, path.odds, path.random, path.sums
         # a lane at bounce 0 begins a path in the next cell of its pixel's side x side raster
         fresh = bounce == 0
         a = 0.5 + stretch * ((mi.Float(sample % side) + (random.next_float32() if jitter else 0.5)) / side - 0.5)
@@ -240,7 +239,7 @@ def _launch(
         sums = [s + a for s, a in zip(sums, [*added, ambient if lit_by_author else 0.0], strict=True)]
 
         if depth == 1 and not lit_by_author:
-            return sample + 1, bounce, origin, direction, weight, pdf, length, odds, random, sums
+            return (_Path(sample + 1, bounce, origin, direction, weight, pdf, length, odds, random, sums),)
         pick, place = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
         if not jitter:  # the first bounce decides most of what is left
             first, where = evenly(order * total + sample, shuffle, 0)
@@ -255,26 +254,48 @@ def _launch(
             narrow = mi.has_flag(further.sampled_type, mi.BSDFFlags.Delta)
             odds *= dr.select(narrow, 0.0, back * dr.abs(dr.dot(surface.n, onward.d)) / further.pdf)
             odds = dr.select(alive, dr.minimum(odds, _CERTAIN), 0.0)
-        return (
-            dr.select(alive, sample, sample + 1),
-            dr.select(alive, bounce + 1, 0),
-            dr.select(alive, onward.o, origin),
-            dr.select(alive, onward.d, direction),
-            dr.select(alive, weight * factor[0], 1.0),
-            further.pdf,
-            length,
-            odds,
-            random,
-            sums,
+        onward_path = _Path(
+            sample=dr.select(alive, sample, sample + 1),
+            bounce=dr.select(alive, bounce + 1, 0),
+            origin=dr.select(alive, onward.o, origin),
+            direction=dr.select(alive, onward.d, direction),
+            weight=dr.select(alive, weight * factor[0], 1.0),
+            pdf=further.pdf,
+            length=length,
+            odds=odds,
+            random=random,
+            sums=sums,
         )
+        return (onward_path,)
 
-    labels = ("sample", "bounce", "origin", "direction", "weight", "pdf", "length", "odds", "random", "sums")
-    *_, sums = dr.while_loop(state, running, step, labels=labels, label="transport")
+    (ended,) = dr.while_loop((start_of_all,), running, step, labels=("path",), label="transport")
+    sums = ended.sums
     scale = dr.opaque(mi.Float, 1.0 / (side * side))
     *code_sums, ambient_sum = sums
     images = [(s + ambient_sum) * scale for s in light.images(code_sums)] + [ambient_sum * scale]
     dr.eval(images)  # all at once: one kernel, whatever the number of images
     return images
+
+
+@dataclass
+class _Path:
+    """State of the light paths of one launch, a lane per pixel, as Dr.Jit's loop carries it.
+
+    ``sample`` of the pixel, ``bounce`` on its path; ``origin`` and ``direction`` of the next ray; ``weight`` of its
+    light; ``pdf`` of its direction; optical ``length`` so far; ``odds`` of photons against paths of the camera;
+    ``random`` numbers; ``sums`` of the light of each code, the last of ambient light.
+    """
+
+    sample: Any
+    bounce: Any
+    origin: Any
+    direction: Any
+    weight: Any
+    pdf: Any
+    length: Any
+    odds: Any
+    random: Any
+    sums: Any
 
 
 def _toward_camera(bsdf: Any, surface: Any, lampward: Any, active: Any) -> Any:
@@ -306,7 +327,7 @@ class _Pupils:
 
 
 def _displacement(shift: NDArray[np.floating], camera: Eye, index: Any) -> Any:
-    """Displacement of the code in the world for each pixel of a window, per distance from the camera [rad]."""
+    """Displacement of the code in the world for each pixel of a region, per distance from the camera [rad]."""
     # gathered, not loaded: a kernel that loads is compiled anew for each alignment that an array of NumPy may have
     along = mi.Float(np.ravel(shift).astype(np.float32))
     below = index + dr.opaque(mi.UInt32, shift[0].size)

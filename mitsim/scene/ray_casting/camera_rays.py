@@ -24,24 +24,10 @@ from mitsim.errors import InputError
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.ray_casting.distortion import Distortion
 from mitsim.sensor.camera import Camera
+from mitsim.sensor.roi import Roi
 
 #: spacing of the raster on which the rays of two calibrations are compared [px]
 _RASTER_PX = 8
-
-
-@dataclass(frozen=True)
-class Window:
-    """Part of an image: columns ``column`` to ``column + width``, rows ``row`` to ``row + height`` [px]."""
-
-    column: int
-    row: int
-    width: int
-    height: int
-
-    @property
-    def inside(self) -> tuple[slice, slice]:
-        """Rows and columns of the part, to index an image (H, W) with."""
-        return slice(self.row, self.row + self.height), slice(self.column, self.column + self.width)
 
 
 class CameraRays:
@@ -86,9 +72,9 @@ class CameraRays:
         return other
 
     @property
-    def whole(self) -> Window:
+    def whole(self) -> Roi:
         """The whole image."""
-        return Window(0, 0, self.camera.width, self.camera.height)
+        return Roi.whole(self.camera.width, self.camera.height)
 
     def corners(self, column: Any, row: Any) -> tuple[list[Any], list[Any]]:
         """Ideal image points x/z and y/z at the four corners of pixels."""

@@ -1,4 +1,4 @@
-"""What a view shows and what a map says of it, from the primary ray to F and sigma in one kernel.
+"""Visible surfaces of a view and their F and sigma from a map, from the primary ray on, in one kernel.
 
 Signal chain: rays of the pixels in which the scene can be -> nearest surface, its front -> frustum of every other
 camera and of the projector -> rays toward those -> |V| and N in the view frame -> F and sigma of the face's own finish
@@ -20,25 +20,25 @@ from characterisation.maps.tables import Surface
 from characterisation.point_cloud import Status, ViewGrid
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.camera_rays import Window
 from mitsim.scene.ray_casting.distortion import Distortion
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
 from mitsim.scene.ray_casting.map_tables import MapTables
 from mitsim.scene.ray_casting.raycast import PixelRays, registered
 from mitsim.sensor.camera import Camera
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 
 @dataclass(frozen=True)
 class MappedView:
-    """Images (h, w) of the pixels of ``window``, outside of which there is nothing of the scene.
+    """Images (h, w) of the pixels of ``roi``; outside of it no pixel shows the scene.
 
     ``status`` is VALID where every eye sees the point, else says which does not; ``shape`` index into the scene's
     names, -1 where a ray meets nothing; ``distance`` |V| [mm], NaN there; ``normal`` (3, h, w) in the view frame, if it
     was asked for; ``fraction`` F and ``sigma`` [mm], NaN where the status is not VALID or the map has no answer.
     """
 
-    window: Window
+    roi: Roi
     status: NDArray[np.uint8]
     shape: NDArray[np.int16]
     distance: NDArray[np.float32]
@@ -91,13 +91,13 @@ class ViewRays:
         self.eyes = [_OtherEye(camera, Status.HIDDEN) for camera in cameras]
         self.eyes += [_OtherEye(projector, Status.SHADOWED)] if projector else []
 
-    def window(self, bounds: NDArray[np.floating], world_from_sensor: Transform, margin: int) -> Window:
-        """Pixels in which a box (2, 3) [mm] of the world can be, and ``margin`` about them; one at least."""
+    def roi(self, bounds: NDArray[np.floating], world_from_sensor: Transform, margin: int) -> Roi:
+        """Return the region that can show a box (2, 3) [mm] of the world, widened by ``margin``; one pixel at least."""
         size = np.array([self.grid.width, self.grid.height])
         corners = np.stack(np.meshgrid(*np.asarray(bounds).T, indexing="ij"), axis=-1).reshape(-1, 3)
         at = self.pinhole.project(world_from_sensor.inverse().points(corners))
         if not np.isfinite(at).all():
-            return Window(0, 0, int(size[0]), int(size[1]))
+            return Roi.whole(self.grid.width, self.grid.height)
         low, high = np.floor(at.min(axis=0)), np.ceil(at.max(axis=0))
         if self.shown is not None:  # a lens bends the box's edges: which pixels show what lies between them?
             column, row = self.shown
@@ -106,13 +106,13 @@ class ViewRays:
             low, high = (np.array([span[end] if len(span) else 0 for span in spans]) for end in (0, -1))
         low = np.clip(low - margin, 0, size - 1).astype(int)
         high = np.clip(high + margin + 1, low + 1, size).astype(int)
-        return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+        return Roi.between(*low, *high)
 
-    def pixels(self, window: Window) -> Any:
-        """Flat numbers of the pixels of a window."""
-        column, row, width = (dr.opaque(mi.UInt32, each) for each in (window.column, window.row, window.width))
-        index = dr.arange(mi.UInt32, window.width * window.height)
-        return (index // width + row) * self.grid.width + index % width + column
+    def pixels(self, roi: Roi) -> Any:
+        """Flat indices of the pixels of a region."""
+        left, top, width = (dr.opaque(mi.UInt32, each) for each in (roi.left, roi.top, roi.width))
+        index = dr.arange(mi.UInt32, roi.width * roi.height)
+        return (index // width + top) * self.grid.width + index % width + left
 
     def in_view_frame(self, normal: Any, ray: Any) -> Any:
         """A normal of the sensor frame in the view frame (:func:`characterisation.coupon.patches.view_frame`)."""
@@ -147,22 +147,22 @@ class MappedScene:
         dr.eval(self.shapes)
 
     def look(self, view: ViewRays, world_from_sensor: Transform, margin: int = 0, normals: bool = False) -> MappedView:
-        """What a view from a pose shows, and what the map says of it.
+        """Return the visible surfaces of a view from a pose, with F and sigma of the map.
 
-        ``margin`` pixels are looked at beyond those in which the scene can be; ``normals`` are brought back too.
+        ``margin`` pixels are added around those that can show the scene; with ``normals`` the normals are returned too.
         """
-        window = view.window(self.scene.bounds, world_from_sensor, margin)
-        size = (window.height, window.width)
-        images = self._images(view, world_from_sensor, window)
+        roi = view.roi(self.scene.bounds, world_from_sensor, margin)
+        size = (roi.height, roi.width)
+        images = self._images(view, world_from_sensor, roi)
         dr.eval(images)
         normal = np.array(images["normal"]).reshape(3, *size) if normals else None
         status, shape, distance, fraction, sigma = (
             np.array(images[name]).reshape(size) for name in ("status", "shape", "distance", "fraction", "sigma")
         )
-        return MappedView(window, status, shape.astype(np.int16), distance, normal, fraction, sigma)
+        return MappedView(roi, status, shape.astype(np.int16), distance, normal, fraction, sigma)
 
-    def _images(self, view: ViewRays, world_from_sensor: Transform, window: Window) -> dict[str, Any]:
-        pixel = view.pixels(window)
+    def _images(self, view: ViewRays, world_from_sensor: Transform, roi: Roi) -> dict[str, Any]:
+        pixel = view.pixels(roi)
         frame = view.rays.frame(world_from_sensor)
         ray = dr.gather(mi.Vector3f, view.rays.directions, pixel)
         direction = frame.turn(ray)

@@ -1,0 +1,143 @@
+"""The files of a capture's folder in memory: each by its path, and the index that lists them with their checksums."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import re
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.checked_files import content_checksum
+from characterisation.documents import validate
+from characterisation.errors import InputError
+from mitsim.capture.calibration import CalibrationDocument, PoseDocument, calibration_table, pose_table
+from mitsim.capture.capture import DERIVED_UNITS, Capture
+from mitsim.capture.capture_document import FRAME, SCHEMA_VERSION, UNITS, CaptureDocument
+from mitsim.capture.npy import encode_npy
+from mitsim.capture.png import LONGEST_SIDE_PX, encode_png
+from mitsim.version import __version__
+
+#: names of cameras and files
+SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+def packed(
+    capture: Capture,
+    folder: str | Path,
+    *,
+    vendor: Mapping[str, bytes] | None = None,
+    truth: Mapping[str, bytes] | None = None,
+) -> dict[str, bytes]:
+    """Every file of a capture's folder by its path in it; messages name ``folder``.
+
+    Raises
+    ------
+    InputError
+        If something in the capture has no place in a file.
+    """
+    beside = {("vendor", name): data for name, data in (vendor or {}).items()}
+    beside |= {("truth", f"{camera}.exr"): data for camera, data in (truth or {}).items()}
+    return files_of(capture, beside, Path(folder))
+
+
+def files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder: Path) -> dict[str, bytes]:
+    """Every file of the folder, by path; ``capture.json`` last. Files that could not be read back are an error."""
+    calibration = calibration_table(capture.rig)
+    pose = pose_table(capture.world_from_sensor, capture.pose_covariance)
+    validate(folder / "calibration.json", calibration, CalibrationDocument)
+    validate(folder / "pose.json", pose, PoseDocument)
+    files = {
+        "calibration.json": _json(calibration, folder, "calibration"),
+        "settings.json": _json(capture.settings, folder, "settings"),
+        "pose.json": _json(pose, folder, "pose"),
+    }
+    entries: list[dict[str, Any]] = [{"path": path, "role": path.removesuffix(".json")} for path in files]
+    for camera, stack in capture.images.items():
+        _check_name(camera, folder, "images", "the name of a camera")
+        if stack.dtype not in (np.uint8, np.uint16) or stack.size == 0 or len(stack) > 1000:
+            raise InputError(
+                folder, f"images.{camera}", f"{stack.dtype} {stack.shape}", "1 to 1000 uint8 or uint16 images"
+            )
+        for frame, image in enumerate(stack):
+            path = f"images/{camera}_{frame:03d}.png"
+            check_image(image, [], capture.bits, folder / path)
+            files[path] = encode_png(image)
+            entries.append(
+                {"path": path, "role": "image", "camera": camera, "frame": frame}
+                | {"dtype": str(image.dtype), "shape": list(image.shape), "unit": "DN", "scale": 1.0, "invalid": None}
+            )
+    for name, values in capture.derived.items():
+        if np.isinf(values).any() or values.size == 0 or max(values.shape) > LONGEST_SIDE_PX:
+            raise InputError(
+                folder, f"derived.{name}", f"{values.shape}, or infinite", "a map of finite numbers or NaN"
+            )
+        path = f"derived/{name}.npy"
+        files[path] = encode_npy(values)
+        entries.append(
+            {"path": path, "role": "derived", "name": name, "dtype": str(values.dtype), "shape": list(values.shape)}
+            | {"unit": DERIVED_UNITS[name], "scale": 1.0, "invalid": "nan"}
+        )
+    for (role, name), data in beside.items():
+        parts = PurePosixPath(name).parts
+        for part in parts or ("",):
+            _check_name(part, folder, role, "the name of a file")
+        path = "/".join([role, *parts])
+        files[path] = data
+        entries.append({"path": path, "role": role})
+    for entry in entries:
+        entry["sha256"] = hashlib.sha256(files[entry["path"]]).hexdigest()
+    index = {
+        "schema_version": SCHEMA_VERSION,
+        "sensor": capture.sensor,
+        "technology": capture.technology,
+        "source": capture.source,
+        "serial": capture.serial,
+        "bits": capture.bits,
+        "units": UNITS,
+        "frame": FRAME,
+        "software": {
+            "mitsim": __version__,
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "opencv": cv2.__version__,
+        },
+        "files": entries,
+    }
+    index["checksum"] = content_checksum(index)
+    validate(folder / "capture.json", index, CaptureDocument)
+    files["capture.json"] = _json(index, folder, "capture")
+    return files
+
+
+def check_image(
+    image: NDArray[np.unsignedinteger[Any]], before: list[NDArray[np.unsignedinteger[Any]]], bits: int, where: Path
+) -> None:
+    """Raise an error for an image of another type than the frames before, or with values over its bits."""
+    if before and before[0].dtype != image.dtype:
+        raise InputError(where, "dtype", image.dtype, f"{before[0].dtype}, as the first frame")
+    if image.max() > 2**bits - 1:
+        raise InputError(where, "pixel value", image.max(), f"0 to {2**bits - 1}, since bits is {bits}")
+
+
+def _check_name(name: str, folder: Path, field: str, what: str) -> None:
+    if not SAFE_NAME.fullmatch(name):
+        raise InputError(folder, field, repr(name), f"{what} of letters, digits, dot, dash, underscore")
+
+
+def _json(value: Any, folder: Path, field: str) -> bytes:
+    try:
+        text = json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False)
+        if field == "settings" and json.loads(text) != value:
+            raise ValueError("tuples, or keys that are not text")
+        return (text + "\n").encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(
+            folder, field, f"a value that JSON cannot hold ({error})", "texts, finite numbers, lists, tables, null"
+        ) from None

@@ -1,0 +1,92 @@
+"""A white coupon before a sensor: the light that its cameras would see of it, with one image in place of the patterns.
+
+Where the projected pattern is not known to be the sensor file's (a device's), the mean level of the patterns stands in
+for it, and the dots count as grain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.capture.capture import Capture
+from mitsim.fit.place import Place
+from mitsim.scene.differentiable import lambertian_coupon
+from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.pattern import RandomDots
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.projector import Projector
+from mitsim.sensor.roi import Roi, roi_around
+from mitsim.simulation.rendering import Rendering
+from mitsim.simulation.simulate import SimulatedSensor
+
+Floats = NDArray[np.float64]
+
+#: one image instead of a sensor's patterns: the mean of all of them; their mean level, the same all over the field;
+#: the first alone
+Pattern = Literal["mean", "level", "first"]
+
+#: pixels of the region around the coupon
+_MARGIN_PX = 12
+
+
+class Bench:
+    """A sensor before white coupons, set up once; its projector has one image in place of its patterns."""
+
+    def __init__(self, sensor: Sensor, samples: int = 16) -> None:
+        self.sensor, self.samples = sensor, samples
+        # the patterns come below, one by one: they are not laid on the device all together
+        self._simulated = SimulatedSensor(replace(sensor, pattern=RandomDots(kind="random_dots", run_length_px=10.0)))
+        self._lit: dict[Pattern, LitPatterns] = {}
+
+    def corner_loss(self, camera: str) -> NDArray[np.float32] | None:
+        """Loss of a camera's lens toward the corners (H, W) [1], None where there is none."""
+        return self._simulated.corner_loss[camera]
+
+    def white(self, place: Place, camera: str, roi: Roi, pattern: Pattern) -> Floats:
+        """Electrons per second (h, w) [e-/s] of a Lambertian coupon of reflectance 1, in a region."""
+        if pattern not in self._lit:
+            self._lit[pattern] = self._one(pattern)
+        self._simulated.patterns = self._lit[pattern]
+        scene = lambertian_coupon(*place.size, self.sensor.wavelength_nm)
+        radiance = self._simulated.radiance(
+            scene, place.world_from_sensor, camera, Rendering(samples=self.samples, depth=1), seed=0, roi=roi
+        )
+        return np.asarray(radiance[0], np.float64) * self.sensor.electrons()
+
+    def _one(self, pattern: Pattern) -> LitPatterns:
+        projector = self.sensor.projector
+        frames = self.sensor.patterns()
+        sent = projector.emit(frames[:1]) if pattern == "first" else _mean_sent(frames, projector)
+        if pattern == "level":
+            sent = np.full_like(sent, sent.mean())
+        values = (sent - projector.black_level) / (1.0 - projector.black_level)
+        values = np.clip(values, 0.0, 1.0) ** (1.0 / projector.gamma)
+        return LitPatterns(values.astype(np.float32), projector)
+
+
+def _mean_sent(frames: NDArray[np.float32], projector: Projector) -> NDArray[np.float32]:
+    """Mean of what frames (P, H, W) send, (1, H, W), one after the other: many fill the memory."""
+    total = np.zeros(frames.shape[1:])
+    for frame in frames:
+        total += projector.emit(frame)
+    return np.asarray(total[None] / len(frames), np.float32)
+
+
+def pattern_is_known(capture: Capture, sensor: Sensor) -> bool:
+    """Whether the images of a capture were taken with the very pattern of the sensor file."""
+    return capture.settings.get("pattern") == sensor.pattern.model_dump(mode="json")
+
+
+def with_rig(sensor: Sensor, rig: Rig) -> Sensor:
+    """The sensor with the cameras of a capture; the projector, of which recordings say nothing, stays the file's."""
+    return replace(sensor, rig=replace(rig, projector=sensor.rig.projector))
+
+
+def coupon_roi(camera: Camera, place: Place) -> Roi:
+    """Return the region of a camera's image that holds a coupon and a margin of 12 px."""
+    return roi_around(camera, place.corners(), _MARGIN_PX) or Roi.whole(camera.width, camera.height)
