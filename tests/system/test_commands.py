@@ -148,7 +148,7 @@ TABLE = "# [characterisation] "
         ("# standoff_mm = 500", "standof_mm = 500", "did you mean 'standoff_mm'"),
         ("# standoff_mm = 500", "standoff_mm = 0.5", "greater than or equal to 50"),
         ("# standoff_mm = 500", "standoff_mm = 1500", "400 to 800 mm"),
-        (TABLE, '[characterisation]\ncampaign = "near.toml" #', "400 to 450 mm, the distances that are characterised"),
+        (TABLE, '[characterisation]\ncampaign = "near.toml" #', "400 to 450 mm, the characterised distances"),
         ('sensor = "ensenso-n10"', 'sensor = "ensenso"', "ensenso-n10"),
         ("seed = 1", "seed = [1", "not TOML"),
         (TABLE, '[characterisation]\ncampaign = "a.toml"\nmap = "b.nc" #', "not both"),

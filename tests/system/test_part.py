@@ -307,7 +307,7 @@ def test_units_are_turned_into_mm(tmp_path, units, length_mm):
 
 def test_a_part_in_metres_is_noticed(tmp_path):
     plate_with_pillar().apply_scale(0.001).export(tmp_path / "plate.stl")
-    with pytest.raises(InputError, match="say --units m"):
+    with pytest.raises(InputError, match="give --units m"):
         read_mesh(tmp_path / "plate.stl")
 
 
