@@ -156,18 +156,19 @@ def test_what_is_left_out_depends_on_what_the_map_knows(run_folder, tmp_path, wr
     folder = tmp_path / "run"
     shutil.copytree(run_folder, folder)
     known = written(folder)
-    assert "Noise that neighbouring points share" in known and "60 pixels, 10°" in known
+    assert "the correlated noise of neighbouring points" in known and "60 pixels, 10°" in known
     with xr.open_dataset(folder / "map.nc") as data:
         data = data.load()
     data["noise_area"][:] = np.nan
     write_netcdf(data, folder / "map.nc")
     unknown = written(folder)
-    assert "take noise as independent from pixel to pixel" in unknown and "Noise that neighbouring" not in unknown
+    assert "assume independent noise from pixel to pixel" in unknown
+    assert "the correlated noise of neighbouring points" not in unknown
 
 
 def test_says_how_good_the_renders_are_and_nothing_where_that_is_not_known(text, run_folder, tmp_path, written):
-    assert "render noise 0 and quadrature error 0.061 of the sensor’s own noise" in text
-    assert "over it in 1.3\N{NO-BREAK SPACE}% of the pixels" in text
+    assert "render noise at most 0, quadrature error at most 0.061 of the sensor’s own noise" in text
+    assert "one of them exceeds it in 1.3\N{NO-BREAK SPACE}% of the pixels" in text
     folder = tmp_path / "run"
     shutil.copytree(run_folder, folder)
     about = json.loads((folder / "run.json").read_text(encoding="utf-8"))

@@ -181,7 +181,7 @@ def test_a_faceted_shape_is_told_from_a_misplaced_one(check, tmp_path):
     mesh = f'<shape type="ply" id="ball"><string name="filename" value="ball.ply"/>{METAL}</shape>'
     checked = check(mesh, task=TASK)
     assert checked.says("warning", "ball", f"facets deviate by up to {sag:.2g} mm")
-    assert not any("mend point_mm" in f.advice for f in checked.found)
+    assert not any("correct point_mm" in f.advice for f in checked.found)
 
 
 def test_a_stock_material_on_a_measured_feature_is_an_error(check):

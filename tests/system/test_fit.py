@@ -376,8 +376,8 @@ def test_a_window_names_the_coupon_whatever_the_pose_says(captures, bench):
     views = observe(CouponCapture(capture, place, 0, "capture"), bench, KNOWN_BLOCK_PX, pattern="mean")
     assert views[0].whole > 20
     pixels = np.stack([views[0].columns, views[0].rows], axis=-1)
-    assert (pixels >= part[:2]).all()
-    assert (pixels < np.add(part[:2], part[2:])).all()
+    assert (pixels >= (part.left, part.top)).all()
+    assert (pixels < (part.right, part.bottom)).all()
 
 
 def test_dots_of_another_pattern_are_as_bright_and_sharp_as_the_file_says(n10, bench, scenes):

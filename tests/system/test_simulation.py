@@ -250,7 +250,7 @@ def test_a_campaign_and_a_study_refuse_an_exposure_that_follows_the_scene(tmp_pa
         lambda: read_campaign(scenes / "coupon/campaign.toml", sensor),
         lambda: read_study(tmp_path / "study.toml"),
     ):
-        with pytest.raises(InputError, match="F depends on whatever else is in view") as caught:
+        with pytest.raises(InputError, match="F depends on the rest of the view") as caught:
             refused()
         assert caught.value.field == "exposure.rule"
         assert sensor.name in caught.value.where
