@@ -231,7 +231,7 @@ def test_the_images_of_binocular_gray_are_right_and_their_finest_bits_are_lost(r
     left_out = unused | {"count": 6}
     assert said([*begin, gray("columns", 9), left_out, gray("rows", 9), left_out], 512) == []
     lost = said([*begin, gray("columns", 12), gray("rows", 12)], 4096)
-    assert [each.partition(", of")[0] for each in lost] == [
+    assert [each.partition(", stripes")[0] for each in lost] == [
         f"{eye} does not resolve the 3 finest bits of the {axis}" for axis in ("columns", "rows")
     ]
 
