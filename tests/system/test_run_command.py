@@ -204,7 +204,7 @@ def test_a_set_of_views_is_chosen_and_told(study_folder, tmp_path):
     assert "set.limits.pilar1_radius" in done.stderr
     (folder / "small.toml").write_text(text + table.format(1e-5))
     done = mitsim("score", folder / "small.toml", "-o", tmp_path / "small")
-    assert "out of reach" in done.stderr
+    assert "is unreachable" in done.stderr
 
 
 def test_report_and_predict_from_what_run_left(study_folder, tmp_path):
