@@ -120,7 +120,7 @@ def test_white_light_times_the_lobe_is_what_the_renderer_gives(n10, lobe, scenes
     white = Bench(n10, samples=4).white(place, "left", part, "mean")
     rendered = SimulatedSensor(n10).radiance(scene, pose, "left", Rendering(samples=4, depth=1), seed=1, roi=part)[0]
     rendered = rendered * n10.electrons()
-    columns, rows = np.meshgrid(np.arange(part.width) + part.column, np.arange(part.height) + part.row)
+    columns, rows = np.meshgrid(np.arange(part.width) + part.left, np.arange(part.height) + part.top)
     rays = pose.directions(camera.rays(np.stack([columns, rows], axis=-1).astype(float)))
     points = pose.translation - rays * (pose.translation[2] / rays[..., 2:])
     inside = (np.abs(points[..., :2]) < 55).all(axis=-1)
