@@ -337,8 +337,12 @@ def sensor_checksum(sensor: Sensor) -> str:
     return hashlib.sha256(_written(sensor).encode()).hexdigest()[:12]
 
 
-#: numpy's default print options, so that a checksum does not depend on those of the caller
+#: print options of numpy: its defaults with every digit of every value, whatever those of the caller are
 _NUMPY_PRINTS: dict[str, Any] = {
+    "precision": 17,
+    "threshold": sys.maxsize,
+    "linewidth": 75,
+    "edgeitems": 3,
     "suppress": False,
     "sign": "-",
     "floatmode": "maxprec",
@@ -353,7 +357,7 @@ def _written(sensor: Sensor) -> str:
     # values of a single unit; a file without them keeps its former checksum, which existing maps have
     own = [sensor.room, sensor.misalignment, sensor.imager.smoothing_px]
     lens = sensor.imager.corner_blur_px
-    with np.printoptions(precision=17, threshold=sys.maxsize, linewidth=75, edgeitems=3, **_NUMPY_PRINTS):
+    with np.printoptions(**_NUMPY_PRINTS):
         said = repr(sensor) + (repr(own) if own != [None, MisalignmentTable(), 0.0] else "")
         return said + ("" if lens is None else f"corner_blur_px={lens!r}")
 

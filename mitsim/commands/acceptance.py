@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from mitsim.commands.options import Clouds, DecodedAs, Json
 from mitsim.errors import InputError
 
 
 def acceptance(
-    clouds: Annotated[
-        list[Path],
-        typer.Argument(metavar="CLOUD...", help="Point clouds, capture folders (decoded first), or folders of either."),
-    ],
+    clouds: Clouds,
     plane: Annotated[
         list[str] | None,
         typer.Option(
@@ -38,8 +35,8 @@ def acceptance(
     baseline: Annotated[
         float | None, typer.Option(min=1.0, max=10000.0, help="Baseline of a stereo camera [mm]: adds sub-pixel RMS.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")] = False,
-    sensor: Annotated[str | None, typer.Option(help="Decode captures with the settings of this sensor.")] = None,
+    as_json: Json = False,
+    sensor: DecodedAs = None,
 ) -> None:
     """Compute acceptance figures of VDI/VDE 2634-2 and of makers' data sheets from clouds of planes and spheres.
 
@@ -50,7 +47,7 @@ def acceptance(
     """
     from mitsim.measuring.acceptance import cloud_figures, joint_figures, read_artefacts
     from mitsim.measuring.clouds import cloud_paths, read_cloud
-    from mitsim.measuring.document import measured_document, repeatability_table, result_table, result_values, summary
+    from mitsim.measuring.document import measured_document, result_table, result_tables, result_values, summary
     from mitsim.measuring.result import repeated
     from mitsim.progress import say
 
@@ -67,10 +64,7 @@ def acceptance(
         document = measured_document(whose, results, over) | {"all_clouds": [result_values(one) for one in together]}
         print(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False))
     else:
-        for one, found in zip(given, results, strict=True):
-            print((f"{one.path}\n" if several else "") + result_table(found) + ("\n" if several else ""))
-        if several:
-            print(repeatability_table(over))
+        print(result_tables([one.path for one in given], results, over))
         if together:
             print("\nall clouds\n" + result_table(together))
     say(summary([*results, together] if together else results))

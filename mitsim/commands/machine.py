@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import typer
 
+from mitsim.commands.options import Json
 
-def doctor(json: Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")] = False) -> None:
+
+def doctor(json: Json = False) -> None:
     """Check this machine: list what is present, what is missing, and how to fix it.
 
     Exit code 3 if something that mitsim needs is missing.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitsim.commands.options import Defines, Variant, check_file, definitions, start
+from mitsim.commands.options import Clouds, DecodedAs, Defines, Json, Variant, check_file, definitions, start
 from mitsim.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,10 +19,7 @@ _WINDOW = "NAME=COLUMN,ROW,WIDTH,HEIGHT"
 
 
 def measure(
-    clouds: Annotated[
-        list[Path],
-        typer.Argument(metavar="CLOUD...", help="Point clouds, capture folders (decoded first), or folders of either."),
-    ],
+    clouds: Clouds,
     plane: Annotated[
         list[str] | None,
         typer.Option(
@@ -93,8 +90,8 @@ def measure(
             help="PNG picture to write: the difference, or the distances and windows; numbered for several clouds."
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")] = False,
-    sensor: Annotated[str | None, typer.Option(help="Decode captures with the settings of this sensor.")] = None,
+    as_json: Json = False,
+    sensor: DecodedAs = None,
     define: Defines = None,
     variant: Variant = None,
 ) -> None:
@@ -107,7 +104,7 @@ def measure(
     Example: mitsim measure cloud.ply --plane top=100,50,200,150 --plane side=400,60,90,300 --angle top,side
     """
     from mitsim.measuring.clouds import cloud_paths, read_cloud
-    from mitsim.measuring.document import measured_document, repeatability_table, result_table, summary
+    from mitsim.measuring.document import measured_document, result_tables, summary
     from mitsim.measuring.request import read_asked
     from mitsim.measuring.result import LEAVES_OUT, repeated
     from mitsim.progress import say
@@ -159,10 +156,7 @@ def measure(
     elif asked.empty and of_task is None:
         pass
     else:
-        for path, found in zip(paths, results, strict=True):
-            print((f"{path}\n" if len(paths) > 1 else "") + result_table(found) + ("\n" if len(paths) > 1 else ""))
-        if over:
-            print(repeatability_table(over))
+        print(result_tables(paths, results, over))
         if any(result.origin == "fit" for found in results for result in found):
             left_out = "; ".join(LEAVES_OUT)
             say(f"u: standard uncertainty (k = 1) from the covariance of the fit; it does not include: {left_out}")

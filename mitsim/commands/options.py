@@ -35,6 +35,12 @@ Processes = Annotated[
     int,
     typer.Option(min=0, max=1024, help="Worker processes on this machine; 0: as many as its cores and memory allow."),
 ]
+Clouds = Annotated[
+    list[Path],
+    typer.Argument(metavar="CLOUD...", help="Point clouds, capture folders (decoded first), or folders of either."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")]
+DecodedAs = Annotated[str | None, typer.Option(help="Decode captures with the settings of this sensor.")]
 Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are reused.")]
 
 Yes = Annotated[

@@ -10,6 +10,7 @@ import typer
 from characterisation.atomic_io import atomic_write
 from mitsim.commands.options import (
     Defines,
+    Json,
     Roll,
     Scene,
     SensorOption,
@@ -33,7 +34,7 @@ def check(
     sensor: SensorOption = "ensenso-n10",
     task: Annotated[Path | None, typer.Option(help="Task TOML file; check that the scene has its features.")] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="PNG picture to write.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")] = False,
+    json: Json = False,
     html: Annotated[
         Path | None,
         typer.Option(help="HTML page to write: edit names, finishes and measurements, then download the files."),

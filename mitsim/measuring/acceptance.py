@@ -97,7 +97,8 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
     for name, (window, distance) in artefacts.planes.items():
         out += _of_plane(name, cloud, window, distance, baseline_mm)
     for name, (window, diameter) in artefacts.spheres.items():
-        points, count = window_points(window, cloud, name), _pixels(cloud, window, name)
+        points = window_points(window, cloud, name)
+        count = cloud.status[window_slices(window, cloud, name)].size
         error = _or_reason(probing_error, points, diameter)
         for label, field in ((f"{name} form error PF", "form"), (f"{name} size error PS", "size")):
             if isinstance(error, str):
@@ -195,10 +196,6 @@ def _mask(cloud: PointCloud, inside: tuple[slice, slice]) -> NDArray[np.bool_]:
     mask = np.zeros(cloud.status.shape, bool)
     mask[inside] = True
     return mask
-
-
-def _pixels(cloud: PointCloud, window: Roi | None, name: str) -> int:
-    return int(_mask(cloud, window_slices(window, cloud, name)).sum())
 
 
 def _length(option: str, text: str, value: float, allowed: str) -> float:

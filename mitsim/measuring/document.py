@@ -51,6 +51,15 @@ def repeatability_table(found: Sequence[Repeated]) -> str:
     return _laid_out(rows)
 
 
+def result_tables(paths: Sequence[Path], results: Sequence[Sequence[Result]], repeated: Sequence[Repeated]) -> str:
+    """Return the table of each cloud, under its path if there are several, and that of their repeatability."""
+    if len(paths) == 1:
+        tables = [result_table(results[0])]
+    else:
+        tables = [f"{path}\n{result_table(found)}\n" for path, found in zip(paths, results, strict=True)]
+    return "\n".join([*tables, *([repeatability_table(repeated)] if repeated else [])])
+
+
 def summary(clouds: Sequence[Sequence[Result]]) -> str:
     """One line that says the result."""
     every = [one for results in clouds for one in results]

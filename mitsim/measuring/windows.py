@@ -127,8 +127,7 @@ def measure_windows(cloud: PointCloud, plan: WindowPlan) -> list[Result]:
     fits: dict[str, ShapeFit | FitError] = {}
     given: dict[str, int] = {}
     for name, (shape, window) in plan.features.items():
-        part = window_slices(window, cloud, name)
-        points = np.asarray(cloud.points[part][cloud.valid[part]], np.float64)
+        points = window_points(window, cloud, name)
         given[name] = len(points)
         fits[name] = fit = _fitted(points, shape, cloud.grid.origin)
         if isinstance(fit, FitError):

@@ -104,11 +104,12 @@ def exposed(
         out[:, *inside] = expose_taps(electrons, code, imager, fixed, noise, rng, seconds)
         return out
 
-    def one(index: int, own: np.random.SeedSequence) -> None:
+    def expose_image(image: tuple[int, np.random.SeedSequence]) -> None:
+        index, own = image
         seconds = exposures[index // len(radiance)]
         electrons = radiance[index % len(radiance)] * np.float32(scale * seconds)
         rng = np.random.Generator(np.random.SFC64(own))  # a quarter faster than the default
         out[index][inside] = expose(electrons, imager, fixed, noise, rng, seconds)
 
-    in_threads(lambda image: one(*image), enumerate(stream.spawn(count)))  # every image has a stream of its own
+    in_threads(expose_image, enumerate(stream.spawn(count)))  # every image has a stream of its own
     return out
