@@ -62,6 +62,8 @@ class Scratch:
                     stderr=subprocess.STDOUT,
                     check=False,
                 )
+                if done.returncode in (130, -2):
+                    raise KeyboardInterrupt(part)
                 self.outputs[part] = done.stdout.decode("utf-8", "replace")
         return "\n".join(self.outputs[part] for part in command.split(" && "))
 
