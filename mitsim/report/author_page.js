@@ -169,7 +169,7 @@ function finishWarning(finish) {
   if (!(Ra > 0)) return 'Ra must be a number of um over 0';
   const known = data.known?.[`${finish.metal}/${finish.process}`];
   if (data.known && !known) return `the map of ${data.sensor} has no ${finish.metal}/${finish.process}: a study that needs it characterises it`;
-  if (known?.length && (Ra < known[0] || Ra > known[1])) return `the map of ${data.sensor} has it for Ra ${known[0]} to ${known[1]} um: a study that needs another value characterises it`;
+  if (known?.length && (Ra < known[0] || Ra > known[1])) return `the map of ${data.sensor} contains this finish for Ra ${known[0]} to ${known[1]} um: a study that needs another value characterises it`;
   if (usual && (Ra < usual[0] || Ra > usual[1])) return `${finish.process} metal usually has Ra ${usual[0]} to ${usual[1]} um`;
   return '';
 }

@@ -187,7 +187,7 @@ def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browse
     page.choose("seat_18mm", "boss_20mm")
     page.pick("#author-finish", "+")
     page.type("[aria-label^='Ra of finish_2']", "7")
-    assert "has it for Ra" in browser.tell("document.getElementById('author-finishes').textContent")
+    assert "contains this finish for Ra" in browser.tell("document.getElementById('author-finishes').textContent")
     page.type("[aria-label^='Ra of finish_2']", "0.2")
     browser.tell("document.getElementById('author-done').click()")
     browser.until("document.getElementById('author-status').textContent.startsWith('Done')", 90)
