@@ -29,7 +29,7 @@ from mitsim.view_sets.joined import JoinedMeasurements
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.stated import digits
 from mitsim.virtual.trials import TrialFolder
-from mitsim.virtual.world import Trial
+from mitsim.virtual.world import SET_DAYS, Trial
 
 #: largest number of sets to measure
 MOST_SETS = 5
@@ -39,9 +39,6 @@ _TIGHTENING = 0.9
 
 #: factor for a measurement without any value, whose uncertainty is unknown
 _WITHOUT_VALUE = 0.5
-
-#: first day of the worlds of sets, different from those of races and statements
-_FIRST_DAY = 1 << 21
 
 #: part of the digest of a set's trials; raise it when the same clouds are joined differently
 _JOINING_VERSION = 2
@@ -126,7 +123,7 @@ def state_set(study: Study, chosen: ViewSet, here: RenderedMeasurements, digest:
     trials = TrialFolder(folder / "set_trials" / decided_by, decided_by, list(study.task.measurements))
     by_number = {view.number: view for view in study.views}
     maker = JoinedMeasurements(here, [by_number[number] for number in chosen.views], table)
-    days = [_FIRST_DAY + k for k in range(table.trials)]
+    days = [SET_DAYS + k for k in range(table.trials)]
     missing = [day for day in days if Trial(day) not in trials.known(0)]
     for day, errors in track(maker.run(missing), "confirm the set", len(missing)):
         trials.add(0, Trial(day), errors)

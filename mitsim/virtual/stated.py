@@ -26,17 +26,17 @@ from mitsim.views import View
 from mitsim.virtual.influences import influences
 from mitsim.virtual.race import Job, Maker
 from mitsim.virtual.trials import TrialFolder
-from mitsim.virtual.world import BEYOND, FRESH, GROUPS, Trial, Unknowns
-
-#: first day of the worlds of statements; the worlds of the race selected the view, and are biased in its favour
-_FIRST_DAY = 1 << 20
+from mitsim.virtual.world import BEYOND, FRESH, GROUPS, STATEMENT_DAYS, Trial, Unknowns
 
 
 def state_view(
     study: Study, view: View, maker: Maker, trials: TrialFolder, unknowns: Unknowns, table: StatementTable
 ) -> list[Statement]:
-    """State every measurement from one view, and reuse trials in the folder."""
-    base = [Trial(_FIRST_DAY + k) for k in range(table.trials)]
+    """State every measurement from one view, and reuse trials in the folder.
+
+    Worlds of the race are not used: they selected the view, and are biased in its favour.
+    """
+    base = [Trial(STATEMENT_DAYS + k) for k in range(table.trials)]
     pairs = base[: min(table.pairs, table.trials)]
     groups = budget_groups(unknowns, maker.source)
     swapped = {group: [Trial(one.day, one.capture, group) for one in pairs] for group in groups}

@@ -50,6 +50,9 @@ FINISHES = 8
 #: number of successive days that share a finish, for the same reason
 FINISH_DAYS = 2
 
+#: first days of the worlds of a race, of its confirmation, of a statement, and of a set of views
+RACE_DAYS, CONFIRMATION_DAYS, STATEMENT_DAYS, SET_DAYS = 0, 1 << 19, 1 << 20, 1 << 21
+
 #: offset of the day of the streams from which ``swapped`` takes a group
 _ELSEWHERE = 1 << 32
 
@@ -100,7 +103,8 @@ class Unknowns:
     ``table`` holds their sizes. ``rig`` is nominal. ``calibration`` is the covariance of the calibration, with the
     drift since then. ``expansion`` of the part is in 1/K. ``centre`` (3,) [mm] is the point about which the part
     rotates. Groups that are not in ``varied`` keep their best estimate. With ``pooled``, finishes come from a pool of
-    :data:`FINISHES`; else every world has its own.
+    :data:`FINISHES`; else every world has its own. The days that confirm a choice share no finish with the pool, since
+    the pool made the choice.
     """
 
     table: UnknownsTable
@@ -127,7 +131,7 @@ class Unknowns:
         return World(
             rig=moved(self.rig, names, values),
             path=path_error(names, values),
-            finish=self._finish(streams["finish"]) if "finish" in self.varied else -1,
+            finish=self._finish(streams["finish"], trial.day) if "finish" in self.varied else -1,
             form=_seed(streams["form"]) if "form" in self.varied else 0,
             room=room,
             power=power,
@@ -149,8 +153,9 @@ class Unknowns:
             place = [0]
         return np.random.default_rng(np.random.SeedSequence([self.seed, GROUPS.index(group), *place]))
 
-    def _finish(self, rng: np.random.Generator) -> int:
-        return int(rng.integers(FINISHES)) if self.pooled else FINISHES + _seed(rng)
+    def _finish(self, rng: np.random.Generator, day: int) -> int:
+        pooled = self.pooled and not CONFIRMATION_DAYS <= day < STATEMENT_DAYS
+        return int(rng.integers(FINISHES)) if pooled else FINISHES + _seed(rng)
 
     def _geometry(self, rng: np.random.Generator, sensor_kelvin: float) -> tuple[tuple[str, ...], NDArray[np.float64]]:
         """Return names and errors of the rig's parameters, due to calibration and temperature."""

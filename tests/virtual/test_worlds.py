@@ -11,7 +11,17 @@ from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import parameter_names
 from mitsim.sensor.room_light import room_irradiance
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
-from mitsim.virtual.world import FINISH_DAYS, FINISHES, FRESH, GROUPS, Trial, Unknowns, finish_deviation
+from mitsim.virtual.world import (
+    CONFIRMATION_DAYS,
+    FINISH_DAYS,
+    FINISHES,
+    FRESH,
+    GROUPS,
+    STATEMENT_DAYS,
+    Trial,
+    Unknowns,
+    finish_deviation,
+)
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +140,14 @@ def test_finishes_have_the_spread_of_a_normal_distribution(unknowns):
     assert finish_deviation(known, 3, "plate").alpha == 0
     days = [unknowns.draw(Trial(day)).finish for day in range(40 * FINISH_DAYS)]
     assert set(days) <= set(range(FINISHES)) and len(set(days)) == FINISHES
+
+
+def test_a_choice_is_confirmed_with_other_finishes_than_those_that_made_it(unknowns):
+    own = [unknowns.draw(Trial(CONFIRMATION_DAYS + day)).finish for day in range(8 * FINISH_DAYS)]
+    assert len(set(own)) == 8 and min(own) >= FINISHES
+    assert unknowns.draw(Trial(STATEMENT_DAYS)).finish < FINISHES
+    alphas = [finish_deviation(unknowns, number, "plate").alpha for number in own]
+    assert len(set(alphas)) == 8
 
 
 def test_a_study_overrules_the_sensor_key_by_key():
