@@ -1,16 +1,19 @@
-"""Trials of a case, of three kinds, each in its own worlds.
+"""Trials of a case, of four kinds, each in its own worlds.
 
 - *tool*: the trials of race and statement;
-- *truth*: trials of every candidate, for the risks. They share interreflections as the tool's trials do;
+- *truth*: trials of every candidate, for the risks. They share interreflections and the pool of finishes as the tool's
+  trials do;
+- *choice*: trials of the candidates of a race, for the regret of its choices. Every two worlds have their own finish,
+  so that the finishes of a pool do not decide which view is the best;
 - *apart*: trials of the stated views, for the coverage. Nothing is shared or pooled: every world renders all of its
   light at its own pose, with its own finish.
 
-Truth and apart may include light paths over more surfaces than the tool.
+All kinds but *tool* may include light paths over more surfaces than the tool.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,10 +31,10 @@ from mitsim.virtual.race import Job, Maker
 from mitsim.virtual.spread_out import spread_over
 from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
-from mitsim.virtual.world import Trial, Unknowns
+from mitsim.virtual.world import OWN_FINISH_DAYS, Trial, Unknowns
 
 #: kinds of trials, with the offset of the seed of their unknowns from the study's
-KINDS = {"tool": 0, "truth": 1 << 20, "apart": 1 << 21}
+KINDS = {"tool": 0, "truth": 1 << 20, "apart": 1 << 21, "choice": 3 << 20}
 
 
 class Bench:
@@ -57,12 +60,12 @@ class Bench:
             self._maker = spread_over(self.workers, self.study, self.unknowns, here)
         return self._maker
 
-    def measure(self, views: Iterable[View], worlds: dict[int, int]) -> None:
-        """Measure views in ``worlds`` worlds each, and reuse existing trials."""
+    def measure(self, views: Iterable[View], worlds: dict[int, Sequence[Trial]]) -> None:
+        """Measure views in the ``worlds`` of each, by its number, and reuse existing trials."""
         jobs = [
             Job(view, trial)
             for view in views
-            for trial in days(worlds[view.number])
+            for trial in worlds[view.number]
             if trial not in self.trials.known(view.number)
         ]
         if jobs:
@@ -97,13 +100,23 @@ def measured_truth(case: PartCase, bench: Bench) -> NDArray[np.float64]:
         view.number: file.raced_worlds if case.table.raced and place < file.raced_candidates else file.worlds
         for place, view in enumerate(views)
     }
-    bench.measure(views, worlds)
+    bench.measure(views, {number: days(count) for number, count in worlds.items()})
     truth = np.full((len(study.task.measurements), len(views), max(worlds.values())), np.inf)
     for v, view in enumerate(views):
         truth[:, v, : worlds[view.number]] = bench.trials.errors(view.number, days(worlds[view.number]))
     return truth
 
 
-def days(count: int) -> list[Trial]:
+def measured_choice(case: PartCase, bench: Bench) -> NDArray[np.float64]:
+    """Measure the candidates of a race in worlds with their own finishes.
+
+    Returns errors (measurement, candidate, world), NaN where a world gave no value.
+    """
+    views, worlds = bench.study.views[: case.file.raced_candidates], days(case.file.raced_worlds, OWN_FINISH_DAYS)
+    bench.measure(views, {view.number: worlds for view in views})
+    return np.stack([bench.trials.errors(view.number, worlds) for view in views], axis=1)
+
+
+def days(count: int, first: int = 0) -> list[Trial]:
     """Return ``count`` worlds, each on its own day."""
-    return [Trial(day) for day in range(count)]
+    return [Trial(first + day) for day in range(count)]

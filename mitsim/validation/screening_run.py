@@ -99,7 +99,7 @@ def screen_case(case: PartCase, folder: Path, workers: Executor | None = None) -
     scores, _ = screen(study, predictor, study.performance_map)
     truth = measured_truth(case, bench["truth"])[:, :, : case.file.worlds]
     tool, numbers = bench["tool"], [view.number for view in study.views]
-    tool.measure(study.views, dict.fromkeys(numbers, FIRST))
+    tool.measure(study.views, dict.fromkeys(numbers, days(FIRST)))
     once = np.stack([tool.trials.errors(number, days(FIRST)) for number in numbers], axis=1)
     keep_trials(case, folder, bench)
     return judged(case, study, scores, seen_by_all(study, predictor), truth, once)

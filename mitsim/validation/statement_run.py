@@ -23,7 +23,7 @@ from mitsim.prediction import Predictor
 from mitsim.progress import say
 from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.study import StatementTable, Study
-from mitsim.validation.case_trials import Bench, benches, days, keep_trials, measured_truth
+from mitsim.validation.case_trials import Bench, benches, days, keep_trials, measured_choice, measured_truth
 from mitsim.validation.part_cases import PartCase
 from mitsim.views import View
 from mitsim.virtual.plan import race_rules
@@ -53,7 +53,8 @@ class JudgedCase:
 
     ``sensor`` is its name. ``views`` (v,) are the numbers of all candidates. ``truth`` (measurement, v, world) are
     errors, infinite where a view was not measured in a world. ``scores`` are those of screening. ``raced`` is the race,
-    None if the case is not raced.
+    and ``choice`` (measurement, candidate, world) are the errors that judge its choices; both are None if the case is
+    not raced.
     """
 
     case: PartCase
@@ -63,6 +64,7 @@ class JudgedCase:
     truth: Floats
     scores: xr.Dataset
     raced: Raced | None
+    choice: Floats | None
     stated: tuple[StatedView, ...]
 
 
@@ -85,12 +87,13 @@ def run_case(case: PartCase, folder: Path, workers: Executor | None = None) -> J
         few_scores = scores.sel(view=[view.number for view in few])
         raced = run_race(few, few_scores, tool.maker, tool.trials, race_rules(study.file.race))
     truth = measured_truth(case, bench["truth"])
+    choice = None if raced is None else measured_choice(case, bench["choice"])
     chosen = None if raced is None else raced.leaders().get(ALL)
     stated = [_stated(case, bench, view, why) for view, why in _to_state(case, study, scores, chosen)]
     keep_trials(case, folder, bench)
     numbers = np.array([view.number for view in study.views])
     return JudgedCase(
-        case, study.sensor.name, tuple(study.task.measurements), numbers, truth, scores, raced, tuple(stated)
+        case, study.sensor.name, tuple(study.task.measurements), numbers, truth, scores, raced, choice, tuple(stated)
     )
 
 
@@ -115,5 +118,5 @@ def _stated(case: PartCase, bench: dict[str, Bench], view: View, why: str) -> St
     tool, apart, count = bench["tool"], bench["apart"], case.file.stated_worlds
     table = StatementTable(trials=tool.study.file.statement.trials, pairs=0)
     statements = state_view(tool.study, view, tool.maker, tool.trials, tool.unknowns, table)
-    apart.measure([view], {view.number: count})
+    apart.measure([view], {view.number: days(count)})
     return StatedView(view.number, why, tuple(statements), apart.trials.errors(view.number, days(count)))

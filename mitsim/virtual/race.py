@@ -28,7 +28,7 @@ from characterisation.statements.selection import Standing, judge, posterior, sa
 from mitsim.progress import say, say_progress
 from mitsim.views import View
 from mitsim.virtual.trials import TrialFolder
-from mitsim.virtual.world import CONFIRMATION_DAYS, RACE_DAYS, Trial
+from mitsim.virtual.world import OWN_FINISH_DAYS, RACE_DAYS, Trial
 
 Floats = NDArray[np.float64]
 
@@ -247,7 +247,7 @@ def _next_round(raced: Raced, made: Mapping[int, Sequence[Trial]], rules: RaceRu
         rivals = [int(v) for v in np.argsort(-one.chance, kind="stable") if one.chance[v] > _LEAST_CHANCE]
         for place in [one.leader, *rivals[:_CHALLENGERS]]:
             number = int(raced.views[place])
-            count = sum(trial.day < CONFIRMATION_DAYS for trial in made[number])
+            count = sum(trial.day < OWN_FINISH_DAYS for trial in made[number])
             if count < rules.most:
                 wanted[number] = _first_trials(min(count + BATCH, rules.most))[count:]
     return wanted
@@ -255,7 +255,7 @@ def _next_round(raced: Raced, made: Mapping[int, Sequence[Trial]], rules: RaceRu
 
 def _confirmation(raced: Raced, made: Mapping[int, Sequence[Trial]], rules: RaceRules) -> dict[int, list[Trial]]:
     """Return the trials that confirm the leaders, by the number of the view, without those that were made."""
-    every = [Trial(CONFIRMATION_DAYS + day) for day in range(rules.confirming)]
+    every = [Trial(OWN_FINISH_DAYS + day) for day in range(rules.confirming)]
     left = {number: [one for one in every if one not in made[number]] for number in set(raced.leaders().values())}
     return {number: some for number, some in sorted(left.items()) if some}
 

@@ -50,8 +50,9 @@ FINISHES = 8
 #: number of successive days that share a finish, for the same reason
 FINISH_DAYS = 2
 
-#: first days of the worlds of a race, of its confirmation, of a statement, and of a set of views
-RACE_DAYS, CONFIRMATION_DAYS, STATEMENT_DAYS, SET_DAYS = 0, 1 << 19, 1 << 20, 1 << 21
+#: first days of the worlds of a race, of worlds whose finishes are not of the pool (they confirm and judge a choice),
+#: of worlds of a statement, and of a set of views
+RACE_DAYS, OWN_FINISH_DAYS, STATEMENT_DAYS, SET_DAYS = 0, 1 << 19, 1 << 20, 1 << 21
 
 #: offset of the day of the streams from which ``swapped`` takes a group
 _ELSEWHERE = 1 << 32
@@ -103,8 +104,8 @@ class Unknowns:
     ``table`` holds their sizes. ``rig`` is nominal. ``calibration`` is the covariance of the calibration, with the
     drift since then. ``expansion`` of the part is in 1/K. ``centre`` (3,) [mm] is the point about which the part
     rotates. Groups that are not in ``varied`` keep their best estimate. With ``pooled``, finishes come from a pool of
-    :data:`FINISHES`; else every world has its own. The days that confirm a choice share no finish with the pool, since
-    the pool made the choice.
+    :data:`FINISHES`; else every world has its own. The days from :data:`OWN_FINISH_DAYS` on have
+    their own as well: they confirm a choice that the pool made.
     """
 
     table: UnknownsTable
@@ -154,7 +155,7 @@ class Unknowns:
         return np.random.default_rng(np.random.SeedSequence([self.seed, GROUPS.index(group), *place]))
 
     def _finish(self, rng: np.random.Generator, day: int) -> int:
-        pooled = self.pooled and not CONFIRMATION_DAYS <= day < STATEMENT_DAYS
+        pooled = self.pooled and not OWN_FINISH_DAYS <= day < STATEMENT_DAYS
         return int(rng.integers(FINISHES)) if pooled else FINISHES + _seed(rng)
 
     def _geometry(self, rng: np.random.Generator, sensor_kelvin: float) -> tuple[tuple[str, ...], NDArray[np.float64]]:

@@ -10,7 +10,7 @@ import xarray as xr
 from mitsim.virtual.race import ALL, FIRST, Job, RaceRules, run_race, shortlist
 from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.trials import TrialFolder
-from mitsim.virtual.world import CONFIRMATION_DAYS, Trial
+from mitsim.virtual.world import OWN_FINISH_DAYS, Trial
 
 NAMES = ["radius", "angle"]
 
@@ -120,7 +120,7 @@ class LuckyMaker:
         for job in jobs:
             self.asked.append(job)
             draws = np.random.default_rng([3, job.trial.day, job.view.number]).standard_normal(2)
-            unlucky = job.view.number == self.lucky and job.trial.day >= CONFIRMATION_DAYS
+            unlucky = job.view.number == self.lucky and job.trial.day >= OWN_FINISH_DAYS
             yield (
                 job,
                 dict(
@@ -136,15 +136,15 @@ def test_a_leader_that_was_lucky_loses_the_lead_when_it_is_confirmed(tmp_path):
     maker = LuckyMaker(spreads, 0)
     raced = race(maker, scores_of(spreads), tmp_path / "confirmed", replace(rules, confirming=16))
     assert raced.leader(ALL) == 1
-    confirmed = {job.view.number for job in maker.asked if job.trial.day >= CONFIRMATION_DAYS}
+    confirmed = {job.view.number for job in maker.asked if job.trial.day >= OWN_FINISH_DAYS}
     assert set(raced.leaders().values()) <= confirmed and 3 not in confirmed
 
 
 def test_every_leader_is_confirmed_once_and_again_after_a_stop(tmp_path):
     scores, rules = scores_of(np.array(SPREADS)), replace(RULES, confirming=8)
     whole = race(KnownMaker(SPREADS), scores, tmp_path / "whole", rules)
-    confirming = [trial for trial in _trials_of(tmp_path / "whole", whole.leader(ALL)) if trial >= CONFIRMATION_DAYS]
-    assert confirming == list(range(CONFIRMATION_DAYS, CONFIRMATION_DAYS + 8))
+    confirming = [trial for trial in _trials_of(tmp_path / "whole", whole.leader(ALL)) if trial >= OWN_FINISH_DAYS]
+    assert confirming == list(range(OWN_FINISH_DAYS, OWN_FINISH_DAYS + 8))
     with pytest.raises(KeyboardInterrupt):
         race(KnownMaker(SPREADS, stop_after=whole.trials - 3), scores, tmp_path / "parts", rules)
     again = KnownMaker(SPREADS)

@@ -12,11 +12,11 @@ from mitsim.sensor.rig_parameters import parameter_names
 from mitsim.sensor.room_light import room_irradiance
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
 from mitsim.virtual.world import (
-    CONFIRMATION_DAYS,
     FINISH_DAYS,
     FINISHES,
     FRESH,
     GROUPS,
+    OWN_FINISH_DAYS,
     STATEMENT_DAYS,
     Trial,
     Unknowns,
@@ -143,7 +143,7 @@ def test_finishes_have_the_spread_of_a_normal_distribution(unknowns):
 
 
 def test_a_choice_is_confirmed_with_other_finishes_than_those_that_made_it(unknowns):
-    own = [unknowns.draw(Trial(CONFIRMATION_DAYS + day)).finish for day in range(8 * FINISH_DAYS)]
+    own = [unknowns.draw(Trial(OWN_FINISH_DAYS + day)).finish for day in range(8 * FINISH_DAYS)]
     assert len(set(own)) == 8 and min(own) >= FINISHES
     assert unknowns.draw(Trial(STATEMENT_DAYS)).finish < FINISHES
     alphas = [finish_deviation(unknowns, number, "plate").alpha for number in own]
