@@ -38,7 +38,8 @@ _NAMES = {
 }
 
 if TYPE_CHECKING:
-    from characterisation.coupon.patches import Coupon, Overall, overall
+    from characterisation.coupon.patch_table import Overall, overall
+    from characterisation.coupon.patches import Coupon
     from characterisation.coupon_cloud import measure_coupon, patch_metrics
     from characterisation.errors import InputError, MissingEnvironmentError
     from characterisation.features.fits import (

@@ -36,7 +36,7 @@ from mitsim.progress import track
 from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.load import Scene
 from mitsim.scene.test_targets import FINISHES, ball, ball_on_plate, plate
-from mitsim.sensor.imager import Noise
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.simulation.rendering import Rendering

@@ -17,7 +17,6 @@ in a pooled mean.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +25,6 @@ from numpy.typing import NDArray
 
 from characterisation.coupon.discs import disc_offsets, independent_share
 from characterisation.coupon.metrics import (
-    LEAST_DEGREES,
     RayNoise,
     clipped,
     density_fraction,
@@ -36,8 +34,9 @@ from characterisation.coupon.metrics import (
     sigma_interval,
 )
 from characterisation.coupon.offsets import known_offset, neighbour_products
+from characterisation.coupon.patch_table import patch_table
 from characterisation.coupon.residual_field import disc_autocorrelation, disc_lengths, disc_residuals, plane_degrees
-from characterisation.datasets import Schema, Variable
+from characterisation.coupon.view_frame import in_view_frame
 from characterisation.errors import InputError
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, ViewGrid
 
@@ -63,24 +62,6 @@ class Coupon:
         along = np.cross(self.normal, self.across)
         half_w, half_h = self.across * self.width / 2, along * self.height / 2
         return np.stack([self.centre + a * half_w + b * half_h for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
-
-
-def view_frame(view: NDArray[np.floating], baseline: NDArray[np.floating]) -> Floats:
-    """Return the axes of view frames: z back toward the sensor, x along the baseline, y = z cross x.
-
-    ``view`` (..., 3) are directions from the sensor to the surface, ``baseline`` is (3,). Returns (..., 3, 3), rows =
-    axes. The two optical centres of a sensor lie on its baseline, so a tilt about the baseline and a tilt across it
-    have different effects.
-    """
-    z = -np.asarray(view, float) / np.linalg.norm(view, axis=-1, keepdims=True)
-    x = baseline - np.einsum("...k,k->...", z, baseline)[..., None] * z
-    x /= np.linalg.norm(x, axis=-1, keepdims=True)
-    return np.stack([x, np.cross(z, x), z], axis=-2)
-
-
-def in_view_frame(normals: Floats, view: Floats, baseline: Floats) -> Floats:
-    """Return normals (..., 3) of the sensor frame in the view frame; the last component is the cosine of incidence."""
-    return np.asarray(np.einsum("...ij,...j->...i", view_frame(view, baseline), normals))
 
 
 def patch_centres(
@@ -245,55 +226,6 @@ def patch_residuals(cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, m
     return np.asarray(residual[np.isfinite(residual)])
 
 
-@dataclass(frozen=True)
-class Overall:
-    """F and sigma [mm] of one capture over its patches, with standard errors from their scatter; NaN where unknown."""
-
-    fraction: float
-    fraction_error: float
-    sigma: float
-    sigma_error: float
-
-
-def overall(patches: xr.Dataset) -> Overall:
-    """Pool the patches of one capture: F weighted by points, sigma^2 by degrees of freedom.
-
-    Parameters
-    ----------
-    patches
-        Table of :func:`characterisation.measure_coupon`. Discs with fewer than 10 degrees of freedom are excluded from
-        sigma.
-
-    Returns
-    -------
-    Overall
-        ``fraction`` F [1] and ``sigma`` [mm] with their standard errors ``fraction_error`` and ``sigma_error``.
-
-    Examples
-    --------
-    >>> import characterisation
-    >>> cloud = characterisation.read_cloud("coupon.ply")
-    >>> pooled = characterisation.overall(characterisation.measure_coupon(cloud, window=(90, 50, 140, 140)))
-    >>> pooled.sigma_error < pooled.sigma
-    True
-    """
-    count, possible = patches["points"].values.astype(float), patches["points_possible"].values.astype(float)
-    if not possible.sum():
-        return Overall(math.nan, math.nan, math.nan, math.nan)
-    fraction = count.sum() / possible.sum()
-    scatter = float(np.std(count / possible)) / math.sqrt(len(count))
-    fraction_error = max(scatter, math.sqrt(max(fraction * (1 - fraction), 0.0) / possible.sum()))
-    sigma = patches["ray_noise_inliers"].values
-    degrees = np.where((count - 3 >= LEAST_DEGREES) & np.isfinite(sigma), count - 3, 0.0)
-    if not degrees.sum():
-        return Overall(fraction, fraction_error, math.nan, math.nan)
-    variance = np.nan_to_num(sigma) ** 2
-    pooled = float((degrees * variance).sum() / degrees.sum())
-    spread = math.sqrt(float((degrees * (variance - pooled) ** 2).sum() / degrees.sum()) / np.count_nonzero(degrees))
-    error = max(spread, pooled * math.sqrt(2 / degrees.sum())) / (2 * math.sqrt(pooled)) if pooled > 0 else 0.0
-    return Overall(fraction, fraction_error, math.sqrt(pooled), error)
-
-
 def _check(
     cloud: PointCloud,
     radius_px: float,
@@ -383,55 +315,3 @@ def _correlated(noise: RayNoise, radius_px: float) -> dict[str, Floats]:
         "correlation_length_pooled": np.full(len(sigma), rho.length()),
         "correlation_area_pooled": np.full(len(sigma), rho.area()),
     }
-
-
-_UNITS = {
-    "ray_noise_std": "mm",
-    "standard_error": "mm",
-    "ray_noise_robust": "mm",
-    "ray_noise_inliers": "mm",
-    "ray_noise_corrected": "mm",
-    "sigma_low": "mm",
-    "sigma_high": "mm",
-    "distance": "mm",
-    "semi_major": "mm",
-    "semi_minor": "mm",
-    "incidence": "rad",
-    "off_axis": "rad",
-    "included_angle": "rad",
-    "correlation_length": "px",
-    "correlation_length_pooled": "px",
-    "correlation_area_pooled": "px2",
-    "ray_offset": "mm",
-    "offset_product_touching": "mm2",
-    "offset_product_apart": "mm2",
-    "row": "px",
-    "column": "px",
-}
-
-
-_PATCH = ("patch",)
-
-#: schema of a stored table of patches from which a map can be made
-PATCHES = Schema(
-    "a table of patches from mitsim characterise",
-    {
-        **{name: Variable(_PATCH, "number", 0, 1) for name in ("recovered_fraction", "false_fraction")},
-        **{name: Variable(_PATCH, "number", 0, 1e9) for name in ("points", "points_possible")},
-        **{name: Variable(_PATCH, "number", 0, 1e6, gaps=True) for name in ("ray_noise_std", "ray_noise_inliers")},
-        **{name: Variable(_PATCH, "number", -1e6, 1e6, gaps=True) for name in ("ray_offset",)},
-        **{
-            name: Variable(_PATCH, "number", -1e12, 1e12, gaps=True)
-            for name in ("offset_product_touching", "offset_product_apart")
-        },
-        **{name: Variable(_PATCH, "number", -1, 1) for name in ("normal_x", "normal_y")},
-        "distance": Variable(_PATCH, "number", 1, 1e6),
-        "independent_share": Variable(_PATCH, "number", 0, 1),
-    },
-    {"patch": (0, 10_000_000)},
-)
-
-
-def patch_table(**columns: NDArray[np.generic]) -> xr.Dataset:
-    """Assemble the table of patches, each column with its unit."""
-    return xr.Dataset({name: ("patch", values, {"units": _UNITS.get(name, "1")}) for name, values in columns.items()})

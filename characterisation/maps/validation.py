@@ -20,7 +20,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.stats import wasserstein_distance
 
-from characterisation.coupon.patches import Overall
+from characterisation.coupon.patch_table import Overall
 
 Floats = NDArray[np.float64]
 

@@ -18,7 +18,8 @@ import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from quoted import PAGES, PICTURE, ROOT, Figure, compared, figures, missing_numbers, pictures_differ, put_picture
+from quoted import PAGES, PICTURE, ROOT, Figure, compared, figures, pictures_differ, put_picture
+from quoted_tables import table_faults
 
 #: recordings that are not in the repository; commands name their folder as $MITSIM_REAL_DATA
 RECORDINGS = Path(os.environ.get("MITSIM_REAL_DATA", ROOT.parent / "shared" / "real"))
@@ -81,8 +82,7 @@ def made_again(figure: Figure, scratch: Scratch, write: bool) -> list[str]:
             if write and new and differs:
                 put_picture(new, picture)
     elif figure.kind == "table":
-        missing = missing_numbers(figure.text, output)
-        faults = [f"not in the output: {', '.join(missing)}"] if missing else []
+        faults = table_faults(figure.text, output, figure.columns, figure.rows)
     else:
         faults, mended = compared(figure.text, output)
         if write and mended != figure.text:

@@ -7,35 +7,38 @@ A comment directly before a fenced output, a table of figures or a picture says 
     <!-- held by: tests/surface/test_metals.py -->    a test computes it again and compares
     <!-- not run: needs the recording stereo.zip -->  a recording, a device, numbers that are settings
     <!-- file: brighten.py -->                        the fence below is a file that later commands need
+    <!-- columns: recorded = real -->                 of a table: names that the command prints otherwise
+    <!-- rows: all = all of 1000 calibrations -->
 
 **When a figure is the same.** Each quoted line has to be in the output, in this order, with the same words. ``...``
-stands for any text, or for omitted lines. Two whole numbers are equal; of 1000 or more they count pixels or points and
-may differ by 0.1 %, because other processors round differently. Other numbers are the same if both can be roundings of
-one value: they differ by at most half a unit in the last digit of the one plus half a unit in the last digit of the
-other, and no digit is quoted that the command does not print. Times (``17 s``) and absolute paths are not compared. Of
-a table, which may be arranged otherwise, each number has to be in the output, except in columns *by others*. A picture
-has to have the same proportions, and grey levels that differ by 2 of 255 in the mean at most.
+stands for any text, or for omitted lines. ``quoted_numbers.py`` says when two numbers are the same. Times (``17 s``)
+and absolute paths are not compared. Tables are compared cell by cell: see ``quoted_tables.py``, also for the comments
+*columns* and *rows*. A picture has to have the same proportions, and grey levels that differ by 2 of 255 in the mean at
+most.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from quoted_numbers import NUMBER, same
+from quoted_tables import names_of, row_of
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 
 MARKER = re.compile(r"\s*<!-- (made by|held by|not run|file): (.*?)(?:; takes (\d+) (s|min|h))? -->")
+NAMES = re.compile(r"\s*<!-- (columns|rows): (.*?) -->")
 PICTURE = re.compile(r"!\[[^\]]*\]\(([^)\s]+)\)")
 SECONDS = {"s": 1, "min": 60, "h": 3600}
 
-NUMBER = r"(?<![A-Za-z_\d.])[-+−]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?(?![A-Za-z_\d])"
 #: parts of a quoted line, by name
 PARTS = re.compile(
     r"(?P<any>\.\.\.)|(?P<time>\d[\d.]*\s?(?:ms|s|min|minutes|h)\b)|(?P<path>(?<!\S)/\S+)"
@@ -54,6 +57,8 @@ class Figure:
     marker: str = ""  # made by, held by, not run, file; empty: there is none
     told: str = ""  # command, test, reason or file name
     seconds: float = 0.0
+    columns: Mapping[str, str] = field(default_factory=dict)  # of a table: printed names by quoted ones
+    rows: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def where(self) -> str:
@@ -66,19 +71,23 @@ def figures(page: Path) -> list[Figure]:
     lines = page.read_text(encoding="utf-8").splitlines()
     found: list[Figure] = []
     markers: list[tuple[str, str, float]] = []
+    names: dict[str, dict[str, str]] = {"columns": {}, "rows": {}}
     at = 0
 
     def add(kind: str, first: int, text: list[str], needed: bool) -> None:
         for marker, told, seconds in markers or ([("", "", 0.0)] if needed else []):
             if (marker, told) == ("made by", "as above"):
                 told, seconds = next((one.told, one.seconds) for one in reversed(found) if one.marker == marker)
-            found.append(Figure(page, first + 1, "file" if marker == "file" else kind, text, marker, told, seconds))
+            own = "file" if marker == "file" else kind
+            found.append(Figure(page, first + 1, own, text, marker, told, seconds, **names))
 
     while at < len(lines):
         line, end = lines[at], at + 1
         if match := MARKER.fullmatch(line):
             told = float(match[3] or 0) * SECONDS[match[4] or "s"]
             markers.append((match[1], match[2], told))
+        elif match := NAMES.fullmatch(line):
+            names[match[1]] = names_of(match[2])
         elif line.startswith("```"):
             while lines[end] != "```":
                 end += 1
@@ -91,7 +100,7 @@ def figures(page: Path) -> list[Figure]:
         elif PICTURE.search(line):
             add("picture", at, [line], needed=True)
         if not (line.startswith("<!--") or PICTURE.search(line)):
-            markers = []
+            markers, names = [], {"columns": {}, "rows": {}}
         at = end
     return found
 
@@ -101,30 +110,10 @@ def cells(table: list[str]) -> list[str]:
     return [cell for row in table[2:] for cell in row_of(row)[1:] if cell]
 
 
-def row_of(line: str) -> list[str]:
-    """Return the cells of a line of a table."""
-    return [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
-
-
 def holds_figures(table: list[str]) -> bool:
     """Return whether more than two fifths of a table's cells begin with a number."""
     filled = cells(table)
     return sum(bool(re.match(r"[-*(+−±<>~]*\s*\d", cell)) for cell in filled) > 0.4 * len(filled)
-
-
-def same(quoted: str, found: str) -> bool:
-    """Return whether two printed numbers are the same figure."""
-    first, second = (float(one.replace("−", "-")) for one in (quoted, found))
-    if unit(quoted) >= 1 and unit(found) >= 1:
-        return first == second or abs(first - second) <= 1e-3 * abs(first) >= 1
-    rounded = (unit(quoted) + unit(found)) / 2 if unit(found) <= unit(quoted) else 0.0
-    return abs(first - second) <= rounded * (1 + 1e-9)
-
-
-def unit(number: str) -> float:
-    """Return the unit of the last digit of a printed number."""
-    digits, _, power = number.lower().partition("e")
-    return float(10.0 ** (int(power or 0) - len(digits.partition(".")[2])))
 
 
 def pattern(line: str) -> re.Pattern[str]:
@@ -154,15 +143,6 @@ def compared(quoted: list[str], output: str) -> tuple[list[str], list[str]]:
         else:
             faults.append(f"quoted: {line.strip()}\n    printed: no line with these words")
     return faults, mended
-
-
-def missing_numbers(table: list[str], output: str) -> list[str]:
-    """Return the numbers in the cells of a table that the output does not have."""
-    printed = re.findall(NUMBER, output)
-    others = [at for at, head in enumerate(row_of(table[0])) if "by others" in head]
-    own = [cell for row in table[2:] for at, cell in enumerate(row_of(row)) if at not in (0, *others)]
-    wanted = re.findall(NUMBER, re.sub(r"`[^`]*`", "", " | ".join(own)))
-    return [one for one in wanted if not any(same(one, other) for other in printed)]
 
 
 def pictures_differ(kept: Path, new: Path) -> str:

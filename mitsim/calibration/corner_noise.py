@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 from mitsim.decode.grey_levels import grey_level_variance
 from mitsim.decode.matching.reference_matching import reference_geometry
 from mitsim.decode.structured_light.phase_shift import fringe_sigma
+from mitsim.sensor.image_formation import expose, fixed_pattern
 from mitsim.sensor.image_sequence import ImageSequence
-from mitsim.sensor.imager import Noise, expose, fixed_pattern
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import Sensor

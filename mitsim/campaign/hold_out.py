@@ -19,7 +19,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.checked_files import read_bounded
-from characterisation.coupon.patches import Coupon, Overall, measure_patches, overall, patch_residuals
+from characterisation.coupon.patch_table import Overall, overall
+from characterisation.coupon.patches import Coupon, measure_patches, patch_residuals
 from characterisation.documents import read_toml
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.validation import Pair

@@ -29,7 +29,7 @@ from mitsim.capture.packed_files import packed
 from mitsim.progress import track
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.ray_casting.triangles import triangles
-from mitsim.sensor.imager import Noise
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.simulation.rendering import Rendering

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from characterisation.coupon.orientations import Refinement, cap_directions
-from characterisation.coupon.patches import view_frame
+from characterisation.coupon.view_frame import view_frame
 from characterisation.documents import Document, read_toml
 from characterisation.maps.performance_map import Variant
 from characterisation.stage.angles import Stage

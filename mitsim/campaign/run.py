@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from characterisation import atomic_io
 from characterisation.coupon.orientations import refine
-from characterisation.coupon.patches import overall, patch_table
+from characterisation.coupon.patch_table import overall, patch_table
 from characterisation.maps.performance_map import PerformanceMap, SampleTable, build_map
 from mitsim.campaign.acquire import Source
 from mitsim.campaign.plan import Campaign, Series, Shot, sensor_checksum

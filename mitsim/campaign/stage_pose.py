@@ -24,7 +24,7 @@ from pydantic import Field, model_validator
 
 from characterisation.atomic_io import write_json
 from characterisation.checked_files import read_bounded
-from characterisation.coupon.patches import view_frame
+from characterisation.coupon.view_frame import view_frame
 from characterisation.documents import Document, Name, validate
 from characterisation.stage.angles import Stage
 from characterisation.stage.calibration import BoardCalibration, CouponCalibration

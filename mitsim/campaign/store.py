@@ -27,7 +27,7 @@ from pydantic import Field
 
 from characterisation.atomic_io import write_folder
 from characterisation.checked_files import LARGEST_FILE, content_checksum, is_inside, read_bounded
-from characterisation.coupon.patches import PATCHES, patch_table
+from characterisation.coupon.patch_table import PATCHES, patch_table
 from characterisation.datasets import check_dataset
 from characterisation.documents import Document, validate
 from mitsim.campaign.plan import Shot

@@ -1,7 +1,7 @@
 """Grey levels of a capture back to photo-electrons, and the noise of their mean over its images.
 
 Signal chain: grey levels [DN] -> companding or gamma undone -> less black, over the gain -> electrons [e-]. The noise
-of a pixel's mean over n images [e-^2], by EMVA 1288 (:mod:`mitsim.sensor.imager`), q the grey level's width:
+of a pixel's mean over n images [e-^2], by EMVA 1288 (:mod:`mitsim.sensor.image_formation`), q the grey level's width:
 
     v = (mu + D t + read^2 + q^2 / 12) / n + dsnu^2 + (prnu mu)^2
 
@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 
 from mitsim.capture.capture import Capture
 from mitsim.errors import InputError
-from mitsim.sensor.imager import Imager, Noise, converter
+from mitsim.sensor.image_formation import converter
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.noise_sources import Noise
 
 Floats = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from mitsim.measuring import clouds
 from mitsim.scene import load
 from mitsim.scene.load import Scene
 from mitsim.sensor import preset
-from mitsim.sensor.imager import Noise
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.simulation.rendering import Rendering

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.coupon.patches import in_view_frame
+from characterisation.coupon.view_frame import in_view_frame
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.tables import Surface
 from characterisation.point_cloud import PointCloud, Status, ViewGrid

@@ -2,8 +2,8 @@
 
 Signal chain: radiance of every correlation 1 + m cos(2 pi f L / c - delta)
 (:class:`mitsim.scene.light_transport.projector_light.ModulatedLight`) -> delays of the pixels -> charge of the two taps
-A and B of a pixel -> noise of each (:mod:`mitsim.sensor.imager`) -> their difference -> quantisation -> grey levels
-[DN].
+A and B of a pixel -> noise of each (:mod:`mitsim.sensor.image_formation`) -> their difference -> quantisation -> grey
+levels [DN].
 
 While a pixel demodulates, the reference signal directs its light to tap A or tap B; none is lost. With w the mean over
 the delays (all light, including ambient) and s_k a correlation, in electrons,
@@ -26,7 +26,9 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from characterisation.documents import Document
-from mitsim.sensor.imager import FixedPattern, Imager, Noise, converter, expose
+from mitsim.sensor.image_formation import FixedPattern, converter, expose
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.noise_sources import Noise
 
 #: speed of light [mm/s]
 LIGHT_MM_S = 299792458e3
@@ -169,7 +171,7 @@ def expose_taps(
     -------
     numpy.ndarray
         (P, H, W), uint8 up to 8 bits, else uint16; bits and black level are those of
-        :func:`mitsim.sensor.imager.converter`. Only a pixel with a full tap reaches full scale.
+        :func:`mitsim.sensor.image_formation.converter`. Only a pixel with a full tap reaches full scale.
     """
     chip = converter(imager, noise)
     fine = replace(noise, quantisation=False)

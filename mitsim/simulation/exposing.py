@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.threads import in_threads
-from mitsim.sensor.imager import FixedPattern, Noise, converter, expose, fixed_pattern
+from mitsim.sensor.image_formation import FixedPattern, converter, expose, fixed_pattern
 from mitsim.sensor.modulation import AmplitudeModulation, delay_pattern, delayed, expose_taps
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform

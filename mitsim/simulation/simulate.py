@@ -32,8 +32,9 @@ from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.imager import Noise, converter
+from mitsim.sensor.image_formation import converter
 from mitsim.sensor.modulation import AmplitudeModulation
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import Roi, roi_around
 from mitsim.sensor.speckle import SpeckleField

@@ -2,8 +2,8 @@
 
 Signal chain: pose and bend of the specimen -> light of the projector's pattern on one camera, traced once for each
 pattern (:mod:`mitsim.simulation.simulate`) -> power, and light of the room -> blur and corner loss of the lens ->
-electrons -> grey levels (:mod:`mitsim.sensor.imager`). It is the signal chain of every simulated capture, except that
-results which a parameter does not affect are cached.
+electrons -> grey levels (:mod:`mitsim.sensor.image_formation`). It is the signal chain of every simulated
+capture, except that results which a parameter does not affect are cached.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from mitsim.fit.place import Place
 from mitsim.scene.light_transport.projector_light import LitPatterns
 from mitsim.scene.load import Scene
 from mitsim.sensor.camera import Rig
-from mitsim.sensor.imager import Noise, electrons_per_radiance, expose, fixed_pattern
+from mitsim.sensor.image_formation import expose, fixed_pattern
+from mitsim.sensor.imager import electrons_per_radiance
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.vignetting import camera_illumination

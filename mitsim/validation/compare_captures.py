@@ -11,8 +11,8 @@ medians. With k = 2,
 
     agrees: |simulated - real| <= max(2 u, margin)
 
-A quantity that agrees only because 2 u is over half of it is not comparable. The margins are *assumed* to be acceptable
-to a user of a simulator: a factor 1.15 for noise, contrast and lengths, and those in :data:`QUANTITIES` for the others.
+A quantity that agrees only because 2 u is over half of it is not comparable. The quantities and their
+margins are those of :mod:`mitsim.validation.compared_quantities`.
 
 The distance between the histograms is Wasserstein's of first order. Two samples of one population also have a distance.
 Its 2 u is therefore the 95th percentile over random exchanges of patches between real and simulated (a permutation
@@ -21,29 +21,24 @@ test).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import wasserstein_distance
 
-from characterisation.coupon.residual_field import Autocorrelation
-from characterisation.point_cloud import Status
 from mitsim.capture.capture import Capture
 from mitsim.decode.matching.stereo import StereoGeometry
 from mitsim.errors import InputError
 from mitsim.fit.place import Place
 from mitsim.reconstruction.cloud import Geometry, Settings, capture_geometry
 from mitsim.report.numbers import two_digits
+from mitsim.validation.compared_quantities import QUANTITIES, Floats, Quantity
 from mitsim.validation.plain_image import plain_image
 from mitsim.validation.rebuild import median_level
 from mitsim.validation.specimen_patches import PATCH_PX, SpecimenPatches, run_length, specimen_patches
 
-Floats = NDArray[np.float64]
-Picked = NDArray[np.intp]
-Figure = Callable[[SpecimenPatches, Picked], Floats]
 Verdict = Literal["agrees", "differs", "not comparable", "does not apply"]
 
 #: draws of the bootstrap, and smallest number of patches
@@ -63,23 +58,6 @@ _ROUNDING = 1e-9
 
 #: smallest and largest side of the window for local contrast [px], and the number of runs of the pattern in it
 _WINDOWS, _RUNS = (7, 31), 2.5
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """A quantity ``of`` the image or the cloud: ``figure`` (D,) of drawn patches (D, P) of a capture, NaN if unknown.
-
-    ``factor``, or ``margin`` [unit], is the acceptable difference between real and simulated. ``needs_pattern``: the
-    quantity is not comparable if only one capture has a pattern.
-    """
-
-    name: str
-    unit: str
-    of: Literal["image", "cloud"]
-    figure: Figure
-    factor: float = 1.0
-    margin: float = 0.0
-    needs_pattern: bool = True
 
 
 @dataclass(frozen=True)
@@ -136,79 +114,6 @@ class Comparison:
             "rows": rows,
         }
 
-
-def _quantile(values: Floats, share: float) -> Floats:
-    """Return the quantile of the known values along the last axis, linearly interpolated; NaN if there are none."""
-    ordered, known = np.sort(values, axis=-1), np.isfinite(values).sum(axis=-1)
-    at = share * np.maximum(known - 1, 0)
-    low = np.floor(at).astype(int)
-    high = np.minimum(low + 1, np.maximum(known - 1, 0))
-    below, above = (np.take_along_axis(ordered, index[..., None], -1)[..., 0] for index in (low, high))
-    return np.where(known > 0, below + (at - low) * (above - below), np.nan)
-
-
-def _sums(values: Floats, picked: Picked) -> Floats:
-    """Return sums (D, ...) of values (P, ...) over the drawn patches (D, P)."""
-    times = np.stack([np.bincount(own, minlength=len(values)) for own in picked]).astype(float)
-    return np.asarray((times @ values.reshape(len(values), -1)).reshape(len(picked), *values.shape[1:]))
-
-
-def _median(name: str) -> Figure:
-    return lambda seen, picked: _quantile(getattr(seen, name)[picked], 0.5)
-
-
-def _level(seen: SpecimenPatches, picked: Picked) -> Floats:
-    return np.array([median_level(counts) for counts in _sums(seen.levels, picked)])
-
-
-def _spread(seen: SpecimenPatches, picked: Picked) -> Floats:
-    return _quantile(seen.sigma[picked], 0.75) - _quantile(seen.sigma[picked], 0.25)
-
-
-def _run(seen: SpecimenPatches, picked: Picked) -> Floats:
-    changes = _sums(seen.crossings, picked)
-    return np.where(changes > 0, _sums(seen.pixels, picked) / np.maximum(changes, 1), np.nan)
-
-
-def _share(status: Status) -> Figure:
-    def figure(seen: SpecimenPatches, picked: Picked) -> Floats:
-        counts = _sums(seen.status, picked)
-        return np.asarray(counts[:, status] / counts.sum(axis=-1))
-
-    return figure
-
-
-def _correlation_length(seen: SpecimenPatches, picked: Picked) -> Floats:
-    products, pairs = _sums(seen.products, picked), _sums(seen.pairs, picked)
-    middle = products.shape[1] // 2
-    lengths = np.full(len(picked), np.nan)
-    for index in np.flatnonzero(pairs[:, middle, middle] > 0):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            covariance = np.where(pairs[index] > 0, products[index] / pairs[index], np.nan)
-            lengths[index] = Autocorrelation(covariance / covariance[middle, middle], pairs[index]).length()
-    return lengths
-
-
-_NOISE_FACTOR, _SHARE_MARGIN = 1.15, 0.02
-
-QUANTITIES = (
-    Quantity("median grey level", "DN", "image", _level, factor=1.05, needs_pattern=False),
-    Quantity("finest detail", "DN", "image", _median("finest"), factor=_NOISE_FACTOR, needs_pattern=False),
-    Quantity("contrast", "1", "image", _median("contrast"), factor=_NOISE_FACTOR),
-    Quantity("run length", "px", "image", _run, factor=_NOISE_FACTOR),
-    Quantity("F", "1", "cloud", _share(Status.VALID), margin=_SHARE_MARGIN),
-    Quantity("sigma, median", "mm", "cloud", _median("sigma"), factor=_NOISE_FACTOR),
-    Quantity("sigma, interquartile range", "mm", "cloud", _spread, factor=1.5),
-    Quantity("sigma in disparity", "px", "cloud", _median("sigma_px"), factor=_NOISE_FACTOR),
-    Quantity("correlation length", "px", "cloud", _correlation_length, factor=_NOISE_FACTOR),
-    Quantity("distance", "mm", "cloud", _median("distance"), factor=1.002),
-    Quantity("vertical error", "px", "cloud", _median("row_error"), margin=0.05),
-    *(
-        Quantity(f"share {status.name.lower()}", "1", "cloud", _share(status), margin=_SHARE_MARGIN)
-        for status in Status
-        if status is not Status.VALID
-    ),
-)
 
 HISTOGRAMS = "grey levels, distance"
 

@@ -36,8 +36,8 @@ from mitsim.fit.place import Place
 from mitsim.fit.specimen import MARGIN_PX, image_mask
 from mitsim.reconstruction.cloud import capture_pattern
 from mitsim.scene.light_transport.projector_light import LitPatterns
-from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import AmplitudeModulation
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
 from mitsim.simulation.exposing import LightOnImagers

@@ -1,38 +1,34 @@
-"""The page of how right statements of uncertainty are: coverage and regret, cell by cell, in Markdown.
+"""Write the page of how right statements of uncertainty are: coverage and regret, cell by cell, in Markdown.
 
-Signal chain: judged cases (:mod:`mitsim.validation.statement_run`) -> shares inside the stated intervals, and regrets
-(:mod:`characterisation.statements.judgement`) -> ``coverage.csv``, ``regret.csv``, a figure -> ``statements.md``.
+Signal chain: judged cases -> their coverage, false accepts and regrets (:mod:`mitsim.validation.judged_statements`) ->
+``coverage.csv``, ``regret.csv`` (:mod:`mitsim.validation.statement_csv`), a figure -> ``statements.md``.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from characterisation.atomic_io import atomic_write
-from characterisation.scores.screening import LEAST_MEASURABLE
-from characterisation.statements.judgement import (
-    Regret,
-    Share,
-    falsely_accepted,
-    pooled_share,
-    regret,
-    share,
-    within,
-)
+from characterisation.statements.judgement import Share, share
 from mitsim.report.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing, write_png
-from mitsim.validation.statement_run import JudgedCase, StatedView
-from mitsim.validation.tables import markdown, number, write_csv
-from mitsim.virtual.race import screening_risk
-
-Floats = NDArray[np.float64]
+from mitsim.validation.judged_statements import (
+    PREDICTED,
+    RACE,
+    TALK,
+    Choice,
+    choices_of,
+    coverage_of,
+    false_accepts,
+    pooled,
+    pooled_coverage,
+)
+from mitsim.validation.statement_csv import write_coverage_csv, write_regret_csv
+from mitsim.validation.statement_run import JudgedCase
+from mitsim.validation.tables import markdown, number
 
 #: between these the share of errors inside the stated 95 % intervals is asked to lie
 COVERAGE = (0.93, 0.97)
@@ -40,92 +36,14 @@ COVERAGE = (0.93, 0.97)
 #: the mean regret of the chosen view is asked to be at most this
 REGRET = 1.15
 
-#: who chose a view: the race, the map's predicted uncertainty, the talk's V_m
-RACE, PREDICTED, TALK = "race", "predicted u", "V_m"
-
-
-@dataclass(frozen=True)
-class Choice:
-    """The view that somebody chose for a measurement of a case, and its regret.
-
-    ``judged``: the best view gives a value in half of the worlds; where it does not, risks are those of a few worlds,
-    and the regret is listed but in no mean.
-    """
-
-    case: JudgedCase
-    measurement: str
-    by: str
-    view: int
-    best: int
-    regret: Regret
-    judged: bool = True
-
-
-def coverage_of(stated: StatedView) -> list[Share]:
-    """Share of errors inside the stated interval, of every measurement; of none where nothing could be stated."""
-    return [share(known[np.isfinite(known)] > 0) for known in _inside(stated)]
-
-
-def pooled_coverage(cases: Sequence[JudgedCase]) -> Share:
-    """Share over all measurements and stated views of some cases; its interval is that over worlds."""
-    return _pooled([_inside(stated) for case in cases for stated in case.stated])
-
-
-def false_accepts(stated: StatedView, corrected: bool) -> Floats:
-    """Whether worlds accept a part at an edge of its tolerance (measurement, world); NaN without a value or interval.
-
-    By the rule of ISO 14253-1 as the tool applies it, to readings as they are or with the stated bias subtracted.
-    """
-    rows = []
-    for one, errors in zip(stated.statements, stated.errors, strict=True):
-        low, high = one.interval_corrected if corrected else one.interval
-        guards = (max(high, 0.0), max(-low, 0.0)) if corrected else (max(abs(low), abs(high)),) * 2
-        known = math.isfinite(low)
-        rows.append(falsely_accepted(errors - one.bias * corrected, guards) if known else np.full(len(errors), np.nan))
-    return np.array(rows)
-
-
-def _pooled(columns: Sequence[Floats]) -> Share:
-    rows = max((len(one) for one in columns), default=0)
-    if not rows:
-        return share([])
-    padded = [np.pad(one, ((0, rows - len(one)), (0, 0)), constant_values=np.nan) for one in columns]
-    return pooled_share(np.concatenate(padded, axis=1))
-
-
-def choices_of(case: JudgedCase) -> list[Choice]:
-    """Views that the race, the map's u and V_m chose for every measurement of a raced case, with their regrets."""
-    if case.raced is None:
-        return []
-    few = case.case.file.raced_candidates
-    numbers = case.views[:few].tolist()
-    errors = case.truth[:, :few, : case.case.file.raced_worlds]
-    told = case.scores.sel(view=numbers)
-    risk = screening_risk(told)
-    talk = told["V_m"].transpose("measurement", "view").values
-    out = []
-    for m, name in enumerate(case.measurements):
-        if np.isfinite(errors[m]).sum(axis=1).max() < 3:
-            continue  # no view can measure it
-        picks = {
-            RACE: numbers.index(case.raced.leader(name)) if name in case.raced.standings else 0,
-            PREDICTED: int(np.argmin(risk[m])),
-            TALK: int(np.nanargmax(np.where(np.isfinite(talk[m]), talk[m], -1.0))),
-        }
-        for by, place in picks.items():
-            found = regret(errors[m], place)
-            judged = bool(np.isfinite(errors[m, found.best]).mean() >= LEAST_MEASURABLE)
-            out.append(Choice(case, name, by, numbers[place], numbers[found.best], found, judged))
-    return out
-
 
 def write_statement_page(cases: Sequence[JudgedCase], folder: str | Path, preamble: str) -> tuple[Path, str]:
     """Write ``statements.md``, its figure and its CSV files; returns its path, and the table of what came out."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     choices = [one for case in cases for one in choices_of(case)]
-    write_csv(folder / "coverage.csv", _COVERAGE_HEAD, [row for case in cases for row in _coverage_rows(case)])
-    write_csv(folder / "regret.csv", _REGRET_HEAD, [_regret_row(one) for one in choices])
+    write_coverage_csv(folder / "coverage.csv", cases)
+    write_regret_csv(folder / "regret.csv", choices)
     write_png(coverage_figure(cases), folder / "coverage.png", dpi=110)
     sensors = sensor_table(cases, choices)
     text = [
@@ -222,7 +140,7 @@ def verdict_table(cases: Sequence[JudgedCase]) -> str:
         for corrected in (False, True):
             found = [false_accepts(one, corrected) for one in mine]
             each = [share(row[np.isfinite(row)] > 0) for one in found for row in one if np.isfinite(row).sum() >= 10]
-            row += [_share(_pooled(found)), f"{sum(one.low <= 0.05 for one in each)} of {len(each)}"]
+            row += [_share(pooled(found)), f"{sum(one.low <= 0.05 for one in each)} of {len(each)}"]
         body.append(row)
     return markdown(
         ["sensor", "false accepts", "cells that agree with 5 % or less", "bias subtracted", "cells that agree"], body
@@ -281,123 +199,12 @@ def _label(one: JudgedCase) -> str:
     return f"{one.sensor}, {one.case.table.part}{more}"
 
 
-def _inside(stated: StatedView) -> Floats:
-    rows = []
-    for one, errors in zip(stated.statements, stated.errors, strict=True):
-        known = all(math.isfinite(end) for end in one.interval)
-        rows.append(within(errors, one.interval) if known else np.full(len(errors), np.nan))
-    return np.array(rows)
-
-
 def _mean_regret(choices: Sequence[Choice]) -> str:
     judged = [one for one in choices if one.judged]
     if not judged:
         return "-"
     plain, unbiased = ([getattr(one.regret, key) for one in judged] for key in ("ratio", "unbiased"))
     return f"{number(float(np.mean(unbiased)))} (plain {number(float(np.mean(plain)))})"
-
-
-_COVERAGE_HEAD = (
-    "part",
-    "sealed",
-    "sensor",
-    "finish",
-    "view",
-    "why",
-    "measurement",
-    "unit",
-    "worlds",
-    "inside",
-    "share",
-    "low",
-    "high",
-    "false_accepts",
-    "false_accepts_corrected",
-    "bias",
-    "u",
-    "interval_low",
-    "interval_high",
-    "true_bias",
-    "true_std",
-    "without_value_stated",
-    "without_value_found",
-)
-
-
-def _coverage_rows(case: JudgedCase) -> list[tuple[Any, ...]]:
-    table, rows = case.case.table, []
-    for view in case.stated:
-        accepts = [np.nansum(false_accepts(view, corrected), axis=1).astype(int) for corrected in (False, True)]
-        for one, found, errors, *falsely in zip(view.statements, coverage_of(view), view.errors, *accepts, strict=True):
-            known = errors[np.isfinite(errors)]
-            rows.append(
-                (
-                    table.part,
-                    int(case.case.sealed),
-                    case.sensor,
-                    table.finish,
-                    view.view,
-                    view.why,
-                    one.measurement,
-                    one.unit,
-                    found.of,
-                    found.count,
-                    found.value,
-                    found.low,
-                    found.high,
-                    *falsely,
-                    one.bias,
-                    one.standard_uncertainty,
-                    *one.interval,
-                    known.mean() if len(known) else math.nan,
-                    known.std(ddof=1) if len(known) > 1 else math.nan,
-                    one.without_value,
-                    1 - len(known) / len(errors),
-                )
-            )
-    return rows
-
-
-_REGRET_HEAD = (
-    "part",
-    "sealed",
-    "sensor",
-    "finish",
-    "measurement",
-    "by",
-    "view",
-    "best",
-    "risk",
-    "least",
-    "ratio",
-    "unbiased",
-    "low",
-    "high",
-    "decided",
-)
-
-
-def _regret_row(one: Choice) -> tuple[Any, ...]:
-    table, raced, found = one.case.case.table, one.case.raced, one.regret
-    assert raced is not None
-    decided = raced.standings[one.measurement].confidence if one.measurement in raced.standings else math.nan
-    return (
-        table.part,
-        int(one.case.case.sealed),
-        one.case.sensor,
-        table.finish,
-        one.measurement,
-        one.by,
-        one.view,
-        one.best,
-        found.risk,
-        found.least,
-        found.ratio,
-        found.unbiased,
-        found.low,
-        found.high,
-        decided,
-    )
 
 
 def _share(one: Share) -> str:

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from characterisation.coupon.patches import view_frame
+from characterisation.coupon.view_frame import view_frame
 from characterisation.stage.angles import TOLERANCE, about_one, about_two, turned
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform

@@ -20,7 +20,7 @@ import numpy as np
 import xarray as xr
 
 from characterisation.coupon.metrics import LEAST_DEGREES
-from characterisation.coupon.patches import overall
+from characterisation.coupon.patch_table import overall
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 from mitsim.campaign.acquire import in_turn, simulated_source

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.coupon.metrics import ray_noise_std
-from characterisation.coupon.patches import in_view_frame
+from characterisation.coupon.view_frame import in_view_frame
 from characterisation.maps.noise_structure import noise_structure
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path

@@ -12,8 +12,9 @@ from mitsim.calibration.corner_noise import WHITE, board_level, coordinate_noise
 from mitsim.decode.structured_light.gray_code import decode_gray_code
 from mitsim.decode.structured_light.phase_shift import decode_phase_shift
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.imager import Noise, expose
+from mitsim.sensor.image_formation import expose
 from mitsim.sensor.light_code import GrayCode, PhaseShift, roles, value
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 
 

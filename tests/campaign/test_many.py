@@ -15,7 +15,7 @@ from mitsim.campaign.many import CommonSettings, ManyFile, read_jobs
 from mitsim.capture.folder import read_capture
 from mitsim.cli import app
 from mitsim.errors import InputError
-from mitsim.sensor.imager import Noise
+from mitsim.sensor.noise_sources import Noise
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = ROOT / "scenes/two_pillars/two_pillars.xml"

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterisation.coupon.orientations import cap_directions
-from characterisation.coupon.patches import in_view_frame, patch_table
+from characterisation.coupon.patch_table import patch_table
+from characterisation.coupon.view_frame import in_view_frame
 from characterisation.lambert_projection import lambert_projection
 
 POSSIBLE = 113

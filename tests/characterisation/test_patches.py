@@ -10,7 +10,8 @@ from scipy.ndimage import gaussian_filter
 
 from characterisation.coupon.discs import disc_offsets
 from characterisation.coupon.metrics import density_fraction
-from characterisation.coupon.patches import Coupon, in_view_frame, measure_patches, patch_centres, view_frame
+from characterisation.coupon.patches import Coupon, measure_patches, patch_centres
+from characterisation.coupon.view_frame import in_view_frame, view_frame
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from characterisation.coupon.orientations import cap_directions, sphere_directions
-from characterisation.coupon.patches import patch_table
+from characterisation.coupon.patch_table import patch_table
 from characterisation.errors import InputError
 from characterisation.maps.performance_map import (
     PerformanceMap,

@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 
 from mitsim.decode.exposures import MergedExposures, merge_exposures
 from mitsim.errors import InputError
-from mitsim.sensor.imager import Imager, Noise, expose
+from mitsim.sensor.image_formation import expose
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.noise_sources import Noise
 
 IMAGER = Imager(
     pixel_um=6.0,

@@ -22,7 +22,8 @@ from mitsim.decode.time_of_flight import (
     unambiguous_path,
 )
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.imager import Imager, Noise, fixed_pattern
+from mitsim.sensor.image_formation import fixed_pattern
+from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import (
     LIGHT_MM_S,
     AmplitudeModulation,
@@ -31,6 +32,7 @@ from mitsim.sensor.modulation import (
     delayed,
     expose_taps,
 )
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.transforms import Transform
 
 SETTINGS = TimeOfFlightSettings(near_mm=400, far_mm=4600)

@@ -10,7 +10,8 @@ from test_docs import PAGES, ROOT, by_page, check_call
 sys.path.insert(0, str(ROOT / "docs" / "site"))
 
 from figures import check, selected
-from quoted import Figure, cells, compared, figures, holds_figures, missing_numbers, same
+from quoted import Figure, cells, compared, figures, holds_figures
+from quoted_numbers import same
 
 #: figures that take no longer are made in this test [s]
 QUICK = 5
@@ -121,13 +122,25 @@ def test_changed_numbers_are_put_in_the_quoted_lines():
     assert compared(["...", "   1  0.70  noise"], OUTPUT)[1] == ["...", "   1  0.83  noise"]
 
 
-def test_numbers_of_a_table_are_looked_for_in_the_output():
+def test_a_table_of_figures_is_one_of_numbers():
     table = ["| row | u |", "|---|---|", "| 3 | 0.83 |", "| `view 7` | 0.5, `0.6` |"]
     assert cells(table) == ["0.83", "0.5, `0.6`"]
     assert holds_figures(table)
     assert not holds_figures(["| key | meaning |", "|---|---|", "| a | a length of 3 mm |"])
-    assert missing_numbers(table, OUTPUT) == ["0.5"]
-    assert missing_numbers(["| row | stated by others |", *table[1:]], OUTPUT) == []
+
+
+def test_names_of_a_table_stand_before_it_and_hold_for_it_alone(tmp_path):
+    page = tmp_path / "page.md"
+    table = "| a | b |\n|---|---|\n| c | 1 |\n\n"
+    page.write_text(
+        "<!-- made by: mitsim decode a; takes 2 min -->\n<!-- columns: B = other; C = D & E -->\n"
+        f"<!-- rows: c = all -->\n{table}<!-- made by: as above -->\n{table}",
+        encoding="utf-8",
+    )
+    first, second = figures(page)
+    assert (first.columns, first.rows) == ({"b": "other", "c": "D & E"}, {"c": "all"})
+    assert (second.columns, second.rows) == ({}, {})
+    assert first.told == second.told == "mitsim decode a"
 
 
 def test_a_marker_is_needed_by_outputs_tables_and_pictures_alone(tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from characterisation.coupon.patches import in_view_frame
+from characterisation.coupon.view_frame import in_view_frame
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from characterisation.point_cloud import Status, ViewGrid

@@ -309,7 +309,7 @@ def _patches(folder):
 
 def _read_patches(path):
     """As if the index beside it had been signed again."""
-    from characterisation.coupon.patches import overall
+    from characterisation.coupon.patch_table import overall
     from mitsim.campaign.run import joined
     from mitsim.campaign.store import _table
 
@@ -373,7 +373,7 @@ deviation = "alpha=1"
 
 def _read_many(path):
     from mitsim.campaign.many import CommonSettings, read_jobs
-    from mitsim.sensor.imager import Noise
+    from mitsim.sensor.noise_sources import Noise
     from mitsim.sensor.preset import load_sensor
 
     common = CommonSettings({}, "", 1, 1, 1, Noise(), False)

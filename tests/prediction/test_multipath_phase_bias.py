@@ -12,8 +12,8 @@ from mitsim.prediction.other_light import OtherLightEffect
 from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.backend import activate
 from mitsim.scene.load import scene_from_dict
-from mitsim.sensor.imager import Noise
 from mitsim.sensor.light_code import PhaseShift
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.rendering import Rendering

@@ -14,8 +14,8 @@ from mitsim.prediction.perturbation import LookedAt
 from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.backend import activate
 from mitsim.scene.load import scene_from_dict
-from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import LIGHT_MM_S
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.rendering import Rendering

@@ -15,7 +15,7 @@ from mitsim.capture.folder import read_capture, write_capture
 from mitsim.errors import InputError
 from mitsim.reconstruction.cloud import capture_cloud, read_out_of, sensor_geometry
 from mitsim.scene.load import load_scene
-from mitsim.sensor.imager import Noise
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import look_at

@@ -15,7 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from characterisation.coupon.patches import Coupon, measure_patches, overall
+from characterisation.coupon.patch_table import overall
+from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.campaign.acquire import coupon_cloud

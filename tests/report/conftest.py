@@ -9,7 +9,7 @@ import trimesh
 import xarray as xr
 
 from characterisation.cloud_files import write_ply
-from characterisation.coupon.patches import patch_table
+from characterisation.coupon.patch_table import patch_table
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.scores.view_score import score_views, view_statistics

@@ -13,15 +13,9 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from mitsim.errors import InputError
-from mitsim.sensor.imager import (
-    Imager,
-    Noise,
-    converter,
-    counted_below,
-    electrons_per_radiance,
-    expose,
-    fixed_pattern,
-)
+from mitsim.sensor.image_formation import converter, counted_below, expose, fixed_pattern
+from mitsim.sensor.imager import Imager, electrons_per_radiance
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor_file import ImagerTable
 

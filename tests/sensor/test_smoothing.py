@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.sensor.imager import Imager, Noise, expose
+from mitsim.sensor.image_formation import expose
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.point_spread import point_spread
 
 IMAGER = Imager(

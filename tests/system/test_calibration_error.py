@@ -11,7 +11,7 @@ from mitsim.calibration.accuracy import measured_points
 from mitsim.campaign.plan import coupon_pose
 from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.test_targets import plate
-from mitsim.sensor.imager import Noise
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import moved

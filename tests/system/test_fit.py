@@ -30,7 +30,9 @@ from mitsim.fit.specimen import place_of
 from mitsim.fit.white_coupon import Bench
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
-from mitsim.sensor.imager import Imager, Noise, expose
+from mitsim.sensor.image_formation import expose
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.speckle import speckle_field
 from mitsim.sensor.transforms import look_at

@@ -13,7 +13,7 @@ from mitsim.cli import app
 from mitsim.reconstruction.cloud import capture_cloud
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
-from mitsim.sensor.imager import Noise
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.rendering import Rendering

@@ -22,8 +22,8 @@ from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.imager import Noise
 from mitsim.sensor.modulation import LIGHT_MM_S
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.transforms import Transform, look_at

@@ -14,7 +14,7 @@ from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.raycast import PixelRays, cast
-from mitsim.sensor.imager import Noise
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.render_residual import render_residual, temporal_noise
 from mitsim.simulation.rendering import Rendering
@@ -183,7 +183,7 @@ def test_the_light_s_own_noise_is_none_at_depth_1_and_falls_with_samples_at_dept
 
 
 def test_temporal_noise_is_what_the_imager_adds(n10, rng):
-    from mitsim.sensor.imager import expose
+    from mitsim.sensor.image_formation import expose
 
     imager = replace(n10.imager, row_noise=0.0)
     images = expose(np.full((1, 300, 400), 5000.0), imager, None, Noise(), rng)

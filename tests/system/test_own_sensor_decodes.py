@@ -12,7 +12,7 @@ import pytest
 from characterisation.cloud_files import read_ply
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.commands.captures import decode
+from mitsim.commands.decode import decode
 from mitsim.errors import InputError
 from mitsim.reconstruction.cloud import decoder_settings
 from mitsim.reconstruction.decoder_registry import technology_of

@@ -22,7 +22,7 @@ from mitsim.errors import InputError
 from mitsim.prediction import Predictor, feature_statistics, performance
 from mitsim.reconstruction.cloud import capture_cloud
 from mitsim.scene.load import load_scene
-from mitsim.sensor.imager import Noise
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import mean_run_length
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at

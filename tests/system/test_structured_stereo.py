@@ -14,7 +14,7 @@ from mitsim.errors import InputError
 from mitsim.reconstruction.cloud import capture_cloud, decoder_settings, sensor_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
-from mitsim.sensor.imager import Noise
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.rendering import Rendering

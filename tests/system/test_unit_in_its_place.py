@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsim.scene.load import scene_from_dict
-from mitsim.sensor.imager import Noise
+from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.sensor_file import MisalignmentTable, RoomTable
 from mitsim.sensor.transforms import look_at

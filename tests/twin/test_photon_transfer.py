@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.sensor.imager import Imager, Noise, expose, fixed_pattern
+from mitsim.sensor.image_formation import expose, fixed_pattern
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.noise_sources import Noise
 from mitsim.twin.noise import fine_gain, smoothing_of
 from mitsim.twin.photon_transfer import Repeats, fixed_variance, one_image_line, repeated_line
 

@@ -22,7 +22,8 @@ from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.validation import compare_captures as compare_module
 from mitsim.validation.captures_run import validate_captures
-from mitsim.validation.compare_captures import QUANTITIES, compare_captures
+from mitsim.validation.compare_captures import compare_captures
+from mitsim.validation.compared_quantities import QUANTITIES
 from mitsim.validation.rebuild import projector_was_on, rebuild
 from mitsim.validation.specimen_patches import PATCH_PX, specimen_patches
 

@@ -11,9 +11,10 @@ from scipy.stats import norm
 import mitsim.validation.case_trials as case_trials
 import mitsim.validation.statement_run as statement_run
 from mitsim.errors import InputError
+from mitsim.validation.judged_statements import choices_of
 from mitsim.validation.kept_trials import take_up_trials, write_trials
 from mitsim.validation.part_cases import described, read_part_cases
-from mitsim.validation.statement_page import choices_of, write_statement_page
+from mitsim.validation.statement_page import write_statement_page
 from mitsim.validation.statement_run import run_cases
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Trial

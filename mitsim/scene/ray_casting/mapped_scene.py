@@ -115,7 +115,7 @@ class ViewRays:
         return (index // width + top) * self.grid.width + index % width + left
 
     def in_view_frame(self, normal: Any, ray: Any) -> Any:
-        """A normal of the sensor frame in the view frame (:func:`characterisation.coupon.patches.view_frame`)."""
+        """A normal of the sensor frame in the view frame (:func:`characterisation.coupon.view_frame.view_frame`)."""
         z = -ray
         x = dr.normalize(self.baseline - z * dr.dot(z, self.baseline))
         return mi.Vector3f(dr.dot(x, normal), dr.dot(dr.cross(z, x), normal), dr.dot(z, normal))

@@ -1,7 +1,7 @@
-"""Read a study: a TOML file with a part, a task, a sensor and the candidate views.
+"""Read a study and all files that it names, and check them before the first long step.
 
 Signal chain: study TOML -> scene, task, sensor, and a performance map or the campaign that makes one -> candidate
-views. This module reads and checks all user input before the first long step (:mod:`mitsim.run_study`).
+views.
 """
 
 from __future__ import annotations
@@ -9,17 +9,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
 from scipy.stats import norm
 
-from characterisation.documents import Document, read_toml
+from characterisation.documents import read_toml
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.samples import Samples
 from characterisation.maps.shipped import map_path, shipped_maps
-from characterisation.scores.joining import POSE_KNOWN, Joining
 from characterisation.statements.decision import needed, tolerance_of
 from characterisation.tasks.evaluation import Task, check_features, read_task
 from mitsim.campaign.answer import (
@@ -38,8 +35,9 @@ from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
+from mitsim.study.tables import ExposureTable, StudyFile
 from mitsim.view_scores import MATT_WHITE
-from mitsim.views import Candidates, View, ViewsTable, candidate_views
+from mitsim.views import Candidates, View, candidate_views
 from mitsim.views.standoffs import characterised_range, chosen_standoffs
 
 #: fewest points on a feature that allow a measurement
@@ -47,169 +45,6 @@ MINIMUM_POINTS = 100
 
 #: equally likely values of a standard normal distribution
 _NORMAL = norm.ppf((np.arange(400) + 0.5) / 400)
-
-
-class CharacterisationTable(Document):
-    """Source of the performance map: a campaign to run, or an existing map.
-
-    ``map`` is a file, or the name of a sensor whose map comes with mitsim. If both keys are missing, the map of the
-    study's sensor is used.
-    """
-
-    campaign: str | None = None
-    map: str | None = None
-
-    @model_validator(mode="after")
-    def _one(self) -> CharacterisationTable:
-        if self.campaign is not None and self.map is not None:
-            raise ValueError("either campaign or map, not both")
-        return self
-
-
-class CheckTable(Document):
-    """Number of best views that are rendered once more for the report's pictures.
-
-    Every unknown is then at its best estimate. The other keys come from studies that were written before virtual
-    measurements existed. They are read and ignored.
-    """
-
-    views: int = Field(default=4, ge=0, le=10000)
-    repeats: int = Field(default=1, ge=1, le=1000)
-    samples_per_pixel: int = Field(default=16, ge=1, le=4096)
-    light_path_depth: int = Field(default=1, ge=1, le=16)
-
-
-class ScoreTable(Document):
-    """Light with which views are screened: up to ``light_path_depth`` surfaces on a light path; 1 is direct light only.
-
-    If no face of the part can see another, screening uses direct light for every value, since the part has no
-    interreflections. Only the predicted uncertainty includes interreflections. V_m is as in the talk.
-    """
-
-    light_path_depth: int = Field(default=2, ge=1, le=16)
-
-
-class MeasureTable(Document):
-    """How virtual measurements are made.
-
-    ``by`` is ``render``, or ``map`` for clouds that are drawn from the performance map; by default it follows from the
-    source of the map. ``samples_per_pixel`` holds for direct light. ``light_path_depth`` is the largest number of
-    surfaces on a light path.
-    """
-
-    by: Literal["render", "map"] | None = None
-    samples_per_pixel: int = Field(default=16, ge=1, le=4096)
-    light_path_depth: int = Field(default=2, ge=1, le=16)
-
-
-class RaceTable(Document):
-    """Views that are measured virtually, and the end of the race.
-
-    The race measures the best ``shortlist`` views of each measurement according to the map, with at most ``trials`` of
-    each. A choice is decided if, with the probability ``confidence``, its view is the best or its error is within
-    ``margin`` of the best. Each leading view is confirmed by ``confirming`` more trials with other finishes. The race
-    ends after ``minutes``.
-    """
-
-    shortlist: int = Field(default=24, ge=1, le=1000)
-    trials: int = Field(default=16, ge=4, le=100_000)
-    confirming: int = Field(default=16, ge=0, le=100_000)
-    margin: Annotated[float, Field(gt=0, le=1)] = 0.1
-    confidence: Annotated[float, Field(ge=0.5, lt=1)] = 0.95
-    minutes: Annotated[float, Field(gt=0, le=100_000)] | None = None
-
-
-class StatementTable(Document):
-    """How the uncertainty of the chosen view is stated.
-
-    ``trials`` are made in worlds that no race uses. ``pairs`` of them serve each line of the budget, with one more
-    trial each.
-    """
-
-    trials: int = Field(default=200, ge=2, le=1_000_000)
-    pairs: int = Field(default=16, ge=0, le=100_000)
-
-
-class ExposureTable(Document):
-    """Exposures of the captures whose uncertainty is stated, in place of the sensor's own exposure rule.
-
-    Several ``exposures_s`` [s] are merged; the projector has the relative ``power``. Without ``exposures_s``, mitsim
-    plans at most ``most`` exposures for the view. The number of points and the uncertainty of every feature are then
-    ``within`` this fraction of the best values that any exposures reach.
-    """
-
-    most: int = Field(default=3, ge=1, le=7)
-    within: Annotated[float, Field(ge=0.01, le=1)] = 0.1
-    exposures_s: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=1, max_length=7)] | None = None
-    power: Annotated[float, Field(gt=0, le=1)] = 1.0
-
-    @model_validator(mode="after")
-    def _one(self) -> ExposureTable:
-        if self.exposures_s is None and self.power != 1.0:
-            raise ValueError("power only with exposures_s; without exposures_s mitsim plans it")
-        return self
-
-
-class SetTable(Document):
-    """The fewest views that together keep limits of uncertainty.
-
-    ``limits`` are standard uncertainties by measurement, in the unit of the measurement; all named limits must hold at
-    once. Without ``limits``, every measurement with a tolerance gets the largest uncertainty that fits the tolerance by
-    its decision rule. A view sees a feature if the feature has enough points with a probability of at least
-    ``least_chance``. After ``seconds`` the search ends with the best set so far, which is then not proven to be the
-    smallest.
-
-    ``joining`` is the method that gives the poses of the views in a common frame. Their standard uncertainty is
-    ``joining_mm`` along and ``joining_deg`` about each axis, at the middle of the part. Missing values are the usual
-    ones of the method. ``trials`` virtual measurements of the whole set confirm it in ``mitsim run``.
-    """
-
-    limits: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
-    joining: Joining = "robot"
-    joining_mm: Annotated[float, Field(ge=0, le=100)] | None = None
-    joining_deg: Annotated[float, Field(ge=0, le=10)] | None = None
-    trials: int = Field(default=40, ge=0, le=100_000)
-    least_chance: Annotated[float, Field(gt=0, lt=1)] = 0.95
-    seconds: Annotated[float, Field(gt=0, le=3600)] = 60.0
-
-    @property
-    def pose_known(self) -> tuple[float, float]:
-        """Return the standard uncertainty of each view's pose: along [mm] and about [deg] each axis."""
-        position, angle = POSE_KNOWN[self.joining]
-        return (
-            position if self.joining_mm is None else self.joining_mm,
-            angle if self.joining_deg is None else self.joining_deg,
-        )
-
-    @model_validator(mode="after")
-    def _joined(self) -> SetTable:
-        if self.joining == "exact" and (self.joining_mm or self.joining_deg):
-            raise ValueError('neither joining_mm nor joining_deg with joining = "exact"')
-        if self.joining == "best_fit" and not all(self.pose_known):
-            raise ValueError(
-                'joining_mm and joining_deg above 0 with joining = "best_fit", which starts from inexact poses'
-            )
-        return self
-
-
-class StudyFile(Document):
-    """A study TOML file; its paths are relative to the file."""
-
-    scene: str
-    parameters: dict[str, str | float] = Field(default_factory=dict)
-    task: str
-    sensor: str
-    seed: Annotated[int, Field(ge=0)] = 1
-    characterisation: CharacterisationTable = CharacterisationTable()
-    views: ViewsTable
-    score: ScoreTable = ScoreTable()
-    unknowns: UnknownsTable = UnknownsTable()
-    measure: MeasureTable = MeasureTable()
-    race: RaceTable = RaceTable()
-    statement: StatementTable = StatementTable()
-    exposure: ExposureTable | None = None
-    set: SetTable | None = None
-    check: CheckTable = CheckTable()
 
 
 @dataclass(frozen=True)

@@ -8,28 +8,18 @@ views -> race of the promising views by virtual measurements (:mod:`mitsim.virtu
 
 from __future__ import annotations
 
-import os
-import platform
 import time
-from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import trimesh
 import xarray as xr
-from scipy.spatial.transform import Rotation
 
-from characterisation.atomic_io import atomic_write, write_json
+from characterisation.atomic_io import write_json
 from characterisation.cloud_files import write_ply
 from characterisation.maps.performance_map import PerformanceMap
-from characterisation.scores.joining import pose_covariance
-from characterisation.scores.task_sets import SetJoining, choose_set
 from characterisation.scores.view_score import write_scores
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import Statement
-from characterisation.tasks.evaluation import InputQuantity
 from mitsim.campaign.acquire import coupon_residuals, in_turn, simulated_source
 from mitsim.campaign.executor import Executor
 from mitsim.campaign.run import run_campaign, write_netcdf
@@ -38,30 +28,25 @@ from mitsim.exposures.planned import exposed_for
 from mitsim.prediction import Predictor, performance
 from mitsim.progress import say, track
 from mitsim.report.run_files import claim_folder, digests_of
-from mitsim.report.stand import write_stand
-from mitsim.scene.ray_casting.triangles import triangles
+from mitsim.run_study.record import Outcome, own_files, run_record
+from mitsim.run_study.scoring import pose_columns, score_study
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.simulation.render_residual import RenderResidual, render_residual, told, worst_of
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import Study
-from mitsim.version import __version__
 from mitsim.view_sets.confirmed_set import (
     Search,
     TriedSet,
-    confirmed_entry,
     confirmed_set,
     joining_in_words,
     set_table,
-    tried_entries,
     write_set_csv,
 )
-from mitsim.views import tell_views
 from mitsim.virtual.plan import measurements_of, race_rules, trial_digest
-from mitsim.virtual.race import Maker, Raced, run_race
+from mitsim.virtual.race import Maker, run_race
 from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.rendered import RenderedMeasurements
-from mitsim.virtual.screening import screen
 from mitsim.virtual.spread_out import spread_over
 from mitsim.virtual.stated import state_view, statement_document, write_statement
 from mitsim.virtual.study_digest import study_digest, with_scene_files
@@ -143,9 +128,9 @@ def run_study(
         _show(study, twin, shown, folder, {} if planned is None else {leaders[0]: planned})
         residuals += [_residual(study, twin.simulated, number) for number in shown[:1]]
     clock.lap("pictures")
-    outcome = _Outcome(raced, shown, chosen, tried, worst_of(residuals), clock.steps)
-    about = _about(study, performance_map, outcome)
-    about["files"] = digests_of(folder, _own_files(study, drawn, shown, bool(stated)))
+    outcome = Outcome(raced, shown, chosen, tried, worst_of(residuals), clock.steps)
+    about = run_record(study, performance_map, outcome)
+    about["files"] = digests_of(folder, own_files(study, drawn, shown, bool(stated)))
     write_json(folder / "run.json", about)
     return stated
 
@@ -155,19 +140,6 @@ def claim(folder: Path, command: str, digest: str) -> None:
     moved = claim_folder(folder, command, digest)
     if moved is not None:
         say(f"{folder} contained results of another study, seed, version, map or command; they were moved to {moved}")
-
-
-def _own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) -> list[str]:
-    """Return the paths of the files that a report of the run reads.
-
-    The index of a capture has the digests of its other files.
-    """
-    names = ["map.nc", "scores.csv", "scores.nc", "checks.nc", "part.ply", "stand.npz"]
-    names += ["samples.nc"] if study.campaign is not None else []
-    names += ["statement.json"] if stated else []
-    names += [f"clouds/predicted_{view:04d}.ply" for view in drawn]
-    names += [f"clouds/rendered_{view:04d}.ply" for view in shown]
-    return names + [f"captures/view_{view:04d}/capture.json" for view in shown]
 
 
 def _confirm(
@@ -213,61 +185,6 @@ def _state(
     document = statement_document(study, view, stated, unknowns, maker.source, planned)
     write_statement(folder / "statement.json", document)
     return stated
-
-
-def score_study(
-    study: Study, predictor: Predictor, performance_map: PerformanceMap, folder: Path
-) -> tuple[xr.Dataset, ViewSet | None, Search]:
-    """Score all views, choose a set if the study asks for one, and write ``scores``, ``poses`` and ``part.ply``.
-
-    Returns the scores, the set, and the function that finds a set for other limits.
-    """
-    tell_views(folder / "poses", study.candidates, study.file.views, study.sensor.name)
-    scores, inputs = screen(study, predictor, performance_map)
-    search = partial(_set_within, study, inputs)
-    chosen = _chosen_set(study, search)
-    write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")
-    write_netcdf(scores, folder / "scores.nc")
-    write_stand(folder, study.scene, study.sensor)
-    with atomic_write(folder / "part.ply") as file:
-        corners = triangles(study.scene)
-        mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=True)
-        file.write_bytes(trimesh.exchange.ply.export_ply(mesh))
-    return scores, chosen, search
-
-
-def _set_within(study: Study, inputs: list[dict[InputQuantity, Any]], limits: dict[str, float]) -> ViewSet:
-    """Return the fewest views that keep the limits according to the map."""
-    table = study.file.set
-    assert table is not None
-    joining = SetJoining(
-        pose_covariance(*table.pose_known), np.asarray(study.scene.centre, float), table.joining == "best_fit"
-    )
-    return choose_set(study.task, inputs, limits, table.least_chance, table.seconds, joining)
-
-
-def _chosen_set(study: Study, search: Search) -> ViewSet | None:
-    table = study.file.set
-    if table is None:
-        return None
-    chosen = search(table.limits)
-    for (name, limit), reached in zip(table.limits.items(), chosen.feasible, strict=True):
-        if not reached:
-            say(f"{name}: {limit:g} {study.task.measurements[name].unit} is unreachable, even with all views together")
-    how = "the fewest" if chosen.exact else "not proven the fewest"
-    say(
-        f"views that measure together: {', '.join(map(str, chosen.views)) or 'none'} ({how}), "
-        f"{joining_in_words(table)}; the map predicts: {_expected(study, table.limits, chosen)}"
-    )
-    return chosen
-
-
-def _expected(study: Study, limits: dict[str, float], chosen: ViewSet) -> str:
-    """Like ``pillar1_radius u 0.36 of 0.5 mm``."""
-    rows = zip(limits.items(), chosen.uncertainty.tolist(), chosen.feasible, strict=True)
-    units = {name: study.task.measurements[name].unit for name in limits}
-    told = [f"{name} u {u:.2g} of {limit:g} {units[name]}" for (name, limit), u, able in rows if able]
-    return ", ".join(told) or "nothing"
 
 
 def _best(scores: xr.Dataset) -> list[int]:
@@ -319,83 +236,3 @@ def _show(
         capture, cloud = maker.exposed_as(planned.get(number)).best_guess(study.views[number])
         write_capture(capture, folder / "captures" / f"view_{number:04d}", overwrite=True)
         write_ply(cloud, folder / "clouds" / f"rendered_{number:04d}.ply")
-
-
-def pose_columns(scores: xr.Dataset) -> dict[str, np.ndarray]:
-    """Return the columns of ``scores.csv`` that are not part of the talk's score."""
-    poses = scores["world_from_sensor"].values
-    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    names = ["uncertainty_rank", "predicted_uncertainty", "chance", "limit", "limiting_feature"]
-    names += [name for name in ("final_rank", "measured_risk", "trials") if name in scores]
-    out = {name: scores[name].values for name in names}
-    out |= {name: scores[name].values for name in ("azimuth_deg", "elevation_deg", "roll_deg", "standoff_mm")}
-    out |= {f"position_{axis}_mm": poses[:, k, 3] for k, axis in enumerate("xyz")}
-    return out | {f"quaternion_{axis}": turns[:, k] for k, axis in enumerate("xyzw")}
-
-
-@dataclass(frozen=True)
-class _Outcome:
-    """Outcome of a run: the race, views whose pictures were ``checked``, the set and those ``tried``.
-
-    ``residual`` is the worst of the renderings, ``seconds`` the wall time of each step [s].
-    """
-
-    raced: Raced
-    checked: list[int]
-    chosen: ViewSet | None
-    tried: list[TriedSet]
-    residual: RenderResidual | None
-    seconds: dict[str, float]
-
-
-def _about(study: Study, performance_map: PerformanceMap, outcome: _Outcome) -> dict[str, Any]:
-    raced, chosen, residual = outcome.raced, outcome.chosen, outcome.residual
-    features = {name: str(study.scene.finishes[study.scene.names.index(name)]) for name in study.task.shapes}
-    return {
-        "schema_version": 1,
-        "mitsim": __version__,
-        "study": str(study.path),
-        "scene": study.scene.where,
-        "sensor": study.sensor.name,
-        "source": "simulated",
-        "map_source": performance_map.data.attrs.get("source", ""),
-        "exposure_rule": study.sensor.exposure.rule,
-        "seed": study.file.seed,
-        "views": len(study.views),
-        "view_sets": [] if chosen is None else [_set_in_words(study, chosen, outcome.tried)],
-        "checked_views": outcome.checked,
-        "raced_views": len(raced.views),
-        "race_trials": raced.trials,
-        "race_decided": raced.decided,
-        "leaders": raced.leaders(),
-        "confidence": {name: one.confidence for name, one in raced.standings.items()},
-        "light_path_depth": study.file.measure.light_path_depth,
-        "score_light_path_depth": study.file.score.light_path_depth,
-        "render_residual": None if residual is None else asdict(residual),
-        "features": features,
-        "measurements": {
-            name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features)}
-            for name, m in study.task.measurements.items()
-        },
-        "seconds": outcome.seconds,
-        "python": platform.python_version(),
-        "machine": platform.machine(),
-        "cores": os.cpu_count(),
-    }
-
-
-def _set_in_words(study: Study, chosen: ViewSet, tried: list[TriedSet]) -> dict[str, Any]:
-    table = study.file.set
-    assert table is not None
-    limits, known = table.limits, table.pose_known
-    return {
-        "limits": limits,
-        "views": list(chosen.views),
-        "exact": chosen.exact,
-        "uncertainty": dict(zip(limits, chosen.uncertainty.tolist(), strict=True)),
-        "feasible": dict(zip(limits, chosen.feasible.tolist(), strict=True)),
-        "joining": {"kind": table.joining, "position_mm": known[0], "angle_deg": known[1]},
-        "joined": joining_in_words(table),
-        "confirmed": confirmed_entry(tried[-1].stated if tried else ()),
-        "tried": tried_entries(tried, limits),
-    }

@@ -1,0 +1,36 @@
+"""A study: a part, a task, a sensor and the candidate views.
+
+:mod:`~mitsim.study.tables` defines the TOML file. :mod:`~mitsim.study.reading` reads it and all files that it names.
+"""
+
+from mitsim.study.reading import MINIMUM_POINTS, Study, open_study, read_map, read_study, with_limits, with_plan
+from mitsim.study.tables import (
+    CharacterisationTable,
+    CheckTable,
+    ExposureTable,
+    MeasureTable,
+    RaceTable,
+    ScoreTable,
+    SetTable,
+    StatementTable,
+    StudyFile,
+)
+
+__all__ = [
+    "MINIMUM_POINTS",
+    "CharacterisationTable",
+    "CheckTable",
+    "ExposureTable",
+    "MeasureTable",
+    "RaceTable",
+    "ScoreTable",
+    "SetTable",
+    "StatementTable",
+    "Study",
+    "StudyFile",
+    "open_study",
+    "read_map",
+    "read_study",
+    "with_limits",
+    "with_plan",
+]
