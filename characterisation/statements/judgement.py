@@ -118,14 +118,19 @@ class Regret:
     high: float
 
 
-def regret(errors: ArrayLike, chosen: int, seed: int = 0) -> Regret:
-    """Return the regret of the view ``chosen`` (a row) from errors (v, w) of all views in the same worlds."""
+def regret(errors: ArrayLike, chosen: int, seed: int = 0, block: int = 1) -> Regret:
+    """Return the regret of the view ``chosen`` (a row) from errors (v, w) of all views in the same worlds.
+
+    Each ``block`` of successive worlds shares a draw, such as a finish. The halves and the resamples keep blocks
+    together, since only blocks are independent. The number of worlds is a multiple of ``block``.
+    """
     found = np.asarray(errors, float)
     risks = true_risk(found)
     rng = np.random.default_rng(seed)
-    worlds = found.shape[1]
-    drawn = np.array([_halved(found, chosen, rng.permutation(worlds)) for _ in range(_HALVES)])
-    again = np.array([_halved(found, chosen, np.asarray(rng.integers(worlds, size=worlds))) for _ in range(_RESAMPLES)])
+    places = np.arange(found.shape[1]).reshape(-1, block)
+    count = len(places)
+    drawn = np.array([_halved(found, chosen, places[rng.permutation(count)]) for _ in range(_HALVES)])
+    again = np.array([_halved(found, chosen, places[rng.integers(count, size=count)]) for _ in range(_RESAMPLES)])
     best = int(np.argmin(risks))
     ratio = float(risks[chosen] / risks[best]) if np.isfinite(risks[best]) else float("nan")
     low, high = np.quantile(again, [0.025, 0.975], method="nearest") if np.isfinite(again).any() else (np.inf, np.inf)
@@ -141,10 +146,13 @@ def regret(errors: ArrayLike, chosen: int, seed: int = 0) -> Regret:
 
 
 def _halved(errors: Floats, chosen: int, order: NDArray[Any]) -> float:
-    """Return the logarithm of the regret in one half of the worlds, against the best view of the other half."""
+    """Return the logarithm of the regret in one half of the blocks, against the best view of the other half.
+
+    ``order`` (block, world) are the places of the worlds.
+    """
     middle = len(order) // 2
-    best = int(np.argmin(true_risk(errors[:, order[:middle]])))
-    risks = true_risk(errors[[chosen, best]][:, order[middle:]])
+    best = int(np.argmin(true_risk(errors[:, order[:middle].ravel()])))
+    risks = true_risk(errors[[chosen, best]][:, order[middle:].ravel()])
     if np.isinf(risks).all():
         return 0.0
     with np.errstate(divide="ignore"):

@@ -17,6 +17,7 @@ from characterisation.scores.screening import LEAST_MEASURABLE
 from characterisation.statements.judgement import Regret, Share, falsely_accepted, pooled_share, regret, share, within
 from mitsim.validation.statement_run import JudgedCase, StatedView
 from mitsim.virtual.race import screening_risk
+from mitsim.virtual.world import FINISH_DAYS
 
 Floats = NDArray[np.float64]
 
@@ -28,6 +29,7 @@ RACE, PREDICTED, TALK = "race", "predicted u", "V_m"
 class Choice:
     """The view that somebody chose for a measurement of a case, and its regret.
 
+    ``regret`` is judged in worlds with their own finishes, ``regret_pooled`` in worlds that share a pool of finishes.
     ``judged``: the best view gives a value in half of the worlds; where it does not, risks are those of a few worlds,
     and the regret is listed but in no mean.
     """
@@ -38,6 +40,7 @@ class Choice:
     view: int
     best: int
     regret: Regret
+    regret_pooled: Regret
     judged: bool = True
 
 
@@ -76,11 +79,11 @@ def pooled(columns: Sequence[Floats]) -> Share:
 
 def choices_of(case: JudgedCase) -> list[Choice]:
     """Views that the race, the map's u and V_m chose for every measurement of a raced case, with their regrets."""
-    if case.raced is None:
+    if case.raced is None or case.choice is None:
         return []
     few = case.case.file.raced_candidates
     numbers = case.views[:few].tolist()
-    errors = case.truth[:, :few, : case.case.file.raced_worlds]
+    errors, pooled_errors = case.choice, case.truth[:, :few, : case.case.file.raced_worlds]
     told = case.scores.sel(view=numbers)
     risk = screening_risk(told)
     talk = told["V_m"].transpose("measurement", "view").values
@@ -94,9 +97,10 @@ def choices_of(case: JudgedCase) -> list[Choice]:
             TALK: int(np.nanargmax(np.where(np.isfinite(talk[m]), talk[m], -1.0))),
         }
         for by, place in picks.items():
-            found = regret(errors[m], place)
+            found = regret(errors[m], place, block=FINISH_DAYS)
             judged = bool(np.isfinite(errors[m, found.best]).mean() >= LEAST_MEASURABLE)
-            out.append(Choice(case, name, by, numbers[place], numbers[found.best], found, judged))
+            before = regret(pooled_errors[m], place)
+            out.append(Choice(case, name, by, numbers[place], numbers[found.best], found, before, judged))
     return out
 
 

@@ -21,6 +21,7 @@ from characterisation.documents import Document, read_toml
 from mitsim.errors import InputError
 from mitsim.study import Study, StudyFile, open_study
 from mitsim.views import ViewsTable
+from mitsim.virtual.world import FINISH_DAYS
 
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
 
@@ -50,7 +51,8 @@ class PartCasesFile(Document):
 
     A part NAME has its scene and its task in ``NAME/NAME.xml`` and ``NAME/task.toml``. ``candidates`` are drawn from
     the ``views`` of the study. The truth consists of errors in random worlds: ``worlds`` for every candidate,
-    ``raced_worlds`` for the first ``raced_candidates`` of a raced case, and ``stated_worlds`` for the ``stated`` views
+    ``raced_worlds`` for the first ``raced_candidates`` of a raced case, once with finishes of a pool, once with their
+    own, and ``stated_worlds`` for the ``stated`` views
     whose statements are judged. ``measured`` is a folder with files of an earlier run, whose measurements are reused.
     """
 
@@ -59,7 +61,7 @@ class PartCasesFile(Document):
     candidates: Annotated[int, Field(ge=2, le=1000)] = 40
     worlds: Annotated[int, Field(ge=2, le=1000)] = 12
     raced_candidates: Annotated[int, Field(ge=2, le=1000)] = 24
-    raced_worlds: Annotated[int, Field(ge=2, le=1000)] = 30
+    raced_worlds: Annotated[int, Field(ge=2 * FINISH_DAYS, le=1000, multiple_of=FINISH_DAYS)] = 30
     stated: Annotated[int, Field(ge=1, le=100)] = 2
     stated_worlds: Annotated[int, Field(ge=2, le=1000)] = 45
     seed: Annotated[int, Field(ge=0)] = 1
@@ -159,6 +161,7 @@ def described(path: str | Path, cases: Sequence[PartCase]) -> str:
         "those of a study. The functions of `mitsim run` screen them, race the first "
         f"{file.raced_candidates} (in the cases that are raced), and state {file.stated} views. Each statement is "
         f"judged by {file.stated_worlds} other worlds, in which all light is rendered anew; each choice by "
-        f"{file.raced_worlds} other worlds of every candidate. Every number is simulated; what the simulator leaves "
+        f"{file.raced_worlds} other worlds of every candidate, with {file.raced_worlds // FINISH_DAYS} finishes. "
+        "Every number is simulated; what the simulator leaves "
         "out ([light](../light.md)) is not in the truth either.\n"
     )

@@ -94,6 +94,7 @@ _REGRET_HEAD = (
     "unbiased",
     "low",
     "high",
+    "unbiased_pooled",
     "decided",
 )
 
@@ -122,5 +123,6 @@ def _regret_row(one: Choice) -> tuple[Any, ...]:
         found.unbiased,
         found.low,
         found.high,
+        one.regret_pooled.unbiased,
         decided,
     )

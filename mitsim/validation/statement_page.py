@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from characterisation.atomic_io import atomic_write
-from characterisation.statements.judgement import Share, share
+from characterisation.statements.judgement import Regret, Share, share
 from mitsim.report.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing, write_png
 from mitsim.validation.judged_statements import (
     PREDICTED,
@@ -63,7 +63,8 @@ def write_statement_page(cases: Sequence[JudgedCase], folder: str | Path, preamb
         verdict_table(cases),
         "\n## Regret\n\nRisk of the chosen view over the least of all candidates. *plain*: as estimated; the least of "
         "many estimates is too low by chance. *unbiased*: the best view is sought in half of the worlds, and both are "
-        "judged in the other half.\n\n",
+        "judged in the other half. Every two worlds have their own finish. *pooled*: judged as before November 2026, "
+        "in worlds that share eight finishes.\n\n",
         regret_table(choices),
     ]
     with atomic_write(folder / "statements.md") as file:
@@ -89,6 +90,7 @@ def sensor_table(cases: Sequence[JudgedCase], choices: Sequence[Choice]) -> str:
                     _mean_regret([one for one in choices if one.by == by and one.case in mine])
                     for by in (RACE, PREDICTED, TALK)
                 ),
+                _mean_regret([one for one in choices if one.by == RACE and one.case in mine], "regret_pooled"),
             ]
         )
     return markdown(
@@ -100,6 +102,7 @@ def sensor_table(cases: Sequence[JudgedCase], choices: Sequence[Choice]) -> str:
             "mean regret: race",
             PREDICTED,
             TALK,
+            "race, pooled finishes",
         ],
         body,
     )
@@ -167,11 +170,11 @@ def regret_table(choices: Sequence[Choice]) -> str:
                 number(one.regret.ratio),
                 f"{number(one.regret.unbiased)} ({number(one.regret.low)} to {number(one.regret.high)})",
                 *(number(other.unbiased) for other in others),
+                number(one.regret_pooled.unbiased),
             ]
         )
-    return markdown(
-        ["part", "sensor", "measurement", "chosen", "best", "risk", "least", "plain", "unbiased", PREDICTED, TALK], body
-    )
+    head = ["part", "sensor", "measurement", "chosen", "best", "risk", "least", "plain", "unbiased", PREDICTED, TALK]
+    return markdown([*head, "pooled"], body)
 
 
 def coverage_figure(cases: Sequence[JudgedCase]) -> Figure:
@@ -199,12 +202,12 @@ def _label(one: JudgedCase) -> str:
     return f"{one.sensor}, {one.case.table.part}{more}"
 
 
-def _mean_regret(choices: Sequence[Choice]) -> str:
-    judged = [one for one in choices if one.judged]
-    if not judged:
+def _mean_regret(choices: Sequence[Choice], key: str = "regret") -> str:
+    found: list[Regret] = [getattr(one, key) for one in choices if one.judged]
+    if not found:
         return "-"
-    plain, unbiased = ([getattr(one.regret, key) for one in judged] for key in ("ratio", "unbiased"))
-    return f"{number(float(np.mean(unbiased)))} (plain {number(float(np.mean(plain)))})"
+    plain, unbiased = (float(np.mean([getattr(one, name) for one in found])) for name in ("ratio", "unbiased"))
+    return f"{number(unbiased)} (plain {number(plain)})"
 
 
 def _share(one: Share) -> str:

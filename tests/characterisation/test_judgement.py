@@ -65,6 +65,22 @@ def test_regret_of_a_bad_view_is_its_ratio():
     assert {one.best for one in found} == {0}
 
 
+def test_worlds_that_share_a_draw_stay_together():
+    """Errors of pairs of worlds are equal, so 40 worlds are 20 independent ones, and the interval is wider."""
+    rng = np.random.default_rng(5)
+    scale = np.array([1.0, 2.0])[:, None]
+    pairs = [np.repeat(scale * rng.normal(size=(2, 20)), 2, axis=1) for _ in range(60)]
+    apart, together = (np.array([_ends(regret(errors, 1, block=block)) for errors in pairs]) for block in (1, 2))
+    width = [np.mean(np.log(found[:, 1] / found[:, 0])) for found in (apart, together)]
+    assert width[1] / width[0] == pytest.approx(np.sqrt(2), rel=0.15)
+    inside = [np.mean((found[:, 0] <= 2.0) & (found[:, 1] >= 2.0)) for found in (apart, together)]
+    assert inside[1] >= 0.9 and inside[1] > inside[0]
+
+
+def _ends(one):
+    return one.low, one.high
+
+
 def test_regret_of_a_view_without_a_value_is_infinite():
     errors = np.ones((2, 10))
     errors[1] = np.nan
