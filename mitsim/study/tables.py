@@ -70,13 +70,11 @@ class RaceTable(Document):
 
     The race measures the best ``shortlist`` views of each measurement according to the map, with at most ``trials`` of
     each. A choice is decided if, with the probability ``confidence``, its view is the best or its error is within
-    ``margin`` of the best. Each leading view is confirmed by ``confirming`` more trials with other finishes. The race
-    ends after ``minutes``.
+    ``margin`` of the best. The race ends after ``minutes``.
     """
 
     shortlist: int = Field(default=24, ge=1, le=1000)
     trials: int = Field(default=16, ge=4, le=100_000)
-    confirming: int = Field(default=16, ge=0, le=100_000)
     margin: Annotated[float, Field(gt=0, le=1)] = 0.1
     confidence: Annotated[float, Field(ge=0.5, lt=1)] = 0.95
     minutes: Annotated[float, Field(gt=0, le=100_000)] | None = None

@@ -71,7 +71,7 @@ def race_rules(table: RaceTable, minutes: float | None = None) -> RaceRules:
     """Return the rules of a race; ``minutes`` replace those of the table."""
     most = table.minutes if minutes is None else minutes
     seconds = None if most is None else 60 * most
-    return RaceRules(table.shortlist, table.trials, table.margin, table.confidence, seconds, table.confirming)
+    return RaceRules(table.shortlist, table.trials, table.margin, table.confidence, seconds)
 
 
 def map_digest(study: Study) -> str:

@@ -1,22 +1,18 @@
 """Race: find the view that measures best, with virtual measurements of the promising views only.
 
 Signal chain: scores of all candidate views -> shortlist -> trials of every view on it, in the same worlds -> posterior
-of their risks (:mod:`characterisation.statements.selection`) -> more trials where the choice is open -> confirmation of
-the leaders in worlds with other finishes -> the best view of every measurement, and of all together.
+of their risks (:mod:`characterisation.statements.selection`) -> more trials where the choice is open -> the best view
+of every measurement, and of all together.
 
 No view is excluded for good. A view gets trials as long as it may be better than the leader by more than the margin.
-Trials end when every leader is, with the stated probability, the best or within the margin of the best. They also end
+The race ends when every leader is, with the stated probability, the best or within the margin of the best. It also ends
 when all views that could decide have the largest number of trials, or when time is over.
-
-The leader of many views is partly a lucky one: its few trials may lack a rare gross error, or a finish that does not
-suit it. Every leader is therefore measured again, with finishes that the race has not seen. If it loses the lead, the
-next leader is confirmed in the same way.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -28,7 +24,7 @@ from characterisation.statements.selection import Standing, judge, posterior, sa
 from mitsim.progress import say, say_progress
 from mitsim.views import View
 from mitsim.virtual.trials import TrialFolder
-from mitsim.virtual.world import OWN_FINISH_DAYS, RACE_DAYS, Trial
+from mitsim.virtual.world import Trial
 
 Floats = NDArray[np.float64]
 
@@ -74,7 +70,7 @@ class RaceRules:
     """Rules of a race: ``shortlist`` views of each measurement, at most ``most`` trials of each view.
 
     A choice is decided if its view is within ``margin`` of the best with the probability ``confidence``. ``seconds``
-    limit the race. Every leader is confirmed by ``confirming`` more trials.
+    limit the race.
     """
 
     shortlist: int
@@ -82,7 +78,6 @@ class RaceRules:
     margin: float
     confidence: float
     seconds: float | None
-    confirming: int = 0
 
 
 @dataclass(frozen=True)
@@ -161,19 +156,19 @@ def run_race(views: Sequence[View], scores: xr.Dataset, maker: Maker, trials: Tr
         say("race: the map predicts that no view can make any measurement")
         return Raced(np.empty(0, np.int64), {}, np.empty((len(trials.measurements), 0, 0)), False)
     by_number = {view.number: view for view in views}
-    made: dict[int, list[Trial]] = {number: [] for number in numbers}
+    counts = dict.fromkeys(numbers, 0)
     predicted = scores.sel(view=numbers)
     began = last = time.monotonic()
 
     def over() -> bool:
         return rules.seconds is not None and time.monotonic() - began > rules.seconds
 
-    def measure(wanted: dict[int, list[Trial]]) -> None:
+    def measure(wanted: dict[int, int]) -> None:
         nonlocal last
         jobs = [
             Job(by_number[number], trial)
-            for number, some in wanted.items()
-            for trial in some
+            for number, count in wanted.items()
+            for trial in _first_trials(count)
             if trial not in trials.known(number)
         ]
         for done, (job, errors) in enumerate(maker.run(maker.in_order(jobs)), 1):
@@ -184,28 +179,30 @@ def run_race(views: Sequence[View], scores: xr.Dataset, maker: Maker, trials: Tr
             if over() and done < len(jobs):
                 break
 
-    wanted = {number: _first_trials(FIRST) for number in numbers}
+    wanted = dict.fromkeys(numbers, FIRST)
     while True:
         measure(wanted)
-        for number, some in wanted.items():
-            made[number] += [trial for trial in some if trial in trials.known(number)]
-        raced = standings(predicted, trials, made, rules)
-        wanted = {} if raced.decided else _next_round(raced, made, rules)
-        wanted = wanted or _confirmation(raced, made, rules)
-        _say_state(raced, rules, time.monotonic() - began)
-        if not wanted or over():
+        for number in wanted:
+            counts[number] = sum(trial in trials.known(number) for trial in _first_trials(wanted[number]))
+        raced = standings(predicted, numbers, trials, counts, rules)
+        wanted = _next_round(raced, counts, rules)
+        _say_state(raced, counts, rules, time.monotonic() - began)
+        if raced.decided or not wanted or over():
             return raced
 
 
-def standings(scores: xr.Dataset, trials: TrialFolder, made: Mapping[int, Sequence[Trial]], rules: RaceRules) -> Raced:
-    """Return the state of the race after the trials ``made`` of each view, by its number."""
-    names, numbers = list(trials.measurements), list(made)
-    worlds = {trial: k for k, trial in enumerate(sorted({one for some in made.values() for one in some}, key=_day))}
-    errors = np.full((len(names), len(numbers), max(len(worlds), 1)), np.inf)
+def standings(
+    scores: xr.Dataset, numbers: Sequence[int], trials: TrialFolder, counts: dict[int, int], rules: RaceRules
+) -> Raced:
+    """Return the state of the race after ``counts`` trials of each view."""
+    names = list(trials.measurements)
+    most = max(max(counts.values(), default=0), 1)
+    errors = np.full((len(names), len(numbers), most), np.inf)
     for v, number in enumerate(numbers):
         known = trials.known(number)
-        for trial in made[number]:
-            errors[:, v, worlds[trial]] = [known[trial][name] for name in names]
+        for k, trial in enumerate(_first_trials(most)):
+            if trial in known and k < counts[number]:
+                errors[:, v, k] = [known[trial][name] for name in names]
     u = scores["predicted_uncertainty"].sel(measurement=names).transpose("measurement", "view").values
     chance = scores["chance"].sel(measurement=names).transpose("measurement", "view").values
     tolerances = scores["tolerance"].sel(measurement=names).values
@@ -231,15 +228,11 @@ def together(samples: Floats, tolerances: Floats) -> Floats:
 
 
 def _first_trials(count: int) -> list[Trial]:
-    return [Trial(RACE_DAYS + day) for day in range(count)]
+    return [Trial(day) for day in range(count)]
 
 
-def _day(trial: Trial) -> int:
-    return trial.day
-
-
-def _next_round(raced: Raced, made: Mapping[int, Sequence[Trial]], rules: RaceRules) -> dict[int, list[Trial]]:
-    """Return the trials of the next round, by the number of the view."""
+def _next_round(raced: Raced, counts: dict[int, int], rules: RaceRules) -> dict[int, int]:
+    """Return the number of trials after the next round, for the views that get more."""
     wanted = {}
     for one in raced.standings.values():
         if one.confidence >= rules.confidence:
@@ -247,25 +240,17 @@ def _next_round(raced: Raced, made: Mapping[int, Sequence[Trial]], rules: RaceRu
         rivals = [int(v) for v in np.argsort(-one.chance, kind="stable") if one.chance[v] > _LEAST_CHANCE]
         for place in [one.leader, *rivals[:_CHALLENGERS]]:
             number = int(raced.views[place])
-            count = sum(trial.day < OWN_FINISH_DAYS for trial in made[number])
-            if count < rules.most:
-                wanted[number] = _first_trials(min(count + BATCH, rules.most))[count:]
+            if counts[number] < rules.most:
+                wanted[number] = min(counts[number] + BATCH, rules.most)
     return wanted
 
 
-def _confirmation(raced: Raced, made: Mapping[int, Sequence[Trial]], rules: RaceRules) -> dict[int, list[Trial]]:
-    """Return the trials that confirm the leaders, by the number of the view, without those that were made."""
-    every = [Trial(OWN_FINISH_DAYS + day) for day in range(rules.confirming)]
-    left = {number: [one for one in every if one not in made[number]] for number in set(raced.leaders().values())}
-    return {number: some for number, some in sorted(left.items()) if some}
-
-
-def _say_state(raced: Raced, rules: RaceRules, seconds: float) -> None:
+def _say_state(raced: Raced, counts: dict[int, int], rules: RaceRules, seconds: float) -> None:
     open_ones = [name for name, one in raced.standings.items() if one.confidence < rules.confidence]
     best = raced.standings[ALL]
     state = f"{len(open_ones)} of {len(raced.standings)} choices open" if open_ones else "all choices made"
     left = "" if rules.seconds is None else f", {max(0.0, rules.seconds - seconds):.0f} s left"
     say_progress(
-        f"race: {raced.trials} trials of {len(raced.views)} views; leads: view {raced.leader(ALL)} "
+        f"race: {sum(counts.values())} trials of {len(counts)} views; leads: view {raced.leader(ALL)} "
         f"({100 * best.confidence:.0f} % sure to be the best or within {100 * rules.margin:.0f} %); {state}{left}"
     )

@@ -50,9 +50,9 @@ FINISHES = 8
 #: number of successive days that share a finish, for the same reason
 FINISH_DAYS = 2
 
-#: first days of the worlds of a race, of worlds whose finishes are not of the pool (they confirm and judge a choice),
-#: of worlds of a statement, and of a set of views
-RACE_DAYS, OWN_FINISH_DAYS, STATEMENT_DAYS, SET_DAYS = 0, 1 << 19, 1 << 20, 1 << 21
+#: first days of worlds whose finishes are not of the pool (they judge the choice of a view), of worlds of a statement,
+#: and of a set of views; the worlds of a race start at day 0
+OWN_FINISH_DAYS, STATEMENT_DAYS, SET_DAYS = 1 << 19, 1 << 20, 1 << 21
 
 #: offset of the day of the streams from which ``swapped`` takes a group
 _ELSEWHERE = 1 << 32
@@ -105,7 +105,7 @@ class Unknowns:
     drift since then. ``expansion`` of the part is in 1/K. ``centre`` (3,) [mm] is the point about which the part
     rotates. Groups that are not in ``varied`` keep their best estimate. With ``pooled``, finishes come from a pool of
     :data:`FINISHES`; else every world has its own. The days from :data:`OWN_FINISH_DAYS` on have
-    their own as well: they confirm a choice that the pool made.
+    their own as well: they judge a choice that the pool made.
     """
 
     table: UnknownsTable

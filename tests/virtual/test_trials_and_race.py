@@ -1,7 +1,7 @@
 """Trials that are kept, and races between views whose truth is known; nothing is rendered."""
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ import xarray as xr
 from mitsim.virtual.race import ALL, FIRST, Job, RaceRules, run_race, shortlist
 from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.trials import TrialFolder
-from mitsim.virtual.world import OWN_FINISH_DAYS, Trial
+from mitsim.virtual.world import Trial
 
 NAMES = ["radius", "angle"]
 
@@ -102,60 +102,6 @@ def test_time_that_is_over_ends_a_race_undecided(tmp_path):
     rules = RaceRules(shortlist=5, most=200, margin=0.1, confidence=0.95, seconds=0.0)
     raced = race(KnownMaker(np.ones((2, 6))), scores_of(np.ones((2, 6))), tmp_path, rules)
     assert not raced.decided and raced.trials <= 6 * FIRST
-
-
-@dataclass
-class LuckyMaker:
-    """Views of known spreads; one of them is three times worse on days outside the race."""
-
-    spreads: np.ndarray
-    lucky: int
-    asked: list = field(default_factory=list)
-    source = "render"
-
-    def in_order(self, jobs):
-        return list(jobs)
-
-    def run(self, jobs):
-        for job in jobs:
-            self.asked.append(job)
-            draws = np.random.default_rng([3, job.trial.day, job.view.number]).standard_normal(2)
-            unlucky = job.view.number == self.lucky and job.trial.day >= OWN_FINISH_DAYS
-            yield (
-                job,
-                dict(
-                    zip(NAMES, (draws * self.spreads[:, job.view.number] * (3 if unlucky else 1)).tolist(), strict=True)
-                ),
-            )
-
-
-def test_a_leader_that_was_lucky_loses_the_lead_when_it_is_confirmed(tmp_path):
-    spreads = np.array([[0.6, 1.0, 1.4, 2.0], [0.6, 1.0, 1.4, 2.0]])
-    rules = replace(RULES, most=16)
-    assert race(LuckyMaker(spreads, 0), scores_of(spreads), tmp_path / "trusting", rules).leader(ALL) == 0
-    maker = LuckyMaker(spreads, 0)
-    raced = race(maker, scores_of(spreads), tmp_path / "confirmed", replace(rules, confirming=16))
-    assert raced.leader(ALL) == 1
-    confirmed = {job.view.number for job in maker.asked if job.trial.day >= OWN_FINISH_DAYS}
-    assert set(raced.leaders().values()) <= confirmed and 3 not in confirmed
-
-
-def test_every_leader_is_confirmed_once_and_again_after_a_stop(tmp_path):
-    scores, rules = scores_of(np.array(SPREADS)), replace(RULES, confirming=8)
-    whole = race(KnownMaker(SPREADS), scores, tmp_path / "whole", rules)
-    confirming = [trial for trial in _trials_of(tmp_path / "whole", whole.leader(ALL)) if trial >= OWN_FINISH_DAYS]
-    assert confirming == list(range(OWN_FINISH_DAYS, OWN_FINISH_DAYS + 8))
-    with pytest.raises(KeyboardInterrupt):
-        race(KnownMaker(SPREADS, stop_after=whole.trials - 3), scores, tmp_path / "parts", rules)
-    again = KnownMaker(SPREADS)
-    parts = race(again, scores, tmp_path / "parts", rules)
-    assert again.made == 3
-    np.testing.assert_array_equal(parts.errors, whole.errors)
-
-
-def _trials_of(folder, view):
-    lines = (folder / f"view_{view:04d}.jsonl").read_text().splitlines()[1:]
-    return sorted(json.loads(line)["day"] for line in lines)
 
 
 def test_a_view_that_often_gives_no_value_falls_behind(tmp_path):

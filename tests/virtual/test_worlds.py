@@ -142,7 +142,7 @@ def test_finishes_have_the_spread_of_a_normal_distribution(unknowns):
     assert set(days) <= set(range(FINISHES)) and len(set(days)) == FINISHES
 
 
-def test_a_choice_is_confirmed_with_other_finishes_than_those_that_made_it(unknowns):
+def test_a_choice_is_judged_with_other_finishes_than_those_that_made_it(unknowns):
     own = [unknowns.draw(Trial(OWN_FINISH_DAYS + day)).finish for day in range(8 * FINISH_DAYS)]
     assert len(set(own)) == 8 and min(own) >= FINISHES
     assert unknowns.draw(Trial(STATEMENT_DAYS)).finish < FINISHES
