@@ -87,7 +87,7 @@ def figures(page: Path) -> list[Figure]:
             told = float(match[3] or 0) * SECONDS[match[4] or "s"]
             markers.append((match[1], match[2], told))
         elif match := NAMES.fullmatch(line):
-            names[match[1]] = names_of(match[2])
+            names[match[1]] |= names_of(match[2])
         elif line.startswith("```"):
             while lines[end] != "```":
                 end += 1

@@ -12,6 +12,7 @@ sys.path.insert(0, str(ROOT / "docs" / "site"))
 from figures import check, selected
 from quoted import Figure, cells, compared, figures, holds_figures
 from quoted_numbers import same
+from quoted_tables import grouped, plain, row_of
 
 #: figures that take no longer are made in this test [s]
 QUICK = 5
@@ -25,6 +26,15 @@ def quick(page: Path) -> list[Figure]:
 @by_page
 def test_every_output_picture_and_table_of_figures_says_where_it_comes_from(page):
     assert [f"{one.where}: {one.kind}" for one in figures(page) if not one.marker] == []
+
+
+@by_page
+def test_names_of_columns_and_rows_are_those_of_the_table(page):
+    for one in (one for one in figures(page) if one.kind == "table"):
+        heads = grouped(row_of(one.text[0]))
+        known = {plain(head) for head in heads} | {f"({at})" for at in range(1, len(heads) + 1)}
+        assert set(one.columns) <= known, one.where
+        assert set(one.rows) <= {plain(cell) for row in one.text[2:] for cell in row_of(row)}, one.where
 
 
 @by_page
