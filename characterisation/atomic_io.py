@@ -140,10 +140,10 @@ def write_netcdf(data: xr.Dataset, path: str | Path, encoding: Mapping[Any, Mapp
     """
     data = data.assign_attrs({DIGEST: dataset_digest(data)})
     attributes = [data.attrs, *(variable.attrs for variable in data.variables.values())]
-    told = sum(len(str(value)) for table in attributes for value in table.values())
+    text = sum(len(str(value)) for table in attributes for value in table.values())
     with atomic_write(path) as file:
         with file.open("xb") as stream:
-            stream.write(bytes(data.nbytes + told + _NETCDF_FILE + len(attributes) * _NETCDF_VARIABLE))
+            stream.write(bytes(data.nbytes + text + _NETCDF_FILE + len(attributes) * _NETCDF_VARIABLE))
         file.unlink()
         data.to_netcdf(file, encoding=encoding)
         with file.open("r+b") as stream:

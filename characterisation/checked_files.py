@@ -85,8 +85,8 @@ def read_json_object(file: Path, absent: str | None = None, hint: str = "") -> d
     try:
         table = json.loads(text)
     except (ValueError, RecursionError) as error:
-        told = "nested too deep" if isinstance(error, RecursionError) else " ".join(str(error).split())[:200]
-        raise InputError(file, "", f"text that is not JSON ({told})", "JSON in UTF-8", hint) from None
+        cause = "nested too deep" if isinstance(error, RecursionError) else " ".join(str(error).split())[:200]
+        raise InputError(file, "", f"text that is not JSON ({cause})", "JSON in UTF-8", hint) from None
     if not isinstance(table, dict):
         raise InputError(file, "", type(table).__name__, "a JSON object", hint)
     return table
@@ -133,8 +133,8 @@ def dataset_digest(data: xr.Dataset) -> str:
     for name in sorted(map(str, data.variables)):
         variable = data.variables[name]
         values = np.asarray(variable.values)
-        told = [name, list(map(str, variable.dims)), list(values.shape), plain(variable.attrs)]
-        digest.update(json.dumps(told, default=str).encode())
+        content = [name, list(map(str, variable.dims)), list(values.shape), plain(variable.attrs)]
+        digest.update(json.dumps(content, default=str).encode())
         if values.dtype.kind == "f":
             whole = np.where(np.isnan(values), np.nan, values).astype(f"<f{values.dtype.itemsize}")
             digest.update(np.ascontiguousarray(whole).tobytes())

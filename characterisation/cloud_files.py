@@ -137,8 +137,8 @@ def read_ply(path: str | Path) -> PointCloud:
         if baseline.shape != (3,) or not (np.abs(numbers) < 1e9).all() or not (fx > 0 and fy > 0):
             raise ValueError("optics or a pose that are infinite, huge or not numbers")
     except (ValueError, KeyError, TypeError, StopIteration, IndexError, OverflowError, RecursionError) as error:
-        told = " ".join(repr(error).split())[:200]
-        raise InputError(path, "comment", f"an inconsistent header ({told})", "as written") from None
+        cause = " ".join(repr(error).split())[:200]
+        raise InputError(path, "comment", f"an inconsistent header ({cause})", "as written") from None
     pixel = _BENT_PIXEL if bent else _PIXEL
     if min(count, width - 1, height - 1) < 0 or len(body) != count * _VERTEX.itemsize + width * height * pixel.itemsize:
         raise InputError(

@@ -107,9 +107,9 @@ def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
     except MemoryError:
         raise InputError(path, "", "more than fits into memory", schema.made_by, schema.hint) from None
     except Exception as error:  # a damaged file may raise anything
-        told = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        cause = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         allowed = f"netCDF: {schema.made_by}"
-        raise InputError(path, "", f"a file that cannot be read ({told})", allowed, schema.hint) from None
+        raise InputError(path, "", f"a file that cannot be read ({cause})", allowed, schema.hint) from None
     data = data.drop_encoding()
     written = data.attrs.pop(DIGEST, None)
     if written is not None and written != dataset_digest(data):
@@ -169,8 +169,8 @@ def _check_bytes(path: Path, schema: Schema) -> None:
     except subprocess.TimeoutExpired:
         found = f"its reader did not finish within {PATIENCE_S:g} s"
     if found:
-        told = " ".join(found.split())
-        raise InputError(path, "", f"a file that cannot be read ({told})", f"netCDF: {schema.made_by}", schema.hint)
+        cause = " ".join(found.split())
+        raise InputError(path, "", f"a file that cannot be read ({cause})", f"netCDF: {schema.made_by}", schema.hint)
 
 
 def _check_form(path: Path, data: xr.Dataset, schema: Schema) -> None:

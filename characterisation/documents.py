@@ -78,8 +78,8 @@ def read_toml(path: str | Path, model: type[Model]) -> Model:
     try:
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # also a whole number of thousands of digits
-        told = " ".join(str(error).split())[:200]
-        raise InputError(path, "", f"text that is not TOML ({told})", "TOML, see https://toml.io") from None
+        cause = " ".join(str(error).split())[:200]
+        raise InputError(path, "", f"text that is not TOML ({cause})", "TOML, see https://toml.io") from None
     _check_numbers(path, table)
     return validate(path, table, model)
 

@@ -39,7 +39,7 @@ class Status(IntEnum):
     HIDDEN = 6  #: the second camera does not see it, or disagrees
     AMBIGUOUS = 7  #: several places fit equally well
     PHASE_INCONSISTENT = 8  #: the code's images contradict one another
-    INTERREFLECTION = 9  #: light that came by way of another surface
+    INTERREFLECTION = 9  #: light that came over another surface
     DROPPED = 10  #: removed at random by the performance map (predicted clouds)
 
 

@@ -213,6 +213,6 @@ def _flushed(code: int) -> int:
     except (OSError, ValueError) as error:
         with suppress(OSError, ValueError):
             sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - for the rest
-        told = getattr(error, "strerror", None) or error
-        return code or _end(3, f"standard output: cannot be written ({told})")
+        cause = getattr(error, "strerror", None) or error
+        return code or _end(3, f"standard output: cannot be written ({cause})")
     return code

@@ -198,7 +198,7 @@ def gallery(sensor: Sensor, seed: int = 1) -> list[tuple[str, Capture, PointClou
 
 
 class _Bench:
-    """A simulated sensor, and the specimens in front of it."""
+    """A simulated sensor, and the test targets in front of it."""
 
     def __init__(self, sensor: Sensor, seed: int) -> None:
         self.sensor, self.seed = sensor, seed

@@ -34,9 +34,9 @@ from mitsim.prediction import (
     CharacterisedScene,
     Effect,
     Ideal,
-    LookedAt,
     Perturbation,
     Predictor,
+    SceneView,
     ViewPoints,
     expected_points,
     feature_statistics,
@@ -139,7 +139,7 @@ def score_candidates(
         whole = looking.surfaces(scene, pose)
         ideal, labels = looking.ideal(whole), looking.labels(scene, pose, whole)
         n_only = np.array([_white_points(looking, one, pose) for one in alone])
-        view_of = LookedAt(scene, pose, whole, ideal)
+        view_of = SceneView(scene, pose, whole, ideal)
         return _Cast(ideal, labels, n_only, together((effect(view_of) for effect in effects), len(ideal.pixel)))
 
     def look(cast: _Cast, view: View) -> _Seen:
@@ -241,9 +241,9 @@ def _limits(
     share = scores["R_f"]
     for m in range(shape[0]):
         for v, one in enumerate(seen):
-            told = one.measurements[m]
-            if not told.uncertainty > 0:
-                short = [name for name in told.reason.split(":")[0].split(", ") if name in kinds]
+            predicted = one.measurements[m]
+            if not predicted.uncertainty > 0:
+                short = [name for name in predicted.reason.split(":")[0].split(", ") if name in kinds]
                 feature[m, v] = short[0] if short else ""
         inputs = next((one.measurements[m].inputs for one in seen), ())
         parts = np.array([one.measurements[m].contributions for one in seen])

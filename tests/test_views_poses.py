@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from characterisation.documents import validate
-from mitsim.views import ViewsTable, candidate_views, tell_views, write_poses
+from mitsim.views import ViewsTable, candidate_views, write_poses, write_views
 
 STAGE = {
     "axes": [
@@ -116,7 +116,7 @@ def test_what_cannot_be_had_is_listed_and_counted(n10, tmp_path, capsys):
     folder = tmp_path / "poses"
     blocked = np.array([[[-400, 300, 0], [400, 300, 0], [0, 300, 600]]], float)
     found, table = views(n10, triangles=blocked, stage=STAGE)
-    tell_views(folder, found, table, n10.name)
+    write_views(folder, found, table, n10.name)
     listed = rows(folder / "left_out.csv")
     assert len(listed) == len(found.left_out) > 0
     assert {row["reason"].partition(":")[0] for row in listed} == {"stage"}
@@ -127,7 +127,7 @@ def test_what_cannot_be_had_is_listed_and_counted(n10, tmp_path, capsys):
     )
     # a run with another table leaves nothing of the former one
     found, table = views(n10)
-    tell_views(folder, found, table, n10.name)
+    write_views(folder, found, table, n10.name)
     assert sorted(p.name for p in folder.iterdir()) == ["poses.csv", "poses.json"]
     assert not capsys.readouterr().err
 
@@ -135,6 +135,6 @@ def test_what_cannot_be_had_is_listed_and_counted(n10, tmp_path, capsys):
 def test_views_that_stand_farther_out_are_counted(n10, tmp_path, capsys):
     wall = np.array([[[-900, 380, -900], [900, 380, -900], [0, 380, 900]]], float)
     found, table = views(n10, triangles=wall, lowest_elevation_deg=20)
-    tell_views(tmp_path / "poses", found, table, n10.name)
+    write_views(tmp_path / "poses", found, table, n10.name)
     assert found.moved_out > 0
     assert f"{found.moved_out} of {len(found.views)} views are moved farther out" in capsys.readouterr().err

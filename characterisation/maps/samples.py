@@ -36,7 +36,7 @@ class Samples:
         """Return the names of the finishes, each once."""
         return list(dict.fromkeys(self.names))
 
-    def told(self) -> str:
+    def in_words(self) -> str:
         """Describe the samples in words: finishes with the range of their Ra."""
         out = []
         for name in self.finishes:

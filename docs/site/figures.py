@@ -71,7 +71,7 @@ class Scratch:
 
 def made_again(figure: Figure, scratch: Scratch, write: bool) -> list[str]:
     """Run the command of a figure and return what differs; with ``write``, put the new one in the page."""
-    output = scratch.run(figure.told)
+    output = scratch.run(figure.source)
     if figure.kind == "picture":
         kept = [figure.page.parent / name for name in PICTURE.findall(figure.text[0])]
         faults = []
@@ -95,8 +95,8 @@ def made_again(figure: Figure, scratch: Scratch, write: bool) -> list[str]:
 def selected(page: Path, only: str = "", within: float = float("inf")) -> list[Figure]:
     """Return the figures of a page that a command can make here: those with a text in page or command, and a time."""
     every = [one for one in figures(page) if one.marker == "made by" and one.seconds <= within]
-    every = [one for one in every if RECORDINGS.is_dir() or "$MITSIM_REAL_DATA" not in one.told]
-    return [one for one in every if only in f"{one.where} {one.told}"]
+    every = [one for one in every if RECORDINGS.is_dir() or "$MITSIM_REAL_DATA" not in one.source]
+    return [one for one in every if only in f"{one.where} {one.source}"]
 
 
 def check(page: Path, chosen: list[Figure], write: bool = False) -> list[str]:
@@ -106,11 +106,11 @@ def check(page: Path, chosen: list[Figure], write: bool = False) -> list[str]:
         scratch = Scratch(Path(folder) / "page")
         for one in figures(page):
             if one.kind == "file":
-                (scratch.folder / one.told).parent.mkdir(parents=True, exist_ok=True)
-                (scratch.folder / one.told).write_text("\n".join(one.text) + "\n", encoding="utf-8")
+                (scratch.folder / one.source).parent.mkdir(parents=True, exist_ok=True)
+                (scratch.folder / one.source).write_text("\n".join(one.text) + "\n", encoding="utf-8")
         for one in chosen:
             found = made_again(one, scratch, write)
-            print(f"{'differs' if found else 'same   '}  {one.where}  {one.told}", *found, sep="\n    ", flush=True)
+            print(f"{'differs' if found else 'same   '}  {one.where}  {one.source}", *found, sep="\n    ", flush=True)
             faults += [f"{one.where}: {fault}" for fault in found]
     return faults
 
@@ -118,14 +118,14 @@ def check(page: Path, chosen: list[Figure], write: bool = False) -> list[str]:
 def main() -> int:
     """Run as a script."""
     parser = argparse.ArgumentParser(description="Make the figures of the pages again, and compare.")
-    for name, told in (("list", "what each comes from"), ("check", "compare"), ("write", "put them in the pages")):
-        parser.add_argument(f"--{name}", action="store_true", help=told)
+    for name, what in (("list", "what each comes from"), ("check", "compare"), ("write", "put them in the pages")):
+        parser.add_argument(f"--{name}", action="store_true", help=what)
     parser.add_argument("--only", default="", metavar="TEXT", help="those with this text in page or command")
     parser.add_argument("--within", type=float, default=float("inf"), metavar="SECONDS", help="those that take less")
     given = parser.parse_args()
     if given.list:
-        for one in (one for page in PAGES for one in figures(page) if given.only in f"{one.where} {one.told}"):
-            print(f"{one.where}  {one.kind}  {one.marker or 'NO MARKER'}: {one.told}  {one.seconds:.0f} s")
+        for one in (one for page in PAGES for one in figures(page) if given.only in f"{one.where} {one.source}"):
+            print(f"{one.where}  {one.kind}  {one.marker or 'NO MARKER'}: {one.source}  {one.seconds:.0f} s")
         return int(any(not one.marker for page in PAGES for one in figures(page)))
     faults = []
     for page in PAGES:

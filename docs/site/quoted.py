@@ -55,7 +55,7 @@ class Figure:
     kind: str  # output, table, picture, file
     text: list[str]
     marker: str = ""  # made by, held by, not run, file; empty: there is none
-    told: str = ""  # command, test, reason or file name
+    source: str = ""  # command, test, reason or file name
     seconds: float = 0.0
     columns: Mapping[str, str] = field(default_factory=dict)  # of a table: printed names by quoted ones
     rows: Mapping[str, str] = field(default_factory=dict)
@@ -75,19 +75,19 @@ def figures(page: Path) -> list[Figure]:
     at = 0
 
     def add(kind: str, first: int, text: list[str], needed: bool) -> None:
-        for marker, told, seconds in markers or ([("", "", 0.0)] if needed else []):
-            if (marker, told) == ("made by", "as above"):
-                told, seconds = next((one.told, one.seconds) for one in reversed(found) if one.marker == marker)
+        for marker, source, seconds in markers or ([("", "", 0.0)] if needed else []):
+            if (marker, source) == ("made by", "as above"):
+                source, seconds = next((one.source, one.seconds) for one in reversed(found) if one.marker == marker)
             own = "file" if marker == "file" else kind
-            found.append(Figure(page, first + 1, own, text, marker, told, seconds, **names))
+            found.append(Figure(page, first + 1, own, text, marker, source, seconds, **names))
 
     while at < len(lines):
         line, end = lines[at], at + 1
         if match := MARKER.fullmatch(line):
-            told = float(match[3] or 0) * SECONDS[match[4] or "s"]
-            markers.append((match[1], match[2], told))
+            seconds = float(match[3] or 0) * SECONDS[match[4] or "s"]
+            markers.append((match[1], match[2], seconds))
         elif match := NAMES.fullmatch(line):
-            names[match[1]] = names_of(match[2])
+            names[match[1]] |= names_of(match[2])
         elif line.startswith("```"):
             while lines[end] != "```":
                 end += 1

@@ -16,10 +16,12 @@ table name those that differ, the quoted name first; ``;`` separates them::
     <!-- rows: sigma along V, median = sigma, median; all = all of 1000 calibrations; open = all in 2 -->
     <!-- columns: recorded = real; simulated, u = simulated & u; (5) = verdict; carpet: recorded = real in 2 -->
     <!-- columns: N10 left = inside 95 % of left.{} in 3 -->
+    <!-- rows: Wasserstein distance = grey levels, distance with difference for simulated -->
 
 ``&`` joins the cells of several printed columns. ``(5)`` is the fifth quoted column. ``of left.{}`` says how the
 printed table writes the first cell of a label. ``in 2``, of a column or a row, is the second printed table that has the
-column; without it a cell is that of the first table that has the column and the row.
+column; without it a cell is that of the first table that has the column and the row. ``with difference for simulated``
+takes another printed column in this row.
 
 A column that no printed table has may only hold words. Columns *by others* and text in backticks are not compared.
 """
@@ -43,11 +45,16 @@ class Table:
 
 @dataclass(frozen=True)
 class Printed:
-    """Where the cells of a quoted column are printed: columns, label of a row, number of the table from 1 or 0."""
+    """Where a quoted column or row is printed: its names, the label of a row, the number of the table, from 1.
 
-    heads: tuple[str, ...]
+    ``table`` 0 is the first that has it. ``other`` is the column that a row has in place of the column ``usual``.
+    """
+
+    names: tuple[str, ...]
     label: str = "{}"
     table: int = 0
+    other: str = ""
+    usual: str = ""
 
 
 def row_of(line: str) -> list[str]:
@@ -96,9 +103,10 @@ def names_of(text: str) -> dict[str, str]:
 
 def printed_place(text: str) -> Printed:
     """Return what a comment says of a column or row: ``head & head of left.{} in 2``."""
-    match = re.fullmatch(r"(.*?)(?: of (\S*\{\}\S*))?(?: in (\d+))?", text)
+    match = re.fullmatch(r"(.*?)(?: of (\S*\{\}\S*))?(?: in (\d+))?(?: with (.+) for (.+))?", text)
     assert match is not None
-    return Printed(tuple(match[1].split(" & ")), match[2] or "{}", int(match[3] or 0))
+    names = tuple(match[1].split(" & "))
+    return Printed(names, match[2] or "{}", int(match[3] or 0), match[4] or "", match[5] or "")
 
 
 def table_faults(
@@ -116,10 +124,10 @@ def table_faults(
         cells = {label: row[at] for label, row in zip(labels, body, strict=True) if row[at]}
         if "by others" in heads[at] or not cells:
             continue
-        having = [table for table in tables if None not in [_place(table, head) for head in places[at].heads]]
+        having = [table for table in tables if None not in [_place(table, head) for head in places[at].names]]
         found = {label: _found(having, places[at], places[:keys], label, rows) for label in cells}
         if not any(found.values()):
-            if any(map(_numbers, cells.values())) or places[at].heads != (heads[at],):
+            if any(map(_numbers, cells.values())) or places[at].names != (heads[at],):
                 faults.append(f"column {heads[at]!r}: no table of the output has it with these rows")
             continue
         for label, cell in cells.items():
@@ -163,15 +171,17 @@ def _found(
 ) -> list[str]:
     """Return the different printed cells of a column in rows with a label, of the tables that have the column."""
     named = [printed_place(rows[plain(one)]) if plain(one) in rows else None for one in label]
-    wanted = [one if name is None else " & ".join(name.heads) for one, name in zip(label, named, strict=True)]
+    wanted = [one if name is None else " & ".join(name.names) for one, name in zip(label, named, strict=True)]
     if named[0] is None:
         wanted[0] = where.label.format(label[0])
+    others = {name.usual: name.other for name in named if name is not None and name.other}
     number = max([where.table, *(name.table for name in named if name is not None)])
     for table in having[number - 1 : number] if number else having:
-        at = [_place(table, key.heads[0]) for key in keys]
+        at = [_place(table, key.names[0]) for key in keys]
         at = [index if place is None else place for index, place in enumerate(at)]
+        own = [_place(table, others.get(name, name)) for name in where.names]
         cells = [
-            " ".join(row[place] for head in where.heads if (place := _place(table, head)) is not None)
+            " ".join(row[place] for place in own if place is not None)
             for row in table.rows
             if all(_same_label(one, row[place]) for one, place in zip(wanted, at, strict=True))
         ]

@@ -128,12 +128,12 @@ class _Maker:
 
     def dimension(self, one: Dimension) -> None:
         """Convert a size or a location."""
-        told = f"#{one.number} {one.kind}" + (f" {one.nominal:g}" if one.nominal is not None else "")
+        described = f"#{one.number} {one.kind}" + (f" {one.nominal:g}" if one.nominal is not None else "")
         first, second = self.faces(one.first), self.faces(one.second) if one.second else []
         on = f" of {', '.join(f.name for f in [*first, *second])}" if first or second else ""
 
         def left_out(why: str) -> None:
-            self.task.left_out.append(f"{told}{on}: {why}")
+            self.task.left_out.append(f"{described}{on}: {why}")
 
         if one.nominal is None:
             return left_out("it has no value in the file")
@@ -192,13 +192,13 @@ class _Maker:
         """Convert a geometric tolerance."""
         faces = self.faces(one.target)
         frame = f" |{'|'.join(one.datums)}" if one.datums else ""
-        told = f"#{one.number} {one.kind}{f' {one.zone:g}' if one.zone is not None else ''}{frame}"
+        described = f"#{one.number} {one.kind}{f' {one.zone:g}' if one.zone is not None else ''}{frame}"
         on = f" of {', '.join(f.name for f in faces)}" if faces else ""
         if one.zone is None or one.zone <= 0:
-            self.task.left_out.append(f"{told}{on}: it has no zone in the file")
+            self.task.left_out.append(f"{described}{on}: it has no zone in the file")
             return
         if not faces:
-            self.task.left_out.append(f"{told}{on}: it is {_what(one.target)}")
+            self.task.left_out.append(f"{described}{on}: it is {_what(one.target)}")
             return
         datums = {letter: [self.by_name[name] for name in names] for letter, names in self.task.datums.items()}
         made = zones(one, faces, datums)
@@ -210,8 +210,8 @@ class _Maker:
             said = (*one.notes, *zone.remarks)
             name = f"{zone.of.name}_{zone.kind}"
             self.add(name, DrawnMeasurement(zone.kind, features, 0.0, "mm", one.zone, one.number, said))
-            self.task.left_out += [f"{told} of {zone.of.name}: {remark}" for remark in zone.remarks]
-        self.task.left_out += [f"{told}{f' of {name}' if name else on}: {why}" for name, why in made.left_out]
+            self.task.left_out += [f"{described} of {zone.of.name}: {remark}" for remark in zone.remarks]
+        self.task.left_out += [f"{described}{f' of {name}' if name else on}: {why}" for name, why in made.left_out]
 
 
 def _deviations(one: Dimension) -> float | tuple[float, float] | None:

@@ -53,7 +53,7 @@ def with_names(faces: Sequence[Face]) -> list[Face]:
         groups[parts[number] + (_given(face) or described_name(face, low, high))].append(number)
     names: dict[int, str] = {}
     for base, members in groups.items():
-        for number, suffix in zip(members, _told_apart([faces[n] for n in members], high - low), strict=True):
+        for number, suffix in zip(members, _distinguished([faces[n] for n in members], high - low), strict=True):
             names[number] = base + suffix
     return _in_order([replace(face, name=name) for face, name in zip(faces, _unique(names, faces), strict=True)])
 
@@ -175,7 +175,7 @@ def _place(face: Face) -> Floats:
     return np.asarray(middle)
 
 
-def _told_apart(faces: list[Face], extent: Floats) -> list[str]:
+def _distinguished(faces: list[Face], extent: Floats) -> list[str]:
     """Return suffixes that distinguish faces with equal descriptions: sides if sufficient, else numbers by z, y, x."""
     if len(faces) == 1:
         return [""]

@@ -196,11 +196,11 @@ def scene_xml(faces: list[Face], finishing: Finishing, source: str) -> str:
     ]
     finishes = finish_names(faces)
     for colour, name in finishes.items():
-        told = (
+        parameters = (
             f"  <!-- colour {hexadecimal(colour)} of the file -->" if colour is not None and len(finishes) > 1 else ""
         )
         lines += [
-            f'    <bsdf type="{material.kind}" id="{name}">{told}',
+            f'    <bsdf type="{material.kind}" id="{name}">{parameters}',
             *(
                 f'        <{"string" if isinstance(value, str) else "float"} name="{key}" value="${key}"/>'
                 for key, value in material.properties.items()

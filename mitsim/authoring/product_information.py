@@ -175,10 +175,10 @@ class _Reader:
         for zone in text.all("TOLERANCE_ZONE"):
             of, form = (None, None, *(zone.of("TOLERANCE_ZONE") or ()))[-2:]
             shape = text.follow(form)
-            told = shape.of("TOLERANCE_ZONE_FORM") if shape else None
+            zone_form = shape.of("TOLERANCE_ZONE_FORM") if shape else None
             for one in of if isinstance(of, tuple) else ():
-                if isinstance(one, Reference) and told and isinstance(told[0], str):
-                    self.zones[one.number] = told[0]
+                if isinstance(one, Reference) and zone_form and isinstance(zone_form[0], str):
+                    self.zones[one.number] = zone_form[0]
 
     def target(self, reference: Any) -> Target:
         """Return the object of a shape aspect, through its members and the aspects it was derived from."""
@@ -308,7 +308,7 @@ class _Reader:
         name = values[0] if isinstance(values[0], str) else ""
         referred = entity.of("GEOMETRIC_TOLERANCE_WITH_DATUM_REFERENCE")
         named = referred[0] if referred else values[4] if len(entity.parts) == 1 else None
-        notes = [told for kind_, told in _RESTRICTIONS.items() if entity.has(kind_)]
+        notes = [note for kind_, note in _RESTRICTIONS.items() if entity.has(kind_)]
         for one in (entity.of(kind_) for kind_ in _MODIFIERS):
             words = [
                 w.name for v in one or () for w in (v if isinstance(v, tuple) else (v,)) if isinstance(w, Enumeration)

@@ -73,20 +73,20 @@ def check_part_file(path: Path, units: str | None) -> None:
         raise InputError(path, "", "a file over 1 GiB", "a smaller one", "mesh the part more coarsely")
 
 
-def _load(told: Path) -> Any:
+def _load(path: Path) -> Any:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return trimesh.load_scene(told)
+            return trimesh.load_scene(path)
     except ImportError as error:
         package = getattr(error, "name", None) or str(error)
         raise InputError(
-            told, "", f"a format that needs the package {package}", "STL, PLY or OBJ", f"pip install {package}"
+            path, "", f"a format that needs the package {package}", "STL, PLY or OBJ", f"pip install {package}"
         ) from None
     except Exception as error:  # the reader raises any exception on damaged files
         reason = " ".join(str(error).split())[:120] or type(error).__name__
-        allowed = f"a {told.suffix.lower().lstrip('.').upper()} file"
-        raise InputError(told, "", f"an unreadable file ({reason})", allowed) from None
+        allowed = f"a {path.suffix.lower().lstrip('.').upper()} file"
+        raise InputError(path, "", f"an unreadable file ({reason})", allowed) from None
 
 
 def _gathered(path: Path, scene: Any, scale: float) -> Mesh:

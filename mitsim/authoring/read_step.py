@@ -88,12 +88,12 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
             arrays = {key: data[key] for key in ("vertices", "normals", "triangles")}
     names = _names(path)
     faces, vertex, triangle = [], 0, 0
-    for told in text["faces"]:
-        points, corners = told["counts"]
+    for record in text["faces"]:
+        points, corners = record["counts"]
         here, there = slice(vertex, vertex + points), slice(triangle, triangle + corners)
         vertex, triangle = vertex + points, triangle + corners
-        face = _face(told, arrays["vertices"][here], arrays["normals"][here], arrays["triangles"][there])
-        faces.append(replace(face, drawn_name=names.get(told["entity"], "")))
+        face = _face(record, arrays["vertices"][here], arrays["normals"][here], arrays["triangles"][there])
+        faces.append(replace(face, drawn_name=names.get(record["entity"], "")))
     joined = _joined(faces)
     remarks = []
     if len(joined) < len(faces):
@@ -103,7 +103,7 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
     bodies = len({face.body for face in faces})
     if bodies > 1:
         remarks.append(f"{bodies} bodies, each with its own faces")
-    closed = all(told["closed"] for told in text["faces"])
+    closed = all(record["closed"] for record in text["faces"])
     if not closed:
         remarks.append("the file has surfaces that bound no solid: mitsim check reports visible backs")
     return Drawn(joined, remarks, closed)
@@ -120,9 +120,9 @@ def _names(path: Path) -> dict[int, str]:
     return found
 
 
-def _face(told: dict[str, Any], vertices: Floats, normals: Floats, triangles: Ints) -> Face:
+def _face(record: dict[str, Any], vertices: Floats, normals: Floats, triangles: Ints) -> Face:
     """Make one face from the worker's data."""
-    surface = _surface(told, vertices)
+    surface = _surface(record, vertices)
     convex, deviation, sag = True, float("nan"), float("nan")
     if surface is not None:
         facing = np.einsum("ij,ij->i", outward_normals(surface, vertices), normals).sum()
@@ -131,7 +131,7 @@ def _face(told: dict[str, Any], vertices: Floats, normals: Floats, triangles: In
         else:
             convex = bool(facing > 0)
         deviation, sag = _distances(surface, vertices, triangles)
-    colour = told["colour"]
+    colour = record["colour"]
     return Face(
         "",
         vertices,
@@ -141,12 +141,12 @@ def _face(told: dict[str, Any], vertices: Floats, normals: Floats, triangles: In
         deviation,
         sag,
         normals,
-        told["part"],
-        told["body"],
+        record["part"],
+        record["body"],
         None if colour is None else (colour[0], colour[1], colour[2]),
-        (told["entity"],) if told["entity"] else (),
+        (record["entity"],) if record["entity"] else (),
         "",
-        frozenset(told["edges"]),
+        frozenset(record["edges"]),
     )
 
 
@@ -156,27 +156,27 @@ def _distances(surface: Surface, vertices: Floats, triangles: Ints) -> tuple[flo
     return one, other
 
 
-def _surface(told: dict[str, Any], vertices: Floats) -> Surface | None:
+def _surface(record: dict[str, Any], vertices: Floats) -> Surface | None:
     """Return the surface in a task's terms: points on the face's own section of an axis."""
-    if told["kind"] == "freeform":
+    if record["kind"] == "freeform":
         return None
-    point, axis = np.array(told["point"]), np.array(told["axis"])
+    point, axis = np.array(record["point"]), np.array(record["axis"])
     axis = axis / np.linalg.norm(axis)
-    if told["kind"] == "plane":
+    if record["kind"] == "plane":
         return Plane(vertices.mean(axis=0) - ((vertices.mean(axis=0) - point) @ axis) * axis, axis)
-    if told["kind"] == "sphere":
-        return Sphere(point, told["radius"])
-    if told["kind"] == "cone":
-        half = told["half_angle"]
+    if record["kind"] == "sphere":
+        return Sphere(point, record["radius"])
+    if record["kind"] == "cone":
+        half = record["half_angle"]
         if half < 0:
             axis, half = -axis, -half
         along = (vertices - point) @ axis
         wide = float(along.max())
-        return Cone(point + wide * axis, axis, told["radius"] + wide * float(np.tan(half)), half)
+        return Cone(point + wide * axis, axis, record["radius"] + wide * float(np.tan(half)), half)
     axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-    if told["kind"] == "torus":
-        return Torus(point, axis, told["radius"], told["tube"])
-    return Cylinder(point + float(((vertices - point) @ axis).min()) * axis, axis, told["radius"])
+    if record["kind"] == "torus":
+        return Torus(point, axis, record["radius"], record["tube"])
+    return Cylinder(point + float(((vertices - point) @ axis).min()) * axis, axis, record["radius"])
 
 
 def _joined(faces: list[Face]) -> list[Face]:

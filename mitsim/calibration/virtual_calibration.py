@@ -97,10 +97,10 @@ def calibrate(
     rng = np.random.default_rng(seed)
     alone = accuracy(sensor, eyes, covariance, _DRAWS, rng)
     drifted = accuracy(sensor, eyes, with_drift(covariance, sensor.rig, drift), _DRAWS, rng)
-    told = {f"calibration_{key}": value for key, value in alone.numbers().items()}
-    told |= {f"with_drift_{key}": value for key, value in drifted.numbers().items() if key not in ("middle_mm",)}
-    told |= {f"drift_{key}": value for key, value in drift.numbers().items()}
-    covariance = replace(covariance, details=dict(covariance.details) | told)
+    numbers = {f"calibration_{key}": value for key, value in alone.numbers().items()}
+    numbers |= {f"with_drift_{key}": value for key, value in drifted.numbers().items() if key not in ("middle_mm",)}
+    numbers |= {f"drift_{key}": value for key, value in drift.numbers().items()}
+    covariance = replace(covariance, details=dict(covariance.details) | numbers)
     return VirtualCalibration(sensor, eyes, board, views, covariance, drift, alone, drifted)
 
 

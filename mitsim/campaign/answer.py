@@ -141,8 +141,8 @@ def answering_map(performance_map: PerformanceMap, wanted: Wanted, ask: Ask | No
     if to_make:
         seconds = sum(expected_seconds(ones[name]) for name, _ in to_make)
         names = list(dict.fromkeys(name for name, _ in to_make))
-        told = ", ".join(_in_words(ones[name].finish) for name in names)
-        question = f"{wanted.sensor.name}: its map lacks {told}; characterise now (about {_minutes(seconds)})?"
+        lacking = ", ".join(_in_words(ones[name].finish) for name in names)
+        question = f"{wanted.sensor.name}: its map lacks {lacking}; characterise now (about {_minutes(seconds)})?"
         if ask is None or not ask(question):
             raise _unknown_finish_error(
                 performance_map,
@@ -151,7 +151,7 @@ def answering_map(performance_map: PerformanceMap, wanted: Wanted, ask: Ask | No
                 missing[names[0]],
                 f"add --yes to characterise it now, in about {_minutes(seconds)}; the result is kept",
             )
-        say(f"{wanted.sensor.name}: characterising {told} in about {_minutes(seconds)}; kept in {cache_folder()}")
+        say(f"{wanted.sensor.name}: characterising {lacking} in about {_minutes(seconds)}; kept in {cache_folder()}")
         kept |= _characterise(ones, to_make, wanted.sensor)
     for one in ones.values():
         if len(one.turns) > 1:
@@ -189,7 +189,7 @@ def distances_about(performance_map: PerformanceMap, between: tuple[float, float
 def _unknown_finish_error(
     performance_map: PerformanceMap, wanted: Wanted, name: str, finish: Finish, hint: str
 ) -> InputError:
-    allowed = f"a finish in the map of {wanted.sensor.name}: {performance_map.known.told()}"
+    allowed = f"a finish in the map of {wanted.sensor.name}: {performance_map.known.in_words()}"
     return InputError(wanted.scene, f"shape {name!r}", f"the finish {_in_words(finish)}", allowed, hint)
 
 

@@ -202,14 +202,14 @@ def _compare_builds(client: Any, address: str, mine: dict[str, str]) -> None:
     for worker, build in builds.items():
         if isinstance(build, OSError):
             continue  # the worker died meanwhile
-        told = differences(mine, build) if isinstance(build, dict) else f"no known build ({_in_a_line(build)})"
-        if told:
-            raise _other_build(address, worker, told)
+        differing = differences(mine, build) if isinstance(build, dict) else f"no known build ({_in_a_line(build)})"
+        if differing:
+            raise _other_build(address, worker, differing)
 
 
-def _other_build(address: str, worker: str, told: str) -> MissingEnvironmentError:
+def _other_build(address: str, worker: str, found: str) -> MissingEnvironmentError:
     return MissingEnvironmentError(
-        f"--scheduler {address}: the worker {worker} has {told}: its captures would differ; install the same mitsim "
+        f"--scheduler {address}: the worker {worker} has {found}: its captures would differ; install the same mitsim "
         "there, and run the same command again"
     )
 
@@ -219,7 +219,7 @@ class _Watch:
 
     def __init__(self, client: Any, address: str) -> None:
         self.client, self.address = client, address
-        self.since = self.told = self.looked = time.monotonic()
+        self.since = self.reported = self.looked = time.monotonic()
         self.alone = False
 
     def look(self) -> None:
@@ -231,14 +231,14 @@ class _Watch:
             self.alone = False
             return
         if not self.alone:
-            self.alone, self.since, self.told = True, now, now - REPORT_EVERY_S
+            self.alone, self.since, self.reported = True, now, now - REPORT_EVERY_S
         if now - self.since > NO_WORKER_S:
             raise MissingEnvironmentError(
                 f"--scheduler {self.address}: no workers in {NO_WORKER_S:g} s; start some with: "
                 f"dask worker {self.address} --nthreads 1; finished work is kept"
             )
-        if now - self.told >= REPORT_EVERY_S:
-            self.told = now
+        if now - self.reported >= REPORT_EVERY_S:
+            self.reported = now
             say(f"{self.address}: no workers yet, waiting up to {NO_WORKER_S - (now - self.since):.0f} s")
 
 

@@ -127,13 +127,13 @@ def keep_rate(sensor: str, seconds: float) -> None:
 def _rates() -> dict[str, float]:
     path = cache_folder() / "rates.json"
     try:
-        told = json.loads(path.read_text(encoding="utf-8")) if is_file(path) else {}
+        stored = json.loads(path.read_text(encoding="utf-8")) if is_file(path) else {}
     except (OSError, ValueError):
         return {}
-    if not isinstance(told, dict):
+    if not isinstance(stored, dict):
         return {}
     return {
         str(name): float(one)
-        for name, one in told.items()
+        for name, one in stored.items()
         if isinstance(one, int | float) and not isinstance(one, bool) and 0 < one < 1e5
     }

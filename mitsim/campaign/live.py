@@ -178,11 +178,11 @@ def live_capture(live: LiveCampaign, shot: Shot, camera: LiveDevice, stage: Live
     read = stage.move(asked)
     capture = camera.take().capture
     angles = np.radians(read)
-    told = {"axes": list(stage.axes), "asked_deg": asked.tolist(), "read_deg": read.tolist()}
+    stage_record = {"axes": list(stage.axes), "asked_deg": asked.tolist(), "read_deg": read.tolist()}
     return replace(
         capture,
         sensor=live.campaign.sensor.name,
         world_from_sensor=calibration.sensor_from_coupon(angles).inverse(),
         pose_covariance=calibration.world_covariance(angles),
-        settings={**capture.settings, "device_model": capture.sensor, "stage": told},
+        settings={**capture.settings, "device_model": capture.sensor, "stage": stage_record},
     )

@@ -81,7 +81,7 @@ class OneFinish:
         These are the sensor, the BSDF as the renderer defines it, the surface parameters of speckle, the plan and the
         versions.
         """
-        told = [
+        content = [
             __version__,
             MEASUREMENT_VERSION,
             DESIGN_VERSION,
@@ -95,7 +95,7 @@ class OneFinish:
             self.seed,
             self.turns,
         ]
-        return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)

@@ -223,12 +223,12 @@ def plan_campaign(
         distances = tuple(sorted(set(file.distances_mm or distances_mm or covering(sensor, file.distance_ratio))))
     else:
         distances, stages = tuple(sorted(places)), tuple(places.values())
-    told = {distance: str(stage.calibration) for distance, stage in (places or {}).items()}
+    calibrations = {distance: str(stage.calibration) for distance, stage in (places or {}).items()}
     series = [
         one
         for index in range(len(file.samples))
         for distance in distances
-        for one in _series_of(Path(path), file, index, distance, sensor, told.get(distance, ""))
+        for one in _series_of(Path(path), file, index, distance, sensor, calibrations.get(distance, ""))
     ]
     campaign = Campaign(file, sensor, distances, tuple(series), stages)
     labels = [sample.label() for sample in campaign.samples]

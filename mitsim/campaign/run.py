@@ -127,8 +127,8 @@ def _with_time(taken: Iterable[tuple[Shot, Finished]], count: int) -> Iterator[t
             start = time.monotonic()
         elif number == _TIMED and count > 2 * _TIMED:
             left = (time.monotonic() - start) / (_TIMED - 1) * (count - number)
-            told = f"{left / 60:.0f} min" if left > 90 else f"{left:.0f} s"
-            say(f"{count} captures: about {told} from here; a refinement adds to them")
+            duration = f"{left / 60:.0f} min" if left > 90 else f"{left:.0f} s"
+            say(f"{count} captures: about {duration} from here; a refinement adds to them")
         yield one
 
 

@@ -185,8 +185,8 @@ def _table(data: bytes, where: Path) -> xr.Dataset:
             io.BytesIO(data), allow_pickle=False, max_header_size=_LONGEST_HEADER
         )
     except Exception as error:  # numpy raises many types for a damaged header, which is Python text
-        told = " ".join(str(error).split())[:200]
-        raise InputError(where, "", f"a table that cannot be read ({told})", "an unchanged file", _AGAIN) from None
+        cause = " ".join(str(error).split())[:200]
+        raise InputError(where, "", f"a table that cannot be read ({cause})", "an unchanged file", _AGAIN) from None
     kinds = [table.dtype[number] for number in range(len(table.dtype.names or ()))]
     if table.ndim != 1 or not kinds or any(kind.kind not in "fiub" or kind.shape for kind in kinds):
         found = f"shape {table.shape} and type {str(table.dtype)[:200]}"

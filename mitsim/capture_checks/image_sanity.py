@@ -116,15 +116,15 @@ def _fitting_order(
     least: float,
 ) -> str:
     """Return the description of an order of the images with more smoothness than ``least``; "" if none."""
-    best, told = least, ""
+    best, description = least, ""
     for name, order in _other_orders(roles(code, *size), axis):
         found = smoothness([each[order] for each in lines], code, size, settings, full_scale, axis)[axis]
         # an order may be smooth although most pixels are contradictory, or its pairs are not complements
         if _changed_exposure(lines[0][order], roles(code, *size), axis, ""):
             continue
         if not found.doubtful and found.evenness - found.contradicted > best:
-            best, told = found.evenness - found.contradicted, name
-    return told
+            best, description = found.evenness - found.contradicted, name
+    return description
 
 
 def smoothness(
@@ -137,7 +137,7 @@ def smoothness(
 ) -> dict[Axis, Smoothness]:
     """Return the smoothness of coordinates along ``lines``: images (P, n, W) of rows, and (P, H, m) of columns."""
     evenness: dict[Axis, list[float]] = {}
-    told: dict[Axis, list[NDArray[np.uint8]]] = {}
+    statuses: dict[Axis, list[NDArray[np.uint8]]] = {}
     for way, part in enumerate(lines):
         try:
             found = decode_coordinates(part, code, size, settings, full_scale=full_scale)
@@ -147,10 +147,10 @@ def smoothness(
             if only in (None, axis):
                 values = coordinate.value if way == 0 else coordinate.value.T
                 evenness.setdefault(axis, []).append(_evenness(values))
-                told.setdefault(axis, []).append(coordinate.status.ravel())
+                statuses.setdefault(axis, []).append(coordinate.status.ravel())
     out: dict[Axis, Smoothness] = {}
     for axis, each in evenness.items():
-        status = np.concatenate(told[axis])
+        status = np.concatenate(statuses[axis])
         lit = np.isin(status, [Status.VALID, Status.PHASE_INCONSISTENT])
         share = float(np.mean(status[lit] == Status.PHASE_INCONSISTENT)) if lit.mean() > 0.02 else 0.0
         known = [value for value in each if np.isfinite(value)]

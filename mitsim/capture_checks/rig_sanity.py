@@ -94,13 +94,13 @@ def camera_warnings(
     known = np.all([each.status == Status.VALID for each in found.values()], axis=0)
     if known.mean() < 0.005:
         return []
-    told = {axis: each.value[known] for axis, each in found.items()}
-    depth, miss = _meeting(eye, projector, rays[known], told)
+    coordinates = {axis: each.value[known] for axis, each in found.items()}
+    depth, miss = _meeting(eye, projector, rays[known], coordinates)
     behind = float(np.mean(~(depth > 0)))
     doubt = "check that the calibration belongs to these images, and that R and T are those of cv2.stereoCalibrate"
     out = []
     if behind > _BEHIND:
-        doubt = _other_place(eye, projector, rays[known], told) or doubt
+        doubt = _other_place(eye, projector, rays[known], coordinates) or doubt
         return [f"{100 * behind:.0f} % of the decoded pixels meet their light behind the camera: {doubt}"]
     if len(found) == 2:
         allowed = max(LARGEST_MISS_PX, settings.epipolar_px) + max(_half_stripe(each) for each in found.values())
@@ -112,17 +112,17 @@ def camera_warnings(
             if other < allowed:
                 doubt = "they fit if columns and rows are exchanged in [pattern]"
             else:
-                doubt = _other_place(eye, projector, rays[known], told) or doubt
+                doubt = _other_place(eye, projector, rays[known], coordinates) or doubt
             out.append(f"view rays miss the light that they decode by {off:.1f} projector px in the median: {doubt}")
     return out
 
 
-def _other_place(eye: Camera, projector: Camera, rays: Floats, told: dict[Axis, Floats]) -> str:
+def _other_place(eye: Camera, projector: Camera, rays: Floats, coordinates: dict[Axis, Floats]) -> str:
     """Return another reading of R and T with which nearly all rays meet their light in front of the camera.
 
     Only codes of both axes reveal it: with one axis nearly every reading gives depths.
     """
-    if len(told) < 2:
+    if len(coordinates) < 2:
         return ""
     camera_from_projector = eye.sensor_from_camera.inverse() @ projector.sensor_from_camera
     inverted, turn = camera_from_projector.inverse(), camera_from_projector.rotation
@@ -132,7 +132,7 @@ def _other_place(eye: Camera, projector: Camera, rays: Floats, told: dict[Axis, 
     }
     for words, place in readings.items():
         moved = replace(projector, sensor_from_camera=eye.sensor_from_camera @ place)
-        depth, miss = _meeting(eye, moved, rays, told)
+        depth, miss = _meeting(eye, moved, rays, coordinates)
         if np.mean(depth > 0) > 1 - _BEHIND / 3 and np.nanmedian(np.abs(miss)) < LARGEST_MISS_PX:
             return words
     return ""
@@ -144,15 +144,15 @@ def _half_stripe(coordinate: ProjectorCoordinate) -> float:
     return float(np.median(sigma)) * np.sqrt(3) if sigma.size else 0.0
 
 
-def _meeting(eye: Camera, projector: Camera, rays: Floats, told: dict[Axis, Floats]) -> tuple[Floats, Floats]:
+def _meeting(eye: Camera, projector: Camera, rays: Floats, coordinates: dict[Axis, Floats]) -> tuple[Floats, Floats]:
     """Return the distance (n,) [mm] along rays at which they meet their light, and the miss distance [projector px].
 
     With one axis the light is the plane of a column or row, which a lens bends slightly; rays cannot miss it.
     """
     start = eye.centre - projector.centre
-    if len(told) == 2:
+    if len(coordinates) == 2:
         light = projector.sensor_from_camera.directions(
-            projector.rays(np.stack([told["columns"], told["rows"]], axis=-1))
+            projector.rays(np.stack([coordinates["columns"], coordinates["rows"]], axis=-1))
         )
         # closest points of two lines
         a, b, c = (np.einsum("ij,ij->i", one, other) for one, other in ((rays, rays), (rays, light), (light, light)))
@@ -161,10 +161,10 @@ def _meeting(eye: Camera, projector: Camera, rays: Floats, told: dict[Axis, Floa
         place = projector.project(eye.centre + along[:, None] * rays)
         # across the epipolar line: no depth explains it
         step = projector.project(eye.centre + 1.001 * along[:, None] * rays) - place
-        off = place - np.stack([told["columns"], told["rows"]], axis=-1)
+        off = place - np.stack([coordinates["columns"], coordinates["rows"]], axis=-1)
         with np.errstate(invalid="ignore", divide="ignore"):
             return along, (off[:, 0] * step[:, 1] - off[:, 1] * step[:, 0]) / np.linalg.norm(step, axis=1)
-    ((axis, value),) = told.items()
+    ((axis, value),) = coordinates.items()
     ends = [
         np.full_like(value, end) for end in (0.0, (projector.height if axis == "columns" else projector.width) - 1.0)
     ]
@@ -199,18 +199,18 @@ def pair_warnings(
     if seen.doubtful:
         names = " and ".join(list(rig.cameras)[:2])
         if geometry.raw_size[0] == geometry.raw_size[1] and not _Matches.of(found[::-1], geometry).doubtful:
-            told = f"the images of {names} fit the calibration if they are exchanged"
-            return [f"{told}: check whether left and right are exchanged"], float("nan"), ""
+            doubt = f"the images of {names} fit the calibration if they are exchanged"
+            return [f"{doubt}: check whether left and right are exchanged"], float("nan"), ""
         return [f"{seen}: check that the calibration belongs to these images"], float("nan"), ""
-    off, told = seen.off, "by the code of the rows"
+    off, source = seen.off, "by the code of the rows"
     if "rows" not in found[0]:
         every = roles(code, *size)
-        told = "by the texture of the surface"
+        source = "by the texture of the surface"
         one, other = (lit_alike(stack, every, full_scale) for stack in (left, right))
         off = textured_row_error((one, other), (found[0]["columns"].value, found[1]["columns"].value), geometry)
     if not np.isfinite(off):
         return [], off, ""
-    return ([row_error_warning(off)] if abs(off) > LARGEST_ROW_ERROR else []), off, told
+    return ([row_error_warning(off)] if abs(off) > LARGEST_ROW_ERROR else []), off, source
 
 
 @dataclass(frozen=True)
@@ -322,12 +322,12 @@ def measured_row_error(images: tuple[Levels, Levels], geometry: StereoGeometry, 
         for column in sides
         if cloud.valid[row : row + _PATCH, column : column + _PATCH].mean() >= 0.5
     ]
-    told = []
+    errors = []
     for row, column in corners[:: -(-len(corners) // _MOST) or 1]:
         rows, columns = np.nonzero(cloud.valid[row : row + _PATCH, column : column + _PATCH])
         rows, columns = rows + row, columns + column
-        told.append(row_error(left, right, geometry, rows, columns, disparity[rows, columns]))
-    known = np.array(told)[np.isfinite(told)] if told else np.empty(0)
+        errors.append(row_error(left, right, geometry, rows, columns, disparity[rows, columns]))
+    known = np.array(errors)[np.isfinite(errors)] if errors else np.empty(0)
     return float(np.median(known)) if len(known) >= _LEAST else float("nan")
 
 

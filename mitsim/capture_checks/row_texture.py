@@ -67,13 +67,13 @@ def textured_row_error(
     )
     place = np.stack([same_coordinate(one, other)[0] for one, other in zip(left[1], right[1], strict=True)])
     place[~np.isfinite(left[0])] = np.nan
-    told = []
+    shifts = []
     for row in range(_ROWS, place.shape[0] - _PATCH - _ROWS, _PATCH):
         for column in range(0, place.shape[1] - _PATCH, _PATCH):
             rows, at = np.nonzero(np.isfinite(place[row : row + _PATCH, column : column + _PATCH]))
             if len(rows) >= _MATCHED * _PATCH**2:
-                told.append(_of_a_patch(left, right, rows + row, at + column, place[rows + row, at + column]))
-    known = np.array([off for off, error in told if error < _OF_A_PATCH])
+                shifts.append(_of_a_patch(left, right, rows + row, at + column, place[rows + row, at + column]))
+    known = np.array([off for off, error in shifts if error < _OF_A_PATCH])
     if len(known) < _LEAST:
         return float("nan")
     middle = float(np.median(known))

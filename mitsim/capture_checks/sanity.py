@@ -33,12 +33,12 @@ from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, r
 class Findings:
     """Findings about a capture: ``warnings``, and ``row_error`` [px] of the second camera; NaN if unknown.
 
-    ``told``: the source of the row error, "" if unknown.
+    ``row_error_source``: the source of the row error, "" if unknown.
     """
 
     warnings: list[str] = field(default_factory=list)
     row_error: float = float("nan")
-    told: str = ""
+    row_error_source: str = ""
 
 
 def capture_warnings(capture: Capture, settings: Settings) -> list[str]:
@@ -86,7 +86,7 @@ def pair_row_error(capture: Capture, cloud: PointCloud) -> float:
     return measured_row_error((left, right), stereo_geometry(capture.rig), cloud)
 
 
-def row_error_told(capture: Capture, settings: Settings, found: Findings, matched: float) -> str:
+def row_error_in_words(capture: Capture, settings: Settings, found: Findings, matched: float) -> str:
     """Describe the row error of the second camera, or that it is unknown; "" if only one camera measures.
 
     ``matched``: row error of a pair decoded by a matcher, see :func:`pair_row_error`.
@@ -94,7 +94,7 @@ def row_error_told(capture: Capture, settings: Settings, found: Findings, matche
     if np.isfinite(matched):
         return f"row error of the second camera: {matched:+.2f} px"
     if np.isfinite(found.row_error):
-        return f"row error of the second camera: {found.row_error:+.2f} px, {found.told}"
+        return f"row error of the second camera: {found.row_error:+.2f} px, {found.row_error_source}"
     paired = isinstance(settings, DecoderSettings) and settings.triangulate == "cameras"
     if capture.technology != "structured_light" or not paired or found.warnings:
         return ""

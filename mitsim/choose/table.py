@@ -15,8 +15,8 @@ import numpy as np
 from characterisation.statements.decision import WORDS, decide, tolerance_of
 from characterisation.statements.statement import Statement
 from characterisation.statements.verdict_words import Judged, result_in_words
-from mitsim.choose.contest import FAR, Found, screened_errors
-from mitsim.choose.entrants import Excluded
+from mitsim.choose.candidates import Excluded
+from mitsim.choose.selection import FAR, Found, screened_errors
 from mitsim.report.choice_document import (
     AskedEntry,
     CaptureEntry,
@@ -84,17 +84,17 @@ def sentence(sensors: Sequence[SensorEntry]) -> str:
 
 def words(one: SensorEntry, asked: dict[str, AskedEntry]) -> str:
     """Return the result of a sensor in one line."""
-    told = [replace(each, unit=asked[each.name].unit) for each in judged(one)]
-    if all(each.verdict == "no tolerance" for each in told):
+    verdicts = [replace(each, unit=asked[each.name].unit) for each in judged(one)]
+    if all(each.verdict == "no tolerance" for each in verdicts):
         if one.ratio is None:
             return "not every measurement can be made"
         least = f"{one.ratio:.2g} times the least uncertainty of all sensors at worst"
         return least if one.ratio > 1 else "the least uncertainty of all sensors in every measurement"
-    return _screened_words(told) if one.status == "screened" else result_in_words(told)
+    return _screened_words(verdicts) if one.status == "screened" else result_in_words(verdicts)
 
 
-def _screened_words(told: Sequence[Judged]) -> str:
-    return f"by screening alone: {result_in_words(told)}"
+def _screened_words(verdicts: Sequence[Judged]) -> str:
+    return f"by screening alone: {result_in_words(verdicts)}"
 
 
 def as_text(choice: ChoiceDocument) -> str:
@@ -142,7 +142,7 @@ def _excluded(one: Excluded) -> SensorEntry:
 
 
 def _sensor(one: Found) -> SensorEntry:
-    study = one.entrant.study
+    study = one.candidate.study
     names = list(study.task.measurements)
     rows = one.best() if one.stated else [None] * len(names)
     cells = {name: _stated(rows[m]) if one.stated else _screened(one, m, name) for m, name in enumerate(names)}
@@ -150,8 +150,8 @@ def _sensor(one: Found) -> SensorEntry:
     used = {cell.view for cell in cells.values()}
     ratio = one.ratio
     return SensorEntry(
-        name=one.entrant.name,
-        given=one.entrant.given,
+        name=one.candidate.name,
+        given=one.candidate.given,
         status="stated" if one.stated else "screened",
         why="" if one.stated else "out by far" if one.far else "time was over",
         ratio=ratio if math.isfinite(ratio) else None,
@@ -210,7 +210,7 @@ _NOTHING = CellEntry(
 
 def _screened(found: Found, m: int, name: str) -> CellEntry:
     """Return a cell from screening; its verdict is decided only if the demand exceeds :data:`FAR`."""
-    u, tolerance = float(found.screened_u[m]), tolerance_of(found.entrant.study.task, name)
+    u, tolerance = float(found.screened_u[m]), tolerance_of(found.candidate.study.task, name)
     if not math.isfinite(u):
         return _NOTHING.model_copy(update={"verdict": "no tolerance"}) if tolerance is None else _NOTHING
     decided = None if tolerance is None else decide(screened_errors(u), tolerance)

@@ -45,7 +45,7 @@ def decode(
     from characterisation.cloud_files import write_ply
     from mitsim.capture.folder import read_capture
     from mitsim.capture.workspace import written_frame
-    from mitsim.capture_checks.sanity import capture_findings, cloud_warnings, pair_row_error, row_error_told
+    from mitsim.capture_checks.sanity import capture_findings, cloud_warnings, pair_row_error, row_error_in_words
     from mitsim.progress import say
     from mitsim.reconstruction.cloud import (
         capture_cloud,
@@ -55,7 +55,7 @@ def decode(
         with_options,
     )
     from mitsim.reconstruction.depth_range import outside, surface_beyond
-    from mitsim.reconstruction.noise import known_noise, noise_told
+    from mitsim.reconstruction.noise import known_noise, noise_in_words
     from mitsim.sensor.preset import presets
 
     read = read_capture(capture)
@@ -73,14 +73,14 @@ def decode(
     noise = known_noise(read, imager)
     cloud = capture_cloud(read, settings, imager=noise)
     matched = pair_row_error(read, cloud)
-    rows = row_error_told(read, settings, found, matched)
+    rows = row_error_in_words(read, settings, found, matched)
     if rows:
         say(rows)
     for warning in cloud_warnings(matched):
         say(f"warning: {warning}")
-    told = noise_told(read, cloud, noise)
-    if told:
-        say(told)
+    noise_text = noise_in_words(read, cloud, noise)
+    if noise_text:
+        say(noise_text)
     beyond = surface_beyond(read, cloud, settings)
     if beyond is not None:
         known = f"a coarse search over a wider range finds it in {100 * beyond.share:.0f} % of the pixels"

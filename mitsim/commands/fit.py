@@ -137,7 +137,7 @@ def sensor_(
     found = fit_sensor(captures or [], sensor, off=off or [], dark=dark or [], roi=roi, seed=seed)
     write_sensor(found, sensor, output)
     print(fit_table(found), end="")
-    say(f"sensor: {output}, {len(found.estimates)} fitted parameters, {len(found.untold)} not determined")
+    say(f"sensor: {output}, {len(found.estimates)} fitted parameters, {len(found.undetermined)} not determined")
 
 
 app.command(name="finish")(finish)

@@ -118,12 +118,12 @@ def _locked(folder: Path) -> int | None:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            told = _holder(handle)
+            holder = _holder(handle)
             os.close(handle)
             raise InputError(
                 folder,
                 "",
-                f"a folder that {told} is writing to",
+                f"a folder that {holder} is writing to",
                 "a folder that no other command is writing to",
                 "wait until that command ends, or choose another folder with -o",
             ) from None

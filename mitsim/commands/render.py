@@ -150,9 +150,10 @@ def render(
             for name in chosen.rig.cameras
         }
     write_capture(capture, output, truth=known)
-    for told in dict.fromkeys(f"{one}: {one.scatter.provenance}" for one in loaded.finishes if one and one.scatter):
-        if deviation:
-            say(told)
+    if deviation:
+        finishes = [one for one in loaded.finishes if one and one.scatter]
+        for source in dict.fromkeys(f"{one}: {one.scatter.provenance}" for one in finishes if one.scatter):
+            say(source)
     say(f"{residual}" + (f"; over {LIMIT}: increase --samples" if residual.worst > LIMIT else ""))
     say(f"capture: {output}")
 

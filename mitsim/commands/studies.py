@@ -109,34 +109,34 @@ def choose(
     from characterisation.atomic_io import write_json
     from characterisation.statements.verdict_words import fits_all
     from mitsim.campaign.executor import executor_of
-    from mitsim.choose import choose_sensor, read_entrants
-    from mitsim.choose.contest import Found
+    from mitsim.choose import choose_sensor, read_candidates
+    from mitsim.choose.selection import Found
     from mitsim.choose.table import as_text, document
     from mitsim.progress import say
     from mitsim.report.choice_document import CHOICE, judged, read_choice
     from mitsim.report.choice_page import write_choice_page
-    from mitsim.report.stand import write_stand
+    from mitsim.report.scene_geometry import write_scene_geometry
     from mitsim.study import with_plan
 
     check_folder(output)
-    entrants, excluded = read_entrants(study, [sensors], asking(yes, " (and likewise for every other sensor)"))
-    entrants = [replace(one, study=with_plan(one.study, plan)) for one in entrants]
+    candidates, excluded = read_candidates(study, [sensors], asking(yes, " (and likewise for every other sensor)"))
+    candidates = [replace(one, study=with_plan(one.study, plan)) for one in candidates]
     done = read_choice(output)
     if done is not None and done.finished:
         keep_finished(output, overwrite, CHOICE)
     for one in excluded:
         say(f"{one.name} is excluded: {one.why}")
-    if entrants[0].study.file.set is not None:
+    if candidates[0].study.file.set is not None:
         say("[set] of the study is not used: sensors are compared by single views; `mitsim run` chooses the set")
     began = time.monotonic()
 
     def tell(found: list[Found], finished: bool) -> None:
-        known = document(entrants[0].study, found, excluded, time.monotonic() - began, finished)
+        known = document(candidates[0].study, found, excluded, time.monotonic() - began, finished)
         write_json(output / CHOICE, known.model_dump(mode="json"))
 
-    found = choose_sensor(entrants, output, minutes, tell, executor_of(scheduler, processes))
-    best = found[0].entrant.study
-    write_stand(output, best.scene, best.sensor)
+    found = choose_sensor(candidates, output, minutes, tell, executor_of(scheduler, processes))
+    best = found[0].candidate.study
+    write_scene_geometry(output, best.scene, best.sensor)
     write_choice_page(output)
     known = read_choice(output)
     assert known is not None

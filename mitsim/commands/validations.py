@@ -197,7 +197,7 @@ def losses(
     Renders and decodes a few views of every open case. Writes the constants with which mitsim screens views, each with
     its 95 % interval. Does not use sealed parts, which are reserved for validation.
 
-    Example: mitsim validate losses scenes/parts/validation.toml -o mitsim/prediction/other_light.toml
+    Example: mitsim validate losses scenes/parts/validation.toml -o mitsim/prediction/interreflections.toml
     """
     start(variant)
     from characterisation.atomic_io import atomic_write

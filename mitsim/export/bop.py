@@ -170,8 +170,8 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
         _write_json(partial / "statuses.json", {str(one.value): one.name.lower() for one in Status})
         _write_json(partial / "features.json", {str(k): name for k, name in enumerate(first.names, 1)})
         _write_json(partial / "finishes.json", {f"{k:06d}": name for k, name in enumerate(finishes, 1)})
-        told = _about(sources, finishes, split, [one.names for one in objects])
-        (partial / "dataset_info.md").write_text(told, encoding="utf-8")
+        described = _about(sources, finishes, split, [one.names for one in objects])
+        (partial / "dataset_info.md").write_text(described, encoding="utf-8")
         partial.rename(output)
     finally:
         shutil.rmtree(partial, ignore_errors=True)

@@ -150,10 +150,10 @@ class DepthaiCamera:
         except BaseException as error:  # Ctrl-C as well
             self._fault = what
             self.close()
-            told = fault_of(error, self._dai, self.where, what)
-            if told is error:
+            fault = fault_of(error, self._dai, self.where, what)
+            if fault is error:
                 raise
-            raise told from error
+            raise fault from error
 
 
 def open_depthai(settings: DepthaiSettings, identifier: str = "") -> DepthaiCamera:

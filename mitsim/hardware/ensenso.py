@@ -251,11 +251,12 @@ class EnsensoCamera:
             yield
         except BaseException as error:  # Ctrl-C as well
             self._fault = what
-            told = fault_of(error, self._nxlib, self.where, what, self._known())  # needs the library, so before closing
+            # needs the library, so before closing
+            fault = fault_of(error, self._nxlib, self.where, what, self._known())
             self.close()
-            if told is error:
+            if fault is error:
                 raise
-            raise told from error
+            raise fault from error
 
     def _known(self) -> list[str]:
         """Return the serial numbers of the stereo cameras that NxLib lists."""

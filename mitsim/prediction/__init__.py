@@ -12,7 +12,7 @@ draw, and :mod:`~mitsim.prediction.perturbation` adds effects that flat coupons 
 Not included: clusters of lost points, since the map has only their share F, and the behaviour of a matcher at edges.
 """
 
-from mitsim.prediction.perturbation import Effect, LookedAt, Perturbation, together
+from mitsim.prediction.perturbation import Effect, Perturbation, SceneView, together
 from mitsim.prediction.point_statistics import ViewPoints, expected_points, feature_statistics, performance
 from mitsim.prediction.predictor import EDGE_MARGIN_PX, CharacterisedScene, Ideal, Predicted, Predictor
 
@@ -21,10 +21,10 @@ __all__ = [
     "CharacterisedScene",
     "Effect",
     "Ideal",
-    "LookedAt",
     "Perturbation",
     "Predicted",
     "Predictor",
+    "SceneView",
     "ViewPoints",
     "expected_points",
     "feature_statistics",

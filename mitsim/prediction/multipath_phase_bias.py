@@ -1,8 +1,8 @@
 r"""Bias of a phase code by interreflections: next to a corner, neighbouring points are biased to the same side.
 
 Signal chain: three fringes shifted by a third of a period, in direct and in interreflected light
-(:mod:`mitsim.prediction.other_light`) -> complex amplitudes A_1 and A_2 -> A_2 relative to the phase of A_1, averaged
-over a window on one face -> its ratio z to A_1 -> phase bias -> projector coordinate -> depth along the ray.
+(:mod:`mitsim.prediction.interreflections`) -> complex amplitudes A_1 and A_2 -> A_2 relative to the phase of A_1,
+averaged over a window on one face -> its ratio z to A_1 -> phase bias -> projector coordinate -> depth along the ray.
 
 Phase shifting measures the argument of A_1 + A_2. The coordinate of a fringe of period P is therefore biased by
 

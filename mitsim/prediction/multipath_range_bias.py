@@ -1,9 +1,9 @@
 r"""Bias of a time-of-flight path by interreflections.
 
-Signal chain: correlations of direct light and of interreflections (:mod:`mitsim.prediction.other_light`) -> complex
-amplitudes A_1 and A_2 at every frequency -> A_2 relative to the phase of A_1, smoothed over one face -> its ratio z to
-A_1 -> phases with and without arg(1 + z) -> the sensor's decoder (:func:`mitsim.decode.time_of_flight.joint_path`) ->
-bias of the path, and whether the decoder rejects the phases.
+Signal chain: correlations of direct light and of interreflections (:mod:`mitsim.prediction.interreflections`) ->
+complex amplitudes A_1 and A_2 at every frequency -> A_2 relative to the phase of A_1, smoothed over one face -> its
+ratio z to A_1 -> phases with and without arg(1 + z) -> the sensor's decoder
+(:func:`mitsim.decode.time_of_flight.joint_path`) -> bias of the path, and whether the decoder rejects the phases.
 
 A time-of-flight imager adds amplitudes: it measures the phase of A_1 + A_2, where A_2 has travelled a longer path. A
 concave face, or one next to another, therefore appears too far away ("multipath"; Fuchs, ICPR 2010, recalled). The
@@ -73,12 +73,12 @@ def path_bias(
     return np.where(lit, read[0] - nominal[0], 0.0), rejected.astype(float)
 
 
-def range_bias(path: Floats, lamp: NDArray[np.floating], ideal: Ideal) -> Floats:
+def range_bias(path: Floats, light_source: NDArray[np.floating], ideal: Ideal) -> Floats:
     """Return the range bias (n,) [mm] along the rays for a path bias ``path`` (n,) [mm]; positive is too far.
 
-    ``lamp`` (3,) [mm] is the position p of the light source in the sensor frame. The path is t + |t d - p| for a
-    distance t on a ray d.
+    ``light_source`` (3,) [mm] is its position p in the sensor frame. The path is t + |t d - p| for a distance t on a
+    ray d.
     """
-    from_lamp = ideal.point - lamp
-    cosine = (ideal.ray * from_lamp).sum(1) / np.linalg.norm(from_lamp, axis=1)
+    from_source = ideal.point - light_source
+    cosine = (ideal.ray * from_source).sum(1) / np.linalg.norm(from_source, axis=1)
     return np.asarray(path / (1 + cosine))

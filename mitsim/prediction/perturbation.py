@@ -1,11 +1,11 @@
 """Effects on a view that flat coupons cannot show: an effect is a function of a view that perturbs the map's answers.
 
-Signal chain: ideal points of a view (:class:`LookedAt`) -> every effect -> changes of F, sigma and position of each
+Signal chain: ideal points of a view (:class:`SceneView`) -> every effect -> changes of F, sigma and position of each
 point (:class:`Perturbation`) -> all of them combined.
 
 A map is made from flat coupons without neighbours. Other influences are effects: interreflections
-(:mod:`mitsim.prediction.other_light`) and errors of calibration and temperature
-(:mod:`mitsim.prediction.shared_errors`). A new effect is a module with a function of a :class:`LookedAt`, and an entry
+(:mod:`mitsim.prediction.interreflections`) and errors of calibration and temperature
+(:mod:`mitsim.prediction.shared_errors`). A new effect is a module with a function of a :class:`SceneView`, and an entry
 in :func:`mitsim.virtual.screening.effects_of`.
 """
 
@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class LookedAt:
+class SceneView:
     """A view of a scene, ray by ray: ``surfaces`` in the sensor frame, and their n ``ideal`` points."""
 
     scene: Scene
@@ -63,7 +63,7 @@ class Perturbation:
         return Perturbation(as_it_is, as_it_is, nothing, nothing, np.zeros((count, 0)))
 
 
-Effect = Callable[[LookedAt], Perturbation]
+Effect = Callable[[SceneView], Perturbation]
 
 
 def together(perturbations: Iterable[Perturbation], count: int) -> Perturbation:

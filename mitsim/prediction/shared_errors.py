@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.prediction.perturbation import LookedAt, Perturbation
+from mitsim.prediction.perturbation import Perturbation, SceneView
 
 Floats = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ class SharedErrors:
 
     coefficients: Floats
 
-    def __call__(self, view: LookedAt) -> Perturbation:
+    def __call__(self, view: SceneView) -> Perturbation:
         """Return the displacements of a view's ideal points along their rays, by one sigma of each field."""
         nothing = Perturbation.none(len(view.ideal.pixel))
         return replace(nothing, shared=self.along(view.ideal.point, view.ideal.ray, view.normal))

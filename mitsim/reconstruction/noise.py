@@ -34,7 +34,7 @@ def known_noise(capture: Capture, imager: Imager | None) -> Imager | MeasuredNoi
     return measured_noise(stacks, every, 2.0**capture.bits - 1) if stacks else None
 
 
-def noise_told(capture: Capture, cloud: PointCloud, noise: Imager | MeasuredNoise | None) -> str:
+def noise_in_words(capture: Capture, cloud: PointCloud, noise: Imager | MeasuredNoise | None) -> str:
     """Return in words where the sigma of a structured-light cloud comes from, or why it has none; "" of others."""
     if capture.technology != "structured_light" or not cloud.valid.any():
         return ""

@@ -150,8 +150,8 @@ def _matrix(transformation: Any) -> NDArray[np.float64] | None:
     if not all(np.abs(each).max() < _LARGEST_ENTRY for each in (frame_from_sensor, sensor)):  # NaN fails too
         return None
     matrix = frame_from_sensor @ sensor
-    told = matrix[0, 0] > 1 and matrix[1, 1] > 1  # an unknown matrix is the identity
-    return matrix if told and np.abs(matrix).max() < _LARGEST_ENTRY else None
+    is_known = matrix[0, 0] > 1 and matrix[1, 1] > 1  # an unknown matrix is the identity
+    return matrix if is_known and np.abs(matrix).max() < _LARGEST_ENTRY else None
 
 
 def _kind(message: Any, file: Path) -> str:

@@ -31,9 +31,9 @@ def advice(found: list[Path], camera: str, code: LightCode, size: tuple[int, int
     ``size`` (width, height) of the projector [px]; ``count`` includes the ambient image.
     """
     more = count - len(roles(code, *size))
-    told = _missing_number(found) or _strangers(found, camera, count)
-    if told:
-        return told
+    reason = _missing_number(found) or _strangers(found, camera, count)
+    if reason:
+        return reason
     changes = [words for words, table in _changes(code) if _count(code, table, size) == len(found) - more]
     changes = [f"{each} in [pattern]" for each in changes[:_TOLD]]
     if not more and len(found) == count + 1:

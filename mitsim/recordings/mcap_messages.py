@@ -65,7 +65,7 @@ def mcap_messages(data: bytes, where: str | Path) -> Iterator[tuple[Schema, Chan
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     kind, at, ended = 0, len(MCAP_MAGIC), 0  # end of the data; 0 until found
-    seen, unpacked, count, told = 0, 0, 0, None
+    seen, unpacked, count, stated = 0, 0, 0, None
     try:
         for kind, at, body in _records(view, len(MCAP_MAGIC)):
             seen = _bounded(seen + 1, MOST_RECORDS, "records")
@@ -78,7 +78,7 @@ def mcap_messages(data: bytes, where: str | Path) -> Iterator[tuple[Schema, Chan
                     raise ValueError(f"data that end at {ended}, not where the summary begins")
                 _check_crc(view[footer.summary_start or at : at + _FOOTER_SIZE], footer.summary_crc, "summary")
             elif kind == Opcode.STATISTICS:
-                told = Statistics.read(_stream(body)).message_count
+                stated = Statistics.read(_stream(body)).message_count
             if ended:  # later records repeat earlier ones
                 continue
             for inner, record in _data(kind, body):
@@ -102,8 +102,8 @@ def mcap_messages(data: bytes, where: str | Path) -> Iterator[tuple[Schema, Chan
         raise InputError(where, f"byte {at}", f"a damaged record ({words})", WHOLE) from None
     if kind != Opcode.FOOTER or not ended:
         raise InputError(where, "", "a file without its footer or the end of its data", WHOLE)
-    if told is not None and told != count:
-        raise InputError(where, "", f"{count} messages of the {told} that its summary counts", WHOLE)
+    if stated is not None and stated != count:
+        raise InputError(where, "", f"{count} messages of the {stated} that its summary counts", WHOLE)
 
 
 def _records(view: memoryview, at: int = 0) -> Iterator[tuple[int, int, memoryview]]:

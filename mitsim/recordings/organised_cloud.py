@@ -85,8 +85,8 @@ def read_organised_cloud(
         If the file is damaged or has no grid, or no camera at the origin sees its points on the pixels of the grid.
     """
     path = Path(path)
-    points, told, given = _on_grid(path, calibration, camera)
-    settings: dict[str, Any] = {"imported_from": path.name, "axes_of_file": axes} | told
+    points, read_settings, given = _on_grid(path, calibration, camera)
+    settings: dict[str, Any] = {"imported_from": path.name, "axes_of_file": axes} | read_settings
     points[~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)] = np.nan
     count = int(np.isfinite(points[..., 0]).sum())
     if count < LEAST_POINTS:

@@ -85,7 +85,7 @@ def decode_ply(data: bytes, where: str | Path) -> Ply:
         raise InputError(where, "element vertex", ", ".join(tables) or "nothing", "vertices with x, y and z")
     with np.errstate(over="ignore", invalid="ignore"):
         points = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float32)
-    size, camera = _told_size(lines), tables.get("camera")
+    size, camera = _stated_size(lines), tables.get("camera")
     if size is None and isinstance(camera, dict) and {"viewportx", "viewporty"} <= set(camera):
         sides = [camera[key] for key in ("viewportx", "viewporty")]
         if all(len(side) == 1 and 0 < side[0] < 1e6 for side in sides):
@@ -190,15 +190,15 @@ def _lists(body: bytes, words: list[str], at: int, order: str, element: _Element
     return rows, at
 
 
-def _told_size(lines: tuple[str, ...]) -> tuple[int, int] | None:
-    told = {}
+def _stated_size(lines: tuple[str, ...]) -> tuple[int, int] | None:
+    stated = {}
     for line in lines:
         match = re.fullmatch(r"(?:obj_info|comment)\s+(num_cols|num_rows|width|height)\s*[:= ]\s*(\d{1,6})", line)
         if match:
-            told[match.group(1)] = int(match.group(2))
+            stated[match.group(1)] = int(match.group(2))
     for wide, high in (("num_cols", "num_rows"), ("width", "height")):
-        if told.get(wide, 0) > 0 and told.get(high, 0) > 0:
-            return told[wide], told[high]
+        if stated.get(wide, 0) > 0 and stated.get(high, 0) > 0:
+            return stated[wide], stated[high]
     return None
 
 

@@ -247,7 +247,7 @@ def read_recording(path: str | Path, given: Given, kind: str | None = None) -> I
         if getattr(given, name) is not None and name not in FOR_ALL and name not in KINDS[kind].heeds:
             heeded = ", ".join(_option(each) for each in (*sorted(KINDS[kind].heeds), *FOR_ALL))
             raise InputError(path, "", f"{_option(name)} for {KINDS[kind].what}", heeded)
-    told = _told_of_all(given)
+    settings_given = _settings_given(given)
     capture, originals = KINDS[kind].read(path, given)
     for name in (given.images or {}) if kind in ("images", "stereo-pair") else ():
         if name not in capture.rig.cameras:
@@ -255,7 +255,7 @@ def read_recording(path: str | Path, given: Given, kind: str | None = None) -> I
     pose, covariance = (None, None) if given.pose is None else read_pose(given.pose)
     capture = replace(
         capture,
-        settings=capture.settings | told,
+        settings=capture.settings | settings_given,
         world_from_sensor=pose or capture.world_from_sensor,
         pose_covariance=covariance if pose is not None else capture.pose_covariance,
     )
@@ -266,25 +266,25 @@ def _option(name: str) -> str:
     return "--" + name.removesuffix("_mm").removesuffix("_s").replace("_", "-")
 
 
-def _told_of_all(given: Given) -> dict[str, Any]:
+def _settings_given(given: Given) -> dict[str, Any]:
     """Return the settings from options that apply to every kind."""
-    told: dict[str, Any] = {}
+    settings_given: dict[str, Any] = {}
     if given.range_mm is not None:
         near, far = given.range_mm
         if not 0 < near < far <= 1e6:
             raise InputError("--range", "", f"{near:g} {far:g}", "near before far, over 0, in mm")
-        told |= {"near_mm": near, "far_mm": far, "range_mm": [near, far]}
+        settings_given |= {"near_mm": near, "far_mm": far, "range_mm": [near, far]}
     if given.exposure_s is not None:
         if not 0 < given.exposure_s <= 1e3:
             raise InputError("--exposure", "", f"{given.exposure_s:g}", "seconds, over 0 to 1000")
-        told["exposure_s"] = given.exposure_s
+        settings_given["exposure_s"] = given.exposure_s
     if given.sample is not None:
-        told["coupon"] = {"sample": given.sample}
+        settings_given["coupon"] = {"sample": given.sample}
     if given.projector is not None:
         if given.projector not in ("on", "off"):
             raise InputError("--projector", "", repr(given.projector), "on | off")
-        told["projector_on"] = given.projector == "on"
-    return told
+        settings_given["projector_on"] = given.projector == "on"
+    return settings_given
 
 
 def _kind_of_folder(path: Path, given: Given) -> str:

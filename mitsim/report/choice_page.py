@@ -18,8 +18,8 @@ from characterisation.errors import InputError
 from mitsim.report.choice_document import CHOICE, CellEntry, ChoiceDocument, SensorEntry, read_choice
 from mitsim.report.first_screen import of_choice, sensor_rows
 from mitsim.report.numbers import MINUS, NONE, listed, percent, quantity, rounded, two_digits
-from mitsim.report.stand import read_stand
-from mitsim.report.stand_figure import VERDICTS
+from mitsim.report.placement_figure import VERDICTS
+from mitsim.report.scene_geometry import read_scene_geometry
 
 
 def write_choice_page(folder: Path) -> Path:
@@ -49,7 +49,7 @@ def write_choice_page(folder: Path) -> Path:
 
 def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
     """Return everything that the template shows."""
-    first = of_choice(choice, read_stand(folder))
+    first = of_choice(choice, read_scene_geometry(folder))
     tolerances = any(one.tolerance is not None for one in choice.measurements.values())
     taking_part = [one for one in choice.sensors if one.status != "excluded"]
     return {

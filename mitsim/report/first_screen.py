@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike
 from characterisation.statements.verdict_words import Judged, fits_all, result_in_words
 from mitsim.report.choice_document import ChoiceDocument, SensorEntry
 from mitsim.report.numbers import MINUS, NONE, percent, quantity
+from mitsim.report.placement_figure import VERDICTS, face_verdicts, placement_figure
 from mitsim.report.run_folder import Run
+from mitsim.report.scene_geometry import SceneGeometry
 from mitsim.report.set_words import with_sets
-from mitsim.report.stand import Stand
-from mitsim.report.stand_figure import VERDICTS, face_verdicts, stand_figure
 from mitsim.report.style import Picture, as_svg
 
 
@@ -56,7 +56,7 @@ class FirstScreen:
     verdicts: dict[str, str]
 
 
-def of_run(run: Run, stand: Stand | None) -> FirstScreen:
+def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     """Return the first screen of the report of a run."""
     document = run.statement
     if document is None:
@@ -100,10 +100,10 @@ def of_run(run: Run, stand: Stand | None) -> FirstScreen:
     verdicts = face_verdicts(asked)
     result = with_sets(result_in_words(judged), fits_all(judged), run.about.view_sets)
     caption = f"{run.about.sensor} at view {document.view}, to scale; on the right the part from the same side."
-    return FirstScreen(result.words, result.good, rows, _picture(stand, poses, verdicts, caption), poses, verdicts)
+    return FirstScreen(result.words, result.good, rows, _picture(geometry, poses, verdicts, caption), poses, verdicts)
 
 
-def of_choice(choice: ChoiceDocument, stand: Stand | None) -> FirstScreen:
+def of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None) -> FirstScreen:
     """Return the first screen of the page that compares sensors, which shows the best one."""
     best = next((one for one in choice.sensors if one.status != "excluded" and one.measurements), None)
     if best is None:
@@ -116,7 +116,7 @@ def of_choice(choice: ChoiceDocument, stand: Stand | None) -> FirstScreen:
     good = all(cell.verdict in ("fits", "no tolerance") for cell in best.measurements.values())
     of = sum(one.status != "excluded" for one in choice.sensors)
     caption = f"{best.name}, the best of {of} sensors, to scale; on the right the part from the same side."
-    return FirstScreen(choice.words, good, rows, _picture(stand, poses, verdicts, caption), poses, verdicts)
+    return FirstScreen(choice.words, good, rows, _picture(geometry, poses, verdicts, caption), poses, verdicts)
 
 
 def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[Row]:
@@ -185,16 +185,16 @@ def accepted_words(accepted: tuple[float | None, float] | None, unit: str, toler
 
 
 def _picture(
-    stand: Stand | None, poses: Sequence[tuple[str, ArrayLike]], verdicts: dict[str, str], caption: str
+    geometry: SceneGeometry | None, poses: Sequence[tuple[str, ArrayLike]], verdicts: dict[str, str], caption: str
 ) -> Picture | None:
-    if stand is None or not len(stand.corners) or not poses:
+    if geometry is None or not len(geometry.corners) or not poses:
         return None
     by_verdict: dict[str, Any] = {}
     for name, verdict in verdicts.items():
         by_verdict.setdefault(verdict, []).append(name)
     faces = (f"{verdict}: {', '.join(names)}" for verdict, names in by_verdict.items())
     alt = "The part and the sensor. " + "; ".join(faces)
-    return Picture(Markup(as_svg(stand_figure(stand, poses, verdicts), alt)), caption)
+    return Picture(Markup(as_svg(placement_figure(geometry, poses, verdicts), alt)), caption)
 
 
 def _quantity(value: float | None, unit: str) -> str:

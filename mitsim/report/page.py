@@ -31,7 +31,7 @@ from mitsim.report.first_screen import of_run
 from mitsim.report.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
 from mitsim.report.page_pictures import camera_view, cloud_picture, map_pictures, measurement_pictures
 from mitsim.report.run_folder import Run, read_run
-from mitsim.report.stand import read_stand
+from mitsim.report.scene_geometry import read_scene_geometry
 from mitsim.report.statement_section import statement_section
 from mitsim.report.view_sphere import view_sphere
 
@@ -122,7 +122,7 @@ def page_content(run: Run) -> dict[str, Any]:
 
 def _first(run: Run) -> dict[str, Any]:
     """Return the first screen: the result in words, the picture, the verdicts."""
-    first = of_run(run, read_stand(run.folder))
+    first = of_run(run, read_scene_geometry(run.folder))
     tolerances = run.statement is not None and any(
         one.tolerance is not None for one in run.statement.measurements.values()
     )

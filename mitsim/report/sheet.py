@@ -20,9 +20,9 @@ from characterisation.atomic_io import atomic_write
 from mitsim.report.choice_document import CHOICE, ChoiceDocument, read_choice
 from mitsim.report.first_screen import FirstScreen, of_choice, of_run
 from mitsim.report.numbers import listed, rounded, two_digits
+from mitsim.report.placement_figure import draw_placement
 from mitsim.report.run_folder import Run, read_run
-from mitsim.report.stand import Stand, read_stand
-from mitsim.report.stand_figure import draw_stand
+from mitsim.report.scene_geometry import SceneGeometry, read_scene_geometry
 from mitsim.report.statement_section import exposed_in_words, read_statement
 from mitsim.report.style import INK, MUTED, drawing
 
@@ -56,9 +56,9 @@ def write_sheet(folder: str | Path) -> Path:
         If a file is missing or damaged; the message names the file.
     """
     folder = Path(folder)
-    stand, choice = read_stand(folder), read_choice(folder)
-    sheet = _of_run(read_run(folder), stand) if choice is None else _of_choice(choice, stand, folder)
-    figure = sheet_figure(sheet, stand)
+    geometry, choice = read_scene_geometry(folder), read_choice(folder)
+    sheet = _of_run(read_run(folder), geometry) if choice is None else _of_choice(choice, geometry, folder)
+    figure = sheet_figure(sheet, geometry)
     FigureCanvasPdf(figure)
     out = BytesIO()
     with drawing():
@@ -69,7 +69,7 @@ def write_sheet(folder: str | Path) -> Path:
     return path
 
 
-def sheet_figure(sheet: Sheet, stand: Stand | None) -> Figure:
+def sheet_figure(sheet: Sheet, geometry: SceneGeometry | None) -> Figure:
     """Return the sheet as an A4 figure."""
     with drawing():
         figure = Figure((_WIDTH, _HEIGHT))
@@ -83,11 +83,11 @@ def sheet_figure(sheet: Sheet, stand: Stand | None) -> Figure:
             colour="#00694e" if sheet.first.good else "#a84a00",
             line=0.19,
         )
-        if stand is not None and len(stand.corners) and sheet.first.poses:
+        if geometry is not None and len(geometry.corners) and sheet.first.poses:
             # one cell of this grid holds the picture
             heights = [_HEIGHT - down.place, _PICTURE, down.place - _PICTURE]
             rows = figure.add_gridspec(3, 1, height_ratios=heights, left=0, right=1, top=1, bottom=0, hspace=0)
-            draw_stand(figure.add_subfigure(rows[1]), stand, sheet.first.poses, sheet.first.verdicts)
+            draw_placement(figure.add_subfigure(rows[1]), geometry, sheet.first.poses, sheet.first.verdicts)
             down.place -= _PICTURE + 0.1
         _table(down, sheet.first)
         for name, text in sheet.facts:
@@ -170,8 +170,8 @@ def _table(down: _Column, first: FirstScreen) -> None:
     down.place -= 0.08
 
 
-def _of_run(run: Run, stand: Stand | None) -> Sheet:
-    first, document = of_run(run, stand), run.statement
+def _of_run(run: Run, geometry: SceneGeometry | None) -> Sheet:
+    first, document = of_run(run, geometry), run.statement
     facts = [("Part", run.about.scene)]
     missing = list[str]()
     if document is not None:
@@ -195,8 +195,8 @@ def _of_run(run: Run, stand: Stand | None) -> Sheet:
     return Sheet(f"{run.about.sensor} measures {Path(run.about.scene).stem}", first, facts, missing, versions)
 
 
-def _of_choice(choice: ChoiceDocument, stand: Stand | None, folder: Path) -> Sheet:
-    first = of_choice(choice, stand)
+def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: Path) -> Sheet:
+    first = of_choice(choice, geometry)
     best = next((one for one in choice.sensors if one.measurements), None)
     facts = [("Part", choice.scene)]
     missing = list[str]()

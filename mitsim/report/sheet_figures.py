@@ -79,7 +79,7 @@ def gallery_figure(sensor: str, seen: Sequence[tuple[str, Capture, PointCloud]])
         figure = Figure((3.3 * len(seen), 5.6), layout="constrained")
         grid = np.asarray(figure.subplots(2, len(seen), squeeze=False))
         present: set[int] = set()
-        cut = _specimen(seen[0][2])
+        cut = _window_around(seen[0][2])
         for (finish, capture, cloud), (upper, lower) in zip(seen, grid.T, strict=True):
             image = _brightest(capture)[_of_grid(cut, capture, cloud)]
             low, high = np.percentile(image, (5, 99.7))
@@ -199,7 +199,7 @@ def _short(source: str) -> str:
     return textwrap.shorten(source.split(":")[0].split(" (")[0], 48, placeholder=" ...")
 
 
-def _specimen(cloud: PointCloud, margin: float = 0.2) -> tuple[slice, slice]:
+def _window_around(cloud: PointCloud, margin: float = 0.2) -> tuple[slice, slice]:
     """Return the rows and columns of the grid around all points, with a margin relative to their extent."""
     rows, columns = np.nonzero(cloud.valid)
     if not len(rows):

@@ -25,11 +25,11 @@ from characterisation.tasks.evaluation import InputQuantity
 from mitsim.campaign.run import write_netcdf
 from mitsim.prediction import Predictor
 from mitsim.progress import say
-from mitsim.report.stand import write_stand
+from mitsim.report.scene_geometry import write_scene_geometry
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.study import Study
 from mitsim.view_sets.confirmed_set import Search, joining_in_words
-from mitsim.views import tell_views
+from mitsim.views import write_views
 from mitsim.virtual.screening import screen
 
 
@@ -40,13 +40,13 @@ def score_study(
 
     Returns the scores, the set, and the function that finds a set for other limits.
     """
-    tell_views(folder / "poses", study.candidates, study.file.views, study.sensor.name)
+    write_views(folder / "poses", study.candidates, study.file.views, study.sensor.name)
     scores, inputs = screen(study, predictor, performance_map)
     search = partial(_set_within, study, inputs)
     chosen = _chosen_set(study, search)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")
     write_netcdf(scores, folder / "scores.nc")
-    write_stand(folder, study.scene, study.sensor)
+    write_scene_geometry(folder, study.scene, study.sensor)
     with atomic_write(folder / "part.ply") as file:
         corners = triangles(study.scene)
         mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=True)
@@ -84,8 +84,8 @@ def _expected(study: Study, limits: dict[str, float], chosen: ViewSet) -> str:
     """Like ``pillar1_radius u 0.36 of 0.5 mm``."""
     rows = zip(limits.items(), chosen.uncertainty.tolist(), chosen.feasible, strict=True)
     units = {name: study.task.measurements[name].unit for name in limits}
-    told = [f"{name} u {u:.2g} of {limit:g} {units[name]}" for (name, limit), u, able in rows if able]
-    return ", ".join(told) or "nothing"
+    parts = [f"{name} u {u:.2g} of {limit:g} {units[name]}" for (name, limit), u, able in rows if able]
+    return ", ".join(parts) or "nothing"
 
 
 def pose_columns(scores: xr.Dataset) -> dict[str, np.ndarray]:

@@ -139,8 +139,8 @@ def _read(file: Path) -> dict[str, Any]:
     try:
         return {name: _plain(storage.root().getNode(name)) for name in storage.root().keys()}  # noqa: SIM118 not a dict
     except (cv2.error, SystemError, UnicodeDecodeError, RecursionError) as error:
-        told = str(error).strip().splitlines()[-1][:200]
-        raise InputError(file, "", f"a file that OpenCV cannot read ({told})", _KINDS) from None
+        cause = str(error).strip().splitlines()[-1][:200]
+        raise InputError(file, "", f"a file that OpenCV cannot read ({cause})", _KINDS) from None
     finally:
         storage.release()
 

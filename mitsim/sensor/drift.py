@@ -120,8 +120,8 @@ def with_drift(covariance: RigCovariance, rig: Rig, drift: Drift) -> RigCovarian
     for mode in drift_modes(rig, covariance.names, drift):
         step = np.array([mode.step.get(name, 0.0) for name in covariance.names])
         total += mode.sigma**2 * np.outer(step, step)
-    told = ", ".join(f"{name} {value:g}" for name, value in drift.numbers().items())
-    return RigCovariance(covariance.names, total, f"{covariance.source}; drift: {told}", covariance.details)
+    described = ", ".join(f"{name} {value:g}" for name, value in drift.numbers().items())
+    return RigCovariance(covariance.names, total, f"{covariance.source}; drift: {described}", covariance.details)
 
 
 def _axes(eye: Camera, baseline: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:

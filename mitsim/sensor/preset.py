@@ -269,23 +269,23 @@ class _Written(Document):
 
 def _assemble(path: Path, table: SensorFile) -> Sensor:
     cameras = {name: optics.camera() for name, optics in table.cameras.items()}
-    lamp, given = table.projector, table.imager
+    keys, given = table.projector, table.imager
     projector = Projector(
-        lamp.camera(),
-        lamp.flux_w,
-        black_level=lamp.black_level,
-        gamma=lamp.gamma,
-        aperture_mm=lamp.aperture_mm,
-        focus_mm=lamp.focus_mm,
-        corner_illumination=lamp.corner_illumination,
-        pixel_gap=lamp.pixel_gap,
+        keys.camera(),
+        keys.flux_w,
+        black_level=keys.black_level,
+        gamma=keys.gamma,
+        aperture_mm=keys.aperture_mm,
+        focus_mm=keys.focus_mm,
+        corner_illumination=keys.corner_illumination,
+        pixel_gap=keys.pixel_gap,
     )
     imager = imager_of(given)
     return Sensor(
         name=table.name,
         technology=table.technology,
         wavelength_nm=table.wavelength_nm,
-        linewidth_nm=lamp.linewidth_nm,
+        linewidth_nm=keys.linewidth_nm,
         working_range_mm=table.working_range_mm,
         rig=Rig(cameras, projector.optics),
         projector=projector,

@@ -121,8 +121,8 @@ def rig_named(name: str | Path) -> tuple[str, str]:
         held = ("cameras", "projector") if "calibration" in table else ()
         missing = [key for key in missing_keys(for_recordings(table), SensorFile) if not key.startswith(held or "\0")]
         raise InputError(path, ", ".join(missing), "nothing", "a value for each: these keys are required")
-    told = validate(path, {key: table[key] for key in ("name", "technology") if key in table}, _Named)
-    return told.name, told.technology
+    named = validate(path, {key: table[key] for key in ("name", "technology") if key in table}, _Named)
+    return named.name, named.technology
 
 
 class _Named(Document):

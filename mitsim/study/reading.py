@@ -232,6 +232,6 @@ def _check_campaign(scene: Scene, known: Samples) -> None:
             scene.where,
             f"shape {name!r}",
             f"the finish {finish}",
-            f"the finishes of the campaign: {known.told()}",
+            f"the finishes of the campaign: {known.in_words()}",
             "add a sample to the campaign, or remove [characterisation]: mitsim then offers to characterise it",
         )

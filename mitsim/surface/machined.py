@@ -153,7 +153,7 @@ def machined(
         wide_angle=deviation.share(share, ends),
         wide_angle_range=ends,
         alpha_factor=lobe.factor,
-        provenance=deviation.told(_in_words(face, process, lobe.provenance), lobe.factor, ends),
+        provenance=deviation.provenance_of(_in_words(face, process, lobe.provenance), lobe.factor, ends),
         lay=lay,
         energy_factor=energy_factors(alpha_u, alpha_v, normal_reflectance(face.metal, wavelength_nm)),
         coherent_alpha=_mirror_directions(lay, mirror),

@@ -207,8 +207,8 @@ def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "",
         except InputError:
             raise
         except Exception as error:  # the header is parsed as Python text and can raise any exception
-            told = " ".join(str(error).split())[:200]
-            raise InputError(path, "", f"a file that does not load ({told})", "an array of numbers") from None
+            cause = " ".join(str(error).split())[:200]
+            raise InputError(path, "", f"a file that does not load ({cause})", "an array of numbers") from None
         if z.ndim != 2 or z.dtype.kind not in "fiu":
             raise InputError(path, "", f"an array of shape {z.shape} and type {z.dtype}", "a grid of real numbers")
     else:

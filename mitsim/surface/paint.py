@@ -94,7 +94,7 @@ def paint(
         share,
         (share, share),
         factor,
-        deviation.told(words, factor, (share, share)),
+        deviation.provenance_of(words, factor, (share, share)),
         energy_factor=energy_factors(alpha, alpha, float(fresnel(1.0, *INDEX))),
         depolarising=True,
     )

@@ -157,7 +157,7 @@ class Deviation:
         ratio = ends[1] / share if self.wide_angle > 0 else share / ends[0]
         return float(min(share * ratio**self.wide_angle, 1.0))
 
-    def told(self, provenance: str, factor: float, ends: tuple[float, float]) -> str:
+    def provenance_of(self, provenance: str, factor: float, ends: tuple[float, float]) -> str:
         """Return the source of alpha and the deviations applied; exactly known properties do not deviate."""
         moved = [f"alpha {self.alpha:+g}"] if self.alpha and factor != 1 else []
         moved += [f"wide angle {self.wide_angle:+g}"] if self.wide_angle and ends[0] != ends[1] else []

@@ -88,14 +88,14 @@ class Bench:
 
     def _lit(self, sensor: Sensor, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the light of the projector at 1 W before the lens, and the gain of speckle behind it."""
-        lamp = replace(sensor.projector, flux=1.0)
+        projector = replace(sensor.projector, flux=1.0)
         key = (
             str(sensor.pattern),
-            lamp.black_level,
-            lamp.gamma,
-            lamp.aperture_mm,
-            lamp.focus_mm,
-            lamp.corner_illumination,
+            projector.black_level,
+            projector.gamma,
+            projector.aperture_mm,
+            projector.focus_mm,
+            projector.corner_illumination,
             seed,
         )
         if key not in self._kept:
@@ -107,7 +107,7 @@ class Bench:
                 pattern = pattern.model_copy(update={"shifts_px": []})  # type: ignore[union-attr]
             one = replace(
                 sensor,
-                projector=lamp,
+                projector=projector,
                 imager=bare,
                 pattern=pattern,
                 room=None,

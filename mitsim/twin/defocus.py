@@ -60,11 +60,11 @@ def fit_defocus(take: Take, white: Floats, black: Floats, pairs: Floats, widths:
     widths
         (n,) of the stripes [projector px].
     """
-    lamp = take.capture.rig.projector
-    assert lamp is not None
+    projector = take.capture.rig.projector
+    assert projector is not None
     settings, _ = decoder_settings(take.capture)
     points = capture_cloud(take.capture, settings).points.astype(float)
-    depth = lamp.sensor_from_camera.inverse().points(points.reshape(-1, 3)).reshape(points.shape)[..., 2]
+    depth = projector.sensor_from_camera.inverse().points(points.reshape(-1, 3)).reshape(points.shape)[..., 2]
     fine = widths < _WIDEST_PX
     difference = np.abs(pairs[fine, 0] - pairs[fine, 1])
     least = _LEAST_DN * (2**take.capture.bits - 1) / 255
@@ -84,7 +84,7 @@ def fit_defocus(take: Take, white: Floats, black: Floats, pairs: Floats, widths:
     table = np.array(rows).reshape(-1, 2)
     if len(table) < _FEWEST:
         return None
-    focal = float(lamp.matrix[0, 0])
+    focal = float(projector.matrix[0, 0])
     found = _fitted(table, focal)
     # neighbouring blocks are correlated: the jackknife leaves out runs of them
     parts = np.array_split(np.arange(len(table)), _PARTS)

@@ -55,7 +55,7 @@ class DotsFit:
 
     - ``patches``: number of patches seen.
     - ``uneven``: standard deviation of the field's terms that no parameter explains [1].
-    - ``untold``: parameters that the capture does not determine; they keep the sensor's own values.
+    - ``undetermined``: parameters that the capture does not determine; they keep the sensor's own values.
     """
 
     sensor: Sensor
@@ -63,7 +63,7 @@ class DotsFit:
     found: Found
     patches: int
     uneven: float
-    untold: tuple[Parameter, ...] = ()
+    undetermined: tuple[Parameter, ...] = ()
 
     def built(self, theta: Floats) -> Sensor:
         """Return the sensor with the varied numbers (k,) inserted."""
@@ -179,29 +179,30 @@ def fit_dots(
         excess = float(np.mean(off[spatial] ** 2 - np.diag(covariance)[spatial]))
         uneven = float(np.sqrt(max(excess, 0.0)))
         covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
-    kept = np.array([_is_told(found, index, parameter) for index, parameter in enumerate(own)])
-    untold = tuple(parameter for parameter, is_kept in zip(own, kept, strict=True) if not is_kept)
-    if any(parameter is CORNER_BLUR for parameter in untold):  # then no parameter explains the variation of sharpness
+    kept = np.array([_is_determined(found, index, parameter) for index, parameter in enumerate(own)])
+    undetermined = tuple(parameter for parameter, is_kept in zip(own, kept, strict=True) if not is_kept)
+    # without it no parameter explains the variation of sharpness
+    if any(parameter is CORNER_BLUR for parameter in undetermined):
         names, spatial = names[:count], spatial[:count]
         wanted, covariance = real.of(names)
         covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
-    if uneven > 0 or untold:
+    if uneven > 0 or undetermined:
         own = [parameter for parameter, is_kept in zip(own, kept, strict=True) if is_kept]
         again = _prior(own, start[kept], found.values[kept])
         found = match_moments(wanted, covariance, simulate, again, draws.number, f"{where}, once more")
     if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)):
         wider = found.covariance * found.chi_square / max(found.freedom, 1)
         found = replace(found, covariance=wider)
-    return DotsFit(sensor, tuple(own), found, len(field.corners), uneven, untold)
+    return DotsFit(sensor, tuple(own), found, len(field.corners), uneven, undetermined)
 
 
-def _is_told(found: Found, index: int, parameter: Parameter) -> bool:
+def _is_determined(found: Found, index: int, parameter: Parameter) -> bool:
     """Return whether a parameter stays in the fit: the room's always, smoothing and corner blur if significant."""
     if parameter.key.startswith("room."):
         return True
     if parameter is SMOOTHING or parameter is CORNER_BLUR:
         return bool(found.values[index] > _SURE * np.sqrt(found.covariance[index, index]))
-    return bool(found.told[index])
+    return bool(found.determined[index])
 
 
 def _prior(own: Sequence[Parameter], middle: Floats, first: Floats | None = None) -> Prior:

@@ -61,7 +61,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Untold:
+class Undetermined:
     """A number that no capture determines: it keeps the file's ``value``; capture ``without`` would determine it."""
 
     key: str

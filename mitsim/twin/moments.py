@@ -29,16 +29,16 @@ Simulate = Callable[[Floats, int], tuple[Floats, Floats]]
 _ROUNDS, _HALVINGS, _ENOUGH = 8, 4, 0.02
 
 #: largest uncertainty of a determined parameter, as a share of the prior's standard deviation
-TOLD_SHARE = 0.35
+DETERMINED_SHARE = 0.35
 
 
 @dataclass(frozen=True)
 class Found:
-    """Parameters (k,), their ``covariance`` (k, k), which of them are determined (``told``); chi-square, freedom."""
+    """Parameters (k,), their ``covariance`` (k, k) and whether they are ``determined``; chi-square, freedom."""
 
     values: Floats
     covariance: Floats
-    told: NDArray[np.bool_]
+    determined: NDArray[np.bool_]
     chi_square: float
     freedom: int
 
@@ -116,8 +116,10 @@ def match_moments(
     weight = np.linalg.pinv(covariance + spread / draws)
     total = np.linalg.inv(jacobian.T @ weight @ jacobian + inverse_prior)
     off = real - seen
-    told = np.sqrt(np.diag(total)) < TOLD_SHARE * prior.spread
-    return Found(theta, np.asarray(total, float), told, float(off @ weight @ off), len(real) - int(told.sum()))
+    determined = np.sqrt(np.diag(total)) < DETERMINED_SHARE * prior.spread
+    return Found(
+        theta, np.asarray(total, float), determined, float(off @ weight @ off), len(real) - int(determined.sum())
+    )
 
 
 def _bounded_step(normal: Floats, pull: Floats, theta: Floats, prior: Prior) -> Floats:

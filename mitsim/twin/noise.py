@@ -21,7 +21,7 @@ from mitsim.fit.specimen import MARGIN_PX, image_mask
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import Sensor
-from mitsim.twin.estimate import Estimate, Untold
+from mitsim.twin.estimate import Estimate, Undetermined
 from mitsim.twin.photon_transfer import (
     Repeats,
     TransferLine,
@@ -50,7 +50,7 @@ class ImagerFit:
 
     imager: Imager
     estimates: tuple[Estimate, ...]
-    untold: tuple[Untold, ...]
+    undetermined: tuple[Undetermined, ...]
     known: bool
 
 
@@ -65,21 +65,21 @@ def fit_imager(groups: list[list[Take]], sensor: Sensor, places: dict[str, Place
     if repeated:
         line = repeated_line([_repeats(group, _there(group[0], places)) for group in repeated], imager)
         if line is not None:
-            told = tuple(take.name for group in repeated for take in group)
-            imager, found = _with_line(imager, line, told, "photon transfer of repeats")
-            imager, fixed, untold = _with_fixed(imager, sensor.imager, repeated, places)
-            return ImagerFit(imager, (*estimates, *found, *fixed), tuple(untold), True)
+            names = tuple(take.name for group in repeated for take in group)
+            imager, found = _with_line(imager, line, names, "photon transfer of repeats")
+            imager, fixed, undetermined = _with_fixed(imager, sensor.imager, repeated, places)
+            return ImagerFit(imager, (*estimates, *found, *fixed), tuple(undetermined), True)
     for group in groups:
         if group[0].kind == "off":
             found_one = _one_image(group[0], imager, places)
             if found_one is not None:
                 imager, found = found_one
                 without = "repeats of one pose; until then read_noise_e and full_well_e include it"
-                untold = [
-                    Untold(key, 0.0, without)
+                undetermined = [
+                    Undetermined(key, 0.0, without)
                     for key in (*_EVERY_SOURCE, "imager.row_noise_e", "imager.column_pattern_e")
                 ]
-                return ImagerFit(imager, (*estimates, *found), tuple(untold), True)
+                return ImagerFit(imager, (*estimates, *found), tuple(undetermined), True)
     return ImagerFit(imager, tuple(estimates), (), False)
 
 
@@ -153,31 +153,31 @@ def _with_black_level(imager: Imager, dark: list[list[Take]]) -> tuple[Imager, E
     image = next(iter(takes[0].capture.images.values()))[0]
     value, spread = float(np.mean(levels)), float(image.std() / np.sqrt(image.size * len(takes)))
     names = tuple(take.name for take in takes)
-    told = Estimate("imager.black_level_dn", value, spread, "DN", names, "mean grey level in the dark")
-    return replace(imager, black_level=value), told
+    estimate = Estimate("imager.black_level_dn", value, spread, "DN", names, "mean grey level in the dark")
+    return replace(imager, black_level=value), estimate
 
 
-def _with_line(imager: Imager, line: TransferLine, told: tuple[str, ...], how: str) -> tuple[Imager, list[Estimate]]:
+def _with_line(imager: Imager, line: TransferLine, names: tuple[str, ...], how: str) -> tuple[Imager, list[Estimate]]:
     (well, well_u), (read, read_u) = line.full_well(imager), line.read_noise()
     return replace(imager, full_well=well, read_noise=read, row_noise=0.0), [
-        Estimate("imager.full_well_e", well, well_u, "e-", told, how),
-        Estimate("imager.read_noise_e", read, read_u, "e-", told, how),
+        Estimate("imager.full_well_e", well, well_u, "e-", names, how),
+        Estimate("imager.read_noise_e", read, read_u, "e-", names, how),
     ]
 
 
 def _with_fixed(
     imager: Imager, before: Imager, repeated: list[list[Take]], places: dict[str, Place]
-) -> tuple[Imager, list[Estimate], list[Untold]]:
+) -> tuple[Imager, list[Estimate], list[Undetermined]]:
     """Estimate DSNU from dark repeats, PRNU from repeats in uniform light."""
     estimates: list[Estimate] = []
-    untold = [Untold("imager.row_noise_e", 0.0, "the mean of rows in the dark; read_noise_e includes it")]
+    undetermined = [Undetermined("imager.row_noise_e", 0.0, "the mean of rows in the dark; read_noise_e includes it")]
     for kind, key, without in (
         ("dark", "imager.dsnu_e", "repeats in the dark"),
         ("off", "imager.prnu", "repeats with the projector off"),
     ):
         groups = [group for group in repeated if group[0].kind == kind]
         if not groups:
-            untold.append(Untold(key, before.dsnu if kind == "dark" else before.prnu, without))
+            undetermined.append(Undetermined(key, before.dsnu if kind == "dark" else before.prnu, without))
             continue
         group = groups[0]
         images = np.stack([next(iter(take.capture.images.values()))[0] for take in group])
@@ -199,7 +199,7 @@ def _with_fixed(
             )
         )
         imager = replace(imager, dsnu=root) if kind == "dark" else replace(imager, prnu=root / scale)
-    return imager, estimates, untold
+    return imager, estimates, undetermined
 
 
 def _one_image(take: Take, imager: Imager, places: dict[str, Place]) -> tuple[Imager, list[Estimate]] | None:
@@ -222,8 +222,8 @@ def _one_image(take: Take, imager: Imager, places: dict[str, Place]) -> tuple[Im
             line.offset / gain, line.slope / gain, line.covariance / gain**2, line.bins, line.chi_square
         )
         if line.full_well(imager)[1] < 0.3 * line.full_well(imager)[0] and line.offset > 0:
-            found, told = _with_line(bare, line, names, how)
-            return found, [*estimates, *told]
+            found, from_line = _with_line(bare, line, names, how)
+            return found, [*estimates, *from_line]
     # nearly one level: keep the file's full well and attribute the rest to read noise; without a rest, fit the well
     electrons = linearised(image, imager)
     level = float(np.median(electrons[there]))

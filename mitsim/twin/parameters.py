@@ -63,20 +63,20 @@ def _log(value: float) -> float:
 def _with_full_well(sensor: Sensor, x: float) -> Sensor:
     """Set the full well and keep grey levels: power, room and read noise scale with it."""
     chip, ratio = sensor.imager, _WELL / max(x, 1e-3) / sensor.imager.full_well
-    lamp, room = replace(sensor.projector, flux=sensor.projector.flux * ratio), sensor.room
+    projector, room = replace(sensor.projector, flux=sensor.projector.flux * ratio), sensor.room
     if room is not None:
         room = room.model_copy(update={"irradiance_w_mm2": room.irradiance_w_mm2 * ratio})
     chip = replace(chip, full_well=chip.full_well * ratio, read_noise=chip.read_noise * ratio)
-    return replace(sensor, imager=chip, projector=lamp, room=room)
+    return replace(sensor, imager=chip, projector=projector, room=room)
 
 
 def _with_flux(sensor: Sensor, x: float) -> Sensor:
     """Set the power and keep the ratio of the room's light to it."""
-    lamp, room = sensor.projector, sensor.room
-    ratio = float(np.exp(x)) * sensor.imager.full_well / lamp.flux
+    projector, room = sensor.projector, sensor.room
+    ratio = float(np.exp(x)) * sensor.imager.full_well / projector.flux
     if room is not None:
         room = room.model_copy(update={"irradiance_w_mm2": room.irradiance_w_mm2 * ratio})
-    return replace(sensor, projector=replace(lamp, flux=lamp.flux * ratio), room=room)
+    return replace(sensor, projector=replace(projector, flux=projector.flux * ratio), room=room)
 
 
 def _with_corner(sensor: Sensor, x: float) -> Sensor:

@@ -27,7 +27,7 @@ from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.roi import Roi
 from mitsim.twin.dots import DotDraws, DotsFit, fit_dots
-from mitsim.twin.estimate import Estimate, Untold, combined, pooled, scaled, unscaled
+from mitsim.twin.estimate import Estimate, Undetermined, combined, pooled, scaled, unscaled
 from mitsim.twin.noise import ImagerFit, fit_imager
 from mitsim.twin.parameters import (
     BLACK_LEVEL,
@@ -55,12 +55,12 @@ _MISFIT = 10.0
 
 @dataclass(frozen=True)
 class SensorFit:
-    """Result of a fit: ``estimates``, undetermined numbers (``untold``), and the fits of every capture."""
+    """Result of a fit: ``estimates``, undetermined numbers (``undetermined``), and the fits of every capture."""
 
     sensor: Sensor = field(repr=False)
     takes: tuple[Take, ...] = field(repr=False)
     estimates: tuple[Estimate, ...]
-    untold: tuple[Untold, ...]
+    undetermined: tuple[Undetermined, ...]
     dots: dict[str, DotsFit] = field(repr=False)
     places: dict[str, Place] = field(repr=False)
     rows: dict[str, Rows] = field(repr=False)
@@ -114,8 +114,8 @@ def fit_sensor(
     room = fit_room(lit, base, places) if lit and any(group[0].kind == "on" for group in groups) else None
     estimates += room.estimates if room is not None else []
     dots = _dots([g[0] for g in groups if g[0].kind == "on"], base, places, imager, room, seed, draws)
-    told, untold = _together(dots, base, imager, room)
-    estimates += told
+    shared, undetermined = _together(dots, base, imager, room)
+    estimates += shared
     if isinstance(base.pattern, LightCode):
         coded: list[Estimate] = []
         for take in (group[0] for group in groups if group[0].kind == "on"):
@@ -130,7 +130,7 @@ def fit_sensor(
             if found is not None:
                 rows[group[0].name] = found
     estimates += _turns(rows)
-    return SensorFit(base, tuple(takes), tuple(estimates), tuple(untold), dots, places, rows)
+    return SensorFit(base, tuple(takes), tuple(estimates), tuple(undetermined), dots, places, rows)
 
 
 def sensor_path(name: str | Path) -> Path:
@@ -204,22 +204,22 @@ def _without_fixed(imager: Imager) -> Imager:
 
 def _together(
     dots: dict[str, DotsFit], base: Sensor, imager: ImagerFit, room: RoomFit | None
-) -> tuple[list[Estimate], list[Untold]]:
+) -> tuple[list[Estimate], list[Undetermined]]:
     """Combine the estimates of all captures of dots key by key, and list the keys that none determines."""
     estimates: list[Estimate] = []
-    untold: list[Untold] = list(imager.untold)
+    undetermined: list[Undetermined] = list(imager.undetermined)
     by_key: dict[str, list[tuple[str, Parameter, float, float, bool]]] = {}
     for name, fit in dots.items():
         values, spreads = fit.in_file_units()
         for parameter, value, spread in zip(fit.parameters, values, spreads, strict=True):
             by_key.setdefault(parameter.key, []).append((name, parameter, float(value), float(spread), True))
-        for parameter in fit.untold:
+        for parameter in fit.undetermined:
             by_key.setdefault(parameter.key, []).append((name, parameter, 0.0, 0.0, False))
     for key, rows in by_key.items():
         parameter = rows[0][1]
         some = [row for row in rows if row[4]]
         if not some:
-            untold.append(Untold(key, parameter.read(base), parameter.without))
+            undetermined.append(Undetermined(key, parameter.read(base), parameter.without))
             continue
         middle, spread = combined([scaled(row[2], parameter.scale) for row in some], [row[3] for row in some])
         estimates.append(
@@ -240,10 +240,14 @@ def _together(
             ("imager.row_noise_e", 0.0),
             ("imager.column_pattern_e", 0.0),
         ):
-            untold.append(Untold(key, value, "repeats of one pose; until then read_noise_e and full_well_e include it"))
+            undetermined.append(
+                Undetermined(key, value, "repeats of one pose; until then read_noise_e and full_well_e include it")
+            )
     if room is None and dots:
-        untold.append(Untold("projector.black_level", base.projector.black_level, "a capture with the projector off"))
-    return estimates, untold
+        undetermined.append(
+            Undetermined("projector.black_level", base.projector.black_level, "a capture with the projector off")
+        )
+    return estimates, undetermined
 
 
 def _turns(rows: dict[str, Rows]) -> list[Estimate]:

@@ -49,12 +49,12 @@ def with_entries(text: str, entries: Mapping[str, Entry]) -> str:
     return text
 
 
-def with_cameras(text: str, cameras: Mapping[str, Camera], told: str) -> str:
+def with_cameras(text: str, cameras: Mapping[str, Camera], source: str) -> str:
     """Replace the tables of the cameras."""
     blocks = _blocks(text)
     kept = [lines for table, lines in blocks if not table.startswith("cameras.")]
     index = next((n for n, (table, _) in enumerate(blocks) if table.startswith("cameras.")), 1)
-    made: list[str] = [f"# cameras of this unit, from {told}"]
+    made: list[str] = [f"# cameras of this unit, from {source}"]
     for name, camera in cameras.items():
         matrix, place = camera.matrix, camera.sensor_from_camera
         made += [

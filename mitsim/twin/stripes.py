@@ -60,11 +60,11 @@ def stripes_of(take: Take) -> Stripes | None:
 
     The brightest and the darkest of the stripes replace a missing white or black image.
     """
-    code, lamp = capture_pattern(take.capture), take.capture.rig.projector
-    if not isinstance(code, LightCode) or lamp is None:
+    code, projector = capture_pattern(take.capture), take.capture.rig.projector
+    if not isinstance(code, LightCode) or projector is None:
         return None
     images = next(iter(take.capture.images.values()))
-    kinds: list[Role] = list(roles(code, lamp.width, lamp.height))
+    kinds: list[Role] = list(roles(code, projector.width, projector.height))
     names = [role.kind for role in kinds]
     pairs, widths, across = [], [], []
     for number, role in enumerate(kinds):
@@ -175,7 +175,7 @@ def _blur(
         return sensor, []
     blur = float(np.median(values))
     spread = 1.2533 * float(np.std(values, ddof=1)) / np.sqrt(len(values))
-    told = Estimate(
+    estimate = Estimate(
         "imager.blur_px",
         min(blur, 5.0),
         spread,
@@ -183,9 +183,9 @@ def _blur(
         (take.name,),
         "modulation of stripes by width, including the projector's blur",
     )
-    lamp = replace(sensor.projector, aperture_mm=0.0)
-    return replace(sensor, imager=replace(chip, blur_px=min(blur, 5.0)), projector=lamp), [
-        told,
+    projector = replace(sensor.projector, aperture_mm=0.0)
+    return replace(sensor, imager=replace(chip, blur_px=min(blur, 5.0)), projector=projector), [
+        estimate,
         Estimate("projector.aperture_mm", 0.0, 0.0, "mm", (take.name,), "imager.blur_px includes its blur"),
     ]
 
@@ -195,8 +195,8 @@ def _with_focus(take: Take, sensor: Sensor, focus: Defocus, scale: float) -> tup
     spread, names = np.sqrt(np.diag(focus.covariance)), (take.name,)
     how = "modulation of stripes by width and depth"
     blur = min(focus.still_px * scale, 5.0)
-    lamp = replace(sensor.projector, aperture_mm=focus.aperture_mm, focus_mm=focus.focus_mm)
-    return replace(sensor, imager=replace(sensor.imager, blur_px=blur), projector=lamp), [
+    projector = replace(sensor.projector, aperture_mm=focus.aperture_mm, focus_mm=focus.focus_mm)
+    return replace(sensor, imager=replace(sensor.imager, blur_px=blur), projector=projector), [
         Estimate("imager.blur_px", blur, float(spread[0]) * scale, "px", names, how + ", independent of depth"),
         Estimate("projector.aperture_mm", focus.aperture_mm, float(spread[1]), "mm", names, how),
         Estimate("projector.focus_mm", focus.focus_mm, float(spread[2]), "mm", names, how),
@@ -205,15 +205,15 @@ def _with_focus(take: Take, sensor: Sensor, focus: Defocus, scale: float) -> tup
 
 def _pixels_per_stripe(take: Take, place: Place) -> tuple[float, float]:
     """Return the camera pixels per projector pixel, along columns and rows, at the centre of the specimen."""
-    camera, lamp = take.capture.rig.reference, take.capture.rig.projector
-    assert lamp is not None
+    camera, projector = take.capture.rig.reference, take.capture.rig.projector
+    assert projector is not None
     pose: Transform = place.world_from_sensor.inverse()
     middle = place.low + place.cell * place.occupied.shape[::-1] / 2
     steps = np.array([[0, 0, 0], [1.0, 0, 0], [0, 1.0, 0]]) + np.array([*middle, 0.0])
     points = pose.points(steps)
-    seen, sent = camera.project(points), lamp.project(points)
+    seen, sent = camera.project(points), projector.project(points)
     to_camera = np.stack([seen[1] - seen[0], seen[2] - seen[0]], axis=1)
-    to_lamp = np.stack([sent[1] - sent[0], sent[2] - sent[0]], axis=1)
+    to_projector = np.stack([sent[1] - sent[0], sent[2] - sent[0]], axis=1)
     # a stripe's edge moves along the gradient of its coordinate in the camera: 1 / |gradient| px for one of its pixels
-    gradient = to_lamp @ np.linalg.inv(to_camera)
+    gradient = to_projector @ np.linalg.inv(to_camera)
     return float(1 / np.linalg.norm(gradient[0])), float(1 / np.linalg.norm(gradient[1]))

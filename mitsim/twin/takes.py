@@ -55,7 +55,7 @@ def read_takes(folders: Sequence[Path], off: Sequence[Path], dark: Sequence[Path
     if len({folder.resolve() for folder, _ in every}) < len(every):
         raise InputError("CAPTURES", "", "a folder twice", "each capture once", "the same noise twice is not a repeat")
     takes = []
-    for folder, told in every:
+    for folder, name_given in every:
         capture = read_capture(folder)
         if capture.technology != sensor.technology:
             allowed = f"{sensor.technology}, as --sensor {sensor.name}"
@@ -65,7 +65,7 @@ def read_takes(folders: Sequence[Path], off: Sequence[Path], dark: Sequence[Path
         own: Kind = "off" if capture.settings.get("projector_on") is False else "on"
         if capture.settings.get("dark") is True:
             own = "dark"
-        takes.append(Take(folder, capture, told or own))
+        takes.append(Take(folder, capture, name_given or own))
     return takes
 
 

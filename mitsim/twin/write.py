@@ -54,9 +54,9 @@ def fit_table(fit: SensorFit) -> str:
             f"| {one.key} | {one.value:.4g} | {low:.4g} to {high:.4g} | {one.unit} | "
             f"{', '.join(one.captures)} | {one.how} |"
         )
-    if fit.untold:
+    if fit.undetermined:
         lines += ["", "| not determined, kept | value | a capture that would determine it |", "| --- | --- | --- |"]
-        lines += [f"| {one.key} | {one.value:.4g} | {one.without} |" for one in fit.untold]
+        lines += [f"| {one.key} | {one.value:.4g} | {one.without} |" for one in fit.undetermined]
     return "\n".join(lines) + "\n"
 
 
@@ -76,7 +76,7 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
         some = next(iter(parts.values()))
         said = f"fitted: standard uncertainties {', '.join(spreads)}; {some.how}; {', '.join(some.captures)}"
         entries[key] = Entry(numbers(np.clip(values, -limit, limit), 5), said)
-    for kept in fit.untold:
+    for kept in fit.undetermined:
         if _ARRAY.match(kept.key):
             continue  # a term of the room without an estimate: none
         entries[kept.key] = Entry(number(kept.value), f"not determined; needs {kept.without}")

@@ -84,9 +84,9 @@ def choices_of(case: JudgedCase) -> list[Choice]:
     few = case.case.file.raced_candidates
     numbers = case.views[:few].tolist()
     errors, pooled_errors = case.choice, case.truth[:, :few, : case.case.file.raced_worlds]
-    told = case.scores.sel(view=numbers)
-    risk = screening_risk(told)
-    talk = told["V_m"].transpose("measurement", "view").values
+    scores = case.scores.sel(view=numbers)
+    risk = screening_risk(scores)
+    talk = scores["V_m"].transpose("measurement", "view").values
     out = []
     for m, name in enumerate(case.measurements):
         if np.isfinite(errors[m]).sum(axis=1).max() < 3:

@@ -2,7 +2,7 @@ r"""Fit the share of points that survive interreflections, to renders of the ope
 
 Signal chain: open cases of matchers and of codes -> some views of each, captured once with every unknown at its best
 estimate, and decoded -> ideal points away from edges, with F of the map and rho, the ratio of interreflected to direct
-light (:mod:`mitsim.prediction.other_light`) -> which points were found within 1 % of their distance -> r and k of
+light (:mod:`mitsim.prediction.interreflections`) -> which points were found within 1 % of their distance -> r and k of
 
     P(found) = F / (1 + (rho / r)^k)
 
@@ -23,7 +23,7 @@ from scipy.optimize import minimize
 
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, Status
 from mitsim.prediction import Predictor, performance
-from mitsim.prediction.other_light import Loss, OtherLightEffect
+from mitsim.prediction.interreflections import InterreflectionEffect, Loss
 from mitsim.progress import say, track
 from mitsim.study import Study
 from mitsim.validation.part_cases import PartCase
@@ -74,7 +74,7 @@ def points_of_cases(cases: Sequence[PartCase], views: int) -> dict[str, dict[str
         if not isinstance(maker, RenderedMeasurements):
             continue
         say(f"case: {case.name}")
-        light, predictor = OtherLightEffect(study.sensor), maker.predictor.thinned(_STEP)
+        light, predictor = InterreflectionEffect(study.sensor), maker.predictor.thinned(_STEP)
         out[kind][case.name] = [
             seen_points(study, view, maker, light, predictor) for view in track(study.views[:views], "views", views)
         ]
@@ -82,7 +82,7 @@ def points_of_cases(cases: Sequence[PartCase], views: int) -> dict[str, dict[str
 
 
 def seen_points(
-    study: Study, view: View, maker: RenderedMeasurements, light: OtherLightEffect, predictor: Predictor
+    study: Study, view: View, maker: RenderedMeasurements, light: InterreflectionEffect, predictor: Predictor
 ) -> SeenPoints:
     """Return which points of a view are found, with F and rho of each."""
     assert study.performance_map is not None
@@ -151,7 +151,7 @@ def _most_likely(views: Sequence[SeenPoints], times: NDArray[Any]) -> Floats:
 
 
 def losses_document(command: str, cases: Sequence[str], losses: dict[str, Loss]) -> str:
-    """Return the data file of :func:`mitsim.prediction.other_light.losses` as TOML."""
+    """Return the data file of :func:`mitsim.prediction.interreflections.losses` as TOML."""
     lines = [
         "# Share of points g(rho) = 1 / (1 + (rho / half)^steepness) that are found if interreflected light is rho",
         "# times direct light: estimated from renders of open parts, with 95 % intervals from a bootstrap over cases",

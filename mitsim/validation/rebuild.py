@@ -228,16 +228,16 @@ def median_level(counts: NDArray[Any]) -> float:
     return float(level - 0.5 + (total[-1] / 2 - below) / counts[level])
 
 
-def projector_was_on(real: Capture, told: Literal["on", "off"] | None, where: str) -> bool:
-    """Return whether the projector was on: as ``told``, else as in the settings; codes and simulations need it on.
+def projector_was_on(real: Capture, given: Literal["on", "off"] | None, where: str) -> bool:
+    """Return whether the projector was on: as ``given``, else as in the settings; codes and simulations need it on.
 
     Raises
     ------
     InputError
         If the state is unknown for a pair that is matched by its texture.
     """
-    if told is not None:
-        return told == "on"
+    if given is not None:
+        return given == "on"
     known = real.settings.get("projector_on")
     if isinstance(known, bool):
         return known

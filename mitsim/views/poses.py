@@ -51,7 +51,7 @@ def write_poses(folder: str | Path, found: Candidates, table: ViewsTable, sensor
     write_folder(folder, {name: text.encode("utf-8") for name, text in files.items()}, overwrite=True)
 
 
-def tell_views(folder: str | Path, found: Candidates, table: ViewsTable, sensor: str) -> None:
+def write_views(folder: str | Path, found: Candidates, table: ViewsTable, sensor: str) -> None:
     """Write the poses, and report on stderr which views were moved or are impossible."""
     write_poses(folder, found, table, sensor)
     if found.moved_out:

@@ -16,7 +16,7 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.tasks.evaluation import InputQuantity
 from mitsim.calibration.accuracy import measured_points
 from mitsim.prediction import Effect, Predictor
-from mitsim.prediction.other_light import OtherLightEffect
+from mitsim.prediction.interreflections import InterreflectionEffect
 from mitsim.prediction.shared_errors import SharedErrors, independent_fields
 from mitsim.scene.ray_casting.self_view import sees_itself
 from mitsim.sensor.preset import Sensor
@@ -51,7 +51,7 @@ def effects_of(study: Study) -> list[Effect]:
     effects: list[Effect] = [shared_errors(study, study_unknowns(study))]
     depth = study.file.score.light_path_depth
     if depth > 1 and sees_itself(study.scene):
-        effects.append(OtherLightEffect(study.sensor, depth))
+        effects.append(InterreflectionEffect(study.sensor, depth))
     return effects
 
 

@@ -139,6 +139,7 @@ def main() -> None:
     backend.activate(None)
     given.output.parent.mkdir(parents=True, exist_ok=True)
     cells = json.loads(given.output.read_text()) if given.output.exists() else {}
+    print(HEAD)
     for name in given.sensors:
         sensor, known = load_sensor(name), PerformanceMap.load(shipped_maps()[name])
         distances = known.data["distance"].values
@@ -151,6 +152,12 @@ def main() -> None:
                 cells[key] = compared(one, simulated, distance, given.orientations, given.seed)
                 given.output.write_text(json.dumps(cells, indent=1))
             tell(key, cells[key])
+
+
+HEAD = (
+    "| sensor | finish | captures | time | F: off, rms | off, largest | within 0.05 | ceiling "
+    "| sigma: off, rms | off, mean | within 10 % | ceiling |\n" + "|---" * 12 + "|"
+)
 
 
 def tell(key: str, one: dict) -> None:

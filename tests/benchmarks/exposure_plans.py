@@ -10,7 +10,6 @@ the geometric mean of the seven measurements.
 
 import argparse
 import math
-import sys
 import time
 from pathlib import Path
 
@@ -37,15 +36,15 @@ def main() -> None:
     from mitsim.exposures.exposure_plan import PlanRules
     from mitsim.exposures.exposure_sweep import needed_shapes
     from mitsim.exposures.planned import exposure_in_words, plan_view
+    from mitsim.sensor.exposure import PlannedExposure
     from mitsim.study import StudyFile, open_study
     from mitsim.virtual.plan import measurements_of
     from mitsim.virtual.study_unknowns import study_unknowns
     from mitsim.virtual.world import Trial
 
-    print(f"{given.sensor}; {given.worlds} worlds")
     print(
-        "Ra    view  planned                                light  points own -> planned                "
-        "values own -> planned  errors  planned in"
+        "| sensor | Ra [um] | view | own | planned | light, planned over own | points, own to planned | values "
+        "| errors | planned in |\n" + "| --- " * 10 + "|"
     )
     for ra in given.ra:
         table = {"sensor": given.sensor, "parameters": {"pillar_Ra": ra, "plane_Ra": ra}}
@@ -74,15 +73,16 @@ def main() -> None:
                 for m in range(len(names))
                 if both[:, m].sum() >= 3
             ]
-            counts = [" ".join(f"{one:.0f}" for one in np.mean(points[planned], axis=0)) for planned in (False, True)]
-            values = [f"{100 * np.isfinite(one).mean():.0f} %" for one in (before, after)]
+            counts = [", ".join(f"{one:.0f}" for one in np.mean(points[planned], axis=0)) for planned in (False, True)]
+            values = [f"{100 * np.isfinite(one).mean():.0f}" for one in (before, after)]
             ratio = f"{math.exp(np.mean(np.log(ratios))):.2f} ({len(ratios)})" if ratios else "-"
             longer = plan.exposure.seconds / sum(own)
             print(
-                f"{ra:<5} {number:>4}  {exposure_in_words(plan.exposure):<37}  {longer:>5.2f}  {counts[0]:>17} -> "
-                f"{counts[1]:<17}  {values[0]:>10} -> {values[1]:<8}  {ratio:>9}  {seconds:.0f} s"
+                f"| {given.sensor} | {ra:g} | {number} | {exposure_in_words(PlannedExposure(own))} "
+                f"| {exposure_in_words(plan.exposure)} | {longer:.2f} | {counts[0]} to {counts[1]} "
+                f"| {values[0]} to {values[1]} % | {ratio} | {seconds:.0f} s |",
+                flush=True,
             )
-            sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -189,7 +189,8 @@ def stated_and_measured(
 def main(given: argparse.Namespace) -> None:
     """Print the table: of other poses, or of each calibration pose by the others."""
     print(
-        "| pose | quantity | predicted [mm] | 95 % interval | measured | | beyond the interval, with noise of draws |"
+        "| pose | quantity | predicted [mm] | 95 % interval | measured | verdict "
+        "| beyond the interval, with noise of draws |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- |")
     if given.in_turn:

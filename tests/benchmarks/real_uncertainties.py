@@ -40,6 +40,8 @@ from mitsim.sensor.roi import Roi
 
 Floats = NDArray[np.float64]
 PITCH, DRAWS = 18.75, 400
+#: last columns of the table of plates
+LAST = ["u [mm]", "95 % interval", "verdict"]
 #: recording, of the folder ``ensenso``, its own or the factory's calibration, preset whose unknowns are taken, window
 PLATES = (
     ("N10, left plate", "locate_multiple_patterns", True, "ensenso-n10", (110, 120, 200, 190)),
@@ -54,11 +56,19 @@ CELLS, DEGREE = (10, 20, 40), 3
 def main(data: Path) -> None:
     """Print both tables."""
     np.seterr(all="ignore")
-    print("| plate | pitch [mm] | error | stated u: dots, calibration, drift | u [mm] | 95 % interval of the pitch | |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
-    for name, folder, dynamic, preset, window in PLATES:
-        print(plate_row(name, data / "ensenso" / folder / "camera.zip", dynamic, preset, window), flush=True)
-    print("\n| plane | cell [px] | cells | scatter of their means [mm] | by the map | by the recording's sigma |")
+    plates = [
+        plate_cells(name, data / "ensenso" / folder / "camera.zip", dynamic, preset, window)
+        for name, folder, dynamic, preset, window in PLATES
+    ]
+    heads = list(dict.fromkeys(head for cells in plates for head in cells if head not in LAST))
+    heads += LAST
+    print("| " + " | ".join(heads) + " |\n" + "| --- " * len(heads) + "|")
+    for cells in plates:
+        print("| " + " | ".join(cells.get(head, "-") for head in heads) + " |")
+    print(
+        "\n| plane | cell [px] | cells | scatter [mm] | from the preset's map "
+        "| from the map's A and the recording's sigma |"
+    )
     print("| --- | --- | --- | --- | --- | --- |")
     sheet = read_ensenso(data / "ensenso" / "colorized_point_cloud" / "stereo.zip")
     settings, imager = decoder_settings(sheet)
@@ -72,8 +82,10 @@ def baseline(rig: Rig) -> Floats:
     return second.centre - first.centre
 
 
-def plate_row(name: str, path: Path, dynamic: bool, preset: str, window: tuple[int, int, int, int] | None) -> str:
-    """One plate: measured, and the interval stated without its print."""
+def plate_cells(
+    name: str, path: Path, dynamic: bool, preset: str, window: tuple[int, int, int, int] | None
+) -> dict[str, str]:
+    """One plate: measured, and the interval stated without its print; its parts in ppm."""
     capture = read_ensenso(path, dynamic=dynamic, frame=0)
     settings, imager = decoder_settings(capture)
     cloud = capture_cloud(capture, settings, imager=imager)
@@ -83,12 +95,17 @@ def plate_row(name: str, path: Path, dynamic: bool, preset: str, window: tuple[i
     parts = contributions(capture, preset, dots.centres)
     total = PITCH * float(np.sqrt(scatter**2 + sum(part**2 for part in parts.values())))
     pitch = scale * PITCH
-    told = ", ".join(f"{key} {1e6 * part:.0f}" for key, part in parts.items())
     low, high = pitch - 1.96 * total, pitch + 1.96 * total
-    return (
-        f"| {name} | {pitch:.3f} | {1e3 * (scale - 1):+.2f} per mille | dots {1e6 * scatter:.0f}, {told} ppm | "
-        f"{total:.3f} | {low:.3f} to {high:.3f} | {'holds' if low <= PITCH <= high else 'misses'} |"
-    )
+    return {
+        "plate": name,
+        "pitch [mm]": f"{pitch:.3f}",
+        "error": f"{1e3 * (scale - 1):+.2f} per mille",
+        "dots [ppm]": f"{1e6 * scatter:.0f}",
+        **{f"{key} [ppm]": f"{1e6 * part:.0f}" for key, part in parts.items()},
+        "u [mm]": f"{total:.3f}",
+        "95 % interval": f"{low:.3f} to {high:.3f}",
+        "verdict": "holds" if low <= PITCH <= high else "misses",
+    }
 
 
 def contributions(capture: Capture, preset: str, dots: Floats) -> dict[str, float]:

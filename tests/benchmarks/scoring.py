@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from mitsim.prediction import Predictor
-from mitsim.prediction.other_light import OtherLightEffect
+from mitsim.prediction.interreflections import InterreflectionEffect
 from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.study import MINIMUM_POINTS, CharacterisationTable, StudyFile, open_study
 from mitsim.view_scores import score_candidates
@@ -40,7 +40,7 @@ def main() -> None:
         predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
         for light, views, effects in (
             ("direct", study.views, []),
-            ("and reflected", study.views[::10], [OtherLightEffect(study.sensor)]),
+            ("and reflected", study.views[::10], [InterreflectionEffect(study.sensor)]),
         ):
             start = time.perf_counter()
             score_candidates(study.scene, study.task, views, predictor, study.performance_map, MINIMUM_POINTS, effects)

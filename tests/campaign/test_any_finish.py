@@ -21,7 +21,7 @@ from mitsim.campaign import answer, finish_cache, one_finish
 from mitsim.campaign.answer import Wanted, answering_map, distances_about, with_lights
 from mitsim.campaign.finish_cache import cache_folder, kept_finish
 from mitsim.campaign.one_finish import OneFinish, one_finish_campaign, plan_of
-from mitsim.choose import read_entrants
+from mitsim.choose import read_candidates
 from mitsim.commands.options import asking
 from mitsim.errors import InputError
 from mitsim.scene.load import load_scene, scene_from_dict
@@ -189,13 +189,13 @@ def test_sensors_that_compete_are_asked_for_once_allowed(scenes, quick, tmp_path
         study = study.replace(f'{name} = "', f'{name} = "{scenes}/two_pillars/')
     (tmp_path / "study.toml").write_text("parameters = { plane_Ra = 3.2 }\n" + study)
     questions = []
-    entrants, excluded = read_entrants(
+    candidates, excluded = read_candidates(
         tmp_path / "study.toml", ["ensenso-n10,kinect-v2"], lambda text: not questions.append(text)
     )
-    assert [one.name for one in entrants] == ["ensenso-n10", "kinect-v2"]
+    assert [one.name for one in candidates] == ["ensenso-n10", "kinect-v2"]
     assert not excluded
     assert [text.split(":")[0] for text in questions] == ["ensenso-n10", "kinect-v2"]
-    for one in entrants:
+    for one in candidates:
         finish = one.study.scene.finishes[one.study.scene.names.index("plane")]
         near = one.study.views[0].standoff
         known = one.study.performance_map.query(finish.name, 3.2, [near], AHEAD, finish.light)

@@ -11,7 +11,7 @@ from simulated_rigs import images_seen, surface_seen
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture_checks.rig_sanity import measured_row_error
-from mitsim.capture_checks.sanity import capture_findings, capture_warnings, cloud_warnings, row_error_told
+from mitsim.capture_checks.sanity import capture_findings, capture_warnings, cloud_warnings, row_error_in_words
 from mitsim.decode.matching.stereo import stereo_geometry
 from mitsim.reconstruction.cloud import capture_cloud
 from mitsim.sensor.camera import Camera, Rig
@@ -276,7 +276,7 @@ def test_rows_of_two_cameras_without_a_code_of_rows(name, off):
     turned = camera(60.0, (np.degrees(off / 260.0), -6.0, 0.0))
     capture = with_rig(taken(CODES[name], {"left": cameras["left"], "right": turned}), cameras)
     found = capture_findings(capture, PAIRED)
-    assert found.told == "by the texture of the surface"
+    assert found.row_error_source == "by the texture of the surface"
     assert abs(found.row_error - off) < 0.06 + 0.05 * abs(off)  # it grows toward the upper and lower end
     assert bool(found.warnings) == (abs(off) > 0.3)
 
@@ -286,8 +286,8 @@ def test_rows_of_a_blank_surface_are_not_known(noise):
     capture = taken(CODES["phases"], pair(), texture=0.0, noise=noise)
     found = capture_findings(capture, PAIRED)
     assert (found.warnings, np.isnan(found.row_error)) == ([], True)
-    assert "unknown; the code has no rows" in row_error_told(capture, PAIRED, found, float("nan"))
-    assert row_error_told(capture, SETTINGS, found, float("nan")) == ""
+    assert "unknown; the code has no rows" in row_error_in_words(capture, PAIRED, found, float("nan"))
+    assert row_error_in_words(capture, SETTINGS, found, float("nan")) == ""
 
 
 def test_a_calibration_of_another_pair():

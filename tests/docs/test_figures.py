@@ -12,6 +12,7 @@ sys.path.insert(0, str(ROOT / "docs" / "site"))
 from figures import check, selected
 from quoted import Figure, cells, compared, figures, holds_figures
 from quoted_numbers import same
+from quoted_tables import grouped, plain, row_of
 
 #: figures that take no longer are made in this test [s]
 QUICK = 5
@@ -19,12 +20,21 @@ QUICK = 5
 
 def quick(page: Path) -> list[Figure]:
     """Figures of a page that are made here: no recordings, a few seconds."""
-    return [one for one in selected(page, within=QUICK) if "$MITSIM_REAL_DATA" not in one.told]
+    return [one for one in selected(page, within=QUICK) if "$MITSIM_REAL_DATA" not in one.source]
 
 
 @by_page
 def test_every_output_picture_and_table_of_figures_says_where_it_comes_from(page):
     assert [f"{one.where}: {one.kind}" for one in figures(page) if not one.marker] == []
+
+
+@by_page
+def test_names_of_columns_and_rows_are_those_of_the_table(page):
+    for one in (one for one in figures(page) if one.kind == "table"):
+        heads = grouped(row_of(one.text[0]))
+        known = {plain(head) for head in heads} | {f"({at})" for at in range(1, len(heads) + 1)}
+        assert set(one.columns) <= known, one.where
+        assert set(one.rows) <= {plain(cell) for row in one.text[2:] for cell in row_of(row)}, one.where
 
 
 @by_page
@@ -38,12 +48,12 @@ def test_every_fence_has_a_language(page):
 @by_page
 def test_commands_and_tests_that_markers_name_exist(page):
     for one in figures(page):
-        assert one.told
+        assert one.source
         if one.marker == "made by":
             assert one.seconds > 0, f"{one.where}: say how long it takes"
         if one.marker == "held by":
-            assert page.name in (ROOT / one.told).read_text(encoding="utf-8"), one.told
-        commands = [one.told] if one.marker == "made by" else re.findall(r"`([^`]+)`", one.told)
+            assert page.name in (ROOT / one.source).read_text(encoding="utf-8"), one.source
+        commands = [one.source] if one.marker == "made by" else re.findall(r"`([^`]+)`", one.source)
         for command in commands:
             for call in re.split(r"&&|;|\bdo\b|\(", command):
                 check_call(call)
@@ -61,7 +71,7 @@ def test_figures_that_are_made_in_seconds_are_those_of_the_commands(page):
 def test_quick_figures_are_few_and_not_none():
     every = [one for page in PAGES for one in quick(page)]
     assert len(every) >= 3
-    assert sum({one.told: one.seconds for one in every}.values()) <= 20
+    assert sum({one.source: one.seconds for one in every}.values()) <= 20
 
 
 @pytest.mark.parametrize(
@@ -140,7 +150,7 @@ def test_names_of_a_table_stand_before_it_and_hold_for_it_alone(tmp_path):
     first, second = figures(page)
     assert (first.columns, first.rows) == ({"b": "other", "c": "D & E"}, {"c": "all"})
     assert (second.columns, second.rows) == ({}, {})
-    assert first.told == second.told == "mitsim decode a"
+    assert first.source == second.source == "mitsim decode a"
 
 
 def test_a_marker_is_needed_by_outputs_tables_and_pictures_alone(tmp_path):

@@ -98,6 +98,16 @@ def test_columns_by_others_or_of_words_alone_and_text_in_backticks_are_not_compa
     assert len(table_faults(quoted.splitlines(), PRINTED)) == 1
 
 
+def test_a_row_can_have_another_column():
+    printed = "| quantity | simulated | difference | u |\n|---|---|---|---|\n"
+    printed += "| levels | - | 31 | 12 |\n| F | 0.9 | 0.1 | 0.2 |"
+    quoted = "| | simulated, u |\n|---|---|\n| grey levels | 31, u 12 |\n| F | 0.9, u 0.2 |"
+    columns = names_of("simulated, u = simulated & u")
+    rows = names_of("grey levels = levels with difference for simulated")
+    assert table_faults(quoted.splitlines(), printed, columns, rows) == []
+    assert len(table_faults(quoted.splitlines(), printed, columns, names_of("grey levels = levels"))) == 1
+
+
 GROUPED = """### Sealed parts
 
 | sensor | parts | recall: map | once | rank: map | once |

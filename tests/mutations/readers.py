@@ -317,10 +317,10 @@ def _read_patches(path):
     overall(table), joined([table, table])
 
 
-def _read_stand(path):
-    from mitsim.report.stand import read_stand
+def _read_scene_geometry(path):
+    from mitsim.report.scene_geometry import read_scene_geometry
 
-    read_stand(path.parent)
+    read_scene_geometry(path.parent)
 
 
 def _choice(folder):
@@ -470,7 +470,7 @@ READERS: dict[str, Reader] = {
     "capture.json": Reader(_run_folder("captures/view_0004/capture.json"), _capture),
     "calibration.json of a capture": Reader(_run_folder("captures/view_0004/calibration.json"), _capture),
     "patches.npy": Reader(_patches, _read_patches),
-    "stand.npz": Reader(_run_folder("stand.npz"), _read_stand),
+    "stand.npz": Reader(_run_folder("stand.npz"), _read_scene_geometry),
     "choice.json": Reader(_choice, _read_choice),
     "trials": Reader(_trials, _read_trials),
     "plan of many": Reader(_plan_of_many, _read_many),

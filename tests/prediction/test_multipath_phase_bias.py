@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mitsim.prediction import Ideal, Predictor
+from mitsim.prediction.interreflections import InterreflectionEffect
 from mitsim.prediction.multipath_phase_bias import WINDOW_PX, amplitude, finest_fringe, fringes, phase_bias
-from mitsim.prediction.other_light import OtherLightEffect
 from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.backend import activate
 from mitsim.scene.load import scene_from_dict
@@ -117,7 +117,7 @@ def test_the_amplitude_of_the_fringes_has_their_phase(david, axis):
 def test_a_sensor_without_fringes_has_none():
     n10 = load_sensor("ensenso-n10")
     assert finest_fringe(n10) is None and len(fringes(n10)) == 0
-    assert OtherLightEffect(n10).light.count == 1
+    assert InterreflectionEffect(n10).light.count == 1
 
 
 def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david):
@@ -142,7 +142,7 @@ def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david):
     high = world[:, 2]
     strip = (ideal.shape == 1) & (np.abs(world[:, 0]) < 4) & (high > 1) & (high < 11)
 
-    light = OtherLightEffect(david, paths=3_000_000, photons=6_000_000).look(scene, pose).at(ideal.point)
+    light = InterreflectionEffect(david, paths=3_000_000, photons=6_000_000).look(scene, pose).at(ideal.point)
     predicted = finest_fringe(david).range_bias(light.displaced, ideal)
     around = pose.inverse().points(np.array([[x, 30, z] for x in (-5.0, 5) for z in (0.0, 12)]))
     noise = Noise(**dict.fromkeys(Noise.__dataclass_fields__, False))

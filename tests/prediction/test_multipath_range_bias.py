@@ -8,9 +8,9 @@ import pytest
 
 from characterisation.point_cloud import Status
 from mitsim.prediction import Ideal, Predictor
+from mitsim.prediction.interreflections import InterreflectionEffect
 from mitsim.prediction.multipath_range_bias import path_amplitudes, path_bias, range_bias
-from mitsim.prediction.other_light import OtherLightEffect
-from mitsim.prediction.perturbation import LookedAt
+from mitsim.prediction.perturbation import SceneView
 from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.backend import activate
 from mitsim.scene.load import scene_from_dict
@@ -109,7 +109,7 @@ def test_a_white_corner_is_lengthened_as_the_full_render_is(kinect):
     predictor = Predictor.of_sensor(kinect, geometry)
     surfaces = predictor.surfaces(scene, pose)
     ideal = predictor.ideal(surfaces)
-    predicted = OtherLightEffect(kinect)(LookedAt(scene, pose, surfaces, ideal)).displaced
+    predicted = InterreflectionEffect(kinect)(SceneView(scene, pose, surfaces, ideal)).displaced
     noise = Noise(**dict.fromkeys(Noise.__dataclass_fields__, False))
     sensor = replace(kinect, pattern=kinect.pattern.model_copy(update={"delay_pattern_mm": 0.0}))
     around = pose.inverse().points(np.array([[x, y, z] for x in (-60.0, 60) for y in (0, 150) for z in (0.0, 60)]))

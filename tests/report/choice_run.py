@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .conftest import FEATURES, statement_of, write_stand
+from .conftest import FEATURES, statement_of, write_scene_geometry
 
 HOSTILE_NAME = "radius <i>& co"
 NAMES = ("distance_of_the_pillars", HOSTILE_NAME, "angle_of_pillar_to_plane")
@@ -85,5 +85,5 @@ def write_choice(folder: Path) -> Path:
     (folder / "choice.json").write_text(json.dumps(choice()), encoding="utf-8")
     (folder / "sensor-a-of-a-long-name").mkdir()
     (folder / "sensor-a-of-a-long-name" / "statement.json").write_text(json.dumps(statement_of(3)), encoding="utf-8")
-    write_stand(folder)
+    write_scene_geometry(folder)
     return folder

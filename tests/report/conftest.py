@@ -171,7 +171,7 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
         "a key of later": 1,
     }
     (folder / "run.json").write_text(json.dumps(about), encoding="utf-8")
-    write_stand(folder)
+    write_scene_geometry(folder)
     if checked:
         (folder / "statement.json").write_text(json.dumps(statement_of(checked[1])), encoding="utf-8")
     return folder
@@ -194,7 +194,7 @@ DECISION = {
 }
 
 
-def write_stand(folder: Path) -> None:
+def write_scene_geometry(folder: Path) -> None:
     """A plate and a block on it, and two eyes that look along z, as mitsim run leaves them."""
     plate = trimesh.creation.box((240, 240, 1)).triangles
     block = trimesh.creation.box((60, 60, 80), trimesh.transformations.translation_matrix([0, 40, 40])).triangles

@@ -21,7 +21,7 @@ from mitsim.capture.grey_image import read_grey
 from mitsim.recordings.image_folder import counted
 from mitsim.recordings.ply import decode_ply
 from mitsim.report.choice_page import write_choice_page
-from mitsim.report.stand import read_stand
+from mitsim.report.scene_geometry import read_scene_geometry
 from mitsim.scene.xml_check import checked_xml
 from mitsim.sensor.calibration_tree import read_tree
 from mitsim.surface.measured import read_height_map, read_profile
@@ -233,14 +233,14 @@ def test_a_choice_whose_cells_do_not_belong_is_refused(tmp_path):
 def test_a_stand_that_is_damaged_or_swells_is_refused(tmp_path):
     folder = write_choice(tmp_path / "c")
     sound = (folder / "stand.npz").read_bytes()
-    assert read_stand(folder) is not None
+    assert read_scene_geometry(folder) is not None
     for place in range(0, len(sound), 7):
         (folder / "stand.npz").write_bytes(sound[:place] + bytes([sound[place] ^ 16]) + sound[place + 1 :])
         with contextlib.suppress(InputError):
-            read_stand(folder)
+            read_scene_geometry(folder)
     with zipfile.ZipFile(folder / "stand.npz", "w", zipfile.ZIP_DEFLATED) as packed:
         packed.writestr("corners.npy", bytes(300 << 20))
-    refused(read_stand, folder, match="unpacked")
+    refused(read_scene_geometry, folder, match="unpacked")
 
 
 def test_a_mesh_whose_vertices_have_two_numbers_is_refused(tmp_path):

@@ -128,7 +128,7 @@ def parameters(smoothing: bool = False) -> list[Parameter]:
 
 
 def standard_errors(seed: int, draws: int = 3) -> tuple[DotsFit, dict[str, float]]:
-    """Fit one unit; errors of all numbers that were told, in the file's units, over their standard uncertainties."""
+    """Fit one unit; errors of all determined numbers, in the file's units, over their standard uncertainties."""
     truth = unit(seed)
     # which dots the unit has is not known to the fit: another draw of them each time
     other = small_sensor().pattern.model_copy(update={"seed": 50_000 + 37 * seed})

@@ -1,4 +1,4 @@
-"""mitsim fit sensor from the shell's side: a file that loads, a table, what is not told, and errors as messages."""
+"""mitsim fit sensor from the shell's side: a file that loads, a table, undetermined numbers, and errors as messages."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_every_preset_takes_fitted_numbers_and_is_a_sensor_again(name, tmp_path)
     for camera, other in zip(sensor.rig.cameras.values(), again.rig.cameras.values(), strict=True):
         np.testing.assert_allclose(other.matrix, camera.matrix, rtol=1e-8)
         np.testing.assert_allclose(other.sensor_from_camera.matrix(), camera.sensor_from_camera.matrix(), atol=1e-6)
-    assert again.imager.full_well == sensor.imager.full_well  # what was not told is as it was
+    assert again.imager.full_well == sensor.imager.full_well  # what is not determined is as it was
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ def test_a_linear_model_is_solved_as_weighted_least_squares_are():
     normal = A.T @ weight @ A
     np.testing.assert_allclose(found.values, np.linalg.solve(normal, A.T @ weight @ seen), rtol=1e-3)
     np.testing.assert_allclose(found.covariance, np.linalg.inv(normal), rtol=1e-3)
-    assert found.told.all() and found.freedom == 1
+    assert found.determined.all() and found.freedom == 1
 
 
 def test_a_bound_holds_a_parameter():
@@ -42,7 +42,7 @@ def test_what_no_figure_shows_is_not_told():
         Prior(np.zeros(2), np.ones(2), np.full(2, 0.1), np.full(2, -9.0), np.full(2, 9.0)),
         1,
     )
-    assert found.told.tolist() == [True, False] and abs(found.values[1]) < 1e-9
+    assert found.determined.tolist() == [True, False] and abs(found.values[1]) < 1e-9
 
 
 def test_captures_that_differ_beyond_their_uncertainty_are_less_sure_together():

@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 
 from characterisation.documents import read_toml
 from mitsim.cli import app
-from mitsim.prediction.other_light import Loss, Losses, losses
+from mitsim.prediction.interreflections import Loss, Losses, losses
 from mitsim.validation.loss_fit import SeenPoints, fitted_loss, losses_document
 
 HALF, STEEPNESS = 1.8, 1.5
@@ -34,7 +34,7 @@ def test_drawn_points_give_the_constants_back_within_their_intervals():
     assert found.half == pytest.approx(HALF, rel=0.25) and found.steepness == pytest.approx(STEEPNESS, rel=0.25)
 
 
-def test_points_without_other_light_tell_nothing():
+def test_points_without_interreflections_do_not_enter_the_fit():
     none = SeenPoints(np.ones(10), np.zeros(10), np.ones(10, bool))
     with pytest.raises(ValueError, match="no points"):
         fitted_loss([[none]])

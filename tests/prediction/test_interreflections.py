@@ -8,8 +8,8 @@ import pytest
 
 from characterisation.point_cloud import Status
 from mitsim.prediction import Predictor
-from mitsim.prediction.other_light import Loss, OtherLightEffect, found_share
-from mitsim.prediction.perturbation import LookedAt
+from mitsim.prediction.interreflections import InterreflectionEffect, Loss, found_share
+from mitsim.prediction.perturbation import SceneView
 from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.sensor.preset import load_sensor
@@ -31,7 +31,7 @@ def test_a_surface_that_faces_nothing_has_none(n10):
     )
     pose = look_at([0, 0, 600], [0, 0, 0], [0, 1, 0])
     places = pose.inverse().points(np.array([[0.0, 0, 0], [50, 20, 0], [-60, -40, 0]]))
-    light = OtherLightEffect(n10).look(plate, pose).at(places)
+    light = InterreflectionEffect(n10).look(plate, pose).at(places)
     np.testing.assert_array_equal(light.rho, 0)
     assert not light.displaced.any()
 
@@ -56,7 +56,7 @@ def test_in_a_sphere_the_second_surface_adds_the_same_everywhere(n10):
     projector = replace(n10.projector, corner_illumination=1.0, black_level=0.0)
     assert not projector.optics.distortion.any()  # so that the flux of the frame is all that is sent
     sensor = replace(n10, rig=replace(n10.rig, projector=projector.optics), projector=projector)
-    effect = OtherLightEffect(sensor, paths=1_500_000)
+    effect = InterreflectionEffect(sensor, paths=1_500_000)
     camera = n10.rig.reference
     column, row = np.meshgrid(np.arange(230, 530, 5.0), np.arange(120, 360, 5.0))
     rays = camera.rays(np.stack([column, row], axis=-1).reshape(-1, 2)) @ camera.sensor_from_camera.rotation.T
@@ -80,7 +80,7 @@ def test_coarse_and_cheap_it_is_what_the_full_render_shows(n10, scenes):
     scene = load_scene(scenes / "two_pillars/matt_white.xml", n10.wavelength_nm)
     pose = look_at([0, -400, 350], [0, 0, 20], [0, 0, 1])
     sensor, camera = SimulatedSensor(n10), n10.rig.reference
-    sensor.patterns = OtherLightEffect(n10).light
+    sensor.patterns = InterreflectionEffect(n10).light
     name = next(iter(n10.rig.cameras))
     direct, both = (
         sensor.radiance(scene, pose, name, Rendering(samples=16, depth=depth), seed=3)[0].astype(float)
@@ -93,7 +93,7 @@ def test_coarse_and_cheap_it_is_what_the_full_render_shows(n10, scenes):
         (both[r - 2 : r + 3, c - 2 : c + 3].sum() / direct[r - 2 : r + 3, c - 2 : c + 3].sum() - 1)
         for r, c in zip(row, column, strict=True)
     ]
-    found = OtherLightEffect(n10, paths=1_500_000).look(scene, pose).at(points).rho
+    found = InterreflectionEffect(n10, paths=1_500_000).look(scene, pose).at(points).rho
     seen = np.isfinite(found) & np.isfinite(known)
     assert seen.mean() > 0.9
     assert 0.02 < np.median(np.array(known)[seen]) < 0.3
@@ -115,7 +115,7 @@ def test_beside_a_wall_points_are_noisier_and_fewer_and_codes_are_pulled(name):
     predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor)).thinned(4)
     surfaces = predictor.surfaces(scene, pose)
     ideal = predictor.ideal(surfaces)
-    found = OtherLightEffect(sensor)(LookedAt(scene, pose, surfaces, ideal))
+    found = InterreflectionEffect(sensor)(SceneView(scene, pose, surfaces, ideal))
     world = pose.points(ideal.point)
     plate = (ideal.shape == 0) & (ideal.status == Status.VALID) & (np.abs(world[:, 0]) < 80)
     beside, far = plate & (world[:, 1] > 65) & (world[:, 1] < 95), plate & (world[:, 1] < -60)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from mitsim.report.stand import read_stand
-from mitsim.report.stand_figure import depth_buffer, face_verdicts, spread, stand_figure
+from mitsim.report.placement_figure import depth_buffer, face_verdicts, placement_figure, spread
+from mitsim.report.scene_geometry import read_scene_geometry
 
-from .conftest import write_stand
+from .conftest import write_scene_geometry
 
 
 def test_the_nearer_triangle_hides_the_farther():
@@ -31,11 +31,11 @@ def test_labels_stand_apart_and_are_moved_least():
 
 
 def test_no_writing_of_the_picture_overlaps_other_writing(tmp_path):
-    write_stand(tmp_path)
-    stand = read_stand(tmp_path)
+    write_scene_geometry(tmp_path)
+    geometry = read_scene_geometry(tmp_path)
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = 500.0
-    figure = stand_figure(stand, [("view 3", pose)], dict.fromkeys(stand.names, "fits"))
+    figure = placement_figure(geometry, [("view 3", pose)], dict.fromkeys(geometry.names, "fits"))
     drawn = FigureCanvasAgg(figure).get_renderer()
     FigureCanvasAgg(figure).draw()
     texts = [one for axes in figure.axes for one in axes.texts] + list(figure.legends[0].get_texts())

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from characterisation.documents import Document, read_toml
 from mitsim.prediction.multipath_phase_bias import amplitude, finest_fringe, fringes, phase_bias
 from mitsim.prediction.multipath_range_bias import path_amplitudes, path_bias, range_bias
-from mitsim.prediction.perturbation import LookedAt, Perturbation
+from mitsim.prediction.perturbation import Perturbation, SceneView
 from mitsim.scene.light_transport.projector_light import LitPatterns, ModulatedLight
 from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import Scene
@@ -87,11 +87,11 @@ class Losses(Document):
 @cache
 def losses() -> Losses:
     """Return the constants of g(rho) that come with mitsim."""
-    return read_toml(str(files("mitsim.prediction") / "other_light.toml"), Losses)
+    return read_toml(str(files("mitsim.prediction") / "interreflections.toml"), Losses)
 
 
 @dataclass(frozen=True)
-class OtherLight:
+class Interreflections:
     """Interreflections at n points: ``rho`` (n,) relative to direct light, NaN without direct light.
 
     ``displaced`` (n,) is the bias of a phase code [rad] or of a path [mm], ``scattered`` (n,) the standard deviation
@@ -105,13 +105,13 @@ class OtherLight:
 
 
 @dataclass(frozen=True)
-class OtherLightImage:
-    """:class:`OtherLight` of every pixel of a ``camera``, (4, H, W) in the order of its fields."""
+class InterreflectionImage:
+    """:class:`Interreflections` of every pixel of a ``camera``, (4, H, W) in the order of its fields."""
 
     camera: Camera
     values: Floats
 
-    def at(self, points: NDArray[np.floating]) -> OtherLight:
+    def at(self, points: NDArray[np.floating]) -> Interreflections:
         """Return the values of the pixels that show points (n, 3) of the sensor frame.
 
         Points outside the image have rho NaN, and 0 for the other values.
@@ -120,10 +120,10 @@ class OtherLightImage:
         column, row = np.rint(places).astype(int).T
         inside = (column >= 0) & (row >= 0) & (column < self.camera.width) & (row < self.camera.height)
         rho, *others = self.values[:, np.where(inside, row, 0), np.where(inside, column, 0)]
-        return OtherLight(np.where(inside, rho, np.nan), *(np.where(inside, one, 0.0) for one in others))
+        return Interreflections(np.where(inside, rho, np.nan), *(np.where(inside, one, 0.0) for one in others))
 
 
-class OtherLightEffect:
+class InterreflectionEffect:
     """Interreflections over up to ``depth`` surfaces for a sensor, prepared for any number of views of any scene.
 
     ``paths`` of the camera and ``photons`` are numbers per render.
@@ -143,7 +143,7 @@ class OtherLightEffect:
         self.middles = PixelRays.of_camera(self.coarse)
         self.light = _light(sensor)
 
-    def __call__(self, view: LookedAt) -> Perturbation:
+    def __call__(self, view: SceneView) -> Perturbation:
         """Return the perturbation of the ideal points of a view."""
         found = self.look(view.scene, view.world_from_sensor).at(view.ideal.point)
         rho = np.where(np.isfinite(found.rho), found.rho, 0.0)
@@ -154,15 +154,15 @@ class OtherLightEffect:
         kept, displaced, scattered = found_share(rho, losses().coded), nothing.displaced, nothing.scattered
         if isinstance(self.sensor.pattern, AmplitudeModulation):
             kept = 1.0 - found.rejected
-            lamp = self.sensor.projector.optics.centre
-            displaced = range_bias(found.displaced, lamp, view.ideal)
+            light_source = self.sensor.projector.optics.centre
+            displaced = range_bias(found.displaced, light_source, view.ideal)
         elif self.fringe is not None:
             displaced, scattered = (
                 self.fringe.range_bias(phase, view.ideal) for phase in (found.displaced, found.scattered)
             )
         return Perturbation(kept, np.sqrt(1 + rho), displaced, np.abs(scattered), nothing.shared)
 
-    def look(self, scene: Scene, world_from_sensor: Transform, seed: int = 1) -> OtherLightImage:
+    def look(self, scene: Scene, world_from_sensor: Transform, seed: int = 1) -> InterreflectionImage:
         """Render the interreflections in a view."""
         given = scene, self.rays, self.light, world_from_sensor
         shape = shapes_met(scene, self.middles, world_from_sensor)
@@ -200,7 +200,7 @@ class OtherLightEffect:
         elif self.fringe is not None:
             one, *two = (amplitude(images[1:]) for images in (direct, *later))
             displaced, scattered = phase_bias(one, (two[0], two[1]), shape, self.step)
-        return OtherLightImage(self.coarse, np.stack([rho, displaced, scattered, rejected]))
+        return InterreflectionImage(self.coarse, np.stack([rho, displaced, scattered, rejected]))
 
     def _levels(self) -> float | Floats:
         """Return grey levels per radiance [DN / (W mm^-2 sr^-1)] in the shortest exposure, for each pixel (H, W)."""

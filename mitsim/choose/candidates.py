@@ -24,7 +24,7 @@ ALL_PRESETS = "all"
 
 
 @dataclass(frozen=True)
-class Entrant:
+class CandidateSensor:
     """A sensor to compare: its ``name`` in the table, the ``given`` text of the user, and the ``study`` for it."""
 
     name: str
@@ -41,9 +41,9 @@ class Excluded:
     why: str
 
 
-def read_entrants(
+def read_candidates(
     path: str | Path, sensors: Sequence[str], ask: Ask | None = None
-) -> tuple[list[Entrant], list[Excluded]]:
+) -> tuple[list[CandidateSensor], list[Excluded]]:
     """Open a study for each of the sensors.
 
     Parameters
@@ -61,20 +61,20 @@ def read_entrants(
     """
     path = Path(path)
     file = read_toml(path, StudyFile)
-    entrants, excluded = list[Entrant](), list[Excluded]()
+    candidates, excluded = list[CandidateSensor](), list[Excluded]()
     for given in _each(sensors):
         opened = _open(path, file, given, ask)
         if isinstance(opened, Excluded):
             excluded.append(opened)
             continue
-        if opened.name in {one.name for one in entrants}:
+        if opened.name in {one.name for one in candidates}:
             raise InputError("--sensors", "", f"{opened.name} twice", "sensors of different names")
-        entrants.append(opened)
-    if not entrants:
+        candidates.append(opened)
+    if not candidates:
         raise InputError(
             "--sensors", "", "; ".join(one.why for one in excluded), "at least one sensor that can measure the study"
         )
-    return entrants, excluded
+    return candidates, excluded
 
 
 def _each(sensors: Sequence[str]) -> list[str]:
@@ -88,7 +88,7 @@ def _each(sensors: Sequence[str]) -> list[str]:
     return out
 
 
-def _open(path: Path, file: StudyFile, given: str, ask: Ask | None) -> Entrant | Excluded:
+def _open(path: Path, file: StudyFile, given: str, ask: Ask | None) -> CandidateSensor | Excluded:
     sensor, _, map_name = given.partition("=")
     own = sensor.endswith(".toml")
     if not own and sensor not in presets():
@@ -114,7 +114,7 @@ def _open(path: Path, file: StudyFile, given: str, ask: Ask | None) -> Entrant |
     if study.performance_map is None:
         why = "its study has a campaign instead of a map: run it, and give its map as SENSOR=MAP"
         return Excluded(study.sensor.name, given, why)
-    return Entrant(study.sensor.name, given, replace(study, path=path))
+    return CandidateSensor(study.sensor.name, given, replace(study, path=path))
 
 
 def _has_distance(file: StudyFile) -> bool:

@@ -23,7 +23,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
-from mitsim.report.stand import Stand
+from mitsim.report.scene_geometry import SceneGeometry
 from mitsim.report.style import INK, MUTED, PAPER, drawing
 
 Floats = NDArray[np.float64]
@@ -65,40 +65,42 @@ def face_verdicts(measurements: Mapping[str, tuple[Sequence[str], str]]) -> dict
     return out
 
 
-def stand_figure(stand: Stand, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]) -> Figure:
+def placement_figure(
+    geometry: SceneGeometry, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]
+) -> Figure:
     """Draw a part with a sensor at each of ``poses`` (label, (4, 4) part_from_sensor) and its verdicts.
 
     The first sensor is drawn in full.
     """
     with drawing():
         figure = Figure(_SIZE_IN)
-    draw_stand(figure, stand, poses, verdicts)
+    draw_placement(figure, geometry, poses, verdicts)
     return figure
 
 
-def draw_stand(
-    figure: FigureBase, stand: Stand, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]
+def draw_placement(
+    figure: FigureBase, geometry: SceneGeometry, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]
 ) -> None:
-    """Draw into a figure or subfigure, about 1.9 times as wide as high; see :func:`stand_figure`."""
+    """Draw into a figure or subfigure, about 1.9 times as wide as high; see :func:`placement_figure`."""
     matrices = [np.asarray(pose, float) for _, pose in poses]
     with drawing():
-        middle = _middle(stand)
+        middle = _middle(geometry)
         turn = _viewpoint(matrices[0], middle)
-        flat, depth = _projected(stand.corners - middle, turn)
+        flat, depth = _projected(geometry.corners - middle, turn)
         whole, near = figure.add_axes((0.0, 0.09, 0.46, 0.91)), figure.add_axes((0.46, 0.09, 0.54, 0.91))
         for axes in (whole, near):
-            _part(axes, stand, flat, depth, turn, verdicts)
+            _part(axes, geometry, flat, depth, turn, verdicts)
             axes.set_aspect("equal")
             axes.set_axis_off()
         for number in reversed(range(len(poses))):
-            _sensor(whole, stand, matrices[number], middle, turn, poses[number][0], number == 0)
+            _sensor(whole, geometry, matrices[number], middle, turn, poses[number][0], number == 0)
         whole.margins(0.04, 0.1)
-        _labels(near, stand, flat, depth, verdicts)
+        _labels(near, geometry, flat, depth, verdicts)
         _legend(figure, verdicts)
 
 
-def _middle(stand: Stand) -> Floats:
-    points = stand.corners.reshape(-1, 3)
+def _middle(geometry: SceneGeometry) -> Floats:
+    points = geometry.corners.reshape(-1, 3)
     return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
@@ -121,21 +123,23 @@ def _projected(points: Floats, turn: Floats) -> tuple[Floats, Floats]:
     return np.asarray(seen[..., :2]), np.asarray(seen[..., 2])
 
 
-def _part(axes: Axes, stand: Stand, flat: Floats, depth: Floats, turn: Floats, verdicts: Mapping[str, str]) -> None:
+def _part(
+    axes: Axes, geometry: SceneGeometry, flat: Floats, depth: Floats, turn: Floats, verdicts: Mapping[str, str]
+) -> None:
     low, high = flat.reshape(-1, 2).min(axis=0), flat.reshape(-1, 2).max(axis=0)
     scale = _PIXELS / max(float((high - low).max()), 1e-9)
     index, _ = depth_buffer((flat - low) * scale, depth, tuple(np.ceil((high - low) * scale).astype(int) + 1))
-    colours = np.array([to_rgb(VERDICTS.get(verdicts.get(name, ""), _NOT_ASKED)) for name in stand.names])
-    normal = np.cross(stand.corners[:, 1] - stand.corners[:, 0], stand.corners[:, 2] - stand.corners[:, 0])
+    colours = np.array([to_rgb(VERDICTS.get(verdicts.get(name, ""), _NOT_ASKED)) for name in geometry.names])
+    normal = np.cross(geometry.corners[:, 1] - geometry.corners[:, 0], geometry.corners[:, 2] - geometry.corners[:, 0])
     length = np.linalg.norm(normal, axis=1)
     facing = np.abs(normal @ (turn.T @ np.array([-0.35, 0.45, 0.82]))) / np.where(length > 0, length, 1.0)
     shade = 0.5 + 0.5 * np.clip(facing, 0, 1)
     picture = np.zeros((*index.shape, 4))
     hit = index >= 0
-    picture[hit, :3] = colours[stand.shape[index[hit]]] * shade[index[hit], None]
+    picture[hit, :3] = colours[geometry.shape[index[hit]]] * shade[index[hit], None]
     picture[hit, 3] = 1.0
     # dark lines between shapes
-    shown = np.where(hit, stand.shape[np.maximum(index, 0)], -1)
+    shown = np.where(hit, geometry.shape[np.maximum(index, 0)], -1)
     edge = np.zeros_like(hit)
     edge[:-1] |= shown[:-1] != shown[1:]
     edge[:, :-1] |= shown[:, :-1] != shown[:, 1:]
@@ -178,7 +182,7 @@ def depth_buffer(places: Floats, depth: Floats, size: tuple[int, ...]) -> tuple[
 
 def _sensor(
     axes: Axes,
-    stand: Stand,
+    geometry: SceneGeometry,
     part_from_sensor: Floats,
     middle: Floats,
     turn: Floats,
@@ -189,8 +193,8 @@ def _sensor(
 
     A view that is not ``strong`` is drawn as its axis alone.
     """
-    centres = stand.centres @ part_from_sensor[:3, :3].T + part_from_sensor[:3, 3] - middle
-    rays = stand.rays[0] @ part_from_sensor[:3, :3].T
+    centres = geometry.centres @ part_from_sensor[:3, :3].T + part_from_sensor[:3, 3] - middle
+    rays = geometry.rays[0] @ part_from_sensor[:3, :3].T
     axis = rays.mean(axis=0)
     reach = -(centres[0] @ axis) / (rays @ axis)
     ends = centres[0] + rays * reach[:, None]
@@ -223,14 +227,14 @@ def _sensor(
     )
 
 
-def _labels(axes: Axes, stand: Stand, flat: Floats, depth: Floats, verdicts: Mapping[str, str]) -> None:
+def _labels(axes: Axes, geometry: SceneGeometry, flat: Floats, depth: Floats, verdicts: Mapping[str, str]) -> None:
     """Draw the names of the measured features in columns left and right of the part, with lines that do not cross."""
     low, high = flat.reshape(-1, 2).min(axis=0), flat.reshape(-1, 2).max(axis=0)
     scale = 240 / max(float((high - low).max()), 1e-9)
     index, _ = depth_buffer((flat - low) * scale, depth, tuple(np.ceil((high - low) * scale).astype(int) + 1))
-    shown = np.where(index >= 0, stand.shape[np.maximum(index, 0)], -1)
+    shown = np.where(index >= 0, geometry.shape[np.maximum(index, 0)], -1)
     places = {}
-    for number, name in enumerate(stand.names):
+    for number, name in enumerate(geometry.names):
         if name in verdicts and (shown == number).any():
             inside = distance_transform_edt(np.pad(shown == number, 1))[1:-1, 1:-1]
             row, column = np.unravel_index(

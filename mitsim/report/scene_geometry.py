@@ -1,7 +1,7 @@
 """Store what a picture of the part with its sensor needs beside the poses: faces by shape, and the sensor's eyes.
 
 Signal chain: scene and sensor -> ``stand.npz``: triangles of every shape, centres of the eyes and the rays through the
-corners of their images -> read again for the picture (:mod:`mitsim.report.stand_figure`).
+corners of their images -> read again for the picture (:mod:`mitsim.report.placement_figure`).
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from mitsim.sensor.working_volume import eyes_of
 Floats = NDArray[np.float64]
 
 #: name of the file in a run's folder
-STAND = "stand.npz"
+GEOMETRY_FILE = "stand.npz"
 
 
 @dataclass(frozen=True)
-class Stand:
+class SceneGeometry:
     """A part and the eyes of a sensor.
 
     ``corners`` (n, 3, 3) of triangles [mm], part frame; ``shape`` (n,) index into ``names``. For every eye, the
@@ -45,7 +45,7 @@ class Stand:
     reach: tuple[float, float]
 
 
-def write_stand(folder: Path, scene: Scene, sensor: Sensor) -> None:
+def write_scene_geometry(folder: Path, scene: Scene, sensor: Sensor) -> None:
     """Write ``stand.npz`` atomically into a folder."""
     parts = triangles_by_shape(scene)
     eyes = list(eyes_of(sensor).values())
@@ -65,11 +65,11 @@ def write_stand(folder: Path, scene: Scene, sensor: Sensor) -> None:
         rays=np.array(rays),
         reach=np.array(sensor.working_range_mm, float),
     )
-    with atomic_write(folder / STAND) as file:
+    with atomic_write(folder / GEOMETRY_FILE) as file:
         file.write_bytes(out.getvalue())
 
 
-def read_stand(folder: Path) -> Stand | None:
+def read_scene_geometry(folder: Path) -> SceneGeometry | None:
     """Read ``stand.npz`` of a folder; return None if there is none.
 
     Raises
@@ -77,7 +77,7 @@ def read_stand(folder: Path) -> Stand | None:
     InputError
         If the file cannot be read.
     """
-    path = folder / STAND
+    path = folder / GEOMETRY_FILE
     if not path.exists():
         return None
     packed = read_bounded(path)
@@ -88,7 +88,7 @@ def read_stand(folder: Path) -> Stand | None:
             raise InputError(path, "size", f"{unpacked:,} bytes unpacked", f"up to {LARGEST_FILE:,}")
         with np.load(io.BytesIO(packed), allow_pickle=False) as data:
             near, far = map(float, data["reach"])
-            return Stand(
+            return SceneGeometry(
                 data["corners"].astype(float).reshape(-1, 3, 3),
                 data["shape"].astype(np.int64),
                 tuple(map(str, data["names"])),

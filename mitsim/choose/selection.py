@@ -35,7 +35,7 @@ from characterisation.statements.statement import Statement
 from characterisation.tasks.task_file import Task
 from mitsim.campaign.executor import Executor
 from mitsim.campaign.run import write_netcdf
-from mitsim.choose.entrants import Entrant
+from mitsim.choose.candidates import CandidateSensor
 from mitsim.exposures.planned import exposed_for
 from mitsim.progress import say
 from mitsim.sensor.exposure import PlannedExposure
@@ -82,7 +82,7 @@ class Found:
     the study asks for them.
     """
 
-    entrant: Entrant
+    candidate: CandidateSensor
     scores: xr.Dataset
     screened: Floats
     screened_u: Floats
@@ -115,7 +115,7 @@ def _demand(one: Statement) -> float:
 
 
 def choose_sensor(
-    entrants: list[Entrant],
+    candidates: list[CandidateSensor],
     folder: Path,
     minutes: float,
     tell: Callable[[list[Found], bool], None],
@@ -127,9 +127,9 @@ def choose_sensor(
     """
     end = time.monotonic() + 60 * minutes
     found = list[Found]()
-    for number, entrant in enumerate(entrants, 1):
-        found.append(_screened(entrant, folder / entrant.name))
-        _say(found, f"{number} of {len(entrants)} screened", end)
+    for number, candidate in enumerate(candidates, 1):
+        found.append(_screened(candidate, folder / candidate.name))
+        _say(found, f"{number} of {len(candidates)} screened", end)
     promising = _promising(found)
     tell(_ordered(found), False)
     for place, one in enumerate(promising):
@@ -137,19 +137,19 @@ def choose_sensor(
         if left <= 0 and place:
             say(f"choose: time is over; {len(promising) - place} sensors are judged by screening alone")
             break
-        _measure_sensor(one, folder / one.entrant.name, max(left, 1.0) / (len(promising) - place), workers)
+        _measure_sensor(one, folder / one.candidate.name, max(left, 1.0) / (len(promising) - place), workers)
         _say(found, f"{place + 1} of {len(promising)} sensors measured", end)
         tell(_ordered(found), False)
     leader = _ordered(found)[0]
     if leader.stated and time.monotonic() < end:
-        _refine_leader(leader, folder / leader.entrant.name, end, workers)
+        _refine_leader(leader, folder / leader.candidate.name, end, workers)
     tell(_ordered(found), True)
     return _ordered(found)
 
 
 def _promising(found: list[Found]) -> list[Found]:
     """Return the sensors worth a virtual measurement, best first: at least one if any sensor can measure at all."""
-    tolerances = any(one.tolerance is not None for one in found[0].entrant.study.task.measurements.values())
+    tolerances = any(one.tolerance is not None for one in found[0].candidate.study.task.measurements.values())
     order = sorted(found, key=lambda one: one.ratio if tolerances else _mean_demand(one))
     least = 1.0 if tolerances else _mean_demand(order[0])
     for place, one in enumerate(order):
@@ -172,16 +172,16 @@ def sort_key(one: Found) -> tuple[bool, float]:
 
     Without tolerances the key is the mean logarithm of the demands.
     """
-    tolerances = any(asked.tolerance is not None for asked in one.entrant.study.task.measurements.values())
+    tolerances = any(asked.tolerance is not None for asked in one.candidate.study.task.measurements.values())
     if tolerances:
         return not one.stated, one.ratio
     rows = [math.inf if row is None else row[1] for row in one.best()] if one.stated else one.screened.tolist()
     return not one.stated, float(np.mean(np.log(rows)))
 
 
-def _screened(entrant: Entrant, folder: Path) -> Found:
+def _screened(candidate: CandidateSensor, folder: Path) -> Found:
     """Return the scores of all views, from the folder if they are there."""
-    study, path = entrant.study, folder / "scores.nc"
+    study, path = candidate.study, folder / "scores.nc"
     folder.mkdir(parents=True, exist_ok=True)
     unknowns = study_unknowns(study)
     digest = trial_digest(study, unknowns, f"screening {study.file.score.light_path_depth} {map_digest(study)}")
@@ -192,7 +192,7 @@ def _screened(entrant: Entrant, folder: Path) -> Found:
 
         assert study.performance_map is not None
         predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
-        say(f"choose: {entrant.name}, {len(study.views)} views")
+        say(f"choose: {candidate.name}, {len(study.views)} views")
         scores, _ = screen(study, predictor, study.performance_map)
         scores.attrs["digest"] = digest
         write_netcdf(scores, path)
@@ -206,7 +206,7 @@ def _screened(entrant: Entrant, folder: Path) -> Found:
         _screened_demand(study.task, name, float(size))
         for name, size in zip(study.task.measurements, least, strict=True)
     ]
-    return Found(entrant, scores, np.array(asked), least, scores["view"].values[best].astype(np.int64))
+    return Found(candidate, scores, np.array(asked), least, scores["view"].values[best].astype(np.int64))
 
 
 _OF_A_VIEW = ("measurement", "view")
@@ -248,7 +248,7 @@ def _screened_demand(task: Task, name: str, u: float) -> float:
 class _Workspace:
     """Everything that virtual measurements of a sensor need."""
 
-    entrant: Entrant
+    candidate: CandidateSensor
     unknowns: Unknowns
     here: RenderedMeasurements | MappedMeasurements
     maker: Maker
@@ -258,7 +258,7 @@ class _Workspace:
     planned: dict[int, PlannedExposure] = field(default_factory=dict)
 
     def state(self, view: int, count: int) -> list[Statement]:
-        study = self.entrant.study
+        study = self.candidate.study
         chosen = next(one for one in study.views if one.number == view)
         exposed = exposed_for(study, chosen, self.here, self.maker, self.digest, self.folder)
         if exposed.planned is not None:
@@ -267,19 +267,19 @@ class _Workspace:
         return state_view(study, chosen, exposed.maker, trials, self.unknowns, StatementTable(trials=count, pairs=0))
 
 
-def _prepared(entrant: Entrant, folder: Path, workers: Executor | None) -> _Workspace:
-    study, unknowns = entrant.study, study_unknowns(entrant.study)
+def _prepared(candidate: CandidateSensor, folder: Path, workers: Executor | None) -> _Workspace:
+    study, unknowns = candidate.study, study_unknowns(candidate.study)
     here = measurements_of(study, unknowns)
     maker = spread_over(workers, study, unknowns, here)
     digest = trial_digest(study, unknowns, maker.source)
     trials = TrialFolder(folder / "trials", digest, list(study.task.measurements))
-    return _Workspace(entrant, unknowns, here, maker, trials, digest, folder)
+    return _Workspace(candidate, unknowns, here, maker, trials, digest, folder)
 
 
 def _measure_sensor(one: Found, folder: Path, seconds: float, workers: Executor | None) -> None:
     """Race and state one sensor in approximately ``seconds``."""
     began = time.monotonic()
-    study, worked = one.entrant.study, _prepared(one.entrant, folder, workers)
+    study, worked = one.candidate.study, _prepared(one.candidate, folder, workers)
     table = study.file.race
     rules = RaceRules(
         min(SHORTLIST, table.shortlist), min(RACE_TRIALS, table.trials), table.margin, 0.9, _RACE_SHARE * seconds
@@ -306,16 +306,18 @@ def _measure_sensor(one: Found, folder: Path, seconds: float, workers: Executor 
 def _say(found: list[Found], done: str, end: float) -> None:
     """Print the progress and the leading sensor."""
     first = _ordered(found)[0]
-    names = list(first.entrant.study.task.measurements)
+    names = list(first.candidate.study.task.measurements)
     stated = [math.inf if row is None else row[1] for row in first.best()]
     rows: list[float] = stated if first.stated else first.screened.tolist()
     worst = int(np.argmax(rows))
     by = "measured" if first.stated else "by the screening"
-    asked = first.entrant.study.task.measurements[names[worst]]
+    asked = first.candidate.study.task.measurements[names[worst]]
     size = f"{rows[worst]:.2g}"
-    told = f"{size} times the limit ({names[worst]})" if asked.tolerance else f"{size} {asked.unit} ({names[worst]})"
+    demand_in_words = (
+        f"{size} times the limit ({names[worst]})" if asked.tolerance else f"{size} {asked.unit} ({names[worst]})"
+    )
     left = max(0.0, end - time.monotonic())
-    say(f"choose: {done}; {first.entrant.name} leads {by}, at worst {told}; {left:.0f} s left")
+    say(f"choose: {done}; {first.candidate.name} leads {by}, at worst {demand_in_words}; {left:.0f} s left")
 
 
 def _open(one: Found) -> bool:
@@ -338,8 +340,8 @@ def _own_views(one: Found, names: list[str], view: int) -> list[int]:
 
 def _refine_leader(leader: Found, folder: Path, end: float, workers: Executor | None) -> None:
     """Add trials of the leader up to the number in the study, as long as there is time."""
-    worked = _prepared(leader.entrant, folder, workers)
-    most = leader.entrant.study.file.statement.trials
+    worked = _prepared(leader.candidate, folder, workers)
+    most = leader.candidate.study.file.statement.trials
     used = {row[0] for row in leader.best() if row is not None}
     while time.monotonic() < end:
         behind = [view for view in used if leader.stated[view] and leader.stated[view][0].trials < most]
@@ -351,7 +353,7 @@ def _refine_leader(leader: Found, folder: Path, end: float, workers: Executor | 
 
 
 def _write(one: Found, worked: _Workspace, folder: Path, view: int) -> None:
-    study = one.entrant.study
+    study = one.candidate.study
     one.planned.update(worked.planned)
     chosen = next(known for known in study.views if known.number == view)
     document: dict[str, Any] = statement_document(
