@@ -15,9 +15,8 @@ def needed_region(positions: NDArray[np.float32], width: int, height: int) -> Ro
     """
     limits = []
     for coordinates, size in zip(positions, (width, height), strict=True):
-        low, high = (
-            float(np.clip(end, 0, size)) for end in (coordinates.min(), coordinates.max())
-        )  # positions of a fisheye camera may be infinite
+        # the positions of a fisheye camera may be infinite
+        low, high = (float(np.clip(end, 0, size)) for end in (coordinates.min(), coordinates.max()))
         first = min(max(int(low) - 1, 0), size - 1)
         limits.append((first, max(min(int(np.ceil(high)) + 2, size), first + 1)))
     (left, right), (top, bottom) = limits
@@ -25,10 +24,9 @@ def needed_region(positions: NDArray[np.float32], width: int, height: int) -> Ro
 
 
 def was_read_out(positions: NDArray[np.float32], read_out: Roi, width: int, height: int) -> NDArray[np.bool_]:
-    """Return whether interpolation at ``positions`` (2, ...), column and row [px], needs only pixels that were read
-    out.
+    """Return whether interpolation at ``positions`` (2, ...) needs only pixels that were read out.
 
-    Where the region ends at the edge of the image, positions up to half a pixel beyond it are included, as in whole
+    The positions are column and row [px]. Where the region ends at the edge of the image, positions up to half a pixel beyond it are included, as in whole
     images.
     """
     column, row = positions
