@@ -175,8 +175,7 @@ def decode_point_map(
 
 
 def roi_of_other_grid(grid: ViewGrid, other: ViewGrid, roi: Roi, near_mm: float, far_mm: float) -> Roi | None:
-    """Return the region of ``other`` that contains everything ``roi`` of ``grid`` shows in the range; None if it is
-    empty.
+    """Return the region of ``other`` that contains all that ``roi`` of ``grid`` shows in the range; None if empty.
 
     The boundary of the region is projected pixel by pixel at both depths [mm], so distorted rays are included. If a
     point of it cannot be projected, the result is the whole of ``other``.

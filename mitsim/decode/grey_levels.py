@@ -68,4 +68,4 @@ def check_full_scale(stack: NDArray[np.generic], full_scale: float) -> None:
     """
     largest = 2.0 ** (8 * stack.dtype.itemsize) - 1 if stack.dtype.kind == "u" else np.inf
     if not 0 < full_scale <= largest or not np.isfinite(full_scale):
-        raise InputError("image stack", "full_scale", full_scale, f"over 0, up to {most:g} DN")
+        raise InputError("image stack", "full_scale", full_scale, f"over 0, up to {largest:g} DN")

@@ -83,10 +83,8 @@ def measured_noise(
 def _residuals(
     stack: NDArray[np.generic], image_roles: Sequence[Role], full_scale: float, axis: Axis
 ) -> tuple[Floats, Floats]:
-    """Return levels [DN] and squared residuals [DN^2], (n,) each, of the fringes along an axis; empty if there are
-    none.
-    """
-    none = np.empty(0), np.empty(0)
+    """Return levels [DN] and squared residuals [DN^2], (n,) each, of the fringes along an axis; n may be 0."""
+    empty = np.empty(0), np.empty(0)
     indices = [
         (role.index, position)
         for position, role in enumerate(image_roles)
@@ -96,7 +94,7 @@ def _residuals(
     groups = [[position for index, position in indices if index == period] for period in periods]
     shifts = [np.array([image_roles[position].shift for position in group]) for group in groups]
     if sum(map(len, groups)) <= 1 + 2 * len(groups):
-        return none
+        return empty
     step = max(1, int(np.sqrt(stack[0].size / _SAMPLED_PIXELS)))
     images = stack[np.concatenate(groups).astype(int)][:, step // 2 :: step, step // 2 :: step]
     images = images.reshape(len(images), -1)
@@ -104,7 +102,7 @@ def _residuals(
     phases = fit_phases(images[:, None], shifts)
     usable &= phases.modulation[:, 0].min(axis=0) > _MINIMUM_MODULATION * full_scale / 255
     if usable.sum() < _MINIMUM_PIXELS:
-        return none
+        return empty
     # orthonormal basis of everything that the model cannot describe
     design = np.zeros((len(images), 1 + 2 * len(groups)))
     design[:, 0], first = 1.0, 0
