@@ -374,8 +374,8 @@ def decode(
         settings_are_known,
         with_options,
     )
-    from mitsim.reconstruction.depth_range import outside, surface_beyond
-    from mitsim.reconstruction.noise import known_noise, noise_told
+    from mitsim.reconstruction.depth_range import range_warning, surface_beyond
+    from mitsim.reconstruction.noise import known_noise, sigma_source
     from mitsim.sensor.preset import presets
 
     read = read_capture(capture)
@@ -398,14 +398,14 @@ def decode(
         say(rows)
     for warning in cloud_warnings(matched):
         say(f"warning: {warning}")
-    told = noise_told(read, cloud, noise)
-    if told:
-        say(told)
+    source = sigma_source(read, cloud, noise)
+    if source:
+        say(source)
     beyond = surface_beyond(read, cloud, settings)
     if beyond is not None:
         known = f"a coarse search over a wider range finds it in {100 * beyond.share:.0f} % of the pixels"
         whose = sensor or (read.sensor if read.sensor in presets() else None)
-        say(outside(f"{capture}: a surface", beyond.depths, settings, whose, known))
+        say(range_warning(f"{capture}: a surface", beyond.depths, settings, whose, known))
     check_file(output)
     write_ply(cloud, output, written)
     for reason, count in cloud.reasons().items():

@@ -166,7 +166,7 @@ def _settings_of_capture(capture: Capture, decoder: Any) -> tuple[Settings, Imag
     validated = validate(
         f"capture of {capture.sensor}: settings.json",
         {"decoder": decoder, "imager": capture.settings.get("imager")},
-        create_model("Brought", __base__=_ImagerSettings, decoder=(model, ...)),
+        create_model("SettingsOfCapture", __base__=_ImagerSettings, decoder=(model, ...)),
     )
     settings: Settings = getattr(validated, "decoder")  # noqa: B009 - a field of a model made just now
     return settings, None if validated.imager is None else _if_bits_match(imager_of(validated.imager), capture.bits)

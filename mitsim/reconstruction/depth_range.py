@@ -132,9 +132,8 @@ def surface_beyond(capture: Capture, cloud: PointCloud, settings: Settings) -> S
     wide = settings.model_copy(
         update={"near_mm": settings.near_mm / RANGE_FACTOR, "far_mm": settings.far_mm * RANGE_FACTOR}
     )
-    if isinstance(
-        wide, MatcherSettings
-    ):  # binned texture has less contrast, and the device's disparity steps would hide the depth
+    # binned texture has less contrast, and the device's disparity steps would hide the depth
+    if isinstance(wide, MatcherSettings):
         wide = wide.model_copy(update={"minimum_contrast_dn": wide.minimum_contrast_dn / 2, "disparity_step": 0.0})
     step = max(1, round(capture.rig.reference.width / _COARSE_COLUMNS))
     if isinstance(wide, MatcherSettings):
