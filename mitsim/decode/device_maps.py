@@ -24,7 +24,7 @@ from pydantic import Field, model_validator
 from characterisation.documents import Document
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.decode.grid_cloud import placed_cloud
+from mitsim.decode.grid_cloud import cloud_on_grid
 from mitsim.decode.structured_light.geometry import camera_grid
 from mitsim.sensor.camera import Rectification, Rig
 from mitsim.sensor.roi import Roi, checked_roi
@@ -212,7 +212,7 @@ def _cloud_in_range(
         accepted = measured & (depth >= near_mm) & (depth <= far_mm)
     status = np.select([accepted, measured], [Status.VALID, Status.OUT_OF_RANGE], Status.NO_SURFACE).astype(np.uint8)
     points = np.where(accepted[..., None], points, np.nan)
-    return placed_cloud(points, status, None, roi, geometry, sensor, source)
+    return cloud_on_grid(points, status, None, roi, geometry, sensor, source)
 
 
 def _wrong_size(name: str, shape: tuple[int, ...], grid: ViewGrid) -> InputError:
