@@ -1,8 +1,8 @@
 """Find the centres of round dots in an image: calibration plates and other printed grids.
 
-Signal chain: image -> upsampled by up to eight and smoothed by a Gaussian of 1 px -> adaptive threshold, for several
-dot diameters -> closed, round outlines -> new outline half-way between the levels of the dot and of its background ->
-centre of gravity. The diameter that yields the most dots of equal size is used.
+Signal chain: image -> upsampled by up to eight, Gaussian filter of 1 px -> adaptive threshold, for several diameters ->
+closed, round outlines -> new outline half-way between the levels of the dot and of its background -> centre of gravity.
+The diameter that yields the most dots of equal size is used.
 
 The adaptive threshold depends on the neighbourhood of a dot. It would shift the dots at the rim of a plate by 0.04 px,
 since they have neighbours on one side only. The plate would then be 0.04 % too large. The second threshold is constant

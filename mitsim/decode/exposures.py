@@ -14,9 +14,9 @@ Hasinoff, Durand and Freeman, CVPR 2010. Noise of equal size at every exposure w
 Robertson, Borman and Stevenson, ICIP 1999. Where read noise dominates and the exposures are 1 : 4 : 16, the sum used
 here is 1.36 times as noisy.
 
-An abrupt exclusion at saturation would keep the pixels whose noise is low by chance, and so bias the mean. The weight
-of every exposure but the shortest therefore falls from 1 to 0 between two levels below full scale, as does the
-certainty of Robertson et al. With a full well of 20 000 e- the remaining bias is below 0.1 % of the signal. A pixel
+An abrupt exclusion at saturation would keep the pixels whose noise is low by chance, and so bias the mean. For every
+exposure but the shortest, the weight therefore falls from 1 to 0 between two levels below full scale. The certainty of
+Robertson et al. does the same. With a full well of 20 000 e- the remaining bias is below 0.1 % of the signal. A pixel
 that is saturated in the shortest exposure is saturated in the result.
 """
 

@@ -31,8 +31,7 @@ This is exact, since d includes the lens distortion. With s_i the noise of phase
 
 and the noise along the ray is sigma_L dt/dL, with dt/dL = (L^2 - 2 L d.p + p.p) / (2 (L - d.p)^2).
 
-Each pixel is decoded from its own grey levels. A region of interest therefore has the same points as in the whole
-image, up to its edge.
+Each pixel is decoded alone, so a region of interest has the same points as in the whole image.
 """
 
 from __future__ import annotations
@@ -71,7 +70,7 @@ class TimeOfFlightGeometry:
     Attributes
     ----------
     camera_name, camera
-        The camera of the rig.
+        The camera.
     ray
         (H, W, 3) unit view direction of each raw pixel in the sensor frame.
     light_source
@@ -102,8 +101,6 @@ def time_of_flight_geometry(rig: Rig, camera_name: str, near_mm: float, far_mm: 
 
     Parameters
     ----------
-    rig, camera_name
-        The rig, and the name of the camera in it.
     near_mm, far_mm
         Range of depths along the camera's axis [mm].
 
@@ -164,10 +161,8 @@ def decode_time_of_flight(
         (P, H, W) differences of the taps [DN], all delays of the lowest frequency first.
     geometry
         From :func:`time_of_flight_geometry`.
-    code
-        Frequencies, delays and contrasts of the modulation.
-    settings
-        Range and limits.
+    code, settings
+        Frequencies, delays and contrasts of the modulation, and range and limits.
     context
         Of the images. Its ``roi`` is a region of the image; ``read_out`` is not used. Without an :class:`Imager`
         ``sigma`` is None, and phases are compared by quantisation and ``systematic_rad`` alone. Measured noise does not
@@ -240,18 +235,14 @@ def joint_path(
     Parameters
     ----------
     phase, variance
-        (F, H, W) phases [rad] and their variances by noise [rad^2].
-    code
-        The modulation, with its frequencies in ascending order.
+        (F, H, W) phases [rad] of the frequencies of ``code``, and their variances by noise [rad^2].
     systematic_rad
         Standard deviation of the systematic phase error [rad], which is added to the noise in the weights.
 
     Returns
     -------
-    path
-        (H, W) optical path L [mm], 0 to the unambiguous one.
-    sigma
-        (H, W) its standard deviation by noise [mm].
+    path, sigma
+        (H, W) optical path L [mm], 0 to the unambiguous one, and its standard deviation by noise [mm].
     chi_square
         (H, W) J of the most likely number of turns.
     """

@@ -101,15 +101,8 @@ def decoder_settings(
     4. the technology's settings with the capture's range, and no imager. A stereo capture of several frames, as with a
        shifted pattern, is then matched by correlation.
 
-    Parameters
-    ----------
-    capture
-        The capture.
-    sensor
-        Preset or sensor file; None for the capture's own.
-    range_mm
-        Nearest and farthest depth [mm], which replace those of the settings. If both ``range_mm`` and ``sensor`` are
-        None, the range requested at the import of the capture is used, if there is one.
+    ``sensor``: preset or sensor file. ``range_mm``: nearest and farthest depth [mm], which replace those of the
+    settings. Without both, the range that was requested at the import of the capture is used, if there is one.
 
     Raises
     ------
@@ -126,12 +119,10 @@ def decoder_settings(
 def in_range(settings: Settings, range_mm: tuple[float, float] | None, where: str) -> Settings:
     """Return settings with the depths [mm] of ``range_mm`` as search range; unchanged if it is None.
 
-    ``where`` the range was given, for the error.
-
     Raises
     ------
     InputError
-        If the range is invalid.
+        If the range is invalid. ``where`` says in the message where it was given.
     """
     if range_mm is None:
         return settings
@@ -185,8 +176,7 @@ def settings_are_known(capture: Capture, sensor: str | None) -> bool:
 def range_is_known(capture: Capture, sensor: str | None, range_mm: tuple[float, float] | None) -> bool:
     """Return whether a user, a sensor or the capture gives the depths to search; else a matcher uses the default.
 
-    The arguments are those of :func:`decoder_settings`. Decoders of light codes and of a device's own map accept all
-    depths, so the result is True for them.
+    Arguments as for :func:`decoder_settings`. Decoders of codes and of device maps accept all depths: always True.
     """
     if capture.technology not in ("active_stereo", "reference_stereo") or sensor is not None or range_mm is not None:
         return True
@@ -258,7 +248,7 @@ def capture_cloud(
     roi: Roi | None = None,
     imager: Imager | MeasuredNoise | None = None,
 ) -> PointCloud:
-    """Decode a capture.
+    """Decode a capture to points in the sensor frame [mm].
 
     Parameters
     ----------
@@ -273,11 +263,6 @@ def capture_cloud(
     imager
         The imager that took the capture, or the noise measured in it. Each point then gets the standard deviation by
         this noise, if the decoder can propagate it. Points of a bracket get none.
-
-    Returns
-    -------
-    PointCloud
-        Points in the sensor frame [mm], on the grid of the decoder.
 
     Raises
     ------
@@ -330,10 +315,7 @@ def read_out_of(capture: Capture) -> dict[str, Roi]:
 def _device_cloud(
     capture: Capture, technology: Technology, settings: Settings, geometry: Geometry | None, roi: Roi | None
 ) -> PointCloud:
-    """Return the cloud of a device's own map, on the map's own grid.
-
-    ``roi`` is a region of the grid of ``geometry``, or of the map's grid if that is None.
-    """
+    """Return the cloud of a device's own map, on the map's grid; ``roi`` is of the grid of ``geometry``, if any."""
     is_map_geometry = isinstance(geometry, DeviceMapGeometry)
     map_geometry = geometry if is_map_geometry and geometry else technology.geometry(capture.rig, settings, None)
     if roi is not None and geometry is not None and not is_map_geometry:

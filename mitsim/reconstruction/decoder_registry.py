@@ -1,8 +1,8 @@
 """Register how the captures of each technology become clouds: one entry of :data:`TECHNOLOGIES` for each.
 
-An entry has the types of the decoder's settings, a function that prepares the geometry of a rig once, and a function
-from images to a cloud. The first four technologies decode raw images. For the last three the device has measured a map,
-which is converted.
+An entry has the types of the decoder's settings and two functions. One prepares the geometry of a rig once, the other
+decodes images to a cloud. The first four technologies decode raw images. For the last three the device has measured a
+map, which is converted.
 """
 
 from __future__ import annotations

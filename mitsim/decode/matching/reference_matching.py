@@ -88,7 +88,7 @@ def reference_geometry(rig: Rig, pattern: DotPattern, reference_mm: float, blur_
     Raises
     ------
     InputError
-        If the rig has no projector, it is not to the right of the camera, or the camera sees nothing that it lights on
+        If the rig has no projector, it is not to the right of the camera, or it lights nothing that the camera sees of
         the reference plane.
     """
     if rig.projector is None:

@@ -44,16 +44,9 @@ _STRIPE_IMAGES = ("white", "black", "gray", "gray_inverse")
 class Stripes:
     """Decoded bits of one axis, (H, W) each.
 
-    Attributes
-    ----------
-    number
-        Number of the stripe, uint16.
-    neighbour
-        Number with the undecided bit inverted; equal to ``number`` if all bits are decided.
-    undecided
-        Whether bits are undecided and do not lead to neighbouring stripes.
-    contrast
-        White minus black [DN], float32.
+    ``number`` of the stripe, uint16. ``neighbour``: number with the undecided bit inverted, else the same number.
+    ``undecided``: whether bits are undecided and do not lead to neighbouring stripes. ``contrast``: white minus black
+    [DN], float32.
     """
 
     number: NDArray[np.uint16]
@@ -63,10 +56,7 @@ class Stripes:
 
 
 def binary_of_gray(gray: NDArray[np.unsignedinteger]) -> NDArray[np.uint16]:
-    """Return the numbers (...) of reflected binary codes of up to 16 bits.
-
-    Each bit of a number is the exclusive or of all bits of its code from the same position upwards.
-    """
+    """Return the numbers (...) of reflected binary codes of up to 16 bits: bit k is the exclusive or of bits k and up."""
     out = gray.astype(np.uint16)
     for shift in (1, 2, 4, 8):
         out ^= out >> np.uint16(shift)
@@ -214,18 +204,9 @@ def stripe_coordinate(
     settings: DecoderSettings,
     full_scale: float,
 ) -> ProjectorCoordinate:
-    """Return the projector coordinate of decoded stripes.
+    """Return the projector coordinate of decoded stripes, whose width is ``stripe`` over ``extent`` projector pixels.
 
-    Parameters
-    ----------
-    decoded
-        From :func:`decode_stripes`.
-    stripe, extent
-        Width of a stripe, and number of pixels along the axis [projector px].
-    saturated
-        (H, W) whether the pixel is saturated in any image of the code.
-    settings, full_scale
-        Limits of the decoder, and value of a saturated pixel [DN].
+    ``saturated`` (H, W): whether the pixel is saturated in any image of the code; ``full_scale`` [DN].
     """
     modulation = np.asarray(decoded.contrast / 2, np.float32)
     low_modulation = modulation < settings.minimum_modulation_dn * full_scale / 255
@@ -256,8 +237,7 @@ def decode_gray_code_phase_shift(
     Raises
     ------
     InputError
-        If the stack does not fit the code, or gamma cannot be estimated: fewer than five steps, and no white and black
-        images.
+        If the stack does not fit the code, or gamma cannot be estimated: fewer than five steps, without white and black.
     """
     image_roles = roles(code, width, height)
     check_stack(stack, image_roles)
@@ -278,10 +258,7 @@ def decode_gray_code_phase_shift(
 
 @dataclass(frozen=True)
 class CodedAxis:
-    """An axis of the projector.
-
-    ``extent`` is its number of pixels, ``stripe`` the width of the finest stripe [projector px].
-    """
+    """An axis of the projector: ``extent`` pixels, with ``stripe`` the width of the finest stripe [projector px]."""
 
     axis: Axis
     extent: int
@@ -301,8 +278,7 @@ def decode_gray_fringes(
     """Decode a Gray code for the order of the fringe, and the phases of one or more periods for the position in it.
 
     The Gray code gives the order of the longest beat of the fringes that is at least two stripes long. Without such a
-    beat, one of at least one stripe is used. The finer beats follow as in
-    :mod:`mitsim.decode.structured_light.unwrapping`.
+    beat, one of at least one stripe is used. :mod:`mitsim.decode.structured_light.unwrapping` leads to the finer beats.
 
     The order is the one that brings the phase nearest to the stripe's centre. Where a stripe is half a fringe (with the
     complementary bit), the true position is up to 1/4 period from its centre. The order changes at 1/2 period. Beyond
@@ -316,23 +292,19 @@ def decode_gray_fringes(
         period after period, the longest first.
     coded_axis, fringes
         Axis and stripes of the Gray code, and periods and shifts of the fringes.
-    settings, full_scale, imager
-        As for :func:`mitsim.decode.structured_light.phase_shift.decode_phase_shift`.
     """
     axis, extent, stripe = coded_axis.axis, coded_axis.extent, coded_axis.stripe
-    indices = [index for index, role in enumerate(image_roles) if role.kind == "phase" and role.axis == axis]
-    images = (
-        stack[indices[0] : indices[-1] + 1] if indices == list(range(indices[0], indices[-1] + 1)) else stack[indices]
-    )
+    used = [index for index, role in enumerate(image_roles) if role.kind == "phase" and role.axis == axis]
+    images = stack[used[0] : used[-1] + 1] if used == list(range(used[0], used[-1] + 1)) else stack[used]
     phases = fit_phases(images, fringes.shifts)
     phase, modulation = phases.phase, phases.modulation[-1]
     weakest = phases.modulation.min(axis=0)
     threshold = settings.minimum_modulation_dn * full_scale / 255
-    white_black = {
+    plain = {
         role.kind: image for role, image in zip(image_roles, stack, strict=True) if role.kind in ("white", "black")
     }
     if settings.correct_gamma:
-        levels = (white_black["white"], white_black["black"]) if len(white_black) == 2 else None
+        levels = (plain["white"], plain["black"]) if len(plain) == 2 else None
         phase = gamma_corrected(phases, images, fringes, threshold, levels)
     scale = np.float32(1 / fringes.contrast)  # ratio of white minus black to the amplitude of the fringes
     middle = phases.offset + np.float32(0.5 - fringes.mean) * scale * modulation
@@ -341,28 +313,22 @@ def decode_gray_fringes(
     path = _unwrapping_of_fringes(fringes, stripe)
     period = path.beats[0].period
     variance = grey_level_variance(phases.offset, imager)
-    relative_variance = variance / np.maximum(weakest, np.float32(1e-3)) ** 2
+    relative = variance / np.maximum(weakest, np.float32(1e-3)) ** 2
     turns = (_centre(decoded, stripe) + 0.5) / period - beat_cycles(phase, path.beats[0])
     order = np.rint(turns)
     limit = (0.5 * stripe / period + 0.5) / 2
     contradicted = np.abs(turns - order) > limit
     value, inconsistent = unwrap(
-        phase,
-        path,
-        extent,
-        relative_variance,
-        settings.systematic_rad,
-        settings.consistency_sigma,
-        order.astype(np.float32),
+        phase, path, extent, relative, settings.systematic_rad, settings.consistency_sigma, order.astype(np.float32)
     )
     undecided = decoded.undecided | contradicted | inconsistent
     saturated = images.max(axis=0) >= full_scale
-    stripe_images = [
+    coded = [
         image
         for image, role in zip(stack, image_roles, strict=True)
         if role.axis in (axis, None) and role.kind in _STRIPE_IMAGES
     ]
-    for image in stripe_images:
+    for image in coded:
         saturated |= (image >= full_scale) & undecided
     status = rejection_status(saturated, weakest < threshold, undecided)
     value[status != Status.VALID] = np.nan
