@@ -56,7 +56,7 @@ class Stripes:
 
 
 def binary_of_gray(gray: NDArray[np.unsignedinteger]) -> NDArray[np.uint16]:
-    """Return the numbers (...) of reflected binary codes of up to 16 bits: bit k is the exclusive or of bits k and up."""
+    """Return the numbers (...) of reflected binary codes of up to 16 bits: bit k is the exclusive or of bits >= k."""
     out = gray.astype(np.uint16)
     for shift in (1, 2, 4, 8):
         out ^= out >> np.uint16(shift)
@@ -237,7 +237,7 @@ def decode_gray_code_phase_shift(
     Raises
     ------
     InputError
-        If the stack does not fit the code, or gamma cannot be estimated: fewer than five steps, without white and black.
+        If the stack does not fit the code, or gamma has fewer than five steps and neither white nor black.
     """
     image_roles = roles(code, width, height)
     check_stack(stack, image_roles)
