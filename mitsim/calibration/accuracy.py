@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from characterisation.acceptance.vdi_2634 import flatness_error
 from mitsim.calibration.board import seen_by_all
-from mitsim.decode.structured_light.geometry import LEAST_CHANGE_PX
+from mitsim.decode.structured_light.geometry import MINIMUM_CHANGE_PX
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, axes
@@ -213,7 +213,7 @@ def _by_coordinate(
         usable = np.abs(change) > 1e-12
         step = np.where(usable, -error * (inverse - before) / np.where(usable, change, 1.0), 0.0)
         before, error_before, inverse = inverse, error, inverse + step
-        if np.abs(error).max() < 1e-9 * LEAST_CHANGE_PX:
+        if np.abs(error).max() < 1e-9 * MINIMUM_CHANGE_PX:
             break
     return np.asarray(start + ray / inverse[:, None])
 

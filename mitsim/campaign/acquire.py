@@ -27,7 +27,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, read_settings_and_pose
 from mitsim.errors import InputError
 from mitsim.reconstruction.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
-from mitsim.reconstruction.depth_range import depths_of, outside
+from mitsim.reconstruction.depth_range import depths_of, range_warning
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
@@ -211,7 +211,7 @@ def out_of_range(campaign: Campaign, found: dict[Path, Shot] | None = None) -> l
         middle, *depths = depths_of(places, sensor.rig, sensor.settings)
         if not sensor.settings.near_mm <= middle <= sensor.settings.far_mm:
             reach = (float(min(depths)), float(max(depths)))
-            lines.append(outside(f"{name}: the coupon", reach, sensor.settings, sensor.name, known))
+            lines.append(range_warning(f"{name}: the coupon", reach, sensor.settings, sensor.name, known))
     if len(lines) > NAMED:
         lines[NAMED:] = [f"warning: and {len(lines) - NAMED} of {len(shown)} more are outside the range"]
     return lines

@@ -21,7 +21,7 @@ from mitsim.decode.matching.row_error import row_error
 from mitsim.decode.matching.stereo import StereoGeometry, stereo_geometry
 from mitsim.decode.structured_light.decoder import decode_coordinates
 from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
-from mitsim.decode.structured_light.two_cameras import same_coordinate
+from mitsim.decode.structured_light.two_cameras import find_coordinates
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
@@ -191,7 +191,8 @@ def pair_warnings(
     """
     geometry = stereo_geometry(rig)
     found = [
-        decode_coordinates(stack, code, size, settings, full_scale=full_scale, between=True) for stack in (left, right)
+        decode_coordinates(stack, code, size, settings, full_scale=full_scale, interpolate=True)
+        for stack in (left, right)
     ]
     seen = _Matches.of(found, geometry)
     if seen.decoded < 0.005:
@@ -237,7 +238,7 @@ class _Matches:
             _on_rows(each["columns"], positions[:, lines], there[lines])
             for each, positions, there in zip(found, maps, seen, strict=True)
         )
-        place = np.stack([same_coordinate(one, other)[0] for one, other in zip(u_left, u_right, strict=True)])
+        place = np.stack([find_coordinates(one, other)[0] for one, other in zip(u_left, u_right, strict=True)])
         matched, decoded = np.isfinite(place), np.isfinite(u_left)
         shift = geometry.rectification.matrix_right[0, 2] - geometry.rectification.matrix_left[0, 2]
         disparity = (np.arange(place.shape[1]) - place)[matched] + shift

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from mitsim.decode.matching.stereo import StereoGeometry
-from mitsim.decode.structured_light.two_cameras import LARGEST_STEP_PX, same_coordinate
+from mitsim.decode.structured_light.two_cameras import LARGEST_STEP_PX, find_coordinates
 from mitsim.sensor.image_role import Role
 
 Levels = NDArray[np.unsignedinteger[Any]]
@@ -65,7 +65,7 @@ def textured_row_error(
             ((textures[1], columns[1]), geometry.map_right, geometry.seen_right),
         )
     )
-    place = np.stack([same_coordinate(one, other)[0] for one, other in zip(left[1], right[1], strict=True)])
+    place = np.stack([find_coordinates(one, other)[0] for one, other in zip(left[1], right[1], strict=True)])
     place[~np.isfinite(left[0])] = np.nan
     shifts = []
     for row in range(_ROWS, place.shape[0] - _PATCH - _ROWS, _PATCH):

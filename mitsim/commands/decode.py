@@ -54,8 +54,8 @@ def decode(
         settings_are_known,
         with_options,
     )
-    from mitsim.reconstruction.depth_range import outside, surface_beyond
-    from mitsim.reconstruction.noise import known_noise, noise_in_words
+    from mitsim.reconstruction.depth_range import range_warning, surface_beyond
+    from mitsim.reconstruction.noise import known_noise, sigma_source
     from mitsim.sensor.preset import presets
 
     read = read_capture(capture)
@@ -78,14 +78,14 @@ def decode(
         say(rows)
     for warning in cloud_warnings(matched):
         say(f"warning: {warning}")
-    noise_text = noise_in_words(read, cloud, noise)
-    if noise_text:
-        say(noise_text)
+    source = sigma_source(read, cloud, noise)
+    if source:
+        say(source)
     beyond = surface_beyond(read, cloud, settings)
     if beyond is not None:
         known = f"a coarse search over a wider range finds it in {100 * beyond.share:.0f} % of the pixels"
         whose = sensor or (read.sensor if read.sensor in presets() else None)
-        say(outside(f"{capture}: a surface", beyond.depths, settings, whose, known))
+        say(range_warning(f"{capture}: a surface", beyond.depths, settings, whose, known))
     check_file(output)
     write_ply(cloud, output, written)
     for reason, count in cloud.reasons().items():

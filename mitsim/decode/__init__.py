@@ -1,1 +1,1 @@
-"""Images to points, by technique. Only images and a rig are known here."""
+"""Decode images to points, by technique. Decoders know only images and a rig."""

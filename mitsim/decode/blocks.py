@@ -1,4 +1,7 @@
-"""Images treated block by block: the data of a block stay in the processor's cache, and threads share the blocks."""
+"""Process images in blocks of pixels, on several threads.
+
+Signal chain: pixels of an image -> blocks that fit into the processor's cache -> consecutive blocks for each thread.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,15 @@ from collections.abc import Callable
 
 from characterisation.threads import in_threads, thread_count
 
-#: pixels treated at once: one period's images as float32 fill half a megabyte
+#: pixels of a block: as float32, the images of one period take half a megabyte
 BLOCK = 16384
 
 
 def in_blocks(work: Callable[[list[slice]], None], count: int) -> None:
-    """Call ``work`` with slices that together cover ``count`` pixels, once in each thread.
+    """Call ``work`` on each thread with a list of slices; together they cover ``count`` pixels.
 
-    Every block is the same whatever thread it falls to, so results do not depend on the threads.
+    The blocks do not depend on the number of threads, so neither do the results.
     """
     blocks = [slice(start, start + BLOCK) for start in range(0, count, BLOCK)]
-    parts = max(min(thread_count(), len(blocks) // 2), 1)
-    in_threads(work, [blocks[len(blocks) * k // parts : len(blocks) * (k + 1) // parts] for k in range(parts)])
+    workers = max(min(thread_count(), len(blocks) // 2), 1)
+    in_threads(work, [blocks[len(blocks) * k // workers : len(blocks) * (k + 1) // workers] for k in range(workers)])

@@ -1,11 +1,16 @@
-"""What a device has measured itself, to an organised point cloud: a map of depth, of disparity or of points.
+"""Convert a map that a device has measured to an organised point cloud: depths, disparities or points.
 
-Signal chain: depth Z along the camera's axis [mm] -> points on the view rays of the camera's pixels; or disparity
-d = x_left - x_right of a rectified pair [px] -> Z = f B / (d + cx_right - cx_left) -> points on the rectified left
-grid; or points as they are -> those between near and far.
+Signal chain, for each kind of map:
 
-NaN is a pixel that was not measured. The device does not say why, so such a pixel is ``NO_SURFACE``. Nothing is
-filtered or filled here; what the device itself has filled cannot be told any more.
+- depth Z along the camera's axis [mm] -> points on the view rays of the camera's pixels
+- disparity d = x_left - x_right of a rectified pair [px] -> Z = f B / (d + cx_right - cx_left) -> points on the
+  rectified left grid (:meth:`mitsim.sensor.camera.Rectification.depth`)
+- points in the sensor frame [mm], which remain as they are
+
+Points outside the range ``near_mm`` to ``far_mm`` are then rejected.
+
+A pixel without a measurement is NaN. The device does not give the reason, so the status is ``NO_SURFACE``. This module
+filters and fills nothing. Points that the device has filled cannot be recognised.
 """
 
 from __future__ import annotations
@@ -19,14 +24,14 @@ from pydantic import Field, model_validator
 from characterisation.documents import Document
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.decode.grid_cloud import placed_cloud
+from mitsim.decode.grid_cloud import cloud_on_grid
 from mitsim.decode.structured_light.geometry import camera_grid
 from mitsim.sensor.camera import Rectification, Rig
 from mitsim.sensor.roi import Roi, checked_roi
 
 
 class DeviceMapSettings(Document):
-    """Depths ``near_mm`` to ``far_mm`` along the camera's axis between which points are accepted."""
+    """Range of depths along the camera's axis in which points are accepted: ``near_mm`` to ``far_mm``."""
 
     near_mm: float = Field(gt=0)
     far_mm: float = Field(gt=0)
@@ -40,7 +45,17 @@ class DeviceMapSettings(Document):
 
 @dataclass(frozen=True)
 class DeviceMapGeometry:
-    """The ``grid`` of a map's pixels, its ``baseline`` (3,), and the ``rectification`` of a map of disparities."""
+    """Geometry of a device's map.
+
+    Attributes
+    ----------
+    grid
+        Pixels of the map.
+    baseline
+        (3,) unit vector in the sensor frame.
+    rectification
+        Of a map of disparities; else None.
+    """
 
     grid: ViewGrid
     baseline: NDArray[np.float64]
@@ -48,26 +63,26 @@ class DeviceMapGeometry:
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """(H, W): what the device sees of its own map is not known, so all of it."""
+        """(H, W), all true: the part of its map that the device can see is not known."""
         return np.ones((self.grid.height, self.grid.width), bool)
 
 
 def camera_map_geometry(rig: Rig) -> DeviceMapGeometry:
-    """Grid of the first camera's pixels, for depths and points."""
+    """Return the geometry of a map of depths or points: the grid of the first camera's pixels."""
     return DeviceMapGeometry(camera_grid(rig.reference), rig.baseline_direction)
 
 
 def disparity_map_geometry(rig: Rig) -> DeviceMapGeometry:
-    """Grid of the rectified left image.
+    """Return the geometry of a map of disparities: the grid of the rectified left image.
 
     Raises
     ------
     InputError
-        If the rig has no rectification: disparities mean nothing without that of the device.
+        If the rig has no rectification. Disparities need the rectification with which the device made them.
     """
     pair = rig.rectification
     if pair is None:
-        raise InputError("rig", "rectification", "none", "that of the device which made the disparities")
+        raise InputError("rig", "rectification", "none", "the rectification with which the device made the disparities")
     left = rig.reference
     rotation = left.sensor_from_camera.rotation @ pair.rotation_left.T
     K = pair.matrix_left
@@ -87,32 +102,39 @@ def decode_depth_map(
     source: str,
     roi: Roi | None = None,
 ) -> PointCloud:
-    """Put depths on their view rays.
+    """Convert depths to points on the view rays of the grid.
 
     Parameters
     ----------
     depth
         (H, W) [mm] along the axis of the grid, NaN where there is none.
+    geometry
+        From :func:`camera_map_geometry` or :func:`disparity_map_geometry`.
     near_mm, far_mm
-        Depths between which points are accepted [mm].
+        Range of accepted depths [mm].
     sensor, source
-        Carried into the cloud.
+        Copied into the cloud.
     roi
-        Region of the grid: decode only this.
+        Region of the grid to decode; None for all.
+
+    Returns
+    -------
+    PointCloud
+        Points in the sensor frame [mm]. Status ``NO_SURFACE`` where the map is NaN, ``OUT_OF_RANGE`` outside the range.
 
     Raises
     ------
     InputError
-        If the map is not of the grid's size.
+        If the map does not have the grid's size, or the region does not lie in the grid.
     """
     grid = geometry.grid
     if depth.shape != (grid.height, grid.width):
         raise _wrong_size("depth", depth.shape, grid)
     roi = checked_roi(roi, grid.width, grid.height, "decode_depth_map")
     columns, rows = roi.pixels()
-    z, ray = depth[roi.slices].astype(np.float64), grid.rays_at(columns, rows)
-    points = grid.origin + ray * (z / (ray @ grid.rotation[:, 2]))[..., None]
-    return _within(points, z, geometry, (near_mm, far_mm), sensor, source, roi)
+    z, rays = depth[roi.slices].astype(np.float64), grid.rays_at(columns, rows)
+    points = grid.origin + rays * (z / (rays @ grid.rotation[:, 2]))[..., None]
+    return _cloud_in_range(points, z, geometry, (near_mm, far_mm), sensor, source, roi)
 
 
 def decode_disparity_map(
@@ -125,7 +147,7 @@ def decode_disparity_map(
     source: str,
     roi: Roi | None = None,
 ) -> PointCloud:
-    """Triangulate disparities (H, W) [px] of the rectified left image; the rest as :func:`decode_depth_map`."""
+    """Triangulate disparities (H, W) [px] of the rectified left image; otherwise as :func:`decode_depth_map`."""
     assert geometry.rectification is not None  # disparity_map_geometry
     with np.errstate(divide="ignore"):
         depth = geometry.rectification.depth(disparity)
@@ -142,38 +164,39 @@ def decode_point_map(
     source: str,
     roi: Roi | None = None,
 ) -> PointCloud:
-    """Take points (H, W, 3) [mm] of the sensor frame as they are; the rest as :func:`decode_depth_map`."""
+    """Accept points (H, W, 3) [mm] in the sensor frame as they are; otherwise as :func:`decode_depth_map`."""
     grid = geometry.grid
     if points.shape != (grid.height, grid.width, 3):
         raise _wrong_size("points", points.shape, grid)
     roi = checked_roi(roi, grid.width, grid.height, "decode_point_map")
-    shown = points[roi.slices].astype(np.float64)
-    depth = (shown - grid.origin) @ grid.rotation[:, 2]
-    return _within(shown, depth, geometry, (near_mm, far_mm), sensor, source, roi)
+    measured = points[roi.slices].astype(np.float64)
+    depth = (measured - grid.origin) @ grid.rotation[:, 2]
+    return _cloud_in_range(measured, depth, geometry, (near_mm, far_mm), sensor, source, roi)
 
 
 def roi_of_other_grid(grid: ViewGrid, other: ViewGrid, roi: Roi, near_mm: float, far_mm: float) -> Roi | None:
-    """Return the region of ``other`` that holds all that ``roi`` of ``grid`` shows from near to far; None if nothing.
+    """Return the region of ``other`` that contains all that ``roi`` of ``grid`` shows in the range; None if empty.
 
-    The edge of the region is projected at both depths, pixel by pixel, so that it also holds for bent rays.
+    The boundary of the region is projected pixel by pixel at both depths [mm], so distorted rays are included. If a
+    point of it cannot be projected, the result is the whole of ``other``.
     """
     columns, rows = np.arange(roi.left, roi.right), np.arange(roi.top, roi.bottom)
-    edge = np.concatenate(
+    boundary = np.concatenate(
         [np.stack(np.broadcast_arrays(columns, row), axis=-1) for row in (roi.top, roi.bottom - 1)]
         + [np.stack(np.broadcast_arrays(column, rows), axis=-1) for column in (roi.left, roi.right - 1)]
     )
-    ray = grid.rays_at(edge[:, 0], edge[:, 1])
-    along = ray / (ray @ grid.rotation[:, 2])[:, None]
-    seen = other.project(np.concatenate([grid.origin + along * depth for depth in (near_mm, far_mm)]))
-    if not np.isfinite(seen).all():
+    rays = grid.rays_at(boundary[:, 0], boundary[:, 1])
+    ray_per_depth = rays / (rays @ grid.rotation[:, 2])[:, None]
+    projected = other.project(np.concatenate([grid.origin + ray_per_depth * depth for depth in (near_mm, far_mm)]))
+    if not np.isfinite(projected).all():
         return Roi.whole(other.width, other.height)
     size = np.array([other.width, other.height])
-    low = np.clip(np.floor(seen.min(axis=0)), 0, size).astype(int)
-    high = np.clip(np.ceil(seen.max(axis=0)) + 1, 0, size).astype(int)
+    low = np.clip(np.floor(projected.min(axis=0)), 0, size).astype(int)
+    high = np.clip(np.ceil(projected.max(axis=0)) + 1, 0, size).astype(int)
     return None if (low >= high).any() else Roi.between(*low, *high)
 
 
-def _within(
+def _cloud_in_range(
     points: NDArray[np.float64],
     depth: NDArray[np.float64],
     geometry: DeviceMapGeometry,
@@ -182,13 +205,14 @@ def _within(
     source: str,
     roi: Roi,
 ) -> PointCloud:
+    """Return the cloud of points (h, w, 3) of a region, with depths (h, w); points outside the range are rejected."""
     near_mm, far_mm = range_mm
     measured = np.isfinite(points).all(axis=-1)
     with np.errstate(invalid="ignore"):
         accepted = measured & (depth >= near_mm) & (depth <= far_mm)
     status = np.select([accepted, measured], [Status.VALID, Status.OUT_OF_RANGE], Status.NO_SURFACE).astype(np.uint8)
     points = np.where(accepted[..., None], points, np.nan)
-    return placed_cloud(points, status, None, roi, geometry, sensor, source)
+    return cloud_on_grid(points, status, None, roi, geometry, sensor, source)
 
 
 def _wrong_size(name: str, shape: tuple[int, ...], grid: ViewGrid) -> InputError:

@@ -1,4 +1,7 @@
-"""Grey levels of images: their noise, as an imager or the images themselves tell it, and their full scale."""
+"""Describe the grey levels of images: their noise, known from the imager or measured, and their full scale.
+
+Signal chain: grey level [DN] -> its variance [DN^2].
+"""
 
 from __future__ import annotations
 
@@ -13,27 +16,39 @@ from mitsim.sensor.imager import Imager
 
 @dataclass(frozen=True)
 class MeasuredNoise:
-    """Variance [DN^2] of grey levels, at some rising ``levels`` [DN]; linear between, and constant beyond."""
+    """Variance of grey levels as a function of the level, measured in images.
+
+    Attributes
+    ----------
+    levels
+        (n,) increasing [DN].
+    variances
+        (n,) [DN^2]; linear between the levels, and constant beyond them.
+    """
 
     levels: NDArray[np.float64]
     variances: NDArray[np.float64]
 
     def variance(self, level: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Variance [DN^2] at levels (...) [DN]."""
+        """Return the variance [DN^2] at levels (...) [DN]."""
         return np.asarray(np.interp(level, self.levels, self.variances), np.float32)
 
     @property
-    def middle(self) -> tuple[float, float]:
-        """Median level of those that were measured, and the standard deviation there [DN]."""
+    def at_median_level(self) -> tuple[float, float]:
+        """Median of the measured levels, and the standard deviation there [DN]."""
         level = float(np.median(self.levels))
         return level, float(np.sqrt(self.variance(np.array([level]))[0]))
 
 
 def grey_level_variance(level: NDArray[np.float32], imager: Imager | MeasuredNoise | None) -> NDArray[np.float32]:
-    """Variance [DN^2] of grey levels ``level`` (...) [DN]: EMVA 1288, as measured, or of quantisation alone.
+    """Return the variance (...) [DN^2] of grey levels (...) [DN].
 
-    sigma^2 = K^2 (sigma_read^2 + sigma_row^2) + K (level - black level) + 1/12, with K the gain [DN/e-], for a straight
-    response (gamma 1) and without the shot noise of dark current.
+    For an imager it follows from the linear camera model of EMVA Standard 1288:
+
+        sigma^2 = K^2 (sigma_read^2 + sigma_row^2) + K (level - black level) + 1/12
+
+    with the gain K [DN/e-]. The formula assumes a linear response (gamma 1) and excludes the shot noise of dark
+    current. Measured noise is interpolated. If ``imager`` is None the variance is that of quantisation, 1/12.
     """
     if imager is None:
         return np.full(level.shape, 1 / 12, np.float32)
@@ -44,13 +59,13 @@ def grey_level_variance(level: NDArray[np.float32], imager: Imager | MeasuredNoi
 
 
 def check_full_scale(stack: NDArray[np.generic], full_scale: float) -> None:
-    """Refuse a full scale that the stack's type cannot show.
+    """Reject a full scale [DN] that the stack's type cannot represent.
 
     Raises
     ------
     InputError
-        If it is not over zero, or over the largest value of the type.
+        If it is not over 0, or exceeds the largest value of the type.
     """
-    most = 2.0 ** (8 * stack.dtype.itemsize) - 1 if stack.dtype.kind == "u" else np.inf
-    if not 0 < full_scale <= most or not np.isfinite(full_scale):
-        raise InputError("image stack", "full_scale", full_scale, f"over 0, up to {most:g} DN")
+    largest = 2.0 ** (8 * stack.dtype.itemsize) - 1 if stack.dtype.kind == "u" else np.inf
+    if not 0 < full_scale <= largest or not np.isfinite(full_scale):
+        raise InputError("image stack", "full_scale", full_scale, f"over 0, up to {largest:g} DN")

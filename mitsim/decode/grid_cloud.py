@@ -1,7 +1,7 @@
-"""Decoded points of a region, put into an organised cloud of the whole grid.
+"""Insert the decoded points of a region into an organised cloud of the whole grid.
 
-Decoding a region gives the same points as decoding the whole image and cutting the region out, but for a margin at its
-edges that each decoder states.
+A decoded region has the same points as the same region of the whole decoded image. Each decoder states how far from the
+edges of a region its points may differ.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.sensor.roi import Roi
 
 
-class OnGrid(Protocol):
-    """What a decoder prepares once from a rig: it has at least the ``grid`` and ``baseline`` (3,) of its clouds."""
+class GridGeometry(Protocol):
+    """Geometry that a decoder prepares once from a rig, with at least ``grid`` and ``baseline``."""
 
     @property
     def grid(self) -> ViewGrid:
@@ -24,19 +24,35 @@ class OnGrid(Protocol):
 
     @property
     def baseline(self) -> NDArray[np.float64]:
-        """Unit vector from the first camera to the second camera or the projector, in the sensor frame."""
+        """(3,) unit vector from the first camera to the second camera or the projector, in the sensor frame."""
 
 
-def placed_cloud(
+def cloud_on_grid(
     points: NDArray[np.floating],
     status: NDArray[np.uint8],
     sigma: NDArray[np.floating] | None,
     roi: Roi,
-    geometry: OnGrid,
+    geometry: GridGeometry,
     sensor: str,
     source: str,
 ) -> PointCloud:
-    """Return a cloud of the whole grid with the points (h, w, 3), status and sigma of a region; else ``NO_SURFACE``."""
+    """Return a cloud of the whole grid with the results of a region; pixels outside are ``NO_SURFACE``.
+
+    Parameters
+    ----------
+    points
+        (h, w, 3) in the sensor frame [mm].
+    status
+        (h, w) of :class:`~characterisation.point_cloud.Status`.
+    sigma
+        (h, w) standard deviation along the view ray [mm], or None.
+    roi
+        The region; it is ignored if ``status`` has the size of the grid.
+    geometry
+        Grid and baseline of the cloud.
+    sensor, source
+        Copied into the cloud.
+    """
     grid, baseline = geometry.grid, geometry.baseline
     if status.shape == (grid.height, grid.width):
         return PointCloud(
@@ -48,18 +64,18 @@ def placed_cloud(
             baseline,
             sigma=None if sigma is None else np.asarray(sigma, np.float32),
         )
-    where, shape = roi.slices, (grid.height, grid.width)
-    every_point = np.full((*shape, 3), np.nan, np.float32)
-    every_status = np.full(shape, Status.NO_SURFACE, np.uint8)
-    every_point[where], every_status[where] = points, status
-    every_sigma = None
+    region, shape = roi.slices, (grid.height, grid.width)
+    all_points = np.full((*shape, 3), np.nan, np.float32)
+    all_status = np.full(shape, Status.NO_SURFACE, np.uint8)
+    all_points[region], all_status[region] = points, status
+    all_sigma = None
     if sigma is not None:
-        every_sigma = np.full(shape, np.nan, np.float32)
-        every_sigma[where] = sigma
-    return PointCloud(every_point, every_status, grid, sensor, source, baseline, sigma=every_sigma)
+        all_sigma = np.full(shape, np.nan, np.float32)
+        all_sigma[region] = sigma
+    return PointCloud(all_points, all_status, grid, sensor, source, baseline, sigma=all_sigma)
 
 
-def unseen_cloud(geometry: OnGrid, sensor: str, source: str) -> PointCloud:
+def empty_cloud(geometry: GridGeometry, sensor: str, source: str) -> PointCloud:
     """Return a cloud without points."""
-    nothing = np.empty((0, 0), np.uint8)
-    return placed_cloud(np.empty((0, 0, 3)), nothing, None, Roi(0, 0, 0, 0), geometry, sensor, source)
+    no_pixels = np.empty((0, 0), np.uint8)
+    return cloud_on_grid(np.empty((0, 0, 3)), no_pixels, None, Roi(0, 0, 0, 0), geometry, sensor, source)

@@ -1,4 +1,4 @@
-"""Properties of the images that a decoder needs beside the images themselves and the calibration."""
+"""Describe the properties of images that a decoder needs in addition to the images and the calibration."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ class ImageContext:
     Attributes
     ----------
     sensor, source
-        Carried into the cloud.
+        Copied into the cloud.
     full_scale
         Value of a saturated pixel [DN], ``2**bits - 1``.
     imager
-        Gain, read noise and black level, from which the expected noise follows; or the noise of grey levels measured
-        in the images themselves (:mod:`mitsim.decode.structured_light.measured_noise`). None where neither is known.
+        The imager, whose gain, read noise and black level give the expected noise; or noise measured in the images
+        (:mod:`mitsim.decode.structured_light.measured_noise`). None if neither is known.
     roi
-        Region of the cloud's grid: decode only this. Pixels outside are ``NO_SURFACE``.
+        Region of the cloud's grid to decode, None for all. Pixels outside are ``NO_SURFACE``.
     read_out
-        Region of the raw image of the first and of the second camera that was read out; None is the whole image.
+        Regions of the raw images of the first and second camera that were read out; None for a whole image.
     """
 
     sensor: str

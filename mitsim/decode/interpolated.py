@@ -1,4 +1,4 @@
-"""Which pixels of an image bilinear interpolation needs, and whether the camera read them out."""
+"""Determine the pixels that bilinear interpolation needs, and whether the camera has read them out."""
 
 from __future__ import annotations
 
@@ -8,28 +8,30 @@ from numpy.typing import NDArray
 from mitsim.sensor.roi import Roi
 
 
-def reach(positions: NDArray[np.float32], width: int, height: int) -> Roi:
-    """Return the region of an image that interpolation at ``positions`` (2, ...), column and row, needs.
+def needed_region(positions: NDArray[np.float32], width: int, height: int) -> Roi:
+    """Return the region of an image that interpolation needs at ``positions`` (2, ...), column and row [px].
 
-    It ends where the image does, so that positions beyond the image are treated as in the whole image.
+    It is clipped to the image. Positions beyond the image therefore give the same result as in the whole image.
     """
-    edges = []
-    for each, size in zip(positions, (width, height), strict=True):
-        low, high = (float(np.clip(end, 0, size)) for end in (each.min(), each.max()))  # a fisheye's may be infinite
+    limits = []
+    for coordinates, size in zip(positions, (width, height), strict=True):
+        # the positions of a fisheye camera may be infinite
+        low, high = (float(np.clip(end, 0, size)) for end in (coordinates.min(), coordinates.max()))
         first = min(max(int(low) - 1, 0), size - 1)
-        edges.append((first, max(min(int(np.ceil(high)) + 2, size), first + 1)))
-    (left, right), (top, bottom) = edges
+        limits.append((first, max(min(int(np.ceil(high)) + 2, size), first + 1)))
+    (left, right), (top, bottom) = limits
     return Roi.between(left, top, right, bottom)
 
 
-def has_been_read(positions: NDArray[np.float32], read_out: Roi, width: int, height: int) -> NDArray[np.bool_]:
-    """Whether interpolation at ``positions`` (2, ...), column and row, needs only pixels that were read out.
+def was_read_out(positions: NDArray[np.float32], read_out: Roi, width: int, height: int) -> NDArray[np.bool_]:
+    """Return whether interpolation at ``positions`` (2, ...) needs only pixels that were read out.
 
-    Where the region ends with the image, half a pixel more counts, as it does for whole images.
+    The positions are column and row [px]. Where the region ends at the edge of the image, positions up to half a pixel
+    beyond it are included, as in whole images.
     """
     column, row = positions
-    within = column >= (read_out.left if read_out.left > 0 else -0.5)
-    within &= column <= (read_out.right - 1 if read_out.right < width else width - 0.5)
-    within &= row >= (read_out.top if read_out.top > 0 else -0.5)
-    within &= row <= (read_out.bottom - 1 if read_out.bottom < height else height - 0.5)
-    return np.asarray(within)
+    inside = column >= (read_out.left if read_out.left > 0 else -0.5)
+    inside &= column <= (read_out.right - 1 if read_out.right < width else width - 0.5)
+    inside &= row >= (read_out.top if read_out.top > 0 else -0.5)
+    inside &= row <= (read_out.bottom - 1 if read_out.bottom < height else height - 0.5)
+    return np.asarray(inside)

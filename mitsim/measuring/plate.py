@@ -30,7 +30,7 @@ from characterisation.features.robust_fit import SMALLEST_SCALE
 from characterisation.features.surfaces import tangents
 from characterisation.point_cloud import PointCloud, ViewGrid
 from mitsim.capture.capture import Capture
-from mitsim.decode.dot_centres import dot_centres, seen_on_grid
+from mitsim.decode.dot_centres import dot_centres, resample_to_grid
 from mitsim.measuring.result import Result, failed
 from mitsim.measuring.windows import window_slices
 from mitsim.sensor.roi import Roi
@@ -85,7 +85,7 @@ def image_on_grid(capture: Capture, grid: ViewGrid) -> NDArray[np.uint8]:
     mean = capture.images[name].mean(axis=0)
     bright = float(np.percentile(mean, 99.9))
     level = np.clip(mean * (255.0 / max(bright, 1.0)), 0, 255).astype(np.uint8)
-    return seen_on_grid(level, capture.rig.reference, grid)
+    return resample_to_grid(level, capture.rig.reference, grid)
 
 
 def measure_plate(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.uint8]) -> list[Result]:

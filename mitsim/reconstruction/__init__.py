@@ -1,1 +1,1 @@
-"""A capture to a point cloud: which decoder it needs, its depth range, its noise."""
+"""Reconstruct a point cloud from a capture: choose the decoder, its depth range and its noise."""

@@ -1,7 +1,8 @@
-"""What each kind of sensor needs so that its captures become clouds: one entry of :data:`TECHNOLOGIES` each.
+"""Register how the captures of each technology become clouds: one entry of :data:`TECHNOLOGIES` for each.
 
-An entry names the settings of the decoder, what is prepared once from a rig, and the way from images to a cloud. The
-first four are decoded from raw images; of the last three the device has done the measuring, and its map is taken.
+An entry has the types of the decoder's settings and two functions. One prepares the geometry of a rig once, the other
+decodes images to a cloud. The first four technologies decode raw images. For the last three the device has measured a
+map, which is converted.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from mitsim.decode.device_maps import (
     disparity_map_geometry,
 )
 from mitsim.decode.grey_levels import MeasuredNoise
-from mitsim.decode.grid_cloud import unseen_cloud
+from mitsim.decode.grid_cloud import empty_cloud
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.reference_matching import ReferenceGeometry, decode_reference, reference_geometry
 from mitsim.decode.matching.stereo import StereoGeometry, decode_stereo, stereo_geometry
@@ -46,10 +47,10 @@ from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
 from mitsim.sensor.roi import Roi
 
-#: searched where neither a preset nor the recording says how near and far the sensor looks [mm]
+#: range of depths to search if neither a preset nor the recording gives one [mm]
 DEFAULT_RANGE_MM = (300.0, 2000.0)
 
-#: of what a device has measured itself, all is taken where nobody says otherwise [mm]
+#: range of depths to accept from a device's own map if none is given: everything [mm]
 DEVICE_RANGE_MM = (1e-3, 1e6)
 
 Settings = MatcherSettings | DecoderSettings | TimeOfFlightSettings | DeviceMapSettings
@@ -61,10 +62,20 @@ Pattern = DotPattern | LightCode | AmplitudeModulation
 class Images:
     """The images of a capture, ready to be decoded.
 
-    ``stacks`` of every camera (images, H, W) [DN], the reference camera's first, a bracket's already merged;
-    ``full_scale`` [DN]; ``imager`` that took them, or the noise measured in them, None where neither is known; ``roi``
-    of the cloud's grid that is decoded, None for all; ``read_out``, the region of the image of each camera that was not
-    read out whole.
+    Attributes
+    ----------
+    capture
+        The capture.
+    stacks
+        (P, H, W) images [DN] of each camera, that of the reference camera first. Exposures of a bracket are merged.
+    full_scale
+        Value of a saturated pixel [DN].
+    imager
+        The imager, or the noise measured in the images; None if neither is known.
+    roi
+        Region of the cloud's grid to decode; None for all.
+    read_out
+        Region that was read out of each camera, without cameras that were read out completely.
     """
 
     capture: Capture
@@ -75,34 +86,34 @@ class Images:
     read_out: dict[str, Roi]
 
     @property
-    def first(self) -> tuple[str, NDArray[np.unsignedinteger[Any]]]:
+    def reference(self) -> tuple[str, NDArray[np.unsignedinteger[Any]]]:
         """Name and stack of the reference camera."""
         return next(iter(self.stacks.items()))
 
     def context(self, roi: Roi | None) -> ImageContext:
-        """Properties of the images for a decoder of a region of the cloud's grid, None for the whole grid."""
-        parts = [self.read_out.get(name) for name in list(self.stacks)[:2]]
-        read_out = (parts[0], parts[-1] if len(parts) > 1 else None)
-        about = self.capture
-        return ImageContext(about.sensor, about.source, self.full_scale, self.imager, roi, read_out)
+        """Return the properties of the images for a decoder of a region of the cloud's grid; None for the whole."""
+        regions = [self.read_out.get(name) for name in list(self.stacks)[:2]]
+        read_out = (regions[0], regions[-1] if len(regions) > 1 else None)
+        capture = self.capture
+        return ImageContext(capture.sensor, capture.source, self.full_scale, self.imager, roi, read_out)
 
-    def of_pixels(self) -> tuple[Roi | None, bool]:
-        """Region of the raw image of the first camera to decode, and whether any of it was read out."""
-        region = self.read_out.get(self.first[0])
+    def raw_region(self) -> tuple[Roi | None, bool]:
+        """Return the region of the reference camera's raw image to decode, and whether any of it was read out."""
+        region = self.read_out.get(self.reference[0])
         if region is None or self.roi is None:
             return region or self.roi, True
-        shared = region.overlap(self.roi)
-        return shared, shared is not None
+        overlap = region.overlap(self.roi)
+        return overlap, overlap is not None
 
-    def counted(self, count: int, camera: str | None = None) -> NDArray[np.unsignedinteger[Any]]:
-        """The first ``count`` images of a camera, the reference if none is named; the scene's own light follows.
+    def first_images(self, count: int, camera: str | None = None) -> NDArray[np.unsignedinteger[Any]]:
+        """Return the first ``count`` images of a camera, by default the reference; the ambient image follows them.
 
         Raises
         ------
         InputError
             If there are fewer.
         """
-        name = camera or self.first[0]
+        name = camera or self.reference[0]
         stack = self.stacks[name]
         if len(stack) < count:
             raise InputError("capture", "images", f"{len(stack)} of {name}", f"{count}, as the pattern has")
@@ -113,10 +124,20 @@ class Images:
 class Technology:
     """How the captures of one kind of sensor become clouds.
 
-    ``settings``: types of what its decoder can be told, its own first; ``patterns``: kinds of pattern that a capture
-    must name, none where the decoder does not ask; ``geometry``: what is prepared once, of rig, settings and pattern;
-    ``decode``: images, geometry, settings and pattern to a cloud; ``range_mm`` that is searched where nobody says
-    another; ``measured``: the device has done it, so of a sensor's settings only their range counts.
+    Attributes
+    ----------
+    settings
+        Types of settings that the decoder accepts, its own first.
+    patterns
+        Kinds of pattern that a capture must name; empty if the decoder does not need one.
+    geometry
+        Function from rig, settings and pattern to the geometry that is prepared once.
+    decode
+        Function from images, geometry, settings and pattern to a cloud.
+    range_mm
+        Default range of depths to search [mm].
+    from_device
+        Whether the device has measured the points. Of a sensor's settings only the range is then used.
     """
 
     settings: tuple[type[Settings], ...]
@@ -124,7 +145,7 @@ class Technology:
     geometry: Callable[[Rig, Any, Any], Geometry]
     decode: Callable[[Images, Any, Any, Any], PointCloud]
     range_mm: tuple[float, float] = DEFAULT_RANGE_MM
-    measured: bool = False
+    from_device: bool = False
 
 
 def _stereo_geometry(rig: Rig, settings: MatcherSettings, pattern: None) -> StereoGeometry:
@@ -132,7 +153,7 @@ def _stereo_geometry(rig: Rig, settings: MatcherSettings, pattern: None) -> Ster
 
 
 def _stereo(images: Images, geometry: StereoGeometry, settings: MatcherSettings, pattern: None) -> PointCloud:
-    # the scene's own light comes last; SGBM takes one frame
+    # the ambient image is the last one; SGBM uses one frame
     ambient = bool(images.capture.settings.get("ambient_image", False))
     left, right = (stack[: len(stack) - ambient] for stack in list(images.stacks.values())[:2])
     if settings.method == "sgbm":
@@ -155,31 +176,31 @@ def _reference_geometry(rig: Rig, settings: MatcherSettings, pattern: DotPattern
 def _reference(
     images: Images, geometry: ReferenceGeometry, settings: MatcherSettings, pattern: DotPattern
 ) -> PointCloud:
-    return decode_reference(images.counted(1), geometry, settings, images.context(images.roi))
+    return decode_reference(images.first_images(1), geometry, settings, images.context(images.roi))
 
 
-class _Projected(Document):
-    """The part of a capture's settings that says how many pixels its pattern has, where the projector has no place."""
+class _ProjectorSize(Document):
+    """The part of a capture's settings with the size of its pattern, if the projector's pose is unknown."""
 
     projector_size_px: tuple[Annotated[int, Field(ge=16, le=20000)], Annotated[int, Field(ge=16, le=20000)]]
 
 
 def projector_size(capture: Capture) -> tuple[int, int]:
-    """Width and height of the pattern of a structured-light capture [px].
+    """Return the width and height of the pattern of a structured-light capture [px].
 
     Raises
     ------
     InputError
-        If the capture says neither where its projector is nor how large.
+        If the capture has neither a projector nor its size.
     """
     projector = capture.rig.projector
     if projector is not None:
         return projector.width, projector.height
     size = capture.settings.get("projector_size_px")
     if size is None:
-        raise InputError("rig", "projector", "none", "a projector: at least the size of its pattern")
+        raise InputError("rig", "projector", "none", "a projector, or at least the size of its pattern")
     where = f"capture of {capture.sensor}: settings.json"
-    return validate(where, {"projector_size_px": size}, _Projected).projector_size_px
+    return validate(where, {"projector_size_px": size}, _ProjectorSize).projector_size_px
 
 
 def _structured_light_geometry(rig: Rig, settings: DecoderSettings, code: LightCode) -> Geometry:
@@ -194,14 +215,14 @@ def _structured_light(
     size = projector_size(images.capture)
     count = len(roles(code, *size))
     if isinstance(geometry, StereoGeometry):
-        left, right = (images.counted(count, name) for name in list(images.stacks)[:2])
+        left, right = (images.first_images(count, name) for name in list(images.stacks)[:2])
         context = images.context(images.roi)
         return decode_structured_light_stereo(left, right, geometry, code, settings, size, context)
-    stack = images.counted(count)
-    roi, anything = images.of_pixels()
-    if not anything:
-        return unseen_cloud(geometry, images.capture.sensor, images.capture.source)
-    return decode_structured_light(stack, geometry, images.first[0], code, settings, images.context(roi))
+    stack = images.first_images(count)
+    roi, any_read_out = images.raw_region()
+    if not any_read_out:
+        return empty_cloud(geometry, images.capture.sensor, images.capture.source)
+    return decode_structured_light(stack, geometry, images.reference[0], code, settings, images.context(roi))
 
 
 def _time_of_flight_geometry(
@@ -213,20 +234,20 @@ def _time_of_flight_geometry(
 def _time_of_flight(
     images: Images, geometry: TimeOfFlightGeometry, settings: TimeOfFlightSettings, code: AmplitudeModulation
 ) -> PointCloud:
-    stack = images.counted(code.count)
-    roi, anything = images.of_pixels()
-    if not anything:
-        return unseen_cloud(geometry, images.capture.sensor, images.capture.source)
+    stack = images.first_images(code.count)
+    roi, any_read_out = images.raw_region()
+    if not any_read_out:
+        return empty_cloud(geometry, images.capture.sensor, images.capture.source)
     return decode_time_of_flight(stack, geometry, code, settings, images.context(roi))
 
 
-Decoded = Callable[..., PointCloud]
+MapDecoder = Callable[..., PointCloud]
 
 
-def _of_map(name: str, decode: Decoded) -> Callable[[Images, DeviceMapGeometry, Settings, None], PointCloud]:
-    """Decode the map of a name, within the range of any settings."""
+def _map_decoder(name: str, decode: MapDecoder) -> Callable[[Images, DeviceMapGeometry, Settings, None], PointCloud]:
+    """Return a function that decodes the map ``name`` within the range of any settings."""
 
-    def decoded(images: Images, geometry: DeviceMapGeometry, settings: Settings, pattern: None) -> PointCloud:
+    def decode_named_map(images: Images, geometry: DeviceMapGeometry, settings: Settings, pattern: None) -> PointCloud:
         capture = images.capture
         if name not in capture.derived:
             raise InputError(
@@ -245,13 +266,13 @@ def _of_map(name: str, decode: Decoded) -> Callable[[Images, DeviceMapGeometry, 
             roi=images.roi,
         )
 
-    return decoded
+    return decode_named_map
 
 
-def _measured(name: str, prepare: Callable[[Rig], DeviceMapGeometry], decode: Decoded) -> Technology:
+def _device_technology(name: str, prepare: Callable[[Rig], DeviceMapGeometry], decode: MapDecoder) -> Technology:
     settings = (DeviceMapSettings, MatcherSettings, DecoderSettings, TimeOfFlightSettings)
     return Technology(
-        settings, (), lambda rig, settings, pattern: prepare(rig), _of_map(name, decode), DEVICE_RANGE_MM, True
+        settings, (), lambda rig, settings, pattern: prepare(rig), _map_decoder(name, decode), DEVICE_RANGE_MM, True
     )
 
 
@@ -267,19 +288,19 @@ TECHNOLOGIES: dict[str, Technology] = {
     "time_of_flight": Technology(
         (TimeOfFlightSettings,), (AmplitudeModulation,), _time_of_flight_geometry, _time_of_flight
     ),
-    "depth_map": _measured("depth", camera_map_geometry, decode_depth_map),
-    "disparity_map": _measured("disparity", disparity_map_geometry, decode_disparity_map),
-    "point_map": _measured("points", camera_map_geometry, decode_point_map),
+    "depth_map": _device_technology("depth", camera_map_geometry, decode_depth_map),
+    "disparity_map": _device_technology("disparity", disparity_map_geometry, decode_disparity_map),
+    "point_map": _device_technology("points", camera_map_geometry, decode_point_map),
 }
 
 
 def technology_of(name: str) -> Technology:
-    """Entry of a technology.
+    """Return the entry of a technology.
 
     Raises
     ------
     InputError
-        If there is none of that name.
+        If there is none of this name.
     """
     if name not in TECHNOLOGIES:
         raise InputError("capture", "technology", repr(name), ", ".join(TECHNOLOGIES))

@@ -1,7 +1,7 @@
-"""From where the points of a structured-light capture have their sigma, and why others have none.
+"""Determine the noise of a capture's grey levels, and describe where the sigma of its points comes from.
 
-Of a whole ``[imager]``, it is that of its gain and read noise. Where nobody describes the imager, fringes show their
-noise themselves (:mod:`mitsim.decode.structured_light.measured_noise`); a Gray code has the error of a stripe's width.
+With a complete ``[imager]``, sigma follows from its gain and read noise. Without one, fringes show their noise
+themselves (:mod:`mitsim.decode.structured_light.measured_noise`). A Gray code has the error of a stripe's width.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.decode.grey_levels import MeasuredNoise
 from mitsim.decode.structured_light.measured_noise import measured_noise
-from mitsim.reconstruction.cloud import bracket_of, capture_pattern
+from mitsim.reconstruction.cloud import bracket_exposures, capture_pattern
 from mitsim.reconstruction.decoder_registry import projector_size
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.imager import Imager
@@ -20,41 +20,42 @@ from mitsim.sensor.light_code import GrayCodePhaseShift, LightCode, PhaseShift, 
 
 
 def known_noise(capture: Capture, imager: Imager | None) -> Imager | MeasuredNoise | None:
-    """Return the imager; where nobody describes it, the noise that the fringes of a structured-light capture show.
+    """Return the imager or, if there is none, the noise that a structured-light capture's fringes show.
 
-    None where neither tells it: of a Gray code alone, of three steps of one period, of a bracket of exposures.
+    The result is None if neither is available: for a Gray code alone, three steps of one period, or a bracket of
+    exposures.
     """
-    if imager is not None or capture.technology != "structured_light" or bracket_of(capture) is not None:
+    if imager is not None or capture.technology != "structured_light" or bracket_exposures(capture) is not None:
         return imager
     code, size = capture_pattern(capture), projector_size(capture)
     if not isinstance(code, PhaseShift | GrayCodePhaseShift | ImageSequence):
         return None
-    every = roles(code, *size)
-    stacks = [stack[: len(every)] for stack in capture.images.values() if len(stack) >= len(every)]
-    return measured_noise(stacks, every, 2.0**capture.bits - 1) if stacks else None
+    image_roles = roles(code, *size)
+    stacks = [stack[: len(image_roles)] for stack in capture.images.values() if len(stack) >= len(image_roles)]
+    return measured_noise(stacks, image_roles, 2.0**capture.bits - 1) if stacks else None
 
 
-def noise_in_words(capture: Capture, cloud: PointCloud, noise: Imager | MeasuredNoise | None) -> str:
-    """Return in words where the sigma of a structured-light cloud comes from, or why it has none; "" of others."""
+def sigma_source(capture: Capture, cloud: PointCloud, noise: Imager | MeasuredNoise | None) -> str:
+    """Return a sentence on the source of a structured-light cloud's sigma, or why it has none; "" for others."""
     if capture.technology != "structured_light" or not cloud.valid.any():
         return ""
     code = capture_pattern(capture)
     fringes = isinstance(code, LightCode) and any(has_fringes(code, axis) for axis in axes(code))
     if cloud.sigma is None or not np.isfinite(cloud.sigma[cloud.valid]).any():
         if not fringes:
-            why = "the error of a Gray code between two cameras is not another from pixel to pixel"
-        elif bracket_of(capture) is not None:
-            why = "it is not told of several exposures"
+            reason = "the errors of a Gray code between two cameras are not independent between pixels"
+        elif bracket_exposures(capture) is not None:
+            reason = "it is not propagated through merged exposures"
         else:
-            why = (
-                "nobody says what the imager's noise is, and the fringes leave nothing over to measure it from: decode "
-                "with --sensor and a file whose [imager] is whole"
+            reason = (
+                "the imager is not described, and the fringes have too few images to measure its noise: decode with "
+                "--sensor and a file with a complete [imager]"
             )
-        return f"sigma of the points: not known, {why}"
+        return f"sigma of the points: not known, {reason}"
     if isinstance(noise, MeasuredNoise) and fringes:
-        level, deviation = noise.middle
+        level, deviation = noise.at_median_level
         return (
-            f"sigma of the points: from the contrast of the fringes and the noise about their fit, "
-            f"{deviation:.2g} DN at a level of {level:.0f}, since nobody describes the imager"
+            f"sigma of the points: from the contrast of the fringes and the residuals of their fit, "
+            f"{deviation:.2g} DN at a level of {level:.0f}, since the imager is not described"
         )
-    return "" if noise is not None else "sigma of the points: that of an even error over the width of a stripe"
+    return "" if noise is not None else "sigma of the points: that of a uniform error over the width of a stripe"

@@ -72,9 +72,9 @@ def test_coupons_out_of_the_decoders_range_are_told(kept, near, far):
     assert len(lines) == NAMED and rest == (
         f"warning: and {len(found) - NAMED} of {len(found)} more are outside the range"
     )
-    assert lines[0].startswith(f"warning: {next(iter(found))}: the coupon stands at a depth of 4")
+    assert lines[0].startswith(f"warning: {next(iter(found))}: the coupon is at a depth of 4")
     assert lines[0].endswith(
-        f"(by its pose), and the decoder searches {near} to {far} mm: change near_mm and far_mm in [matcher] of the "
+        f"(by its pose), but the decoder searches {near} to {far} mm: change near_mm and far_mm in [matcher] of the "
         "sensor file of ensenso-n10"
     )
     planned = out_of_range(other)

@@ -106,7 +106,7 @@ def test_brightness_and_contrast_of_one_eye_do_not_matter(gain, offset):
     assert np.abs(plain.disparity - changed.disparity)[both].max() < 0.01
 
 
-def test_what_the_other_eye_does_not_show_is_not_claimed_or_disagrees():
+def test_pixels_that_the_other_camera_does_not_see_have_no_match_from_it_or_disagree():
     left, right = drawn(2, 20.0)
     far = drawn(2, 12.0)[1]
     right[:, :, 100:] = far[:, :, 100:]  # a nearer surface up to right column 100, a farther one behind
@@ -143,12 +143,12 @@ def test_matrix_products_find_what_a_search_disparity_by_disparity_finds(monkeyp
     """Up to rounding: the sub-pixel step of a match that hangs by a thread multiplies it, in one of 1000."""
     images = drawn(frames, 20.4, 0.02, noise=4.0)
     by_products = matched(images, block_size=block)
-    monkeypatch.setattr(correlation, "_MANY_FRAMES", frames + 1)
+    monkeypatch.setattr(correlation, "_PRODUCT_FRAMES", frames + 1)
     by_disparity = matched(images, block_size=block)
     both = np.isfinite(by_products.disparity) & np.isfinite(by_disparity.disparity)
     assert both.mean() > 0.75
     assert np.mean(np.isfinite(by_products.disparity) != np.isfinite(by_disparity.disparity)) < 1e-3
-    assert np.mean(by_products.claimed != by_disparity.claimed) < 1e-3
+    assert np.mean(by_products.matched_back != by_disparity.matched_back) < 1e-3
     off = np.abs(by_products.disparity - by_disparity.disparity)[both]
     assert np.quantile(off, 0.999) < 1e-4
 
@@ -160,7 +160,7 @@ def test_a_match_does_not_depend_on_the_columns_beside_it(frames, columns):
     left, right = (each.astype(np.float32) - 120 for each in drawn(frames, 20.4, 0.02, noise=4.0))
     whole = correlate_both_ways(left, right, (0, WIDTH), 10, 32, SETTINGS)
     part = correlate_both_ways(left, right, columns, 10, 32, SETTINGS)
-    for name in ("disparity", "disagreement", "claimed"):
+    for name in ("disparity", "disagreement", "matched_back"):
         one, other = getattr(part, name), getattr(whole, name)[:, slice(*columns)]
         assert np.ascontiguousarray(one[:, 2:-2]).tobytes() == np.ascontiguousarray(other[:, 2:-2]).tobytes(), name
 

@@ -8,7 +8,7 @@ import pytest
 from mitsim.capture.capture import Capture
 from mitsim.decode.structured_light.measured_noise import measured_noise
 from mitsim.reconstruction.cloud import capture_cloud
-from mitsim.reconstruction.noise import known_noise, noise_in_words
+from mitsim.reconstruction.noise import known_noise, sigma_source
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
@@ -127,8 +127,9 @@ def test_points_scatter_as_their_sigma_says(pair, rng):
     ratio = off / cloud.sigma[inner]
     assert inner.sum() > 10000
     assert 1.4826 * np.median(np.abs(ratio)) == pytest.approx(1, abs=0.06)
-    words = noise_in_words(capture, cloud, noise)
-    assert "from the contrast of the fringes and the noise about their fit, 1.5 DN" in words
+    assert "from the contrast of the fringes and the residuals of their fit, 1.5 DN" in sigma_source(
+        capture, cloud, noise
+    )
     bare = capture_cloud(capture, settings)
     assert bare.sigma is None or not np.isfinite(bare.sigma[bare.valid]).any()
-    assert "not known" in noise_in_words(capture, bare, None)
+    assert "not known" in sigma_source(capture, bare, None)

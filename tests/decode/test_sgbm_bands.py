@@ -13,9 +13,9 @@ from mitsim.decode.matching.sgbm_bands import (
     Penalties,
     bytes_by_opencv,
     bytes_of_band,
-    fits,
+    fits_16_bits,
     match_in_bands,
-    rows_within,
+    rows_in_budget,
 )
 from mitsim.sensor.matcher import MatcherSettings
 
@@ -52,7 +52,7 @@ def test_bands_are_opencv_to_the_last_bit(
 ):
     reference, other = pair(height, width + count, blur, noise, seed)
     penalties = Penalties(block, p1 * block**2, p2 * block**2, cap, uniqueness)
-    if not fits(penalties):
+    if not fits_16_bits(penalties):
         return
     whole = cv2.StereoSGBM.create(
         0, count, block, penalties.p1, penalties.p2, -1, cap, uniqueness, 0, 0, cv2.STEREO_SGBM_MODE_HH
@@ -73,7 +73,7 @@ def test_matches_do_not_depend_on_the_budget(block, mode):
     if block < 31:
         assert np.isfinite(wide.disparity).mean() > 0.5
     for other in (one_way, tiny):
-        for name in ("disparity", "disagreement", "claimed"):
+        for name in ("disparity", "disagreement", "matched_back"):
             np.testing.assert_array_equal(getattr(other, name), getattr(wide, name))
 
 
@@ -95,9 +95,9 @@ def test_a_tiny_budget_matches_in_bands(monkeypatch):
 
 
 def test_the_rows_of_a_band_keep_the_budget_where_any_do():
-    rows = rows_within(450e6, 1024, 1280, 512)
+    rows = rows_in_budget(450e6, 1024, 1280, 512)
     assert bytes_of_band(rows, 1024, 1280, 512) <= 450e6 < bytes_of_band(rows + 1, 1024, 1280, 512)
-    least = rows_within(1.0, 1024, 1280, 512)
+    least = rows_in_budget(1.0, 1024, 1280, 512)
     assert bytes_of_band(least, 1024, 1280, 512) == min(bytes_of_band(k, 1024, 1280, 512) for k in range(1, 1025))
 
 
@@ -117,8 +117,10 @@ def test_the_memory_of_bands_is_what_is_said(rows):
 def test_both_ways_together_keep_the_budget_whatever_the_range(count):
     """Images of 1280 x 1024: what OpenCV takes, or a band of as many rows as fit; at least one row has to."""
     budget = sgbm.BUDGET_BYTES
-    share, ways = sgbm._memory(MatcherSettings(near_mm=275, far_mm=3878, mode="hh"), 1024, 1280, count, budget)
+    share, ways = sgbm._memory_per_direction(
+        MatcherSettings(near_mm=275, far_mm=3878, mode="hh"), 1024, 1280, count, budget
+    )
     taken = bytes_by_opencv(1024, 1280, count)
     if taken > share:
-        taken = bytes_of_band(rows_within(share, 1024, 1280, count), 1024, 1280, count)
+        taken = bytes_of_band(rows_in_budget(share, 1024, 1280, count), 1024, 1280, count)
     assert ways * taken <= budget

@@ -266,7 +266,7 @@ DISTORTED_GRID = structured_light_geometry(distorted_rig(), "eye", PHASE, 400, 9
     [
         ({"stack": np.zeros((24, 5, 5), np.uint8)}, "images of eye"),
         ({"stack": np.zeros((23, HEIGHT, WIDTH), np.uint8)}, "image stack"),
-        ({"camera": "eyes"}, "did you mean 'eye'"),
+        ({"camera_name": "eyes"}, "did you mean 'eye'"),
         ({"rig": replace(distorted_rig(), projector=None)}, "projector"),
         ({"context": ImageContext("drawn", "simulated", 0)}, "full_scale"),
         (
@@ -290,7 +290,7 @@ def test_what_does_not_fit_together_is_refused(change, message):
     given = {
         "stack": np.zeros((24, HEIGHT, WIDTH), np.uint8),
         "rig": distorted_rig(),
-        "camera": "eye",
+        "camera_name": "eye",
         "code": PHASE,
         "settings": SETTINGS,
         "context": ImageContext("drawn", "simulated", 255),

@@ -331,7 +331,7 @@ def test_what_cannot_be_decoded_is_told():
         decode(np.zeros((6, *SHAPE), np.uint16), geometry, modulation((80.0, 120.0)))
     assert np.isclose(unambiguous_path(code), LIGHT_MM_S / 8e6)
     assert np.isclose(unambiguous_path(modulation((999.0, 1000.0))), 64 * LIGHT_MM_S / 1e9)
-    with pytest.raises(InputError, match="the lamp"):
+    with pytest.raises(InputError, match="the light source"):
         time_of_flight_geometry(Rig(rig().cameras), "depth", 400, 4600)
     with pytest.raises(InputError, match="found 'left'; allowed: depth"):
         time_of_flight_geometry(rig(), "left", 400, 4600)

@@ -13,7 +13,7 @@ from mitsim.campaign.plan import coupon_pose
 from mitsim.capture.folder import write_capture
 from mitsim.cli import app
 from mitsim.reconstruction.cloud import capture_cloud
-from mitsim.reconstruction.depth_range import _coarse, agreement, depths_of, surface_beyond
+from mitsim.reconstruction.depth_range import _coarse_capture, depths_of, neighbour_agreement, surface_beyond
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.camera import Rig, stereo_rectification
 from mitsim.sensor.preset import load_sensor
@@ -62,7 +62,7 @@ def test_a_surface_nearer_or_farther_than_the_range_is_found(taken):
 def test_an_ordinary_capture_is_not_looked_at_twice(taken, monkeypatch):
     sensor, capture = taken
     cloud = capture_cloud(capture, sensor.settings)
-    assert agreement(cloud) > 0.95
+    assert neighbour_agreement(cloud) > 0.95
 
     def twice(*_):
         raise AssertionError("decoded twice")
@@ -110,7 +110,7 @@ def test_fewer_pixels_look_along_the_same_rays(n10, binned):
         rig=replace(n10.rig, rectification=pair),
         settings=capture.settings | {"read_out": {"left": [10, 20, 300, 200]}},
     )
-    few = _coarse(capture, 3, binned=binned)
+    few = _coarse_capture(capture, 3, binned=binned)
     eye = few.rig.reference
     assert (eye.height, eye.width) == few.images["left"].shape[1:]
     mine = eye.rays(np.array([[40.0, 50.0]]))
@@ -149,7 +149,7 @@ def test_decode_warns_in_one_line(n10, tmp_path):
         told[folder.name] = [line for line in done.stderr.splitlines() if "warning" in line]
     assert told["near"] == []
     (line,) = told["far"]
-    assert line.startswith(f"warning: {far}: a surface stands at a depth of ")
+    assert line.startswith(f"warning: {far}: a surface is at a depth of ")
     assert "searches 1000 to 2000 mm: change near_mm and far_mm in settings.json" in line
     depths = [float(number) for number in re.findall(r"(\d+) to (\d+) mm \(a coarse", line)[0]]
     assert 0.93 * distance < depths[0] <= depths[1] < 1.07 * distance

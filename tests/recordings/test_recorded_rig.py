@@ -63,7 +63,7 @@ def test_the_smallest_file_of_the_how_to_imports_and_decodes_at_the_first_try(tm
     run("import", tmp_path / "images", "--sensor", file, "-o", tmp_path / "capture")
     done = run("decode", tmp_path / "capture", "-o", tmp_path / "cloud.ply")
     assert "50 to 20000 mm" in done.output
-    assert "sigma of the points: that of an even error over the width of a stripe" in done.output
+    assert "sigma of the points: that of a uniform error over the width of a stripe" in done.output
     cloud = read_ply(tmp_path / "cloud.ply")
     assert cloud.valid.mean() > 0.8
     off = np.linalg.norm(cloud.points - truth, axis=-1)[cloud.valid]
@@ -176,5 +176,5 @@ def test_fringes_without_an_imager_have_the_sigma_of_their_own_noise_and_decode_
     assert (capture.bits, capture.settings["exposure_s"]) == (12, 0.02)
     assert "bits_from" in done.output
     done = run("decode", tmp_path / "capture", "--range", 300, 800, "-o", tmp_path / "cloud.ply")
-    assert "sigma of the points: from the contrast of the fringes and the noise about their fit, 16 DN" in done.output
+    assert "sigma of the points: from the contrast of the fringes and the residuals of their fit, 16 DN" in done.output
     assert np.isfinite(read_ply(tmp_path / "cloud.ply").sigma).sum() > 5000

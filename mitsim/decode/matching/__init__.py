@@ -1,1 +1,1 @@
-"""Stereo and reference matching: two images, or an image and its reference, to disparity and points."""
+"""Match two images, or an image and its reference, to disparity and points."""

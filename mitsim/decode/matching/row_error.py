@@ -1,8 +1,10 @@
-"""By how many rows the rectified right image of a pair is off: what calibration or a shock has left.
+"""Measure the row error of the rectified right image of a pair, which a calibration error or a shock causes.
 
-Rectified images show a point in the same row. Signal chain: pixels of a patch of the rectified left image -> their
-places in the right one, by the disparity that was decoded -> sum of squared differences, less the means, at whole rows
-up and down -> the parabola through the smallest and its neighbours.
+Rectified images show a point in the same row.
+
+Signal chain: pixels of a patch of the rectified left image -> their positions in the right image, by the decoded
+disparity -> mean squared difference without the means, at whole rows up and down -> parabola through the least value
+and its neighbours -> row error [px].
 """
 
 from __future__ import annotations
@@ -15,8 +17,8 @@ from mitsim.decode.matching.stereo import StereoGeometry
 
 Floats = NDArray[np.float64]
 
-#: rows up and down that are tried
-ROWS = 2
+#: largest offset that is tested, up and down [rows]
+MAXIMUM_ROWS = 2
 
 
 def row_error(
@@ -27,26 +29,39 @@ def row_error(
     columns: NDArray[np.intp],
     disparity: Floats,
 ) -> float:
-    """Rows [px] by which the right image must be moved to fit a patch best; NaN if more than :data:`ROWS`.
+    """Return the number of rows [px] by which the right image must be shifted to fit a patch best.
 
-    ``left``, ``right`` (H, W) raw images [DN]; ``rows``, ``columns`` (n,) of the patch's pixels in the rectified left
-    image, and their ``disparity`` (n,) [px].
+    Parameters
+    ----------
+    left, right
+        (H, W) raw images [DN].
+    geometry
+        Rectifying maps of the pair.
+    rows, columns
+        (n,) pixels of the patch in the rectified left image.
+    disparity
+        (n,) of these pixels [px].
+
+    Returns
+    -------
+    float
+        NaN if the best offset is not within :data:`MAXIMUM_ROWS`.
     """
-    mine = _at(left, geometry.map_left[:, rows, columns])
+    left_levels = _sampled(left, geometry.map_left[:, rows, columns])
     costs = []
-    for step in range(-ROWS, ROWS + 1):
-        at = [rows + float(step), columns - disparity]
-        raw = np.stack([map_coordinates(axis, at, order=1, mode="nearest") for axis in geometry.map_right])
-        theirs = _at(right, raw)
-        off = mine - mine.mean() - (theirs - theirs.mean())
-        costs.append(float(np.mean(off**2)))
+    for step in range(-MAXIMUM_ROWS, MAXIMUM_ROWS + 1):
+        positions = [rows + float(step), columns - disparity]
+        raw = np.stack([map_coordinates(axis, positions, order=1, mode="nearest") for axis in geometry.map_right])
+        right_levels = _sampled(right, raw)
+        difference = left_levels - left_levels.mean() - (right_levels - right_levels.mean())
+        costs.append(float(np.mean(difference**2)))
     best = int(np.argmin(costs))
-    if not 0 < best < 2 * ROWS:
+    if not 0 < best < 2 * MAXIMUM_ROWS:
         return float("nan")
-    before, here, after = costs[best - 1 : best + 2]
-    bend = before - 2 * here + after
-    return best - ROWS + (0.5 * (before - after) / bend if bend > 0 else 0.0)
+    before, lowest, after = costs[best - 1 : best + 2]
+    curvature = before - 2 * lowest + after
+    return best - MAXIMUM_ROWS + (0.5 * (before - after) / curvature if curvature > 0 else 0.0)
 
 
-def _at(image: Floats, raw: NDArray[np.floating]) -> Floats:
+def _sampled(image: Floats, raw: NDArray[np.floating]) -> Floats:
     return np.asarray(map_coordinates(image, [raw[1], raw[0]], order=1, mode="nearest"))

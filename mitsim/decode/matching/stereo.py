@@ -1,17 +1,24 @@
-"""Passive and active stereo: a raw pair and its calibration to an organised point cloud.
+"""Decode passive and active stereo: a raw pair and its calibration to an organised point cloud.
 
-Signal chain: raw pair [DN], of one frame or several -> undistorted and rectified (bilinear) -> SGBM of the one frame,
-in 8 bit and with its local contrast evened where asked (:mod:`mitsim.decode.matching.sgbm`), or correlation of all
-frames (:mod:`mitsim.decode.matching.correlation`), from the left and from the right -> left-right check -> disparity d
-[px], in steps where asked -> depth Z = f B / (d + cx_right - cx_left) [mm] -> points in the sensor frame.
+Signal chain: raw pair [DN], of one frame or several -> undistorted and rectified (bilinear) -> matched from the left
+and from the right -> left-right check -> disparity d [px], in steps if the device has them -> depth Z = f B / (d +
+cx_right - cx_left) [mm] -> points in the sensor frame.
 
-SGBM takes 8 bits: images are scaled by 255 / full scale after rectification and rounded. Nothing is filled,
-filtered or smoothed: the recovered fraction is that of the matcher. There is one rejection beyond the left-right check
-and uniqueness: SGBM's smoothness term readily paints a disparity over a blank area, so a pixel whose block has less
-contrast than ``minimum_contrast_dn`` is no point, and its reason is ``LOW_MODULATION``.
+There are two matchers:
 
-A region of interest is matched with :data:`ROI_MARGIN_PX` around it. By correlation its points are those of the whole
-image up to its very edge; SGBM's smoothness lets the cut change points some pixels into it where the pattern is faint.
+- SGBM of one frame, in 8 bits, with equalised local contrast if set (:mod:`mitsim.decode.matching.sgbm`)
+- correlation of all frames (:mod:`mitsim.decode.matching.correlation`)
+
+SGBM needs 8 bits, so images are scaled by 255 / full scale after rectification and rounded. Nothing is filled, filtered
+or smoothed, so the recovered fraction is that of the matcher.
+
+There is one rejection in addition to the left-right check and uniqueness. SGBM's smoothness term extends disparities
+into areas without texture. A pixel whose block has a contrast below ``minimum_contrast_dn`` is therefore rejected as
+``LOW_MODULATION``.
+
+A region of interest is matched with a margin of :data:`ROI_MARGIN_PX`. By correlation it has the same points as in the
+whole image, up to its edge. With SGBM, the cut may change points some pixels inside the edge where the pattern is
+faint.
 """
 
 from __future__ import annotations
@@ -25,11 +32,17 @@ from numpy.typing import NDArray
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.decode.grid_cloud import placed_cloud
+from mitsim.decode.grid_cloud import cloud_on_grid
 from mitsim.decode.image_context import ImageContext
-from mitsim.decode.interpolated import has_been_read, reach
+from mitsim.decode.interpolated import needed_region, was_read_out
 from mitsim.decode.matching.correlation import correlate_both_ways
-from mitsim.decode.matching.evidence import at_right, block_deviation, block_saturated, nearest_value, reasons
+from mitsim.decode.matching.evidence import (
+    block_deviation,
+    block_saturated,
+    first_reason,
+    nearest_value,
+    right_property,
+)
 from mitsim.decode.matching.sgbm import local_contrast, match_both_ways, search_range
 from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
 from mitsim.sensor.matcher import MatcherSettings
@@ -37,16 +50,26 @@ from mitsim.sensor.roi import Roi, checked_roi
 
 Raw = NDArray[np.uint8] | NDArray[np.uint16]
 Strips = list[NDArray[Any]]
-#: pixels matched beyond a region of interest on each side, so that SGBM's paths forget the cut before they reach it
+#: pixels that are matched beyond a region of interest on each side, to reduce the effect of the cut on SGBM's paths
 ROI_MARGIN_PX = 16
 
 
 @dataclass(frozen=True)
 class StereoGeometry:
-    """All that decoding needs of a rig, computed once: rectifying maps, what they can see, and the grid of the cloud.
+    """Geometry of a rectified pair, computed once.
 
-    ``map_left``, ``map_right`` (2, H, W) float32: raw column and row shown at each rectified pixel; ``seen_left``,
-    ``seen_right`` (H, W): whether that raw pixel exists; ``raw_size`` (H, W) of the raw images.
+    Attributes
+    ----------
+    rectification
+        Matrices and rotations of the rectified pair.
+    map_left, map_right
+        (2, H, W) float32: raw column and row [px] of each rectified pixel.
+    seen_left, seen_right
+        (H, W) whether this raw pixel exists.
+    raw_size
+        (H, W) of the raw left and right images.
+    grid, baseline
+        Pixels of the cloud, and unit vector (3,) from the left to the right camera.
     """
 
     rectification: Rectification
@@ -60,12 +83,12 @@ class StereoGeometry:
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """Pixels of the grid that the reference camera has."""
+        """(H, W) whether the reference camera has the pixel of the grid."""
         return self.seen_left
 
 
 def stereo_geometry(rig: Rig) -> StereoGeometry:
-    """Rectify the first two cameras of a rig: by its own rectification where it has one, else by Bouguet's method.
+    """Rectify the first two cameras of a rig, by its own rectification if it has one, else by Bouguet's method.
 
     Raises
     ------
@@ -120,27 +143,35 @@ def decode_stereo(
     Parameters
     ----------
     left, right
-        (H, W) or (F, H, W) raw images [DN], uint8 or uint16, of the first and second camera of the rig. Several
-        frames are of the same scene under different patterns.
+        (H, W) or (F, H, W) raw images [DN], uint8 or uint16, of the first and second camera of the rig. Several frames
+        show the same scene with different patterns.
     rig
-        The calibration; or the :func:`stereo_geometry` made of it, which saves making the maps for every pair.
+        The calibration, or the :func:`stereo_geometry` made from it, which saves computing the maps for each pair.
     settings
         Search range and limits of the matcher.
     context
-        Of the images; its ``roi`` is one of the rectified left grid.
+        Of the images. Its ``roi`` is a region of the rectified left grid.
     noisy_right
-        False where the right image is a reference without noise.
+        False if the right image is a reference without noise.
 
     Returns
     -------
     PointCloud
-        On the rectified left grid, points in the sensor frame [mm].
+        On the rectified left grid, points in the sensor frame [mm]. Status of a pixel without a point, by the first
+        condition that holds:
+
+        - ``NO_SURFACE``: outside an image
+        - ``SATURATED``: a quarter of the block, in either image
+        - ``LOW_MODULATION``: too little contrast, in either image
+        - ``OUT_OF_RANGE``: the depth is not between near and far
+        - ``HIDDEN``: no match from the right image, or a contradicting one
+        - ``AMBIGUOUS``: none of these, so there is no unique match
 
     Raises
     ------
     InputError
-        If the images are not what the calibration says, the method takes one frame and there are several, or the
-        region of interest does not lie in the grid.
+        If the images do not fit the calibration, there are several frames for SGBM, or the region of interest does not
+        lie in the grid.
     """
     geometry = rig if isinstance(rig, StereoGeometry) else stereo_geometry(rig)
     grid, rectification = geometry.grid, geometry.rectification
@@ -160,7 +191,7 @@ def decode_stereo(
     if roi is None and read_out[0] is not None:
         roi = rectified_roi(geometry, read_out[0])
     roi = checked_roi(roi, grid.width, grid.height, "decode_stereo")
-    # matched are the region and a margin, whole rows of both images
+    # the region is matched with a margin, and with whole rows of both images
     begin, end = max(roi.left - ROI_MARGIN_PX, 0), min(roi.right + ROI_MARGIN_PX, grid.width)
     rows = slice(max(roi.top - ROI_MARGIN_PX, 0), min(roi.bottom + ROI_MARGIN_PX, grid.height))
 
@@ -178,10 +209,10 @@ def decode_stereo(
             noisy_right=noisy_right,
         )
     else:
-        even_left, even_right = (
+        equalised_left, equalised_right = (
             local_contrast(strips[0], settings.contrast_window_px) for strips in (left_strips, right_strips)
         )
-        matches = match_both_ways(even_left, even_right, (begin, end), first, count, settings)
+        matches = match_both_ways(equalised_left, equalised_right, (begin, end), first, count, settings)
     disparity = matches.disparity
     if settings.disparity_step > 0:
         disparity = settings.disparity_step * np.rint(disparity / settings.disparity_step)
@@ -191,49 +222,51 @@ def decode_stereo(
     block = settings.block_size
     seen_left, seen_right = geometry.seen_left[rows, begin:end], geometry.seen_right[rows]
     if read_out[0] is not None:
-        seen_left = seen_left & _read(geometry.map_left[:, rows, begin:end], read_out[0], geometry.raw_size[0])
+        seen_left = seen_left & _read_out_pixels(
+            geometry.map_left[:, rows, begin:end], read_out[0], geometry.raw_size[0]
+        )
     if read_out[1] is not None:
-        seen_right = seen_right & _read(geometry.map_right[:, rows], read_out[1], geometry.raw_size[1])
-    blank_left = _blank(left_strips, settings)[:, begin:end]
+        seen_right = seen_right & _read_out_pixels(geometry.map_right[:, rows], read_out[1], geometry.raw_size[1])
+    blank_left = _lacks_contrast(left_strips, settings)[:, begin:end]
     matched = np.isfinite(disparity)
     in_range = (depth >= settings.near_mm) & (depth <= settings.far_mm)
     confirmed = matches.disagreement <= settings.left_right_px
-    where = np.where(matched, disparity, 0)
-    right_exists = at_right(seen_right, columns, where, outside=False)
+    disparity_or_zero = np.where(matched, disparity, 0)
+    right_exists = right_property(seen_right, columns, disparity_or_zero, outside=False)
     valid = matched & in_range & confirmed & seen_left & right_exists & ~blank_left
 
-    # where the right camera would see the pixel, were it a part of the nearest surface that was found
+    # disparity at which the right camera would see the pixel, if the pixel belonged to the nearest decoded surface
     expected = nearest_value(disparity, valid, first + count / 2)
-    blank_right = _blank(right_strips, settings)
-    blown_left, blown_right = (
+    blank_right = _lacks_contrast(right_strips, settings)
+    saturated_left, saturated_right = (
         np.any([block_saturated(frame, block) for frame in full], axis=0) for full in (left_full, right_full)
     )
-    saturated = blown_left[:, begin:end] | at_right(blown_right, columns, expected, outside=False)
+    saturated = saturated_left[:, begin:end] | right_property(saturated_right, columns, expected, outside=False)
     evidence = [
-        (Status.NO_SURFACE, ~seen_left | ~at_right(seen_right, columns, expected, outside=False)),
+        (Status.NO_SURFACE, ~seen_left | ~right_property(seen_right, columns, expected, outside=False)),
         (Status.SATURATED, saturated),
-        (Status.LOW_MODULATION, blank_left | at_right(blank_right, columns, expected, outside=False)),
+        (Status.LOW_MODULATION, blank_left | right_property(blank_right, columns, expected, outside=False)),
         (Status.OUT_OF_RANGE, matched & ~in_range),
-        (Status.HIDDEN, ~matches.claimed | (matches.disagreement > settings.left_right_px)),
+        (Status.HIDDEN, ~matches.matched_back | (matches.disagreement > settings.left_right_px)),
     ]
-    status = reasons(valid, evidence, Status.AMBIGUOUS)
+    status = first_reason(valid, evidence, Status.AMBIGUOUS)
 
-    inner = Roi(roi.left - begin, roi.top - rows.start, roi.width, roi.height).slices
-    points = _points(np.where(valid, depth, np.nan)[inner], roi, grid)
-    return placed_cloud(points, status[inner], None, roi, geometry, context.sensor, context.source)
+    inside_margin = Roi(roi.left - begin, roi.top - rows.start, roi.width, roi.height).slices
+    points = _points(np.where(valid, depth, np.nan)[inside_margin], roi, grid)
+    return cloud_on_grid(points, status[inside_margin], None, roi, geometry, context.sensor, context.source)
 
 
 def rectified_roi(geometry: StereoGeometry, read_out: Roi) -> Roi | None:
-    """Return the region of the rectified left grid that a region of the raw left image fills; None if it fills none."""
-    return Roi.around(geometry.seen_left & _read(geometry.map_left, read_out, geometry.raw_size[0]))
+    """Return the region of the rectified left grid that shows a region of the raw left image; None if it is empty."""
+    return Roi.around(geometry.seen_left & _read_out_pixels(geometry.map_left, read_out, geometry.raw_size[0]))
 
 
-def _read(positions: NDArray[np.float32], read_out: Roi, raw_size: tuple[int, int]) -> NDArray[np.bool_]:
-    return has_been_read(positions, read_out, raw_size[1], raw_size[0])
+def _read_out_pixels(positions: NDArray[np.float32], read_out: Roi, raw_size: tuple[int, int]) -> NDArray[np.bool_]:
+    return was_read_out(positions, read_out, raw_size[1], raw_size[0])
 
 
 def _points(depth: NDArray[np.float64], roi: Roi, grid: ViewGrid) -> NDArray[np.float64]:
-    """Points (h, w, 3) in the sensor frame of the depths (h, w) of a region, along the grid's axis."""
+    """Return points (h, w, 3) in the sensor frame from the depths (h, w) [mm] of a region along the grid's axis."""
     x = (np.arange(roi.left, roi.right) - grid.cx) / grid.fx
     y = (np.arange(roi.top, roi.bottom) - grid.cy) / grid.fy
     local = np.stack([x[None, :] * depth, y[:, None] * depth, depth], axis=-1)
@@ -243,7 +276,7 @@ def _points(depth: NDArray[np.float64], roi: Roi, grid: ViewGrid) -> NDArray[np.
 def _rectifying_map(
     camera: Camera, K: NDArray[np.float64], rotation: NDArray[np.float64], rectification: Rectification
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Raw pixel of each rectified pixel, and whether the camera has it."""
+    """Return the raw pixel (2, H, W) of each rectified pixel, and whether the camera has it (H, W)."""
     size = (rectification.width, rectification.height)
     if camera.model == "fisheye":
         distortion = camera.distortion.reshape(-1, 1)
@@ -251,22 +284,22 @@ def _rectifying_map(
     else:
         raw = cv2.initUndistortRectifyMap(camera.matrix, camera.distortion, rotation, K, size, cv2.CV_32FC1)
     column, row = np.asarray(raw[0]), np.asarray(raw[1])
-    # A distortion polynomial folds back far outside the image it was fitted to: there the map turns inside out.
-    (column_down, column_along), (row_down, row_along) = np.gradient(column), np.gradient(row)
-    unfolded = column_along * row_down - column_down * row_along > 0
+    # Far outside the calibrated image, a distortion polynomial may fold back; the map then changes its orientation.
+    (column_dy, column_dx), (row_dy, row_dx) = np.gradient(column), np.gradient(row)
+    orientation_kept = column_dx * row_dy - column_dy * row_dx > 0
     exists = (column >= -0.5) & (column <= camera.width - 0.5) & (row >= -0.5) & (row <= camera.height - 0.5)
-    return np.stack([column, row]), unfolded & exists
+    return np.stack([column, row]), orientation_kept & exists
 
 
 def _centred(strips: Strips, raw: Raw, read_out: Roi | None, full_scale: float) -> NDArray[np.float32]:
-    """Strips (F, h, W) less the mean of each whole raw frame, or of what was read out of it."""
-    seen = raw if read_out is None else raw[:, *read_out.slices]
-    mean = seen.mean(axis=(1, 2)) * (255.0 / full_scale)
+    """Return strips (F, h, W) without the mean of each raw frame, or of its region that was read out."""
+    pixels = raw if read_out is None else raw[:, *read_out.slices]
+    mean = pixels.mean(axis=(1, 2)) * (255.0 / full_scale)
     return np.asarray(np.stack(strips) - mean.astype(np.float32)[:, None, None])
 
 
-def _blank(strips: Strips, settings: MatcherSettings) -> NDArray[np.bool_]:
-    """Blocks without contrast in any frame."""
+def _lacks_contrast(strips: Strips, settings: MatcherSettings) -> NDArray[np.bool_]:
+    """Return where a block has too little contrast in every frame (h, W)."""
     deviation = np.max([block_deviation(strip, settings.block_size) for strip in strips], axis=0)
     return np.asarray(deviation < settings.minimum_contrast_dn)
 
@@ -274,29 +307,32 @@ def _blank(strips: Strips, settings: MatcherSettings) -> NDArray[np.bool_]:
 def _rectified(
     raw: Raw, positions: NDArray[np.float32], full_scale: float, method: str
 ) -> tuple[Strips, list[NDArray[np.uint8]]]:
-    """Rectified strip of every frame [DN of 8 bit], and the strip of its saturation, 255 where a raw pixel is full.
+    """Return the rectified strip (h, w) of each frame [DN of 8 bit], and of its saturation.
 
-    SGBM takes whole levels; correlation is spared the rounding.
+    The saturation is 255 at a saturated raw pixel, else 0. Levels are rounded to integers for SGBM only.
     """
     strips: Strips = []
-    blown = []
-    needed = reach(positions, raw.shape[2], raw.shape[1])
-    positions = positions - np.array([needed.left, needed.top], np.float32)[:, None, None]  # exact: whole numbers
-    for frame in raw[:, *needed.slices]:
-        full = frame >= full_scale
-        shown = np.zeros(positions.shape[1:], np.uint8)
-        blown.append(_remapped(full.astype(np.uint8) * np.uint8(255), positions) if full.any() else shown)
+    saturation = []
+    region = needed_region(positions, raw.shape[2], raw.shape[1])
+    # exact, since these are integers
+    positions = positions - np.array([region.left, region.top], np.float32)[:, None, None]
+    for frame in raw[:, *region.slices]:
+        saturated = frame >= full_scale
+        unsaturated = np.zeros(positions.shape[1:], np.uint8)
+        saturation.append(
+            _resampled(saturated.astype(np.uint8) * np.uint8(255), positions) if saturated.any() else unsaturated
+        )
         if method == "correlation":
-            strips.append(_remapped(frame.astype(np.float32) * np.float32(255.0 / full_scale), positions))
+            strips.append(_resampled(frame.astype(np.float32) * np.float32(255.0 / full_scale), positions))
             continue
-        image = _remapped(frame, positions)
+        image = _resampled(frame, positions)
         if frame.dtype != np.uint8 or full_scale != 255:
             image = np.clip(np.rint(image * (255.0 / full_scale)), 0, 255)
         strips.append(image.astype(np.uint8))
-    return strips, blown
+    return strips, saturation
 
 
-def _remapped(image: NDArray[Any], positions: NDArray[np.float32]) -> NDArray[Any]:
+def _resampled(image: NDArray[Any], positions: NDArray[np.float32]) -> NDArray[Any]:
     mapped = cv2.remap(image, positions[0], positions[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(mapped)
 

@@ -1,1 +1,1 @@
-"""Fringes and Gray codes to projector coordinates, and those to points."""
+"""Decode fringes and Gray codes to projector coordinates, and these to points."""

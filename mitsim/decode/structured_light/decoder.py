@@ -1,14 +1,14 @@
-"""Structured light: the images of one camera, a code and a calibration to an organised point cloud.
+"""Decode structured light: the images of one camera, a code and a calibration to an organised point cloud.
 
-Signal chain: images [DN] -> projector column u (or row) seen by each raw pixel -> the depth on the pixel's own view ray
-whose exact projection has that u (:mod:`mitsim.decode.structured_light.geometry`) -> points in the sensor frame [mm],
-and the noise along the ray to expect.
+Signal chain: images [DN] -> projector column u (or row) seen by each raw pixel -> depth on the pixel's view ray whose
+exact projection has that u (:mod:`mitsim.decode.structured_light.geometry`) -> points in the sensor frame [mm], and
+their expected noise along the ray.
 
-Nothing is rectified or undistorted before the phase is known: interpolated images have blurred phases. The rays are
-those of the camera as it is, so the cloud's grid carries them (:class:`ViewGrid`, ``normalised``).
+The images are neither rectified nor undistorted before the phase is known, since interpolated images have blurred
+phases. The cloud's grid therefore carries the rays of the raw pixels (``normalised`` of :class:`ViewGrid`).
 
-Every pixel is decoded from its own grey levels, so a region of interest may be decoded alone, up to its very edge. Only
-a gamma estimated from the images (``correct_gamma``) is then that of the region.
+Each pixel is decoded from its own grey levels. A region of interest therefore has the same points as in the whole
+image, up to its edge. Only a gamma that is estimated from the images (``correct_gamma``) is then that of the region.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.decode.blocks import in_blocks
 from mitsim.decode.grey_levels import MeasuredNoise
-from mitsim.decode.grid_cloud import placed_cloud
+from mitsim.decode.grid_cloud import cloud_on_grid
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.structured_light.geometry import StructuredLightGeometry, evaluate, structured_light_geometry
 from mitsim.decode.structured_light.gray_code import decode_gray_code, decode_gray_code_phase_shift
@@ -44,23 +44,38 @@ def decode_coordinates(
     *,
     full_scale: float,
     imager: Imager | MeasuredNoise | None = None,
-    between: bool = False,
+    interpolate: bool = False,
 ) -> dict[Axis, ProjectorCoordinate]:
-    """Projector coordinates seen by each pixel, for each axis of any code.
+    """Return the projector coordinates seen by each pixel, for each axis of any code.
 
-    ``size``: width and height of the projector [px]. ``between``: columns of a Gray code without fringes rise between
-    the edges of their stripes, along rows, in place of the stripes' centres.
+    Parameters
+    ----------
+    stack
+        (P, H, W) raw images [DN] of one camera, in the order of :func:`mitsim.sensor.light_code.roles`.
+    code, settings
+        The code, and the limits of the decoder.
+    size
+        Width and height of the projector [px].
+    full_scale
+        Value of a saturated pixel [DN].
+    imager
+        The imager, or measured noise, from which the expected noise follows; None if neither is known.
+    interpolate
+        For a Gray code without fringes: interpolate columns along rows between the edges of their stripes, instead of
+        taking the stripes' centres.
 
     Raises
     ------
     InputError
-        If the stack is not what the code says, or the code cannot be told apart over the projector.
+        If the stack does not fit the code, or the code is ambiguous over the projector.
     """
     width, height = size
     if isinstance(code, GrayCode):
-        return decode_gray_code(stack, code, width, height, settings, full_scale=full_scale, between=between)
+        return decode_gray_code(stack, code, width, height, settings, full_scale=full_scale, interpolate=interpolate)
     if isinstance(code, ImageSequence):
-        return decode_image_sequence(stack, code, size, settings, full_scale=full_scale, imager=imager, between=between)
+        return decode_image_sequence(
+            stack, code, size, settings, full_scale=full_scale, imager=imager, interpolate=interpolate
+        )
     if isinstance(code, PhaseShift):
         extent = width if code.axis == "columns" else height
         found = decode_phase_shift(stack, code, extent, settings, full_scale=full_scale, imager=imager)
@@ -72,7 +87,7 @@ def decode_coordinates(
 def decode_structured_light(
     stack: NDArray[np.generic],
     rig: Rig | StructuredLightGeometry,
-    camera: str,
+    camera_name: str,
     code: LightCode,
     settings: DecoderSettings,
     context: ImageContext,
@@ -84,115 +99,123 @@ def decode_structured_light(
     stack
         (P, H, W) raw images [DN], uint8, uint16 or floats, in the order of :func:`mitsim.sensor.light_code.roles`.
     rig
-        The calibration; or the :func:`structured_light_geometry` made of it, which saves preparing it every time.
-    camera
+        The calibration, or the :func:`structured_light_geometry` made from it, which saves preparing it for each
+        capture.
+    camera_name
         Name of the camera in the rig.
+    code
+        The code of the images.
     settings
         Range and limits.
     context
-        Of the images; its ``roi`` is one of the image. ``read_out`` is not used.
+        Of the images. Its ``roi`` is a region of the image; ``read_out`` is not used.
 
     Returns
     -------
     PointCloud
-        On the camera's own pixels, points in the sensor frame [mm]; ``sigma`` [mm] along the view ray where the
-        imager or the width of a stripe tells it. A pixel that decodes, but to a place where its ray is not between
-        near and far, is ``OUT_OF_RANGE``; one that shows no code, and that the projector cannot reach there,
-        ``NO_SURFACE``. Shadow cannot be told from a dark surface: both are ``LOW_MODULATION``.
+        On the camera's own pixels, points in the sensor frame [mm]. ``sigma`` [mm] along the view ray, if the imager or
+        the width of a stripe determines it. Status, in addition to that of the code:
+
+        - ``OUT_OF_RANGE``: the pixel is decoded, but its depth is not between near and far.
+        - ``NO_SURFACE``: the pixel shows no code, and the projector does not reach its ray.
+        - ``LOW_MODULATION``: the pixel shows no code. Shadow cannot be distinguished from a dark surface.
 
     Raises
     ------
     InputError
-        If the images are not what code and calibration say, or the region of interest does not lie in them.
+        If the images do not fit code and calibration, or the region of interest does not lie in them.
     """
     if isinstance(rig, StructuredLightGeometry):
         geometry = rig
-        if camera != geometry.camera_name or geometry.axis not in axes(code):
-            asked = f"camera {camera!r}, code along {', '.join(axes(code))}"
-            raise InputError("structured-light geometry", "", asked, f"{geometry.camera_name!r}, {geometry.axis}")
+        if camera_name != geometry.camera_name or geometry.axis not in axes(code):
+            requested = f"camera {camera_name!r}, code along {', '.join(axes(code))}"
+            raise InputError("structured-light geometry", "", requested, f"{geometry.camera_name!r}, {geometry.axis}")
         if not (geometry.near <= settings.near_mm and settings.far_mm <= geometry.far):
-            asked = f"{settings.near_mm:g} to {settings.far_mm:g} mm"
-            raise InputError("decoder settings", "near_mm, far_mm", asked, f"{geometry.near:g} to {geometry.far:g} mm")
+            requested = f"{settings.near_mm:g} to {settings.far_mm:g} mm"
+            raise InputError(
+                "decoder settings", "near_mm, far_mm", requested, f"{geometry.near:g} to {geometry.far:g} mm"
+            )
     else:
-        geometry = structured_light_geometry(rig, camera, code, settings.near_mm, settings.far_mm)
-    eye, projector = geometry.camera, geometry.projector
-    if stack.shape[1:] != (eye.height, eye.width):
-        raise InputError(f"images of {camera}", "shape", stack.shape, f"(images, {eye.height}, {eye.width})")
-    roi = checked_roi(context.roi, eye.width, eye.height, "decode_structured_light")
-    part = roi.slices
-    found = decode_coordinates(
-        np.ascontiguousarray(stack[:, *part]),
+        geometry = structured_light_geometry(rig, camera_name, code, settings.near_mm, settings.far_mm)
+    camera, projector = geometry.camera, geometry.projector
+    if stack.shape[1:] != (camera.height, camera.width):
+        raise InputError(f"images of {camera_name}", "shape", stack.shape, f"(images, {camera.height}, {camera.width})")
+    roi = checked_roi(context.roi, camera.width, camera.height, "decode_structured_light")
+    region = roi.slices
+    coordinates = decode_coordinates(
+        np.ascontiguousarray(stack[:, *region]),
         code,
         (projector.width, projector.height),
         settings,
         full_scale=context.full_scale,
         imager=context.imager,
     )
-    coordinate = found[geometry.axis]
-    points, sigma, in_range = _points(coordinate, geometry, settings, part)
+    coordinate = coordinates[geometry.axis]
+    points, sigma, in_range = _points(coordinate, geometry, settings, region)
     status = coordinate.status.copy()
     decoded = status == Status.VALID
     status[decoded & ~in_range] = Status.OUT_OF_RANGE
-    status[(status == Status.LOW_MODULATION) & ~geometry.seen[part]] = Status.NO_SURFACE
-    for axis, other in found.items():
+    status[(status == Status.LOW_MODULATION) & ~geometry.seen[region]] = Status.NO_SURFACE
+    for axis, second in coordinates.items():
         if axis != geometry.axis:
-            _check_other(points, status, other, projector, axis, settings.epipolar_px)
+            _reject_contradictions(points, status, second, projector, axis, settings.epipolar_px)
     missing = status != Status.VALID
     points[missing], sigma[missing] = np.nan, np.nan
-    told = sigma if np.isfinite(sigma).any() else None
-    return placed_cloud(points, status, told, roi, geometry, context.sensor, context.source)
+    cloud_sigma = sigma if np.isfinite(sigma).any() else None
+    return cloud_on_grid(points, status, cloud_sigma, roi, geometry, context.sensor, context.source)
 
 
 def _points(
     coordinate: ProjectorCoordinate,
     geometry: StructuredLightGeometry,
     settings: DecoderSettings,
-    part: tuple[slice, slice],
+    region: tuple[slice, slice],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Points (h, w, 3) and their noise (h, w) along the ray [mm], and whether they lie within range, of a part."""
+    """Return points (h, w, 3) and noise along the ray (h, w) [mm] of a region, and whether they are in range (h, w)."""
     shape, count = coordinate.value.shape, len(geometry.nodes)
     points, sigma = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
     in_range = np.empty(shape, bool)
-    value, spread = coordinate.value.ravel(), coordinate.sigma.ravel()
-    nodes, differences = (each[:, *part].reshape(count, -1) for each in (geometry.nodes, geometry.differences))
-    rays, seen = geometry.ray[part].reshape(-1, 3), geometry.seen[part].ravel()
+    value, value_sigma = coordinate.value.ravel(), coordinate.sigma.ravel()
+    nodes, differences = (each[:, *region].reshape(count, -1) for each in (geometry.nodes, geometry.differences))
+    rays, seen = geometry.ray[region].reshape(-1, 3), geometry.seen[region].ravel()
     nearest_w, farthest_w = 1 / settings.near_mm, 1 / settings.far_mm
 
     @np.errstate(invalid="ignore", divide="ignore")
-    def place(blocks: list[slice]) -> None:
+    def triangulate_blocks(blocks: list[slice]) -> None:
         for block in blocks:
             u = value[block]
             w, slope = evaluate(nodes[:, block], differences[:, block], u)
             depth = 1 / w
-            # a pixel beyond the ends the polynomial still holds; farther out it may turn back into the range
-            least, most = nodes[:, block].min(axis=0), nodes[:, block].max(axis=0)
-            within = (u > least - 1) & (u < most + 1) & seen[block]
-            in_range.reshape(-1)[block] = within & (w >= farthest_w) & (w <= nearest_w)
-            ray = rays[block]
-            points.reshape(-1, 3)[block] = geometry.camera.centre + ray * depth[:, None]
-            length = np.sqrt(np.einsum("ij,ij->i", ray, ray))
-            sigma.reshape(-1)[block] = np.abs(slope) * depth * depth * length * spread[block]
+            # the polynomial holds one pixel beyond its ends; farther out it may turn back into the range
+            lowest, highest = nodes[:, block].min(axis=0), nodes[:, block].max(axis=0)
+            inside = (u > lowest - 1) & (u < highest + 1) & seen[block]
+            in_range.reshape(-1)[block] = inside & (w >= farthest_w) & (w <= nearest_w)
+            block_rays = rays[block]
+            points.reshape(-1, 3)[block] = geometry.camera.centre + block_rays * depth[:, None]
+            length = np.sqrt(np.einsum("ij,ij->i", block_rays, block_rays))
+            sigma.reshape(-1)[block] = np.abs(slope) * depth * depth * length * value_sigma[block]
 
-    in_blocks(place, value.size)
+    in_blocks(triangulate_blocks, value.size)
     return points, sigma, in_range
 
 
-def _check_other(
+def _reject_contradictions(
     points: NDArray[np.float32],
     status: NDArray[np.uint8],
-    other: ProjectorCoordinate,
+    second: ProjectorCoordinate,
     projector: Camera,
     axis: Axis,
     tolerance_px: float,
 ) -> None:
-    """Refuse points whose projection misses the coordinate that was decoded along the other axis.
+    """Reject points whose projection contradicts the coordinate decoded along the other axis.
 
-    The centre of a stripe wider than a pixel may be missed by so much more: sigma is stripe / sqrt(12).
+    The tolerance grows with stripes wider than a pixel, whose centre may be off by half a stripe. Since sigma is stripe
+    / sqrt(12), half a stripe is sqrt(3) sigma.
     """
-    rows, columns = np.nonzero((status == Status.VALID) & (other.status == Status.VALID))
-    there = projector.project(points[rows, columns].astype(np.float64))[:, 0 if axis == "columns" else 1]
-    wider = np.nan_to_num(np.maximum(np.sqrt(3.0) * other.sigma[rows, columns] - 0.5, 0.0))
-    missed = ~(np.abs(there - other.value[rows, columns]) <= tolerance_px + wider)
-    status[rows[missed], columns[missed]] = Status.PHASE_INCONSISTENT
-    unknown = (status == Status.VALID) & (other.status != Status.VALID)
-    status[unknown] = other.status[unknown]
+    rows, columns = np.nonzero((status == Status.VALID) & (second.status == Status.VALID))
+    projected = projector.project(points[rows, columns].astype(np.float64))[:, 0 if axis == "columns" else 1]
+    stripe_margin = np.nan_to_num(np.maximum(np.sqrt(3.0) * second.sigma[rows, columns] - 0.5, 0.0))
+    contradicted = ~(np.abs(projected - second.value[rows, columns]) <= tolerance_px + stripe_margin)
+    status[rows[contradicted], columns[contradicted]] = Status.PHASE_INCONSISTENT
+    undecoded = (status == Status.VALID) & (second.status != Status.VALID)
+    status[undecoded] = second.status[undecoded]

@@ -1,13 +1,15 @@
-"""From a projector coordinate to the depth on a pixel's own view ray, exactly for distorted lenses on both sides.
+"""Compute the depth on a pixel's view ray from a projector coordinate, exactly for distorted lenses on both sides.
 
-Signal chain: raw pixel -> its view ray -> projector coordinate u of points along the ray -> polynomial w(u), w = 1/Z
-the inverse depth, for each pixel.
+Signal chain: raw pixel -> its view ray -> projector coordinate u of points along the ray -> polynomial w(u) for each
+pixel, with the inverse depth w = 1/Z.
 
-On one view ray u is a smooth function of the inverse depth w = 1/Z; for pinholes (a + b w) / (c + d w), nearly
-straight for nearly parallel axes. It is computed exactly, with the distortion of both lenses, at a few w between near
-and far (Chebyshev points of the part that is within reach of the projector), once for a rig; w(u) is then the
-polynomial through them, Newton's with divided differences, so that decoding needs no iteration. How many points it
-takes is found by trying: between them it is to be right within :data:`EXACT_PX`, and must be within :data:`WORST_PX`.
+On one view ray u is a smooth function of w. For pinholes it is (a + b w) / (c + d w), and nearly straight for nearly
+parallel axes. The coordinate u is computed exactly, with the distortion of both lenses, at some w between near and far.
+These are the Chebyshev points of the interval that the projector reaches. They are computed once for a rig.
+
+The polynomial w(u) through these points is Newton's, with divided differences, so decoding needs no iteration. The
+number of points is increased until the error between them is below :data:`TARGET_ERROR_PX`. If it exceeds
+:data:`MAXIMUM_ERROR_PX` with the largest number, the rig is rejected.
 """
 
 from __future__ import annotations
@@ -26,30 +28,44 @@ from mitsim.sensor.light_code import LightCode, axes
 
 Floats = NDArray[np.float64]
 
-#: how far the polynomial w(u) may be from the exact projection [projector px]
-EXACT_PX = 1e-5
+#: intended error of the polynomial w(u) against the exact projection [projector px]
+TARGET_ERROR_PX = 1e-5
 
-#: how far it may be at the very worst, with all points that are tried [projector px]: a tenth of good phase noise
-WORST_PX = 1e-3
+#: largest permitted error, with the largest number of points [projector px]: a tenth of the noise of a good phase
+MAXIMUM_ERROR_PX = 1e-3
 
-#: numbers of points of the polynomial that are tried
-_POINTS = (6, 8, 10, 13, 16)
+#: numbers of points of the polynomial, in the order of trial
+_POINT_COUNTS = (6, 8, 10, 13, 16)
 
-#: rays beyond the projector's edge that still count as within its reach, as a share of its field
-_REACH = 0.03
+#: margin around the projector's field within which a ray still counts as reached, as a share of the field
+_FIELD_MARGIN = 0.03
 
-#: a view ray along which the coordinate changes less than this from near to far [projector px] tells no depth
-LEAST_CHANGE_PX = 0.5
+#: least change of the coordinate from near to far [projector px]; a view ray with less does not determine depth
+MINIMUM_CHANGE_PX = 0.5
 
 
 @dataclass(frozen=True)
 class StructuredLightGeometry:
-    """All that decoding needs of a camera and a projector, computed once.
+    """Geometry of a camera and a projector, computed once.
 
-    ``axis`` of the coordinate; ``near``, ``far`` [mm] depths along the camera's axis; ``ray`` (H, W, 3) of each raw
-    pixel in the sensor frame, as long as its depth is 1; ``nodes`` (K, H, W) coordinates u_k [projector px] and
-    ``differences`` (K, H, W) divided differences of w(u) [1/mm/px^k], both ends of the range among the nodes; ``seen``
-    (H, W): the projector reaches the ray between near and far.
+    Attributes
+    ----------
+    camera_name, camera, projector
+        The camera of the rig, and the projector.
+    axis
+        Axis of the coordinate.
+    near, far
+        Range of depths along the camera's axis [mm].
+    ray
+        (H, W, 3) view ray of each raw pixel in the sensor frame, scaled to a depth of 1.
+    nodes
+        (K, H, W) coordinates u_k [projector px], which include both ends of the range.
+    differences
+        (K, H, W) divided differences of w(u) [1/mm/px^k].
+    seen
+        (H, W) whether the projector reaches the ray between near and far.
+    grid, baseline
+        Pixels of the cloud, and unit vector (3,) from the camera to the projector.
     """
 
     camera_name: str
@@ -67,78 +83,88 @@ class StructuredLightGeometry:
 
 
 def structured_light_geometry(
-    rig: Rig, camera: str, code: LightCode, near_mm: float, far_mm: float
+    rig: Rig, camera_name: str, code: LightCode, near_mm: float, far_mm: float
 ) -> StructuredLightGeometry:
     """Prepare one camera of a rig and its projector for a code.
 
-    A code with both axes is triangulated along the one in which projector and camera lie farther apart.
+    If the code has both axes, points are triangulated along the axis with the larger separation of projector and
+    camera.
+
+    Parameters
+    ----------
+    rig, camera_name
+        The rig, and the name of the camera in it.
+    code
+        The code, which determines the axis.
+    near_mm, far_mm
+        Range of depths along the camera's axis [mm].
 
     Raises
     ------
     InputError
-        If there is no such camera or no projector, the code's coordinate does not change with depth anywhere, or it
-        changes so unevenly that no polynomial follows it.
+        If there is no such camera or no projector, or if the code's coordinate changes with depth at no pixel, or too
+        unevenly for a polynomial.
     """
-    if camera not in rig.cameras:
-        hint = nearest(camera, list(rig.cameras))
-        raise InputError("rig", "cameras", repr(camera), ", ".join(rig.cameras), hint)
+    if camera_name not in rig.cameras:
+        hint = nearest(camera_name, list(rig.cameras))
+        raise InputError("rig", "cameras", repr(camera_name), ", ".join(rig.cameras), hint)
     if rig.projector is None:
         raise InputError("rig", "projector", "none", "a calibrated projector, for structured light of one camera")
-    eye, projector = rig.cameras[camera], rig.projector
-    apart = projector.sensor_from_camera.inverse().directions(eye.centre - projector.centre)
-    both = axes(code)
-    axis = both[0] if len(both) == 1 or abs(apart[0]) >= abs(apart[1]) else both[1]
+    camera, projector = rig.cameras[camera_name], rig.projector
+    offset = projector.sensor_from_camera.inverse().directions(camera.centre - projector.centre)
+    code_axes = axes(code)
+    axis = code_axes[0] if len(code_axes) == 1 or abs(offset[0]) >= abs(offset[1]) else code_axes[1]
     component = 0 if axis == "columns" else 1
 
-    rays = eye.rays(eye.pixel_grid())
+    rays = camera.rays(camera.pixel_grid())
     with np.errstate(divide="ignore", invalid="ignore"):
         local = rays / rays[..., 2:]
-    ray = eye.sensor_from_camera.directions(local)
-    low, high = _reach(eye, projector, ray, near_mm, far_mm)
+    ray = camera.sensor_from_camera.directions(local)
+    low, high = _depth_limits(camera, projector, ray, near_mm, far_mm)
     seen = (high > low) & np.isfinite(local).all(axis=-1)
     low, high = np.where(seen, low, 1 / far_mm), np.where(seen, high, 1 / near_mm)
 
     def coordinate(inverse_depth: Floats, rays: Floats) -> Floats:
-        return _projected(projector, eye.centre + rays / inverse_depth[..., None], component)
+        return _projected_component(projector, camera.centre + rays / inverse_depth[..., None], component)
 
-    # every seventh pixel each way tells how many points the polynomial needs
-    some = np.s_[::7, ::7]
-    for count in _POINTS:
-        nodes, differences = _polynomial(coordinate, ray[some], low[some], high[some], count)
+    # every seventh pixel in both directions suffices to determine the number of points
+    sample = np.s_[::7, ::7]
+    for count in _POINT_COUNTS:
+        nodes, differences = _polynomial(coordinate, ray[sample], low[sample], high[sample], count)
         change = np.diff(nodes, axis=0)
-        told = seen[some] & _monotonic(change)
-        between = low[some] + (high - low)[some] * np.linspace(0.02, 0.98, 2 * count + 1)[:, None, None]
-        wanted = np.stack([coordinate(w, ray[some]) for w in between])
-        found, slope = zip(*(evaluate(nodes, differences, u) for u in wanted), strict=True)
+        usable = seen[sample] & _monotonic(change)
+        tested = low[sample] + (high - low)[sample] * np.linspace(0.02, 0.98, 2 * count + 1)[:, None, None]
+        exact = np.stack([coordinate(w, ray[sample]) for w in tested])
+        fitted, slope = zip(*(evaluate(nodes, differences, u) for u in exact), strict=True)
         with np.errstate(divide="ignore", invalid="ignore"):
-            error = np.abs((np.stack(found) - between) / np.stack(slope))[:, told]
-        worst = float(error.max(initial=0.0))
-        if worst < EXACT_PX:
+            error = np.abs((np.stack(fitted) - tested) / np.stack(slope))[:, usable]
+        largest_error = float(error.max(initial=0.0))
+        if largest_error < TARGET_ERROR_PX:
             break
-    if worst > WORST_PX:
+    if largest_error > MAXIMUM_ERROR_PX:
         raise InputError(
             "rig",
             "projector",
-            f"a coordinate along view rays that {count} points describe to {worst:.2g} px only",
-            f"{WORST_PX:g} px",
-            "shorten the range near_mm to far_mm, or mend the distortion of the projector",
+            f"a coordinate that a polynomial of {count} points along a ray follows to {largest_error:.2g} px only",
+            f"{MAXIMUM_ERROR_PX:g} px",
+            "shorten the range near_mm to far_mm, or correct the distortion of the projector",
         )
     nodes, differences = _polynomial(coordinate, ray, low, high, count)
     change = np.diff(nodes, axis=0)
-    seen &= _monotonic(change) & (np.abs(change.sum(axis=0)) > LEAST_CHANGE_PX)
+    seen &= _monotonic(change) & (np.abs(change.sum(axis=0)) > MINIMUM_CHANGE_PX)
     if not seen.any():
         raise InputError(
             "pattern",
             "axis",
             repr(axis),
             "an axis along which the coordinate changes with depth",
-            f"no pixel of {camera} sees it change by {LEAST_CHANGE_PX:g} px from {near_mm:g} to {far_mm:g} mm: "
-            "the code runs across the baseline, or the projector lights nothing there",
+            f"no pixel of {camera_name} sees it change by {MINIMUM_CHANGE_PX:g} px from {near_mm:g} to {far_mm:g} mm: "
+            "the code changes across the baseline, or the projector lights nothing there",
         )
-    baseline = projector.centre - eye.centre
+    baseline = projector.centre - camera.centre
     return StructuredLightGeometry(
+        camera_name,
         camera,
-        eye,
         projector,
         axis,
         near_mm,
@@ -147,14 +173,17 @@ def structured_light_geometry(
         nodes,
         differences,
         seen,
-        camera_grid(eye, local),
+        camera_grid(camera, local),
         baseline / np.linalg.norm(baseline),
     )
 
 
 def camera_grid(camera: Camera, local: Floats | None = None) -> ViewGrid:
-    """The grid of a camera's raw pixels; ``local`` (H, W, 3) are its rays in its own frame, if they are known."""
-    place, K = camera.sensor_from_camera, camera.matrix
+    """Return the grid of a camera's raw pixels.
+
+    ``local`` (H, W, 3): rays of the pixels in the camera's frame, if they are known already.
+    """
+    pose, K = camera.sensor_from_camera, camera.matrix
     pinhole = ViewGrid(
         float(K[0, 0]),
         float(K[1, 1]),
@@ -162,8 +191,8 @@ def camera_grid(camera: Camera, local: Floats | None = None) -> ViewGrid:
         float(K[1, 2]),
         camera.width,
         camera.height,
-        place.rotation,
-        place.translation,
+        pose.rotation,
+        pose.translation,
     )
     if camera.model == "perspective" and not camera.distortion.any():
         return pinhole
@@ -172,25 +201,25 @@ def camera_grid(camera: Camera, local: Floats | None = None) -> ViewGrid:
     return replace(pinhole, normalised=(local[..., :2] / local[..., 2:]).astype(np.float32))
 
 
-def _reach(eye: Camera, projector: Camera, ray: Floats, near: float, far: float) -> tuple[Floats, Floats]:
-    """Inverse depths (H, W) between which each ray is within range and within reach of the projector's field.
+def _depth_limits(camera: Camera, projector: Camera, ray: Floats, near: float, far: float) -> tuple[Floats, Floats]:
+    """Return the inverse depths (H, W) between which each ray is in range and in the projector's field.
 
-    A point at inverse depth w is proportional to ray + w (eye - projector); each side of the field, as a plane through
-    the projector's centre, is an inequality linear in w.
+    A point at inverse depth w is proportional to ray + w (camera - projector). Each side of the field is a plane
+    through the projector's centre, and thus an inequality that is linear in w.
     """
     columns = np.concatenate([np.linspace(-0.5, projector.width - 0.5, 33)] * 2 + [np.full(33, -0.5)] * 2)
     columns[-33:] = projector.width - 0.5
     rows = np.concatenate([np.full(33, -0.5)] * 2 + [np.linspace(-0.5, projector.height - 0.5, 33)] * 2)
     rows[33:66] = projector.height - 0.5
-    edge = projector.rays(np.stack([columns, rows], axis=-1))
-    edge = edge[:, :2] / edge[:, 2:]
-    slack = _REACH * (edge.max(axis=0) - edge.min(axis=0))
-    least, most = edge.min(axis=0) - slack, edge.max(axis=0) + slack
+    boundary = projector.rays(np.stack([columns, rows], axis=-1))
+    boundary = boundary[:, :2] / boundary[:, 2:]
+    margin = _FIELD_MARGIN * (boundary.max(axis=0) - boundary.min(axis=0))
+    lowest, highest = boundary.min(axis=0) - margin, boundary.max(axis=0) + margin
 
     to_projector = projector.sensor_from_camera.inverse()
-    direction, start = to_projector.directions(ray), to_projector.points(eye.centre)
+    direction, start = to_projector.directions(ray), to_projector.points(camera.centre)
     low, high = (np.full(ray.shape[:2], 1 / depth) for depth in (far, near))
-    for side, bound, component in ((1, least[0], 0), (-1, most[0], 0), (1, least[1], 1), (-1, most[1], 1)):
+    for side, bound, component in ((1, lowest[0], 0), (-1, highest[0], 0), (1, lowest[1], 1), (-1, highest[1], 1)):
         constant = side * (direction[..., component] - bound * direction[..., 2])
         slope = side * (start[component] - bound * start[2])
         if slope > 0:
@@ -202,10 +231,10 @@ def _reach(eye: Camera, projector: Camera, ray: Floats, near: float, far: float)
     return low, high
 
 
-def _projected(projector: Camera, points: Floats, component: int) -> Floats:
-    """One coordinate (...) of the projections of points (..., 3): 0 the column, 1 the row [projector px]."""
+def _projected_component(projector: Camera, points: Floats, component: int) -> Floats:
+    """Return one coordinate (...) [projector px] of the projections of points (..., 3): 0 is the column, 1 the row."""
     if projector.model == "perspective" and not projector.distortion.any():
-        # OpenCV takes a microsecond for each point even then
+        # direct, since OpenCV takes a microsecond for each point even without distortion
         local = projector.sensor_from_camera.inverse().points(points)
         depth = np.where(local[..., 2] > 0, local[..., 2], np.nan)
         return np.asarray(
@@ -217,9 +246,10 @@ def _projected(projector: Camera, points: Floats, component: int) -> Floats:
 def _polynomial(
     coordinate: Callable[[Floats, Floats], Floats], ray: Floats, low: Floats, high: Floats, count: int
 ) -> tuple[Floats, Floats]:
-    """Newton's polynomial w(u) through ``count`` exact points of each ray: its nodes and divided differences."""
-    place = (1 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2  # Chebyshev-Lobatto: both ends are among them
-    differences = low + (high - low) * place[:, None, None]
+    """Return Newton's polynomial w(u) through ``count`` exact points of each ray: its nodes and divided differences."""
+    # Chebyshev-Lobatto points, which include both ends
+    fraction = (1 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2
+    differences = low + (high - low) * fraction[:, None, None]
     nodes = np.stack([coordinate(inverse_depth, ray) for inverse_depth in differences])
     with np.errstate(invalid="ignore", divide="ignore"):
         for order in range(1, count):
@@ -230,7 +260,10 @@ def _polynomial(
 
 
 def evaluate(nodes: Floats, differences: Floats, u: Floats) -> tuple[Floats, Floats]:
-    """w(u) and dw/du by Horner's scheme; nodes and differences (K, ...), u (...)."""
+    """Return w(u) and dw/du by Horner's scheme.
+
+    ``nodes`` and ``differences`` (K, ...) are those of :class:`StructuredLightGeometry`, ``u`` (...) [projector px].
+    """
     value, slope = differences[-1].copy(), np.zeros_like(u)
     for node, difference in zip(nodes[-2::-1], differences[-2::-1], strict=True):
         step = u - node
@@ -242,5 +275,5 @@ def evaluate(nodes: Floats, differences: Floats, u: Floats) -> tuple[Floats, Flo
 
 
 def _monotonic(change: Floats) -> NDArray[np.bool_]:
-    """Where all steps (K - 1, H, W) have the same sign."""
+    """Return where all steps (K - 1, H, W) have the same sign."""
     return np.asarray((change > 0).all(axis=0) | (change < 0).all(axis=0))

@@ -1,12 +1,13 @@
-"""Gray code: images to bits, bits to stripes, and what an undecided bit means.
+"""Decode Gray codes: images to bits, bits to stripes, and stripes to projector coordinates.
 
-Signal chain: pattern against its inverse, or against the middle between white and black -> bits, most significant first
--> reflected binary code to stripe number -> centre of the stripe [projector px].
+Signal chain: pattern compared with its inverse, or with the middle between white and black -> bits, most significant
+first -> reflected binary code to stripe number (Gray, US patent 2632058, 1953) -> centre of the stripe [projector px].
 
-Between neighbouring stripes one bit changes. So a single undecided bit is no contradiction if both its values lead to
-neighbours: the pixel looks at the edge between them, and the edge is its coordinate. Any other undecided bit makes the
-pixel ``PHASE_INCONSISTENT``. A saturated pixel is refused only if it cannot be decoded: bits need an order of two grey
-levels, not their size.
+One bit changes between neighbouring stripes. A single undecided bit is therefore no contradiction if its two values
+lead to neighbouring stripes. The pixel then sees the edge between them, and the edge is its coordinate. With any other
+undecided bit the pixel is ``PHASE_INCONSISTENT``.
+
+A saturated pixel is rejected only if its bits cannot be decided, since a bit needs only the order of two grey levels.
 """
 
 from __future__ import annotations
@@ -20,35 +21,42 @@ from numpy.typing import NDArray
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decode.grey_levels import MeasuredNoise, check_full_scale, grey_level_variance
-from mitsim.decode.structured_light.phase_shift import Fringes, fit_phases, fringe_sigma, refusals, without_gamma
+from mitsim.decode.structured_light.phase_shift import (
+    Fringes,
+    fit_phases,
+    fringe_sigma,
+    gamma_corrected,
+    rejection_status,
+)
 from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
-from mitsim.decode.structured_light.stripe_edges import between_edges, refused_without_edge
+from mitsim.decode.structured_light.stripe_edges import interpolate_between_edges, status_without_edges
 from mitsim.decode.structured_light.unwrapping import UnwrappingPath, beat_cycles, unwrap, unwrapping_path
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis, Role
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, axes, check_stack, roles, stripes
 
-#: images by which a stripe is told
-_BITS = ("white", "black", "gray", "gray_inverse")
+#: kinds of images that determine the stripe
+_STRIPE_IMAGES = ("white", "black", "gray", "gray_inverse")
 
 
 @dataclass(frozen=True)
 class Stripes:
     """Decoded bits of one axis, (H, W) each.
 
-    ``number`` of the stripe (uint16) and ``other``, that of the neighbour if the one undecided bit is turned, else the
-    same; ``undecided``: bits that contradict one another; ``contrast`` float32 [DN], white minus black.
+    ``number`` of the stripe, uint16. ``neighbour``: number with the undecided bit inverted, else the same number.
+    ``undecided``: whether bits are undecided and do not lead to neighbouring stripes. ``contrast``: white minus black
+    [DN], float32.
     """
 
     number: NDArray[np.uint16]
-    other: NDArray[np.uint16]
+    neighbour: NDArray[np.uint16]
     undecided: NDArray[np.bool_]
     contrast: NDArray[np.float32]
 
 
 def binary_of_gray(gray: NDArray[np.unsignedinteger]) -> NDArray[np.uint16]:
-    """Stripe numbers of reflected binary codes (...), up to 16 bits: the exclusive or of all bits from each one up."""
+    """Return the numbers (...) of reflected binary codes of up to 16 bits: bit k is the exclusive or of bits >= k."""
     out = gray.astype(np.uint16)
     for shift in (1, 2, 4, 8):
         out ^= out >> np.uint16(shift)
@@ -57,57 +65,59 @@ def binary_of_gray(gray: NDArray[np.unsignedinteger]) -> NDArray[np.uint16]:
 
 def decode_stripes(
     stack: NDArray[np.generic],
-    every: list[Role],
+    image_roles: list[Role],
     axis: Axis,
     bit_share: float,
     middle_contrast: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None,
 ) -> Stripes:
-    """Read the Gray bits of one axis.
+    """Decode the Gray bits of one axis.
 
     Parameters
     ----------
-    stack, every
-        (P, H, W) images and their roles.
+    stack, image_roles
+        (P, H, W) images [DN] and their roles.
+    axis
+        Axis of the bits.
     bit_share
-        A bit is undecided where its two levels differ by less than this share of white minus black.
+        A bit is undecided if its two levels differ by less than this share of white minus black.
     middle_contrast
-        Threshold and white minus black (H, W) [DN] where the stack has neither inverse, nor white and black.
+        Threshold, and white minus black, (H, W) [DN]; needed if the stack has neither inverse nor white and black.
     """
-    where = {(role.kind, role.axis, role.index): image for role, image in zip(every, stack, strict=True)}
-    bits = sorted(role.index for role in every if role.kind == "gray" and role.axis == axis)
-    inverse = ("gray_inverse", axis, 0) in where
-    if ("white", None, 0) in where:
-        white, black = (where[kind, None, 0].astype(np.float32) for kind in ("white", "black"))
+    image_of = {(role.kind, role.axis, role.index): image for role, image in zip(image_roles, stack, strict=True)}
+    bits = sorted(role.index for role in image_roles if role.kind == "gray" and role.axis == axis)
+    has_inverse = ("gray_inverse", axis, 0) in image_of
+    if ("white", None, 0) in image_of:
+        white, black = (image_of[kind, None, 0].astype(np.float32) for kind in ("white", "black"))
         middle, contrast = (white + black) / 2, white - black
     elif middle_contrast is not None:
         middle, contrast = middle_contrast
     else:
-        pairs = [(where["gray", axis, bit], where["gray_inverse", axis, bit]) for bit in bits]
+        pairs = [(image_of["gray", axis, bit], image_of["gray_inverse", axis, bit]) for bit in bits]
         contrast = np.mean([cv2.absdiff(a, b) for a, b in pairs], axis=0, dtype=np.float32)
-        middle = contrast  # not used: there is an inverse
+        middle = contrast  # not used, since there is an inverse
     gray: NDArray[np.uint16] = np.zeros(contrast.shape, np.uint16)
-    doubtful: NDArray[np.uint16] = np.zeros(contrast.shape, np.uint16)
-    least = bit_share * contrast
-    if inverse and stack.dtype.kind == "u":  # comparing whole grey levels is several times faster
-        least = np.ceil(np.maximum(least, 1)).astype(stack.dtype)
+    weak_bits: NDArray[np.uint16] = np.zeros(contrast.shape, np.uint16)
+    threshold = bit_share * contrast
+    if has_inverse and stack.dtype.kind == "u":  # comparing integers is several times faster
+        threshold = np.ceil(np.maximum(threshold, 1)).astype(stack.dtype)
     for bit in bits:
-        image = where["gray", axis, bit]
-        if inverse:
-            other = where["gray_inverse", axis, bit]
-            lit, difference = image > other, cv2.absdiff(image, other)
+        image = image_of["gray", axis, bit]
+        if has_inverse:
+            complement = image_of["gray_inverse", axis, bit]
+            lit, difference = image > complement, cv2.absdiff(image, complement)
         else:
-            signed = image - middle
-            signed += signed  # the inverse would lie as far on the other side of the middle
-            lit, difference = signed > 0, np.abs(signed)
+            level = image - middle
+            level += level  # the inverse would differ from the middle by as much in the other direction
+            lit, difference = level > 0, np.abs(level)
         gray += gray
         gray |= lit
-        doubtful += doubtful
-        doubtful |= difference < least
+        weak_bits += weak_bits
+        weak_bits |= difference < threshold
     number = binary_of_gray(gray)
-    other_number = binary_of_gray(np.bitwise_xor(gray, doubtful))
-    apart = number.astype(np.int32) - other_number
-    several = (doubtful & (doubtful - np.uint16(1))) != 0
-    return Stripes(number, other_number, several | (np.abs(apart) > 1), contrast)
+    neighbour = binary_of_gray(np.bitwise_xor(gray, weak_bits))
+    number_change = number.astype(np.int32) - neighbour
+    multiple = (weak_bits & (weak_bits - np.uint16(1))) != 0
+    return Stripes(number, neighbour, multiple | (np.abs(number_change) > 1), contrast)
 
 
 def decode_gray_code(
@@ -118,7 +128,7 @@ def decode_gray_code(
     settings: DecoderSettings,
     *,
     full_scale: float,
-    between: bool = False,
+    interpolate: bool = False,
 ) -> dict[Axis, ProjectorCoordinate]:
     """Decode the images of a Gray code.
 
@@ -126,71 +136,84 @@ def decode_gray_code(
     ----------
     stack
         (P, H, W) raw images [DN] of one camera, in the order of :func:`mitsim.sensor.light_code.roles`.
+    code, settings
+        The code, and the limits of the decoder.
     width, height
-        Of the projector [px].
+        Size of the projector [px].
     full_scale
         Value of a saturated pixel [DN].
-    between
-        Columns rise between the edges of their stripes (:mod:`mitsim.decode.structured_light.stripe_edges`).
+    interpolate
+        Interpolate columns between the edges of their stripes (:mod:`mitsim.decode.structured_light.stripe_edges`).
 
     Returns
     -------
     dict
-        A coordinate for each axis of the code: the centre of the stripe, or the edge between two; ``sigma`` is
-        stripe / sqrt(12), that of an even distribution over the stripe.
+        A coordinate for each axis of the code: the centre of the stripe, or the edge between two. ``sigma`` is stripe /
+        sqrt(12), the standard deviation of a uniform distribution over the stripe.
 
     Raises
     ------
     InputError
-        If the stack is not what the code says.
+        If the stack does not fit the code.
     """
-    every = roles(code, width, height)
-    check_stack(stack, every)
+    image_roles = roles(code, width, height)
+    check_stack(stack, image_roles)
     check_full_scale(stack, full_scale)
     saturated = stack.max(axis=0) >= full_scale
     out: dict[Axis, ProjectorCoordinate] = {}
     for axis in axes(code):
         extent = width if axis == "columns" else height
-        found, stripe = decode_stripes(stack, every, axis, settings.bit_share), stripes(code, extent)[1]
-        out[axis] = stripe_coordinate(found, stripe, extent, saturated, settings, full_scale)
-        if between and axis == "columns":
-            out[axis] = between_stripes(out[axis], found, stack, every, stripe)
+        decoded, stripe = decode_stripes(stack, image_roles, axis, settings.bit_share), stripes(code, extent)[1]
+        out[axis] = stripe_coordinate(decoded, stripe, extent, saturated, settings, full_scale)
+        if interpolate and axis == "columns":
+            out[axis] = interpolated_columns(out[axis], decoded, stack, image_roles, stripe)
     return out
 
 
-def between_stripes(
-    coordinate: ProjectorCoordinate, found: Stripes, stack: NDArray[np.generic], every: list[Role], stripe: float
+def interpolated_columns(
+    coordinate: ProjectorCoordinate,
+    decoded: Stripes,
+    stack: NDArray[np.generic],
+    image_roles: list[Role],
+    stripe: float,
 ) -> ProjectorCoordinate:
-    """Columns of a projector that rise between the edges of their stripes, in place of the stripes' centres."""
-    where = {(role.kind, role.axis, role.index): image for role, image in zip(every, stack, strict=True)}
-    bits = sorted((role.index for role in every if role.kind == "gray" and role.axis == "columns"), reverse=True)
+    """Return columns that are interpolated between the edges of their stripes, instead of the stripes' centres.
+
+    ``coordinate`` and ``decoded`` are the results for the columns of ``stack`` (P, H, W) [DN]; ``stripe`` is the width
+    of a stripe [projector px].
+    """
+    image_of = {(role.kind, role.axis, role.index): image for role, image in zip(image_roles, stack, strict=True)}
+    bits = sorted((role.index for role in image_roles if role.kind == "gray" and role.axis == "columns"), reverse=True)
 
     def signed(bit: int) -> NDArray[np.floating]:
-        image: NDArray[np.floating] = where["gray", "columns", bits[bit]].astype(np.float32)
-        if ("gray_inverse", "columns", bits[bit]) in where:
-            return np.asarray(image - where["gray_inverse", "columns", bits[bit]].astype(np.float32))
-        white, black = (where[kind, None, 0].astype(np.float32) for kind in ("white", "black"))
+        image: NDArray[np.floating] = image_of["gray", "columns", bits[bit]].astype(np.float32)
+        if ("gray_inverse", "columns", bits[bit]) in image_of:
+            return np.asarray(image - image_of["gray_inverse", "columns", bits[bit]].astype(np.float32))
+        white, black = (image_of[kind, None, 0].astype(np.float32) for kind in ("white", "black"))
         return np.asarray(image - (white + black) / 2)
 
-    value, placed = between_edges(found.number, coordinate.status == Status.VALID, signed, stripe)
-    return replace(coordinate, value=value, status=refused_without_edge(coordinate.status, placed))
+    value, located = interpolate_between_edges(decoded.number, coordinate.status == Status.VALID, signed, stripe)
+    return replace(coordinate, value=value, status=status_without_edges(coordinate.status, located))
 
 
 def stripe_coordinate(
-    found: Stripes,
+    decoded: Stripes,
     stripe: float,
     extent: int,
     saturated: NDArray[np.bool_],
     settings: DecoderSettings,
     full_scale: float,
 ) -> ProjectorCoordinate:
-    """Coordinate of stripes ``stripe`` px wide over ``extent`` px; ``saturated`` (H, W) in any image of the code."""
-    modulation = np.asarray(found.contrast / 2, np.float32)
-    faint = modulation < settings.minimum_modulation_dn * full_scale / 255
-    outside = found.number * stripe >= extent
-    undecided = found.undecided | outside
-    status = refusals(saturated & (faint | undecided), faint, undecided)
-    value = _centre(found, stripe)
+    """Return the projector coordinate of decoded stripes, whose width is ``stripe`` over ``extent`` projector pixels.
+
+    ``saturated`` (H, W): whether the pixel is saturated in any image of the code; ``full_scale`` [DN].
+    """
+    modulation = np.asarray(decoded.contrast / 2, np.float32)
+    low_modulation = modulation < settings.minimum_modulation_dn * full_scale / 255
+    outside = decoded.number * stripe >= extent
+    rejected = decoded.undecided | outside
+    status = rejection_status(saturated & (low_modulation | rejected), low_modulation, rejected)
+    value = _centre(decoded, stripe)
     value[status != Status.VALID] = np.nan
     sigma = np.full(value.shape, stripe / np.sqrt(12), np.float32)
     return ProjectorCoordinate(value, sigma, modulation, status)
@@ -206,23 +229,25 @@ def decode_gray_code_phase_shift(
     full_scale: float,
     imager: Imager | MeasuredNoise | None = None,
 ) -> ProjectorCoordinate:
-    """Decode Gray code for the order of the fringe and phase shifting inside it; arguments as for the others.
+    """Decode a Gray code for the order of the fringe, and phase shifting for the position in it.
+
+    ``stack`` (P, H, W) [DN]; ``width`` and ``height`` of the projector [px]; ``full_scale`` [DN]; ``imager`` as for
+    :func:`mitsim.decode.structured_light.phase_shift.decode_phase_shift`.
 
     Raises
     ------
     InputError
-        If the stack is not what the code says, or gamma is to be corrected with fewer than five steps and without a
-        white and a black image.
+        If the stack does not fit the code, or gamma has fewer than five steps and neither white nor black.
     """
-    every = roles(code, width, height)
-    check_stack(stack, every)
+    image_roles = roles(code, width, height)
+    check_stack(stack, image_roles)
     check_full_scale(stack, full_scale)
     extent = width if code.axis == "columns" else height
-    shift = np.array([role.shift for role in every if role.kind == "phase"])
+    shift = np.array([role.shift for role in image_roles if role.kind == "phase"])
     fringes = Fringes((code.period_px,), (shift,), code.mean, code.contrast)
     return decode_gray_fringes(
         stack,
-        every,
+        image_roles,
         CodedAxis(code.axis, extent, stripes(code, extent)[1]),
         fringes,
         settings,
@@ -233,7 +258,7 @@ def decode_gray_code_phase_shift(
 
 @dataclass(frozen=True)
 class CodedAxis:
-    """An axis of the projector: ``extent`` pixels along it, ``stripe`` width of the finest stripe [projector px]."""
+    """An axis of the projector: ``extent`` pixels, with ``stripe`` the width of the finest stripe [projector px]."""
 
     axis: Axis
     extent: int
@@ -242,79 +267,87 @@ class CodedAxis:
 
 def decode_gray_fringes(
     stack: NDArray[np.generic],
-    every: list[Role],
-    along: CodedAxis,
+    image_roles: list[Role],
+    coded_axis: CodedAxis,
     fringes: Fringes,
     settings: DecoderSettings,
     *,
     full_scale: float,
     imager: Imager | MeasuredNoise | None = None,
 ) -> ProjectorCoordinate:
-    """Decode Gray code for the order of the fringe and the phases of one period or several inside it.
+    """Decode a Gray code for the order of the fringe, and the phases of one or more periods for the position in it.
 
-    The longest beat of the fringes that is at least two stripes long takes its order from the Gray code (if there is
-    none, one of at least a stripe); finer ones follow as in :mod:`mitsim.decode.structured_light.unwrapping`. The order
-    is the one that brings the phase nearest to the stripe's centre. Where a stripe is half a fringe (the complementary
-    bit) the true place is up to 1/4 period from its centre and the order flips at 1/2: farther than half-way between,
-    3/8, the phase contradicts the Gray code. Where it is as wide as a fringe the two cannot contradict each other.
+    The Gray code gives the order of the longest beat of the fringes that is at least two stripes long. Without such a
+    beat, one of at least one stripe is used. :mod:`mitsim.decode.structured_light.unwrapping` leads to the finer beats.
+
+    The order is the one that brings the phase nearest to the stripe's centre. Where a stripe is half a fringe (with the
+    complementary bit), the true position is up to 1/4 period from its centre. The order changes at 1/2 period. Beyond
+    half-way between them, 3/8 period, the phase contradicts the Gray code. Where a stripe is as wide as a fringe, they
+    cannot contradict each other.
 
     Parameters
     ----------
-    stack, every
-        (P, H, W) raw images [DN] of one camera and their roles; those of the other axis are left out of account, and
-        the fringes come period after period, the longest first.
+    stack, image_roles
+        (P, H, W) raw images [DN] of one camera and their roles. Images of the other axis are ignored. The fringes come
+        period after period, the longest first.
+    coded_axis, fringes
+        Axis and stripes of the Gray code, and periods and shifts of the fringes.
     """
-    axis, extent, stripe = along.axis, along.extent, along.stripe
-    own = [index for index, role in enumerate(every) if role.kind == "phase" and role.axis == axis]
-    images = stack[own[0] : own[-1] + 1] if own == list(range(own[0], own[-1] + 1)) else stack[own]
+    axis, extent, stripe = coded_axis.axis, coded_axis.extent, coded_axis.stripe
+    used = [index for index, role in enumerate(image_roles) if role.kind == "phase" and role.axis == axis]
+    images = stack[used[0] : used[-1] + 1] if used == list(range(used[0], used[-1] + 1)) else stack[used]
     phases = fit_phases(images, fringes.shifts)
     phase, modulation = phases.phase, phases.modulation[-1]
     weakest = phases.modulation.min(axis=0)
     threshold = settings.minimum_modulation_dn * full_scale / 255
-    plain = {role.kind: image for role, image in zip(every, stack, strict=True) if role.kind in ("white", "black")}
+    plain = {
+        role.kind: image for role, image in zip(image_roles, stack, strict=True) if role.kind in ("white", "black")
+    }
     if settings.correct_gamma:
         levels = (plain["white"], plain["black"]) if len(plain) == 2 else None
-        phase = without_gamma(phases, images, fringes, threshold, levels)
-    scale = np.float32(1 / fringes.contrast)  # from the amplitude of the fringes to white minus black
+        phase = gamma_corrected(phases, images, fringes, threshold, levels)
+    scale = np.float32(1 / fringes.contrast)  # ratio of white minus black to the amplitude of the fringes
     middle = phases.offset + np.float32(0.5 - fringes.mean) * scale * modulation
-    found = decode_stripes(stack, every, axis, settings.bit_share, (middle, scale * modulation))
+    decoded = decode_stripes(stack, image_roles, axis, settings.bit_share, (middle, scale * modulation))
 
-    path = _path(fringes, stripe)
+    path = _unwrapping_of_fringes(fringes, stripe)
     period = path.beats[0].period
     variance = grey_level_variance(phases.offset, imager)
     relative = variance / np.maximum(weakest, np.float32(1e-3)) ** 2
-    expected = (_centre(found, stripe) + 0.5) / period - beat_cycles(phase, path.beats[0])
-    order = np.rint(expected)
+    turns = (_centre(decoded, stripe) + 0.5) / period - beat_cycles(phase, path.beats[0])
+    order = np.rint(turns)
     limit = (0.5 * stripe / period + 0.5) / 2
-    contradicted = np.abs(expected - order) > limit
+    contradicted = np.abs(turns - order) > limit
     value, inconsistent = unwrap(
         phase, path, extent, relative, settings.systematic_rad, settings.consistency_sigma, order.astype(np.float32)
     )
-    undecided = found.undecided | contradicted | inconsistent
+    undecided = decoded.undecided | contradicted | inconsistent
     saturated = images.max(axis=0) >= full_scale
     coded = [
-        image for image, role in zip(stack, every, strict=True) if role.axis in (axis, None) and role.kind in _BITS
+        image
+        for image, role in zip(stack, image_roles, strict=True)
+        if role.axis in (axis, None) and role.kind in _STRIPE_IMAGES
     ]
     for image in coded:
         saturated |= (image >= full_scale) & undecided
-    status = refusals(saturated, weakest < threshold, undecided)
+    status = rejection_status(saturated, weakest < threshold, undecided)
     value[status != Status.VALID] = np.nan
     sigma = fringe_sigma(fringes.periods[-1], fringes.steps[-1], variance, modulation, imager)
     return ProjectorCoordinate(value, sigma, weakest, status)
 
 
-def _path(fringes: Fringes, stripe: float) -> UnwrappingPath:
-    """From a beat that the Gray code can count, two stripes long if there is one, to the finest fringe."""
+def _unwrapping_of_fringes(fringes: Fringes, stripe: float) -> UnwrappingPath:
+    """Return the path from a beat that the Gray code can count, two stripes long if possible, to the finest fringe."""
     try:
         return unwrapping_path(fringes.periods, fringes.steps, 2 * stripe)
     except InputError:
         return unwrapping_path(fringes.periods, fringes.steps, stripe)
 
 
-def _centre(found: Stripes, stripe: float) -> NDArray[np.float64]:
-    """Middle of a stripe, or the edge to its neighbour [projector px]."""
-    both = found.number.astype(np.float64) + found.other
-    both += 1
-    both *= stripe / 2
-    both -= 0.5
-    return both
+def _centre(decoded: Stripes, stripe: float) -> NDArray[np.float64]:
+    """Return the centre of the stripe, or the edge to its neighbour [projector px]."""
+    centre = decoded.number.astype(np.float64) + decoded.neighbour
+    centre += 1
+    centre *= stripe / 2
+    centre -= 0.5
+    return centre

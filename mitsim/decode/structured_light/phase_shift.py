@@ -1,12 +1,13 @@
-"""N-step phase shifting: images to phase, modulation and offset; phases of several periods to a projector coordinate.
+"""Decode N-step phase shifting: images to phase, modulation and offset; phases of several periods to a coordinate.
 
-Signal chain: images I_k = A + B cos(phi - delta_k) [DN] -> least squares for (A, B cos phi, B sin phi) -> phi, B -> too
-bright or too faint pixels are told -> temporal unwrapping -> coordinate [projector px] and its expected noise.
+Signal chain: images I_k = A + B cos(phi - delta_k) [DN] -> least squares for (A, B cos phi, B sin phi) -> phi, B ->
+rejection of saturated and faint pixels -> temporal unwrapping -> coordinate [projector px] and its expected noise.
 
     sigma_phi = sqrt(2 / N) sigma_I / B        sigma_u = P / (2 pi) sigma_phi
 
-for N equidistant steps (Surrel, Applied Optics 36, 271, 1997). sigma_I is taken at the level A: with shot
-noise, the terms that change with the phase cancel for N >= 4, and for N = 3 they cancel in the mean over all phases.
+for N equidistant steps and a period P (Surrel, Applied Optics 36, 271, 1997). sigma_I is the noise at the level A. Shot
+noise depends on the phase, but for N >= 4 these terms cancel, and for N = 3 they cancel in the mean over all phases.
+
 For equidistant steps the least squares are the usual arctan of two sums; other shifts are allowed.
 """
 
@@ -34,16 +35,23 @@ from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import PhaseShift, check_stack, roles
 
-#: blocks are filled up to a multiple of this: what does not fill a processor's vectors is rounded in another way, and a
-#: pixel's phase must not depend on where in a window it lies
+#: blocks are padded to a multiple of this number of pixels. A processor rounds the elements that do not fill a vector
+#: differently, and a pixel's phase must not depend on its position in a window
 _VECTOR = 64
 
 
 @dataclass(frozen=True)
 class Phases:
-    """What the images say of each period: ``phase`` (n, H, W) [rad], 0 to 2 pi, ``modulation`` B (n, H, W) [DN];
+    """Fitted parameters of the fringes, float32.
 
-    ``offset`` A (H, W) [DN], the mean over all periods. float32.
+    Attributes
+    ----------
+    phase
+        (n, H, W) [rad] of each period, 0 to 2 pi.
+    modulation
+        (n, H, W) amplitude B [DN].
+    offset
+        (H, W) level A [DN], the mean over all periods.
     """
 
     phase: NDArray[np.float32]
@@ -52,34 +60,40 @@ class Phases:
 
 
 def fit_phases(stack: NDArray[np.generic], shifts: Sequence[NDArray[np.floating]]) -> Phases:
-    """Fit A + B cos(phi - delta) to the images of each period.
+    """Fit A + B cos(phi - delta) to the images of each period by least squares.
 
-    ``stack`` (P, H, W) [DN]; ``shifts`` delta [rad], one array for each period, of as many shifts as it has images,
-    in the order of the stack.
+    Parameters
+    ----------
+    stack
+        (P, H, W) images [DN], period after period.
+    shifts
+        For each period, the shift delta [rad] of each of its images.
     """
     shape = stack.shape[1:]
     flat = stack.reshape(len(stack), -1)
     phase = np.empty((len(shifts), flat.shape[1]), np.float32)
     modulation = np.empty_like(phase)
     offset = np.zeros(flat.shape[1], np.float32)
-    first = np.cumsum([0, *map(len, shifts)])
-    solve = [_least_squares(delta) for delta in shifts]
-    most = max(map(len, shifts))
+    starts = np.cumsum([0, *map(len, shifts)])
+    solvers = [_least_squares(delta) for delta in shifts]
+    largest = max(map(len, shifts))
 
     def fit(blocks: list[slice]) -> None:
-        room = np.empty((most, BLOCK), np.float32)  # one for all blocks: fresh pages cost more than the sums
+        # one buffer for all blocks, since new memory costs more time than the sums
+        buffer = np.empty((largest, BLOCK), np.float32)
         for block in blocks:
-            for index, matrix in enumerate(solve):
-                part = flat[first[index] : first[index + 1], block]
-                size = part.shape[1]
-                images = room[: len(part), : -(-size // _VECTOR) * _VECTOR]
-                images[:, :size] = part
+            for index, matrix in enumerate(solvers):
+                raw = flat[starts[index] : starts[index + 1], block]
+                size = raw.shape[1]
+                images = buffer[: len(raw), : -(-size // _VECTOR) * _VECTOR]
+                images[:, :size] = raw
                 images[:, size:] = 0
-                mean, along, across = matrix @ images
-                radius, angle = cv2.cartToPolar(along, across)
-                # OpenCV's angle is good to 2e-4 rad; one step of Newton's method leaves the rounding of float32
+                mean, cosine, sine = matrix @ images
+                radius, angle = cv2.cartToPolar(cosine, sine)
+                # OpenCV's angle has an error of 2e-4 rad; one step of Newton's method reduces it to the rounding of
+                # float32
                 x, y = cv2.polarToCart(radius, angle)
-                error = across[:, None] * x - along[:, None] * y
+                error = sine[:, None] * x - cosine[:, None] * y
                 error /= np.maximum(radius * radius, np.float32(1e-18))
                 angle += error
                 phase[index, block], modulation[index, block] = angle[:size, 0], radius[:size, 0]
@@ -91,7 +105,7 @@ def fit_phases(stack: NDArray[np.generic], shifts: Sequence[NDArray[np.floating]
 
 
 def phase_noise(steps: int, sigma_i: float, modulation: float) -> float:
-    """Expected standard deviation of the phase [rad] of N steps, for noise sigma_I and modulation B [DN]."""
+    """Return the expected standard deviation of an N-step phase [rad], for noise sigma_I and modulation B [DN]."""
     return float(np.sqrt(2.0 / steps) * sigma_i / modulation)
 
 
@@ -110,34 +124,43 @@ def decode_phase_shift(
     ----------
     stack
         (P, H, W) raw images [DN] of one camera, in the order of :func:`mitsim.sensor.light_code.roles`.
+    code, settings
+        The code, and the limits of the decoder.
     extent
-        Pixels of the projector along the code's axis.
+        Number of projector pixels along the code's axis.
     full_scale
-        Value of a saturated pixel [DN]; a pixel that reaches it in any image is refused.
+        Value of a saturated pixel [DN]; a pixel that has it in any image is rejected.
     imager
-        Its gain and read noise, or measured noise, give the expected noise. Without it ``sigma`` is NaN, and phases of
-        different periods are held against quantisation and ``systematic_rad`` alone.
+        The imager, or measured noise, from which the expected noise follows. If it is None, ``sigma`` is NaN. Phases of
+        different periods are then compared by quantisation and ``systematic_rad`` alone.
 
     Raises
     ------
     InputError
-        If the stack is not what the code says, the periods cannot be unwrapped over the extent, or gamma is to be
-        corrected with fewer than five steps.
+        If the stack does not fit the code, the code is ambiguous over the extent, or gamma has to be corrected from
+        fewer than five steps.
     """
-    every = roles(code, extent, extent)
-    check_stack(stack, every)
+    image_roles = roles(code, extent, extent)
+    check_stack(stack, image_roles)
     check_full_scale(stack, full_scale)
     steps = code.steps_of_period
-    shifts = [np.array([r.shift for r in every if r.index == index]) for index in range(len(steps))]
+    shifts = [np.array([role.shift for role in image_roles if role.index == index]) for index in range(len(steps))]
     fringes = Fringes(tuple(code.periods_px), tuple(shifts), code.mean, code.contrast)
     return decode_fringes(stack, fringes, extent, settings, full_scale=full_scale, imager=imager)
 
 
 @dataclass(frozen=True)
 class Fringes:
-    """Fringes along one axis: ``periods`` [px], falling; ``shifts`` delta [rad] of each period's images.
+    """Fringes along one axis.
 
-    ``mean`` and ``contrast`` of the projected cosine [1].
+    Attributes
+    ----------
+    periods
+        Decreasing [px].
+    shifts
+        Shifts delta [rad] of the images of each period.
+    mean, contrast
+        Of the projected cosine [1].
     """
 
     periods: tuple[float, ...]
@@ -147,7 +170,7 @@ class Fringes:
 
     @property
     def steps(self) -> tuple[int, ...]:
-        """N of each period."""
+        """Number of steps N of each period."""
         return tuple(map(len, self.shifts))
 
 
@@ -161,43 +184,53 @@ def decode_fringes(
     imager: Imager | MeasuredNoise | None = None,
     white_black: tuple[NDArray[np.generic], NDArray[np.generic]] | None = None,
 ) -> ProjectorCoordinate:
-    """Decode fringes with any shifts; ``stack`` (P, H, W) [DN] period after period, the rest as above.
+    """Decode fringes with any shifts.
 
-    ``white_black``: images (H, W) of an all-white and a black frame, from which gamma can be estimated with fewer than
-    five steps.
+    Parameters
+    ----------
+    stack
+        (P, H, W) images [DN], period after period.
+    fringes
+        Periods and shifts.
+    extent, settings, full_scale, imager
+        As for :func:`decode_phase_shift`.
+    white_black
+        Images (H, W) of a white and a black frame, from which gamma can be estimated with fewer than five steps.
     """
     path = unwrapping_path(fringes.periods, fringes.steps, extent)
     phases = fit_phases(stack, fringes.shifts)
     phase = phases.phase
     weakest = phases.modulation.min(axis=0)
     if settings.correct_gamma:
-        phase = without_gamma(phases, stack, fringes, _threshold(settings, full_scale), white_black)
+        phase = gamma_corrected(phases, stack, fringes, _threshold(settings, full_scale), white_black)
     variance = grey_level_variance(phases.offset, imager)
-    relative = variance / np.maximum(weakest, np.float32(1e-3)) ** 2
-    value, inconsistent = unwrap(phase, path, extent, relative, settings.systematic_rad, settings.consistency_sigma)
+    relative_variance = variance / np.maximum(weakest, np.float32(1e-3)) ** 2
+    value, inconsistent = unwrap(
+        phase, path, extent, relative_variance, settings.systematic_rad, settings.consistency_sigma
+    )
     saturated = stack.max(axis=0) >= full_scale
-    faint = weakest < _threshold(settings, full_scale)
-    status = refusals(saturated, faint, inconsistent)
+    low_modulation = weakest < _threshold(settings, full_scale)
+    status = rejection_status(saturated, low_modulation, inconsistent)
     sigma = fringe_sigma(fringes.periods[-1], fringes.steps[-1], variance, phases.modulation[-1], imager)
     value[status != Status.VALID] = np.nan
     return ProjectorCoordinate(value, sigma, weakest, status)
 
 
-def without_gamma(
+def gamma_corrected(
     phases: Phases,
     stack: NDArray[np.generic],
     fringes: Fringes,
     minimum_modulation: float,
     white_black: tuple[NDArray[np.generic], NDArray[np.generic]] | None = None,
 ) -> NDArray[np.float32]:
-    """Phases (n, H, W) [rad] without the error of the projector's gamma, which is estimated from the images.
+    """Return phases (n, H, W) [rad] without the error of the projector's gamma, which is estimated from the images.
 
-    From the second harmonic of the shortest period if that has five steps or more, else from white and black.
+    The estimate uses the second harmonic of the shortest period if that has five steps or more, else white and black.
 
     Raises
     ------
     InputError
-        If there is neither, or the steps of a period are not equidistant.
+        If both are missing, or the steps of a period are not equidistant.
     """
     mean, contrast, steps = fringes.mean, fringes.contrast, fringes.steps
     orders = [equidistant_order(shifts) for shifts in fringes.shifts]
@@ -222,19 +255,22 @@ def fringe_sigma(
     modulation: NDArray[np.float32],
     imager: Imager | MeasuredNoise | None,
 ) -> NDArray[np.float32]:
-    """Expected standard deviation of the coordinate [projector px]; NaN without an imager."""
+    """Return the expected standard deviation of the coordinate [projector px]; NaN without an imager.
+
+    ``variance`` [DN^2] of the grey levels and ``modulation`` [DN] of the finest fringe have the same shape (...).
+    """
     if imager is None:
         return np.full(modulation.shape, np.nan, np.float32)
     scale = np.float32(period / (2 * np.pi) * np.sqrt(2.0 / steps))
     return np.asarray(np.sqrt(variance) * (scale / np.maximum(modulation, np.float32(1e-3))))
 
 
-def refusals(
-    saturated: NDArray[np.bool_], faint: NDArray[np.bool_], inconsistent: NDArray[np.bool_]
+def rejection_status(
+    saturated: NDArray[np.bool_], low_modulation: NDArray[np.bool_], inconsistent: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
-    """Status per pixel, the first reason that holds: too bright, too faint, contradictory."""
+    """Return the status of each pixel by the first condition that holds: saturated, low modulation, inconsistent."""
     status = inconsistent * np.uint8(Status.PHASE_INCONSISTENT)
-    status[faint] = Status.LOW_MODULATION
+    status[low_modulation] = Status.LOW_MODULATION
     status[saturated] = Status.SATURATED
     return status
 
@@ -244,6 +280,6 @@ def _threshold(settings: DecoderSettings, full_scale: float) -> float:
 
 
 def _least_squares(delta: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Matrix (3, N) from the images to A, B cos(phi), B sin(phi)."""
+    """Return the matrix (3, N) from the images to A, B cos(phi) and B sin(phi), for shifts ``delta`` (N,) [rad]."""
     design = np.stack([np.ones(len(delta)), np.cos(delta), np.sin(delta)], axis=1)
     return np.linalg.pinv(design).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What a decoded code says about each pixel of a camera: from where on the projector its light came, and how surely."""
+"""Define the result of decoding a code: the projector coordinate that each camera pixel sees, and its uncertainty."""
 
 from __future__ import annotations
 
@@ -10,13 +10,19 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class ProjectorCoordinate:
-    """Projector column or row seen by each pixel of a camera (H, W).
+    """Projector column or row seen by each pixel of a camera, (H, W).
 
-    ``value`` float64 [projector px], pixel centres at integers, NaN where refused; ``sigma`` float32 [projector px],
-    the standard deviation from noise or the width of a stripe, NaN where unknown; ``modulation`` float32
-    [DN], half of what the projector can do at this pixel, from black to white or from crest to trough of the weakest
-    fringe; ``status`` uint8 of :class:`~characterisation.point_cloud.Status`: VALID, SATURATED, LOW_MODULATION or
-    PHASE_INCONSISTENT.
+    Attributes
+    ----------
+    value
+        Coordinate [projector px], float64, with pixel centres at integers; NaN if rejected.
+    sigma
+        Standard deviation by noise, or by the width of a stripe [projector px], float32; NaN if unknown.
+    modulation
+        Half of white minus black, or the amplitude of the weakest fringe [DN], float32.
+    status
+        uint8 of :class:`~characterisation.point_cloud.Status`: VALID, SATURATED, LOW_MODULATION, PHASE_INCONSISTENT, or
+        AMBIGUOUS after interpolation between stripes.
     """
 
     value: NDArray[np.float64]

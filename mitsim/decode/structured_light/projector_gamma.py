@@ -1,12 +1,15 @@
-"""The projector's gamma: from the harmonics that it puts into the fringes, and out of the phase again.
+"""Estimate the projector's gamma from the fringes, and correct the phase error that it causes.
 
 Signal chain: pattern p = mean + contrast cos(phi) -> light a + b p^gamma -> images of N shifts -> their first and
-second harmonic -> gamma; and gamma -> error of the phase as a function of the phase -> corrected phase.
+second harmonic, or their mean level between black and white -> gamma -> phase error as a function of the phase ->
+corrected phase.
 
 With mean = contrast the second harmonic is (gamma - 1) / (gamma + 2) of the first (Pan, Kemao, Huang and Asundi, Optics
-Letters 34(4), 2009); for other fringes the ratio is computed. Neither the surface's reflectance nor ambient light
-changes it. Blur does: it takes more from the second harmonic, so gamma comes out nearer to 1 than it is. The correction
-by a table of the phase error is that of Zhang and Huang, Optical Engineering 46(6), 2007.
+Letters 34(4), 2009). For other fringes the ratio is computed numerically. It is independent of the surface's
+reflectance and of ambient light. Blur attenuates the second harmonic more than the first, so the estimated gamma is too
+near 1.
+
+The correction by a table of the phase error follows Zhang and Huang, Optical Engineering 46(6), 2007.
 """
 
 from __future__ import annotations
@@ -17,18 +20,27 @@ from scipy.optimize import brentq
 
 from characterisation.errors import InputError
 
-#: gammas that are looked for
+#: range of possible gammas
 GAMMA_RANGE = (0.2, 5.0)
 
 _SAMPLES = 2048
 
 
 def estimate_gamma(stack: NDArray[np.generic], mean: float, contrast: float, minimum_modulation: float = 0.0) -> float:
-    """Gamma of the projector from the N >= 5 equidistant shifts of one period, (N, H, W) [DN].
+    """Estimate the projector's gamma from N >= 5 equidistant shifts of one period.
 
-    Each pixel's second harmonic is turned back by twice its own phase, and the sums over all pixels of at least
-    ``minimum_modulation`` [DN] are divided: what noise and third harmonics (they alias onto the second at N = 5) add
-    cancels over the phases. The pixels must show all phases about equally often.
+    Each pixel's second harmonic is rotated back by twice its own phase. The sums of both harmonics over the pixels are
+    then divided. Noise and the third harmonic, which aliases onto the second at N = 5, cancel over the phases. The
+    pixels must therefore show all phases about equally often.
+
+    Parameters
+    ----------
+    stack
+        (N, H, W) images [DN].
+    mean, contrast
+        Of the projected cosine [1].
+    minimum_modulation
+        Least modulation of the pixels that are used [DN].
 
     Raises
     ------
@@ -37,19 +49,21 @@ def estimate_gamma(stack: NDArray[np.generic], mean: float, contrast: float, min
     """
     steps = len(stack)
     if steps < 5:
-        raise InputError("gamma", "steps", steps, "5 or more: with fewer, the second harmonic cannot be told")
+        raise InputError("gamma", "steps", steps, "5 or more: fewer do not determine the second harmonic")
     flat = stack.reshape(steps, -1).astype(np.float32)
     delta = 2 * np.pi * np.arange(steps) / steps
     first, second = (np.exp(1j * k * delta).astype(np.complex64) @ flat for k in (1, 2))
-    strength = np.abs(first)
-    used = 2 / steps * strength > max(minimum_modulation, 1e-6)
+    first_magnitude = np.abs(first)
+    used = 2 / steps * first_magnitude > max(minimum_modulation, 1e-6)
     if not used.any():
         raise InputError("gamma", "modulation", "no fringes", "a stack that shows fringes")
-    first, second, strength = first[used], second[used], strength[used]
-    ratio = float(np.sum((second * np.conj(first / strength) ** 2).real) / np.sum(strength))
+    first, second, first_magnitude = first[used], second[used], first_magnitude[used]
+    ratio = float(np.sum((second * np.conj(first / first_magnitude) ** 2).real) / np.sum(first_magnitude))
     low, high = GAMMA_RANGE
     if not harmonic_ratio(low, mean, contrast) < ratio < harmonic_ratio(high, mean, contrast):
-        raise InputError("gamma", "second harmonic", f"{ratio:.3g} of the first", f"that of a gamma of {low} to {high}")
+        raise InputError(
+            "gamma", "second harmonic", f"{ratio:.3g} of the first", f"the ratio of a gamma of {low} to {high}"
+        )
     return float(brentq(lambda gamma: harmonic_ratio(gamma, mean, contrast) - ratio, low, high, xtol=1e-9))
 
 
@@ -61,60 +75,73 @@ def gamma_from_white(
     contrast: float,
     used: NDArray[np.bool_],
 ) -> float:
-    """Gamma from the fringes' mean level between black and white, for any number of steps.
+    """Estimate gamma from the fringes' mean level between black and white, for any number of steps.
 
-    (A - black) / (white - black) is, in the mean over all phases, that of (mean + contrast cos phi)^gamma. Neither
-    reflectance, nor blur, nor light by way of other surfaces changes it: all of them act on the means alike. A pixel
-    whose white is saturated does, so give ``used`` (H, W) without them; it must show all phases about equally often.
+    The mean of (A - black) / (white - black) over all phases equals that of (mean + contrast cos phi)^gamma.
+    Reflectance, blur and interreflections do not affect it, since they change all means alike.
+
+    Parameters
+    ----------
+    offset
+        (H, W) mean level A of the fringes [DN].
+    white, black
+        (H, W) images of a white and a black frame [DN].
+    mean, contrast
+        Of the projected cosine [1].
+    used
+        (H, W) pixels to use. They must show all phases about equally often, and exclude pixels whose white is
+        saturated.
 
     Raises
     ------
     InputError
-        If no pixel is used, or no gamma fits.
+        If no used pixel is brighter in white than in black, or no gamma fits.
     """
-    bottom = float(black[used].sum(dtype=np.float64))
-    span = float(white[used].sum(dtype=np.float64)) - bottom
-    if span <= 0:
+    black_sum = float(black[used].sum(dtype=np.float64))
+    range_sum = float(white[used].sum(dtype=np.float64)) - black_sum
+    if range_sum <= 0:
         raise InputError("gamma", "white", "no brighter than black", "a white and a black image of lit surfaces")
-    ratio = (float(offset[used].sum(dtype=np.float64)) - bottom) / span
+    ratio = (float(offset[used].sum(dtype=np.float64)) - black_sum) / range_sum
     low, high = GAMMA_RANGE
     if not mean_level(high, mean, contrast) < ratio < mean_level(low, mean, contrast):
-        raise InputError("gamma", "mean level", f"{ratio:.3g} of white", f"that of a gamma of {low} to {high}")
+        raise InputError("gamma", "mean level", f"{ratio:.3g} of white", f"the level of a gamma of {low} to {high}")
     return float(brentq(lambda gamma: mean_level(gamma, mean, contrast) - ratio, low, high, xtol=1e-9))
 
 
 def mean_level(gamma: float, mean: float, contrast: float) -> float:
-    """Mean of (mean + contrast cos phi)^gamma over all phases."""
+    """Return the mean of (mean + contrast cos phi)^gamma over all phases."""
     phi = 2 * np.pi * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
     return float(np.mean(np.maximum(mean + contrast * np.cos(phi), 0) ** gamma))
 
 
 def equidistant_order(shifts: NDArray[np.floating]) -> NDArray[np.intp]:
-    """Order in which shifts [rad] rise by 2 pi / N from the first of them on.
+    """Return the order in which shifts [rad] increase by 2 pi / N, starting from the first.
 
     Raises
     ------
     InputError
         If they are not equidistant.
     """
-    turn = np.mod(shifts - shifts[0], 2 * np.pi)
-    turn[turn > 2 * np.pi - 1e-6] = 0.0
-    order = np.argsort(turn)
-    if not np.allclose(turn[order], 2 * np.pi * np.arange(len(shifts)) / len(shifts), atol=1e-4):
+    angle = np.mod(shifts - shifts[0], 2 * np.pi)
+    angle[angle > 2 * np.pi - 1e-6] = 0.0
+    order = np.argsort(angle)
+    if not np.allclose(angle[order], 2 * np.pi * np.arange(len(shifts)) / len(shifts), atol=1e-4):
         found = np.round(np.degrees(shifts), 2).tolist()
-        raise InputError("gamma", "shifts", f"{found} deg", "equidistant steps: of others gamma's error is not known")
+        raise InputError(
+            "gamma", "shifts", f"{found} deg", "equidistant steps: the error by gamma is not known for others"
+        )
     return order
 
 
 def harmonic_ratio(gamma: float, mean: float, contrast: float) -> float:
-    """Second harmonic of (mean + contrast cos phi)^gamma over its first, signed."""
+    """Return the signed ratio of the second to the first harmonic of (mean + contrast cos phi)^gamma."""
     phi = 2 * np.pi * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
     light = np.maximum(mean + contrast * np.cos(phi), 0) ** gamma
     return float((light @ np.cos(2 * phi)) / (light @ np.cos(phi)))
 
 
 def phase_error(gamma: float, steps: int, mean: float, contrast: float) -> NDArray[np.float64]:
-    """Error of the N-step phase [rad] that gamma causes, at ``_SAMPLES`` true phases from 0 on."""
+    """Return the error of the N-step phase [rad] by gamma, at ``_SAMPLES`` equidistant true phases from 0 on."""
     phi = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
     delta = 2 * np.pi * np.arange(steps) / steps
     light = np.maximum(mean + contrast * np.cos(phi[:, None] - delta), 0) ** gamma
@@ -124,8 +151,8 @@ def phase_error(gamma: float, steps: int, mean: float, contrast: float) -> NDArr
 def correct_phase(
     phase: NDArray[np.float32], gamma: float, steps: int, mean: float, contrast: float
 ) -> NDArray[np.float32]:
-    """Phase (...) [rad] without the error that ``gamma`` caused in ``steps`` equidistant steps."""
+    """Return phases (...) [rad] without the error that ``gamma`` causes with ``steps`` equidistant steps."""
     true = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
     error = phase_error(gamma, steps, mean, contrast)
-    # the error is wanted where a phase was measured, not where it is true
+    # interpolated over the measured phase, not over the true one
     return np.asarray(phase - np.interp(phase, true + error, error, period=2 * np.pi)).astype(np.float32)

@@ -1,14 +1,16 @@
-"""Temporal phase unwrapping: which fringe a phase belongs to, from the phases of other periods at the same pixel.
+"""Unwrap phases temporally: find the fringe of a phase from the phases of other periods at the same pixel.
 
-Signal chain: phases phi_i of periods P_i -> beats, sums of phases with small whole numbers c_i, whose frequency is
-sum c_i / P_i -> a path of beats, from one whose period covers the projector down to the shortest period -> along the
-path, the nearest whole number of periods at each step -> coordinate.
+Signal chain: phases phi_i of periods P_i -> beats, sums of phases with small integers c_i and the frequency sum c_i /
+P_i -> path of beats from one whose period covers the projector to the shortest period -> at each step of the path, the
+nearest whole number of periods -> coordinate.
 
-Going from a beat a to a finer b, the order is k = round(f_b x_a - psi_b), psi in cycles; it is wrong where the noise of
-f_b x_a - psi_b exceeds half a cycle. Of all paths the one is taken whose weakest step has the most room for noise, so
-hierarchical sets (long periods first) and heterodyne sets (neighbouring periods, whose beat is long) need no different
-treatment. The heterodyne principle is Reich, Ritter and Thesing, Optical Engineering 39(1), 2000; how noise grows
-along the steps, and which periods are best, Towers, Towers and Jones, Optics Letters 28(11), 2003.
+From a beat a with unwrapped coordinate x_a to a finer beat b of phase psi_b [cycles], the order is
+k = round(f_b x_a - psi_b). It is wrong where the noise of f_b x_a - psi_b exceeds half a cycle. Of all paths, the one
+is used whose weakest step has the largest margin for noise. The same rule thus serves hierarchical sets (long periods
+first) and heterodyne sets (neighbouring periods with a long beat).
+
+Sources: Reich, Ritter and Thesing, Optical Engineering 39(1), 2000, for the heterodyne principle. Towers, Towers and
+Jones, Optics Letters 28(11), 2003, for the growth of noise along the steps and the best periods.
 """
 
 from __future__ import annotations
@@ -23,13 +25,16 @@ from scipy.special import erfc
 from characterisation.errors import InputError
 from mitsim.decode.blocks import in_blocks
 
-#: a residual beyond this many cycles is refused whatever the noise: half of what flips the order
+#: largest residual [cycles] that is accepted whatever the noise: half of the residual that changes the order
 LARGEST_RESIDUAL = 0.25
 
 
 @dataclass(frozen=True)
 class Beat:
-    """A sum of phases: ``weights`` c_i, one per period; ``period`` [px] that it has itself."""
+    """A sum of phases.
+
+    ``weights`` are the integers c_i, one for each period; ``period`` is that of the sum [px].
+    """
 
     weights: tuple[int, ...]
     period: float
@@ -37,10 +42,16 @@ class Beat:
 
 @dataclass(frozen=True)
 class UnwrappingPath:
-    """Beats from the longest to the finest, and how each step between them spreads noise.
+    """Beats from the longest to the finest, and the gain of noise at each step between them.
 
-    ``noise`` (steps,): standard deviation of the residual f_b x_a - psi_b [cycles] per unit of sigma_I / B;
-    ``systematic`` (steps,): the same per radian of an error that all phases have independently.
+    Attributes
+    ----------
+    beats
+        From the longest to the finest.
+    noise
+        (steps,) standard deviation of the residual f_b x_a - psi_b [cycles] per unit of sigma_I / B.
+    systematic
+        (steps,) the same per radian of an independent error of all phases.
     """
 
     beats: tuple[Beat, ...]
@@ -49,7 +60,14 @@ class UnwrappingPath:
 
 
 def unwrapping_path(periods: tuple[float, ...], steps: tuple[int, ...], extent: float) -> UnwrappingPath:
-    """The most robust path for periods [px] with N ``steps`` each, over ``extent`` pixels of the projector.
+    """Return the most robust path.
+
+    Parameters
+    ----------
+    periods, steps
+        Periods [px], and the number of steps N of each.
+    extent
+        Number of projector pixels along the code.
 
     Raises
     ------
@@ -59,44 +77,45 @@ def unwrapping_path(periods: tuple[float, ...], steps: tuple[int, ...], extent: 
     beats = _beats(periods)
     scale = np.sqrt(2.0 / np.array(steps))
     finest = next(beat for beat in beats if beat.weights == tuple(np.eye(len(periods), dtype=int)[-1]))
-    # the widest path: beats fall in period, so each one's best way is known before any finer beat asks for it
-    room: dict[Beat, float] = {}
-    before: dict[Beat, Beat | None] = {}
+    # widest path: beats are sorted by period, so the best path to a beat is known before any finer beat needs it
+    margin: dict[Beat, float] = {}
+    predecessor: dict[Beat, Beat | None] = {}
     for beat in beats:
         if beat.period >= extent * (1 - 1e-9):
-            room[beat], before[beat] = np.inf, None
-        for coarse, its_room in list(room.items()):
+            margin[beat], predecessor[beat] = np.inf, None
+        for coarse, coarse_margin in list(margin.items()):
             if coarse.period > beat.period:
-                width = min(its_room, 0.5 / float(np.linalg.norm(_spread(coarse, beat) * scale)))
-                if width > room.get(beat, 0.0):
-                    room[beat], before[beat] = width, coarse
+                step_margin = min(coarse_margin, 0.5 / float(np.linalg.norm(_residual_gain(coarse, beat) * scale)))
+                if step_margin > margin.get(beat, 0.0):
+                    margin[beat], predecessor[beat] = step_margin, coarse
         if beat is finest:
             break
-    if finest not in room:
+    if finest not in margin:
         longest = max(beat.period for beat in beats)
         raise InputError(
             "pattern",
             "periods_px",
             list(periods),
             f"a period, or a beat of periods, of {extent:g} px or more",
-            f"the longest here is {longest:.6g} px: add a period of {extent:g} px, or one nearer to the shortest",
+            f"the longest is {longest:.6g} px: add a period of {extent:g} px, or one nearer to the shortest",
         )
     chain = [finest]
-    while (coarser := before[chain[0]]) is not None:
+    while (coarser := predecessor[chain[0]]) is not None:
         chain.insert(0, coarser)
-    spreads = [_spread(a, b) for a, b in pairwise(chain)]
+    gains = [_residual_gain(a, b) for a, b in pairwise(chain)]
     return UnwrappingPath(
         tuple(chain),
-        tuple(float(np.linalg.norm(spread * scale)) for spread in spreads),
-        tuple(float(np.linalg.norm(spread)) for spread in spreads),
+        tuple(float(np.linalg.norm(gain * scale)) for gain in gains),
+        tuple(float(np.linalg.norm(gain)) for gain in gains),
     )
 
 
 def failure_rate(path: UnwrappingPath, relative_noise: float) -> float:
-    """Share of pixels that come out in a wrong fringe, for Gaussian noise sigma_I / B = ``relative_noise``.
+    """Return the expected share of pixels with a wrong fringe order.
 
-    P = erfc(0.5 / (sqrt(2) sigma)) for each step, sigma the noise of its residual in cycles; summed over the steps,
-    which is an upper bound and close to the truth while P is small. Refusals are not taken into account.
+    ``relative_noise`` is sigma_I / B of Gaussian noise. Each step fails with P = erfc(0.5 / (sqrt(2) sigma)). Here
+    sigma is the noise of its residual [cycles]. The sum over the steps is an upper bound, and close to the true rate
+    while P is small. Rejected pixels are not considered.
     """
     return float(min(1.0, sum(erfc(0.5 / (np.sqrt(2) * gain * relative_noise)) for gain in path.noise)))
 
@@ -110,7 +129,7 @@ def unwrap(
     k_sigma: float,
     order: NDArray[np.float32] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Coordinate from the phases of all periods.
+    """Return the coordinate from the phases of all periods.
 
     Parameters
     ----------
@@ -119,33 +138,34 @@ def unwrap(
     path
         From :func:`unwrapping_path`.
     extent
-        Pixels of the projector along the code.
+        Number of projector pixels along the code.
     relative_variance
         (...) sigma_I^2 / B^2 of each pixel.
     systematic_rad, k_sigma
-        A step is believed if its residual is at most k sigma, sigma^2 the sum of noise and systematic error, and at
-        most :data:`LARGEST_RESIDUAL`.
+        A step is accepted if its residual is at most k sigma, and at most :data:`LARGEST_RESIDUAL`. sigma^2 is the sum
+        of the variances of noise and systematic error.
     order
-        (...) whole turns of the path's first beat, where something else tells them, as a Gray code does; the beat then
-        need not cover the projector.
+        (...) whole turns of the path's first beat, if they are known from another source, for example a Gray code. The
+        beat then need not cover the projector.
 
     Returns
     -------
     coordinate
-        (...) [projector px], pixel centres at integers.
+        (...) [projector px], with pixel centres at integers.
     inconsistent
-        (...) where the phases contradict each other, or point outside the projector by more than a pixel; and within
-        a pixel of the projector's two ends, if no more than 2 px of the longest period lie beyond them.
+        (...) whether the phases contradict each other, or the coordinate is outside the projector by more than a pixel.
+        If the longest period extends at most 2 px beyond the projector, pixels within a pixel of its two ends are
+        inconsistent too.
     """
     flat = phase.reshape(len(phase), -1)
     variance = relative_variance.reshape(-1)
     coordinate = np.empty(flat.shape[1])
     inconsistent = np.empty(flat.shape[1], bool)
     first = path.beats[0]
-    # a period longer than the projector has room for noise on both sides of it
+    # a period longer than the projector has a margin for noise on both sides of it
     guard = np.float32(max(0.0, 1 - extent / first.period) / 2)
 
-    def follow(blocks: list[slice]) -> None:
+    def unwrap_blocks(blocks: list[slice]) -> None:
         for block in blocks:
             cycles = beat_cycles(flat[:, block], first)
             if order is None:
@@ -153,7 +173,7 @@ def unwrap(
                 turns = np.zeros_like(cycles)
             else:
                 turns = order.reshape(-1)[block]
-            bad = np.zeros(cycles.shape, bool)
+            rejected = np.zeros(cycles.shape, bool)
             for coarse, beat, noise, systematic in zip(
                 path.beats, path.beats[1:], path.noise, path.systematic, strict=False
             ):
@@ -166,21 +186,21 @@ def unwrap(
                 expected *= expected
                 limit = variance[block] * np.float32((k_sigma * noise) ** 2)
                 limit += np.float32((k_sigma * systematic * systematic_rad) ** 2)
-                bad |= expected > np.minimum(limit, np.float32(LARGEST_RESIDUAL**2))
-            place = (turns.astype(np.float64) + cycles) * path.beats[-1].period
-            bad |= (place < -1) | (place > extent + 1)
+                rejected |= expected > np.minimum(limit, np.float32(LARGEST_RESIDUAL**2))
+            position = (turns.astype(np.float64) + cycles) * path.beats[-1].period
+            rejected |= (position < -1) | (position > extent + 1)
             if order is None:
-                # one turn of the longest period away and on the projector as well: either could be meant
-                bad |= (place + first.period <= extent + 1) | (place - first.period >= -1)
-            coordinate[block] = place - 0.5
-            inconsistent[block] = bad
+                # ambiguous if the position one turn of the longest period away is on the projector too
+                rejected |= (position + first.period <= extent + 1) | (position - first.period >= -1)
+            coordinate[block] = position - 0.5
+            inconsistent[block] = rejected
 
-    in_blocks(follow, flat.shape[1])
+    in_blocks(unwrap_blocks, flat.shape[1])
     return coordinate.reshape(phase.shape[1:]), inconsistent.reshape(phase.shape[1:])
 
 
 def _beats(periods: tuple[float, ...]) -> list[Beat]:
-    """Single phases, differences of two, and second differences of neighbours; from the longest period on."""
+    """Return single phases, differences of two, and second differences of neighbours, the longest period first."""
     frequency, single = 1 / np.array(periods), np.eye(len(periods), dtype=int)
     weights = [*single]
     weights += [single[fine] - single[coarse] for coarse, fine in combinations(range(len(periods)), 2)]
@@ -193,14 +213,14 @@ def _beats(periods: tuple[float, ...]) -> list[Beat]:
     return sorted(beats, key=lambda beat: -beat.period)
 
 
-def _spread(coarse: Beat, fine: Beat) -> NDArray[np.float64]:
-    """How an error of each phase [rad] enters the residual of a step [cycles]."""
+def _residual_gain(coarse: Beat, fine: Beat) -> NDArray[np.float64]:
+    """Return the factor (n,) from an error of each phase [rad] to the residual of a step [cycles]."""
     ratio = coarse.period / fine.period
     return np.asarray((ratio * np.array(coarse.weights) - np.array(fine.weights)) / (2 * np.pi))
 
 
 def beat_cycles(phase: NDArray[np.float32], beat: Beat) -> NDArray[np.float32]:
-    """Phase of a beat, 0 to 1 cycles."""
+    """Return the phase (...) of a beat, 0 to 1 cycles, from phases (n, ...) [rad]."""
     out = np.zeros(phase.shape[1:], np.float32)
     for each, weight in zip(phase, beat.weights, strict=True):
         if weight:
