@@ -128,12 +128,12 @@ def test_later_light_is_all_light_less_direct_light(n10, scenes):
     given = scene, rays, patterns, look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
     roi = Roi(300, 200, 120, 80)
     direct, both, later = (
-        trace(*given, LightPaths(16, 4, depth, only_later=only), roi)
+        trace(*given, LightPaths(16, 4, depth, indirect_only=only), roi)
         for depth, only in ((1, False), (2, False), (2, True))
     )
     assert later.mean() > 0.01 * direct.mean()
     np.testing.assert_allclose(direct + later, both, atol=1e-5 * both.max())
-    assert not trace(*given, LightPaths(16, 4, only_later=True), roi).any()
+    assert not trace(*given, LightPaths(16, 4, indirect_only=True), roi).any()
 
 
 @pytest.mark.parametrize("depth", [1, 3])
@@ -243,7 +243,7 @@ def test_later_light_of_the_scene_is_all_of_it_less_its_direct_light(lamp):
                     rays,
                     dark,
                     pose,
-                    LightPaths(samples=64, seed=s, depth=depth, with_ambient=True, only_later=only),
+                    LightPaths(samples=64, seed=s, depth=depth, with_ambient=True, indirect_only=only),
                 )[-1]
                 .reshape(4, 8, 6, 8)
                 .sum(axis=(1, 3))

@@ -263,7 +263,7 @@ def test_a_render_that_is_too_coarse_for_its_sensor_is_told(small, scenes, simul
     coarse = coupon_residuals(simulated, plan)
     assert len(coarse) == 1
     assert coarse[0].worst > LIMIT
-    assert f"matt_white: {coarse[0]}; over {LIMIT}: take more samples_per_pixel" in capsys.readouterr().err
+    assert f"matt_white: {coarse[0]}; above {LIMIT}: use more samples_per_pixel" in capsys.readouterr().err
     told("fine", RenderResidual(0.0, 0.1, 0.0))
     told("dark", RenderResidual(math.nan, math.nan, math.nan))
     assert not capsys.readouterr().err
