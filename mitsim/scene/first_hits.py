@@ -49,8 +49,16 @@ class VisibleSurfaces:
 class Hits:
     """First surfaces on n rays.
 
-    ``shape`` (n,) index, -1 for none; ``front`` (n,) whether the ray meets the reflecting side; ``normal`` (n, 3) unit,
-    on the side of the ray's origin, world frame; ``distance`` (n,) [mm]. Normal and distance are NaN without a surface.
+    Attributes
+    ----------
+    shape
+        (n,) index of the shape; -1 for none.
+    front
+        (n,) whether the ray meets the reflecting side.
+    normal
+        (n, 3) unit normal on the side of the ray's origin, world frame; NaN without a surface.
+    distance
+        (n,) [mm]; NaN without a surface.
     """
 
     shape: NDArray[np.int16]

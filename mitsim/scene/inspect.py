@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 #: number of points on each shape; number of rays along one side of the square grid of each direction
 _SAMPLES, _ROW = 2048, 96
 
-#: vertices closer than this share of the size of the scene are merged
+#: spacing of the grid in which vertices are merged, as a share of the size of the scene
 _MERGE = 1e-6
 
 
@@ -97,9 +97,16 @@ class ShapeFacts:
 class SceneFacts:
     """Facts about a scene.
 
-    ``shapes``; ``bounds`` (2, 3) of the scene [mm]; ``merged_mesh``: all meshes as one, without emitters, None if there
-    are none; ``emitters``: kind and flux [W] of each. The flux is NaN for an emitter without a position (sky,
-    directional light).
+    Attributes
+    ----------
+    shapes
+        Facts about each shape.
+    bounds
+        (2, 3) corners of the bounding box [mm], world frame.
+    merged_mesh
+        All meshes as one, without emitters; None if there are none.
+    emitters
+        Kind and flux [W] of each. The flux is NaN for an emitter without a position (sky, directional light).
     """
 
     shapes: tuple[ShapeFacts, ...]

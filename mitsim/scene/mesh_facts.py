@@ -72,8 +72,8 @@ def mesh_facts(
     edges = np.sort(regular[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     edges, count = np.unique(edges, axis=0, return_counts=True) if len(edges) else (edges, np.empty(0, int))
     open_edges, nonmanifold = int((count == 1).sum()), int((count > 2).sum())
-    middle = vertices.mean(axis=0) if len(vertices) else np.zeros(3)
-    volume = float(np.einsum("ij,ij->", a - middle, np.cross(b - middle, c - middle)) / 6)
+    centre = vertices.mean(axis=0) if len(vertices) else np.zeros(3)
+    volume = float(np.einsum("ij,ij->", a - centre, np.cross(b - centre, c - centre)) / 6)
     closed = open_edges == nonmanifold == 0 and len(regular) > 0
     return MeshFacts(
         vertices,

@@ -38,8 +38,8 @@ def checked_xml(path: Path, include_depth: int = 0) -> ElementTree.Element:
     Raises
     ------
     InputError
-        If a file is missing, does not parse, is not UTF-8, is too large or too deeply nested, or refers to something
-        that is not a regular file.
+        If a file is missing, does not parse, is not UTF-8, or is too large or too deeply nested. Also if it refers to
+        something that is not a regular file.
     """
     xml_files = _xml_files_beside(path)
     data = read_bounded(path, "a Mitsuba scene XML", nearest(path.name, xml_files), LARGEST_XML)

@@ -3,9 +3,9 @@
 Signal chain: image before the lens -> Gaussian blurs of a few widths -> at each pixel, linear interpolation in the
 variance between the two nearest to its own.
 
-Of the third-order aberrations, coma grows with the distance from the axis, astigmatism and field curvature with its
-square (Born and Wolf, Principles of Optics, section 5.3). The additional standard deviation is *assumed* to grow like
-coma:
+Of the third-order aberrations, coma grows with the distance from the axis. Astigmatism and field curvature grow with
+its square (Born and Wolf, Principles of Optics, section 5.3). The additional standard deviation is *assumed* to grow
+like coma:
 
     s^2(rho) = s_0^2 + (s_c^2 - s_0^2) rho^2,     rho = distance from the principal point / of the farthest corner
 

@@ -8,9 +8,9 @@ sensor's rule -> grey levels with noise (:mod:`mitsim.simulation.exposing`) ->
 One seed determines everything: each camera has its own random streams for rendering, speckle and noise. Speckle is one
 draw for all images of a pose. The noise of the imager has a stream for each image.
 
-If only a part of the scene matters, only its region of each image is traced and exposed, as cameras read out a region
-of interest. The settings of the capture state the region. The rest of the image is missing, not dark, and has grey
-level 0.
+If only a part of the scene matters, only its region of each image is traced and exposed. Cameras read out a region of
+interest in the same way. The settings of the capture state the region. The rest of the image is missing, not dark, and
+has grey level 0.
 """
 
 from __future__ import annotations
@@ -169,9 +169,8 @@ class SimulatedSensor:
             images += indirect_images[: len(images)]
         projected, ambient_images = images[: self.patterns.count], images[self.patterns.count :]
 
-        def apply_lens(
-            image: NDArray[np.float32],
-        ) -> None:  # in place, because two copies of a large stack need too much memory
+        # in place, because two copies of a large stack need too much memory
+        def apply_lens(image: NDArray[np.float32]) -> None:
             image[:] = self.apply_lens(image, camera, roi)
 
         def finish_projected(image: NDArray[np.float32]) -> None:

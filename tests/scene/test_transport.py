@@ -122,7 +122,7 @@ def test_direct_light_has_no_noise_and_a_small_quadrature_error(n10, scenes):
     assert (one - reference).std() < 0.003 * reference.mean()
 
 
-def test_later_light_is_all_light_less_direct_light(n10, scenes):
+def test_indirect_light_is_all_light_less_direct_light(n10, scenes):
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
     rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
     given = scene, rays, patterns, look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
@@ -229,7 +229,7 @@ def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
 
 
 @pytest.mark.parametrize("lamp", ["sky", "bulb", "panel"])
-def test_later_light_of_the_scene_is_all_of_it_less_its_direct_light(lamp):
+def test_indirect_light_of_emitters_is_all_of_it_less_its_direct_light(lamp):
     """With the projector off; each is random by itself, so that means over blocks of pixels are held together."""
     scene, _ = _lit_corner([lamp], {"type": "matt_white"})
     rays = CameraRays(pinhole(48, 32, 85.0))

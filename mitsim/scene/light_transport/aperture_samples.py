@@ -6,8 +6,8 @@ positions on the projector's lens, in the order that correlates least and blurs 
 A sample has a position z in the pixel, L in the camera's lens and P in the projector's. Out of focus it sees the
 pattern at z + c L + p P. The radii c and p of the two blurs [px] change sign at the planes of focus. The mean over n
 samples should equal the mean over the pixel and both discs. These sums must therefore fill the convolution of a square
-and two discs evenly for *every* c and p, and have its second moments. Otherwise the blur is too wide or too narrow. If
-the light depends on P, as on a face that is turned away, a correlation of P with z or L would also shift the pattern.
+and two discs evenly for *every* c and p, and have its second moments. Otherwise the blur is too wide or too narrow. On
+a face that is turned away, the light depends on P. A correlation of P with z or L would then shift the pattern.
 
 L is z mapped to the disc and rotated by 90 deg. Then cov(z, L) = 0, and z + c L is a raster for every c, rotated and
 stretched. No second map of this kind exists for P, so its order is searched:
@@ -149,7 +149,7 @@ def _target_distributions() -> Floats:
 def _misfit(cells: Floats, camera: Floats, projector: Floats, target: Floats) -> float:
     """Return the distance of the sums from the target, for one half of the samples; the other half is opposite.
 
-    It is a sum over the blurs: root mean square difference of the cumulative distributions, plus a tenth of the mean
+    For each blur, this is the root mean square difference of the cumulative distributions, plus a tenth of the mean
     relative error of the second moments.
     """
     sums = np.array([cells + c * camera + p * projector for c, p in _BLURS])

@@ -3,13 +3,15 @@
 Signal chain: pixel (column, row) -> position along a Z-order curve -> index of the sample -> additive recurrence.
 
 Any aligned square of 2^k x 2^k pixels is a contiguous part of the Z-order curve. Any contiguous part of the recurrence
-R_3 fills the unit cube evenly (Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018; Kronecker's
-sequence with powers of the root of x^4 = x + 1). The error of a mean over neighbouring pixels therefore falls faster
-than with independent random numbers (Ahmed and Wonka, "Screen-space blue-noise diffusion of Monte Carlo sampling error
-via hierarchical ordering of pixels", 2020).
+R_3 fills the unit cube evenly [1]. R_3 is Kronecker's sequence with powers of the root of x^4 = x + 1. The error of a
+mean over neighbouring pixels therefore falls faster than with independent random numbers [2].
 
 A seed shifts the sequence (Cranley and Patterson, SIAM J. Numer. Anal. 13, 1976). Each number is uniform, so every
 estimate is unbiased over seeds.
+
+[1] Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018.
+[2] Ahmed and Wonka, "Screen-space blue-noise diffusion of Monte Carlo sampling error via hierarchical ordering of
+pixels", 2020.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Shortcuts for scenes in which a ray needs no search: one flat shape, such as a coupon, or one material.
 
-Mitsuba calls shapes and BSDFs indirectly, for each lane. If all lanes reach the same object, the object is called
-directly and its arithmetic becomes part of the kernel: the same formulas in a third of the time. A single flat shape
-also needs no shadow rays, because it cannot shadow itself.
+Mitsuba calls shapes and BSDFs indirectly, for each lane. If all lanes reach the same object, mitsim calls the object
+directly. Its arithmetic becomes part of the kernel: the same formulas in a third of the time. A single flat shape also
+needs no shadow rays, because it cannot shadow itself.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ plane of focus -> distortion (:mod:`mitsim.scene.ray_casting.distortion`) -> pro
 -> value of the code of each image.
 
 The code of patterns is a function of (u, v): :class:`LitPatterns`. The code of a time-of-flight sensor is a function of
-the optical length L from the projector by way of the scene to the camera: :class:`ModulatedLight`. The same loop
-evaluates both on the same paths. The radiometry is that of :mod:`mitsim.sensor.projector`.
+L, the optical length from the projector over the scene to the camera: :class:`ModulatedLight`. The same loop evaluates
+both on the same paths. The radiometry is that of :mod:`mitsim.sensor.projector`.
 """
 
 from __future__ import annotations

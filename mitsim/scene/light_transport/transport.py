@@ -5,16 +5,16 @@ the projector's aperture, and coordinate (u, v) whose light arrives from there, 
 per unit of code value, optical length L -> one sum per image.
 
 The code of an image is a function of (u, v) or of L (:mod:`mitsim.scene.light_transport.projector_light`). All images
-of a capture are therefore evaluated on the same paths: one kernel, one lane per pixel, the loop over samples inside it,
-no film and no atomic additions.
+of a capture are therefore evaluated on the same paths, in one kernel. It has one lane per pixel and contains the loop
+over samples. It needs no film and no atomic additions.
 
 Direct light from the projector is free of noise, which could be mistaken for the sensor's. The positions inside a pixel
 form a raster, and those in the two apertures are a fixed set. The remaining error is that of a quadrature rule, the
 same in every capture of a pose. ``jitter`` draws the positions at random, for comparison with other renderers.
 
-Later bounces use the same loop: a lane whose path has ended starts its next sample. A part of their light is left to
-photons from the projector (:mod:`mitsim.scene.light_transport.light_tracing`), which find paths that are rarely found
-from the camera. Emitters of the scene (:mod:`mitsim.scene.light_transport.ambient`) add the same light to all images.
+Later bounces use the same loop: a lane whose path has ended starts its next sample. Photons from the projector carry a
+part of their light, on paths that are rarely found from the camera (:mod:`mitsim.scene.light_transport.light_tracing`).
+Emitters of the scene add the same light to all images (:mod:`mitsim.scene.light_transport.ambient`).
 
 Radiometry: code value x plane irradiance E_1 [W] -> radiance [W / (mm^2 sr)], see :mod:`mitsim.sensor.projector`.
 """
@@ -118,8 +118,8 @@ def trace(
     roi
         Region of the image to trace, by default all of it. Its pixels are the same as in the whole image.
     shift
-        (2, height, width) [rad] of the region, along the x and y axes of the camera: angle, seen from the camera,
-        between the surface point and the point at which the code of its direct light is evaluated. Speckle causes it.
+        (2, height, width) [rad] of the region, along the x and y axes of the camera. The code of direct light is
+        evaluated at this angle, seen from the camera, beside the surface point. Speckle causes it.
 
     Returns
     -------

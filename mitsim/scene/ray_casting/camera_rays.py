@@ -5,8 +5,10 @@ sharp focus -> ray toward it from a position in the aperture.
 
 The camera may be any smooth function from pixels to rays. The kernel has the directions at pixel corners and
 interpolates inside the pixel. The error is below 3e-4 px for the strongest distortion of the presets, in the corners of
-the image. A thin lens of diameter D and focal length f [px], in focus at depth z_f, images a point at depth z as a disc
-of diameter D f |1/z - 1/z_f| px.
+the image.
+
+A thin lens in focus at depth z_f images a point at depth z as a disc of diameter D f |1/z - 1/z_f| px. Here D is the
+diameter of the lens [mm] and f the focal length [px].
 """
 
 from __future__ import annotations

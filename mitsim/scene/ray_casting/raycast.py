@@ -54,9 +54,8 @@ class PixelRays:
         self.origin = np.asarray(origin, float)
         self.size = (directions.shape[0], directions.shape[1])
         columns = np.ascontiguousarray(np.asarray(directions, np.float32).reshape(-1, 3).T)
-        self.directions = mi.Vector3f(
-            *[mi.Float(one) for one in columns]
-        )  # an array (3, n) would compile its size into the kernel
+        # an array (3, n) would compile its size into the kernel
+        self.directions = mi.Vector3f(*[mi.Float(one) for one in columns])
 
     def frame(self, world_from_sensor: Transform) -> Eye:
         """Return the origin of the rays and the axes of the sensor, in the world frame."""

@@ -1,4 +1,4 @@
-"""Decide whether the faces of a part can see one another: only then are there interreflections.
+"""Decide whether the faces of a part can see each other: only then are there interreflections.
 
 Signal chain: triangles -> random points on them -> directions by the cosine law -> share of rays that meet the part.
 """
