@@ -104,7 +104,22 @@ def load_scene(
 
 
 def scene_from_dict(description: dict[str, Any], wavelength_nm: float, where: str = "scene") -> Scene:
-    """Load a scene from a dictionary in Mitsuba's form; its keys are the names of the shapes."""
+    """Load a scene from a dictionary in Mitsuba's form; its keys are the names of the shapes.
+
+    Parameters
+    ----------
+    description
+        Shapes and emitters by name.
+    wavelength_nm
+        Wavelength at which the materials are evaluated [nm].
+    where
+        Description of the scene, for messages.
+
+    Raises
+    ------
+    InputError
+        If there is no shape, or a part in mm cannot have the size.
+    """
     _prepare()
     with loading(wavelength_nm, where) as state:
         scene = backend.mi.load_dict({"type": "scene", **description}, optimize=False)

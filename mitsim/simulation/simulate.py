@@ -268,13 +268,13 @@ class SimulatedSensor:
             rendered["indirect_light"] = asdict(rendering.indirect_settings)
         return LightOnImagers(light, rois, exposures, noise, world_from_sensor, rendered)
 
-    def _check_finite(self, values: NDArray[np.floating], where: str, what: str) -> None:
+    def _check_finite(self, values: NDArray[np.floating], where: str, quantity: str) -> None:
         """Reject light that is not finite, before it becomes an image of zeros."""
         if not np.isfinite(values.sum(dtype=np.float64)):
             raise InputError(
                 f"sensor {self.sensor.name}",
                 where,
-                f"{what} that is infinite or not a number",
+                f"{quantity} that is infinite or not a number",
                 "finite light: check the optics, flux_w and the scene's own emitters",
             )
 

@@ -94,9 +94,9 @@ class ViewRays:
         projector: Camera | None,
     ) -> None:
         self.grid, self.rays = grid, PixelRays.of_grid(grid)
-        self.pinhole, self.shown = replace(grid, normalised=None), None
+        self.pinhole, self.pinhole_pixels = replace(grid, normalised=None), None
         if grid.normalised is not None:
-            self.shown = np.ascontiguousarray(np.moveaxis(grid.pinhole_positions(), -1, 0))
+            self.pinhole_pixels = np.ascontiguousarray(np.moveaxis(grid.pinhole_positions(), -1, 0))
         self.seen = mi.Bool(seen_by_reference.ravel())
         self.baseline, self.origin = mi.Vector3f(_point(baseline)), _point(grid.origin)
         # the projector comes last, so that SHADOWED takes precedence over HIDDEN
@@ -110,12 +110,13 @@ class ViewRays:
         """
         size = np.array([self.grid.width, self.grid.height])
         corners = np.stack(np.meshgrid(*np.asarray(bounds).T, indexing="ij"), axis=-1).reshape(-1, 3)
-        at = self.pinhole.project(world_from_sensor.inverse().points(corners))
-        if not np.isfinite(at).all():
+        pixels = self.pinhole.project(world_from_sensor.inverse().points(corners))
+        if not np.isfinite(pixels).all():
             return Roi.whole(self.grid.width, self.grid.height)
-        low, high = np.floor(at.min(axis=0)), np.ceil(at.max(axis=0))
-        if self.shown is not None:  # distortion bends the box's edges: select pixels by their undistorted positions
-            column, row = self.shown
+        low, high = np.floor(pixels.min(axis=0)), np.ceil(pixels.max(axis=0))
+        # distortion bends the box's edges: select pixels by their undistorted positions
+        if self.pinhole_pixels is not None:
+            column, row = self.pinhole_pixels
             inside = (column >= low[0]) & (column <= high[0]) & (row >= low[1]) & (row <= high[1])
             spans = [np.flatnonzero(inside.any(axis)) for axis in (0, 1)]
             low, high = (np.array([span[end] if len(span) else 0 for span in spans]) for end in (0, -1))
@@ -192,13 +193,13 @@ class MappedScene:
         facing = dr.select(dr.dot(surface.n, direction) > 0, -1.0, 1.0)
         hit = met & (index >= 0) & ((facing > 0) | (two_sided > 0))
         normal = surface.n * facing
-        shown = hit & dr.gather(mi.Bool, view.seen, pixel)
-        status = self._occluded(view, world_from_sensor, surface, normal, view.origin + ray * surface.t, shown)
+        visible = hit & dr.gather(mi.Bool, view.seen, pixel)
+        status = self._occluded(view, world_from_sensor, surface, normal, view.origin + ray * surface.t, visible)
         in_view = view.in_view_frame(frame.to_local(normal), ray)
         fraction = sigma = dr.full(mi.Float, dr.nan, dr.width(pixel))
         if self.tables is not None:
-            asked = (status == _code(Status.VALID)) & (known >= 0)
-            fraction, sigma = self.tables.look_up(mi.UInt32(known), surface.t, in_view, asked)
+            queried = (status == _code(Status.VALID)) & (known >= 0)
+            fraction, sigma = self.tables.look_up(mi.UInt32(known), surface.t, in_view, queried)
         return {
             "status": dr.uint8_array_t(mi.Float)(status),
             "shape": dr.select(hit, index, -1),
@@ -209,17 +210,17 @@ class MappedScene:
         }
 
     def _occluded(
-        self, view: ViewRays, world_from_sensor: Transform, surface: Any, normal: Any, point: Any, shown: Any
+        self, view: ViewRays, world_from_sensor: Transform, surface: Any, normal: Any, point: Any, visible: Any
     ) -> Any:
         """Return the status of each pixel; ``point`` is in the sensor frame, ``surface`` in the world frame."""
-        inside, status = shown, _code(Status.VALID)
+        inside, status = visible, _code(Status.VALID)
         for eye in view.eyes:
             inside &= eye.sees(point)
         for eye in view.eyes:
             to_eye = _point(world_from_sensor.points(eye.camera.centre)) - surface.p
             length = dr.norm(to_eye)
-            front = inside & (dr.dot(normal, to_eye) > 0)
-            free = front & ~self.scene.mitsuba.ray_test(shadow_ray(surface, to_eye / length, length), front)
+            facing = inside & (dr.dot(normal, to_eye) > 0)
+            free = facing & ~self.scene.mitsuba.ray_test(shadow_ray(surface, to_eye / length, length), facing)
             status = dr.select(free, status, _code(eye.hidden))
         return dr.select(inside, status, _code(Status.NO_SURFACE))
 

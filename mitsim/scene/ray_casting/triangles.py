@@ -1,8 +1,11 @@
 """Return all solid surfaces of a scene as triangles, to test a housing for collisions.
 
-A mesh has its own triangles. A sphere, cylinder or disk is approximated with 128 corners around. The corners lie on the
-surface; the triangles lie up to 6e-4 of the radius inside it. Any other shape (an instance, curves, a signed distance
-grid) is replaced by its bounding box, which is larger.
+Signal chain: shape -> its own triangles, a grid on a sphere, cylinder or disk, or the bounding box -> triangles in the
+world frame -> corners of their convex hull.
+
+A sphere, cylinder or disk is approximated with 128 corners around. The corners lie on the surface; the triangles lie up
+to 6e-4 of the radius inside it. Any other shape that is no mesh (an instance, curves, a signed distance grid) is
+replaced by its bounding box, which is larger.
 """
 
 from __future__ import annotations
