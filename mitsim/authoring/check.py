@@ -27,7 +27,7 @@ from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.evaluation import Feature, Measurement, read_task
 from mitsim.authoring.face import surface_distance
 from mitsim.errors import nearest
-from mitsim.scene.first_hits import Sight
+from mitsim.scene.first_hits import VisibleSurfaces
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.mesh_facts import MeshFacts
 from mitsim.sensor.preset import Sensor
@@ -98,7 +98,12 @@ def read_features(path: str | Path) -> TaskFeatures:
 
 
 def findings(
-    facts: SceneFacts, sensor: Sensor, pose: Transform, sight: Sight, posed: bool, task: TaskFeatures | None = None
+    facts: SceneFacts,
+    sensor: Sensor,
+    pose: Transform,
+    visible: VisibleSurfaces,
+    posed: bool,
+    task: TaskFeatures | None = None,
 ) -> list[Finding]:
     """Return all findings, the most severe first.
 
@@ -108,14 +113,14 @@ def findings(
     found: list[Finding] = []
     borders = open_borders(facts)
     for number, shape in enumerate(facts.shapes):
-        if shape.lamp:
+        if shape.emitter:
             continue
         found += _named(shape)
         found += _material(shape, shape.name in measured)
         found += _mesh(shape, borders[number])
-        found += _facing(shape, number, sight)
+        found += _facing(shape, number, visible)
         if posed:
-            found += _placed(shape, number, sensor, pose, sight)
+            found += _placed(shape, number, sensor, pose, visible)
     found += _whole(facts, sensor, sum(len(one) for one in borders))
     if task:
         found += _task(facts, task)
@@ -165,11 +170,11 @@ def _mesh(shape: ShapeFacts, border: NDArray[np.float64]) -> Iterator[Finding]:
     if mesh.duplicate or mesh.degenerate > _SLIVERS * len(mesh.triangles):
         what = f"{mesh.degenerate} triangles without area, {mesh.duplicate} duplicates"
         yield Finding("warning", shape.name, what, "Clean the mesh: mitsim part leaves them out")
-    if mesh.crowded_edges:
+    if mesh.nonmanifold_edges:
         yield Finding(
             "warning",
             shape.name,
-            f"{mesh.crowded_edges} edges belong to more than two triangles",
+            f"{mesh.nonmanifold_edges} edges belong to more than two triangles",
             "Remove inner walls, or make one shape of each touching body",
         )
     holes = _holes(mesh, border)
@@ -188,7 +193,9 @@ def open_borders(facts: SceneFacts) -> list[NDArray[np.float64]]:
     Edges close one another within :data:`_CLOSED` of the part's size. The faces of a part are meshed separately: their
     edges meet within a CAD program's tolerance, not vertex by vertex.
     """
-    borders = [np.empty((0, 2, 3)) if one.mesh is None or one.lamp else one.mesh.border for one in facts.shapes]
+    borders = [
+        np.empty((0, 2, 3)) if one.mesh is None or one.emitter else one.mesh.open_edge_ends for one in facts.shapes
+    ]
     every = np.concatenate(borders) if borders else np.empty((0, 2, 3))
     if len(every) < 2:
         return borders
@@ -219,30 +226,32 @@ def _holes(mesh: MeshFacts, border: NDArray[np.float64]) -> int:
     return int((around[of_edge] < _HOLE * size).sum())
 
 
-def _facing(shape: ShapeFacts, number: int, sight: Sight) -> Iterator[Finding]:
+def _facing(shape: ShapeFacts, number: int, visible: VisibleSurfaces) -> Iterator[Finding]:
     """Yield findings about faces whose black back side is visible."""
     if shape.two_sided:
         return
     turn = 'Reverse its triangles, or write <boolean name="flip_normals" value="true"/>'
-    mesh, mine = shape.mesh, sight.shape == number
+    mesh, mine = shape.mesh, visible.shape == number
     if mesh is not None and mesh.closed and mesh.volume < 0:
         what = f"inward normals: a closed mesh of {mesh.volume:.4g} mm^3, black from outside"
         yield Finding("error", shape.name, what, turn)
-    elif shape.fronts + shape.backs == 0:
+    elif shape.front_hits + shape.back_hits == 0:
         what = "visible from nowhere: it lies inside the part, or is very small"
         yield Finding("note", shape.name, what, "Leave it out if it is not needed")
-    elif shape.fronts < 0.02 * shape.backs:
+    elif shape.front_hits < 0.02 * shape.back_hits:
         what = "inward normals: only its black back is visible, from all directions"
         yield Finding("error", shape.name, what, turn)
-    elif mine.sum() > _CRACK_PX and not sight.front[mine].any():
+    elif mine.sum() > _CRACK_PX and not visible.front[mine].any():
         what = "shows only its black back in this view"
         yield Finding("warning", shape.name, what, f"{turn}; or look from the other side")
 
 
-def _placed(shape: ShapeFacts, number: int, sensor: Sensor, pose: Transform, sight: Sight) -> Iterator[Finding]:
+def _placed(
+    shape: ShapeFacts, number: int, sensor: Sensor, pose: Transform, visible: VisibleSurfaces
+) -> Iterator[Finding]:
     """Yield findings about shapes that the chosen pose cannot measure."""
-    mine = sight.shape == number
-    if not len(shape.points) or (mine.any() and not sight.front[mine].any()):
+    mine = visible.shape == number
+    if not len(shape.points) or (mine.any() and not visible.front[mine].any()):
         return  # another finding reports a visible back
     points, normals = pose.inverse().points(shape.points), pose.inverse().directions(shape.normals)
     facing = np.einsum("ij,ij->i", normals, sensor.rig.reference.centre - points) > 0
@@ -259,7 +268,7 @@ def _placed(shape: ShapeFacts, number: int, sensor: Sensor, pose: Transform, sig
     if share < 0.99:
         what = f"{100 * share:.0f} % of the facing area lies in the working volume: {_why_outside(sensor, shown)}"
         yield Finding("note", shape.name, what, "Move the sensor if the rest is measured")
-    if not (mine & sight.everyone).any():
+    if not (mine & visible.seen_by_all).any():
         why = "another camera or the projector does not see it" if mine.any() else "other faces occlude it"
         what = f"cameras and projector see no point in common: {why}"
         yield Finding("warning", shape.name, what, "Look from another side if it is measured")
@@ -282,10 +291,10 @@ def _why_outside(sensor: Sensor, points: np.ndarray) -> str:
 def _whole(facts: SceneFacts, sensor: Sensor, open_edges: int) -> Iterator[Finding]:
     """Yield findings about size, units, gaps and light of the whole scene."""
     yield from _size(sorted((facts.bounds[1] - facts.bounds[0]).tolist(), reverse=True), sensor)
-    parts = [shape for shape in facts.shapes if not shape.lamp]
+    parts = [shape for shape in facts.shapes if not shape.emitter]
     cut = all(shape.kind not in _STOCK for shape in parts)
     each_closed = all(shape.mesh is not None and shape.mesh.closed for shape in parts)
-    if facts.together is not None and cut and open_edges and not each_closed:
+    if facts.merged_mesh is not None and cut and open_edges and not each_closed:
         what = f"all meshes together are not closed ({open_edges} open edges)"
         advice = "Correct if only one side of the part is modelled: light passes through the openings"
         yield Finding("note", "", what, advice)

@@ -31,7 +31,7 @@ from mitsim.reconstruction.depth_range import depths_of, range_warning
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
-from mitsim.simulation.render_residual import RenderResidual, render_residual, told
+from mitsim.simulation.render_residual import RenderResidual, render_residual, warn_above_limit
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
@@ -167,7 +167,7 @@ def coupon_residuals(sensor: SimulatedSensor, campaign: Campaign) -> list[Render
             residual = render_residual(
                 sensor, sample.scene, pose.inverse(), camera, Rendering(samples), seed=seed, around=corners
             )
-            out.append(told(sample.label(), residual))
+            out.append(warn_above_limit(sample.label(), residual))
     return out
 
 

@@ -56,7 +56,7 @@ def check(
     from mitsim.report.scene_preview import preview_figure
     from mitsim.report.scene_table import as_data, as_text
     from mitsim.report.style import write_png
-    from mitsim.scene.first_hits import look
+    from mitsim.scene.first_hits import visible_surfaces
     from mitsim.scene.inspect import inspect
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
@@ -72,11 +72,11 @@ def check(
         say(f"no position was given: using --position {seen[0]} --target {seen[1]}")
     else:
         pose = pose_of(position, target, roll, chosen)
-    facts, sight = inspect(loaded), look(loaded, chosen.rig, pose)
-    found = findings(facts, chosen, pose, sight, position is not None, wanted)
+    facts, visible = inspect(loaded), visible_surfaces(loaded, chosen.rig, pose)
+    found = findings(facts, chosen, pose, visible, position is not None, wanted)
     if output:
         check_file(output)
-        write_png(preview_figure(loaded, facts, chosen, pose, sight, list(wanted.features) if wanted else []), output)
+        write_png(preview_figure(loaded, facts, chosen, pose, visible, list(wanted.features) if wanted else []), output)
         say(f"picture: {output}")
     if html:
         from mitsim.report.author_page import Authored, author_page
@@ -88,9 +88,9 @@ def check(
         say(f"page: {html}")
     if json:
         about = {"scene": loaded.where, "sensor": chosen.name, "world_from_sensor": pose.matrix().tolist()}
-        print(json_module.dumps({**about, **as_data(facts, sight, found)}, indent=2))
+        print(json_module.dumps({**about, **as_data(facts, visible, found)}, indent=2))
     else:
-        print(as_text(facts, sight, found))
+        print(as_text(facts, visible, found))
     if any(one.severity == "error" for one in found):
         raise typer.Exit(1)
 
@@ -186,7 +186,7 @@ def _edit(scene: Path, sensor: str | None, port: int) -> None:
     from mitsim.progress import say
     from mitsim.report.author_page import Authored, author_page, findings_data
     from mitsim.report.author_server import AuthorServer
-    from mitsim.scene.first_hits import look
+    from mitsim.scene.first_hits import visible_surfaces
     from mitsim.scene.inspect import inspect
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
@@ -201,7 +201,7 @@ def _edit(scene: Path, sensor: str | None, port: int) -> None:
         facts = inspect(loaded)
         pose = pose_at(chosen, usual_place(chosen, loaded.centre), loaded.centre)
         known = read_features(task) if task.exists() else None
-        found = findings(facts, chosen, pose, look(loaded, chosen.rig, pose), False, known)
+        found = findings(facts, chosen, pose, visible_surfaces(loaded, chosen.rig, pose), False, known)
         return Authored(loaded, facts, chosen, found, task if known else None, known)
 
     authored()  # report errors in the scene before serving the page

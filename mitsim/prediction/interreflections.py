@@ -171,7 +171,11 @@ class InterreflectionEffect:
             trace(
                 *given,
                 LightPaths(
-                    samples=self.samples, seed=2 * seed + half, depth=self.depth, photons=self.photons, only_later=True
+                    samples=self.samples,
+                    seed=2 * seed + half,
+                    depth=self.depth,
+                    photons=self.photons,
+                    indirect_only=True,
                 ),
             )
             for half in range(1 if self.fringe is None else 2)

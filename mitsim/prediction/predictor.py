@@ -214,7 +214,7 @@ class Predictor:
         InputError
             If the view shows a face whose finish was not characterised.
         """
-        seen = characterised.mapped.look(self.view, world_from_sensor, self.margin, normals)
+        seen = characterised.mapped.cast(self.view, world_from_sensor, self.margin, normals)
         for index, error in characterised.unknown.items():
             if ((seen.shape == index) & (seen.status == Status.VALID)).any():
                 raise error

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mitsim.report.numbers import finish_name
 from mitsim.report.style import FIELD, INK, MUTED, drawing
-from mitsim.scene.first_hits import Sight, trace
+from mitsim.scene.first_hits import VisibleSurfaces, trace
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.load import Scene
 from mitsim.sensor.preset import Sensor
@@ -48,7 +48,12 @@ _WIDTH_IN, _PANEL_IN, _TITLE_IN, _ROW_IN = 7.5, 2.65, 0.3, 0.176
 
 
 def preview_figure(
-    scene: Scene, facts: SceneFacts, sensor: Sensor, pose: Transform, sight: Sight, first: Sequence[str] = ()
+    scene: Scene,
+    facts: SceneFacts,
+    sensor: Sensor,
+    pose: Transform,
+    visible: VisibleSurfaces,
+    first: Sequence[str] = (),
 ) -> Figure:
     """Draw both views with their legend; shapes named in ``first`` get the first colours, then the largest."""
     colours = _colours(facts, first)
@@ -61,7 +66,7 @@ def preview_figure(
         wide = min(_PANEL_IN * camera.width / camera.height / _WIDTH_IN, 0.58)
         left = figure.add_axes((0.015, bottom, wide, tall))
         right = figure.add_axes((wide + 0.035, bottom, 0.95 - wide, tall))
-        _from_sensor(left, colours, sensor, sight)
+        _from_sensor(left, colours, sensor, visible)
         _from_above(right, scene, facts, colours, sensor, pose)
         _overview(right.inset_axes((0.30, 1 - _OVERVIEW, 0.685, _OVERVIEW - 0.02)), facts, sensor, pose)
         position = pose.points(camera.centre)
@@ -79,7 +84,9 @@ def preview_figure(
 def _colours(facts: SceneFacts, first: Sequence[str]) -> list[str]:
     """Return one colour for each shape, in the order of the scene."""
     shapes = facts.shapes
-    order = sorted(range(len(shapes)), key=lambda i: (shapes[i].lamp, shapes[i].name not in first, -shapes[i].area, i))
+    order = sorted(
+        range(len(shapes)), key=lambda i: (shapes[i].emitter, shapes[i].name not in first, -shapes[i].area, i)
+    )
     coloured = order if len(order) <= len(COLOURS) else order[: len(COLOURS)]
     own = dict(zip(coloured, COLOURS, strict=False))
     return [own.get(i, _OTHER) for i in range(len(shapes))]
@@ -104,23 +111,23 @@ def _painted(
     return np.asarray(image)
 
 
-def _from_sensor(axes: Axes, colours: list[str], sensor: Sensor, sight: Sight) -> None:
+def _from_sensor(axes: Axes, colours: list[str], sensor: Sensor, visible: VisibleSurfaces) -> None:
     light = np.array([-0.35, -0.45, -0.82])  # from behind the sensor's left shoulder
-    lit = np.clip(sight.normal @ (light / np.linalg.norm(light)), 0, 1)
-    clear = sight.everyone & np.where(sight.shape >= 0, _within(sensor, sight), False)
-    axes.imshow(_painted(sight.shape, sight.front, lit, colours, clear), interpolation="antialiased")
+    lit = np.clip(visible.normal @ (light / np.linalg.norm(light)), 0, 1)
+    clear = visible.seen_by_all & np.where(visible.shape >= 0, _within(sensor, visible), False)
+    axes.imshow(_painted(visible.shape, visible.front, lit, colours, clear), interpolation="antialiased")
     near, far = sensor.working_range_mm
     for at, style in ((near, "--"), (far, ":")):
         region = np.pad(common_view(sensor, at, _STEP), 1).astype(float)
         rows, columns = ((np.arange(count) - 1) * _STEP for count in region.shape)
         axes.contour(columns, rows, region, [0.5], colors=INK, linewidths=0.9, linestyles=style)
-    height, width = sight.shape.shape
+    height, width = visible.shape.shape
     axes.set_xlim(-0.5, width - 0.5)
     axes.set_ylim(height - 0.5, -0.5)
     _frame(axes)
-    seen = sight.shape >= 0
+    seen = visible.shape >= 0
     if seen.any():
-        at = float(np.median(depth(sensor, sight.point[seen])))
+        at = float(np.median(depth(sensor, visible.point[seen])))
         pixels = float(sensor.rig.reference.matrix[0, 0]) / at
         length = _round_length(0.2 * width / pixels)
         _scale_bar(
@@ -130,10 +137,10 @@ def _from_sensor(axes: Axes, colours: list[str], sensor: Sensor, sight: Sight) -
         axes.text(width / 2, height / 2, "the image shows no part", ha="center", va="center", color=MUTED)
 
 
-def _within(sensor: Sensor, sight: Sight) -> NDArray[np.bool_]:
-    inside = np.zeros(sight.shape.shape, bool)
-    seen = sight.shape >= 0
-    inside[seen] = in_working_volume(sensor, sight.point[seen])
+def _within(sensor: Sensor, visible: VisibleSurfaces) -> NDArray[np.bool_]:
+    inside = np.zeros(visible.shape.shape, bool)
+    seen = visible.shape >= 0
+    inside[seen] = in_working_volume(sensor, visible.point[seen])
     return inside
 
 
@@ -280,4 +287,4 @@ def _label(shape: ShapeFacts) -> str:
     name = shape.name if len(shape.name) <= 22 else f"{shape.name[:21]}…"
     if shape.finish is not None:
         return f"{name}  {finish_name(shape.finish.name, shape.finish.roughness)}"
-    return f"{name}  {'lamp' if shape.lamp else shape.bsdf}"
+    return f"{name}  {'lamp' if shape.emitter else shape.bsdf}"

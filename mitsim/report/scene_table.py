@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 
 from mitsim.authoring.check import Finding
-from mitsim.scene.first_hits import Sight
+from mitsim.scene.first_hits import VisibleSurfaces
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.text_table import aligned
 
 _NONE = "-"
 
 
-def as_text(facts: SceneFacts, sight: Sight, found: Sequence[Finding]) -> str:
+def as_text(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[Finding]) -> str:
     """Return tables of features and materials, then one line for each finding."""
     features = [("feature", "material", "Ra um", "area mm2", "size mm", "from mm", "to mm", "triangles", "seen px")]
     materials = [("material", "Ra um", "alpha u, v", "1-sigma", "from")]
     for number, shape in enumerate(facts.shapes):
         material, roughness = _material(shape)
         low, high = shape.bounds
-        pixels = int(((sight.shape == number) & sight.front & sight.everyone).sum())
+        pixels = int(((visible.shape == number) & visible.front & visible.seen_by_all).sum())
         triangles = str(len(shape.mesh.triangles)) if shape.mesh else _NONE
         features.append(
             (
@@ -45,11 +45,11 @@ def as_text(facts: SceneFacts, sight: Sight, found: Sequence[Finding]) -> str:
     return "\n".join(lines if found else [*lines, "no problems found"])
 
 
-def as_data(facts: SceneFacts, sight: Sight, found: Sequence[Finding]) -> dict[str, Any]:
+def as_data(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[Finding]) -> dict[str, Any]:
     """Return the same as data; lengths in mm, null without a value."""
     shapes = []
     for number, shape in enumerate(facts.shapes):
-        mine = (sight.shape == number) & sight.front
+        mine = (visible.shape == number) & visible.front
         finish = shape.finish
         shapes.append(
             {
@@ -67,9 +67,9 @@ def as_data(facts: SceneFacts, sight: Sight, found: Sequence[Finding]) -> dict[s
                 "bounds_mm": shape.bounds.tolist(),
                 "triangles": len(shape.mesh.triangles) if shape.mesh else None,
                 "closed": shape.mesh.closed if shape.mesh else None,
-                "lamp": shape.lamp,
+                "lamp": shape.emitter,
                 "pixels": int(mine.sum()),
-                "pixels_seen_by_all": int((mine & sight.everyone).sum()),
+                "pixels_seen_by_all": int((mine & visible.seen_by_all).sum()),
             }
         )
     return {
@@ -84,7 +84,7 @@ def as_data(facts: SceneFacts, sight: Sight, found: Sequence[Finding]) -> dict[s
 
 def _material(shape: ShapeFacts) -> tuple[str, str]:
     if shape.finish is None:
-        return ("lamp" if shape.lamp else shape.bsdf), _NONE
+        return ("lamp" if shape.emitter else shape.bsdf), _NONE
     return shape.finish.name, _number(shape.finish.roughness)
 
 

@@ -31,7 +31,7 @@ from mitsim.report.run_files import claim_folder, digests_of
 from mitsim.run_study.record import Outcome, own_files, run_record
 from mitsim.run_study.scoring import pose_columns, score_study
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.simulation.render_residual import RenderResidual, render_residual, told, worst_of
+from mitsim.simulation.render_residual import RenderResidual, largest_residual, render_residual, warn_above_limit
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import Study
@@ -128,7 +128,7 @@ def run_study(
         _show(study, twin, shown, folder, {} if planned is None else {leaders[0]: planned})
         residuals += [_residual(study, twin.simulated, number) for number in shown[:1]]
     clock.lap("pictures")
-    outcome = Outcome(raced, shown, chosen, tried, worst_of(residuals), clock.steps)
+    outcome = Outcome(raced, shown, chosen, tried, largest_residual(residuals), clock.steps)
     about = run_record(study, performance_map, outcome)
     about["files"] = digests_of(folder, own_files(study, drawn, shown, bool(stated)))
     write_json(folder / "run.json", about)
@@ -222,7 +222,7 @@ def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderRe
     table, pose = study.file.measure, study.views[number].world_from_sensor
     camera = next(iter(study.sensor.rig.cameras))
     rendering = Rendering(table.samples_per_pixel, table.light_path_depth)
-    return told(
+    return warn_above_limit(
         f"view {number}",
         render_residual(simulated, study.scene, pose, camera, rendering, seed=study.file.seed),
     )

@@ -1,1 +1,1 @@
-"""Light and geometry: the only room that knows Mitsuba."""
+"""Scenes, materials, rays and light transport: the only room that imports Mitsuba."""

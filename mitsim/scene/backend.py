@@ -1,11 +1,14 @@
-"""Choose and start Mitsuba's just-in-time backend, without ever loading a library that would abort the process.
+"""Choose and start Mitsuba's just-in-time backend, and never load a library that aborts the process.
 
-Mitsuba's CPU variants compile with a libLLVM that its wheel does not bring. LLVM 14 is refused by Dr.Jit, LLVM 15
-and 16 are accepted and then *kill the process* at the first render; 19 and later work (17 and 18 were not tried, so
-they are not trusted). The library is looked for in this order: a path that the user has set, the one that pip
-installed beside us, the system's. Its version is read before it is allowed near Mitsuba.
+Mitsuba's CPU variants compile with libLLVM, which Mitsuba's wheel does not contain. Dr.Jit rejects LLVM 14. It accepts
+LLVM 15 and 16, and then *aborts the process* at the first render. Versions from 19 on work. Versions 17 and 18 are
+untested and therefore rejected.
 
-Everything in :mod:`mitsim.scene` takes ``mi`` and ``dr`` from here, so that the choice is made once, first.
+Candidates are the path that the user has set, or else the library that pip installed, then those of the system. The
+version of a candidate is determined before Mitsuba may load it.
+
+All of :mod:`mitsim.scene` takes ``mi`` and ``dr`` from this module, so that the variant is chosen before their first
+use.
 """
 
 from __future__ import annotations
@@ -36,8 +39,8 @@ _SYSTEM_FOLDERS = (
     "/usr/local/opt/llvm/lib",
 )
 
-# run in a child: a library that cannot be loaded, or that is broken, must not take us with it
-_ASK_VERSION = """
+# run in a child process: a broken library may end the process that loads it
+_VERSION_SCRIPT = """
 import ctypes, sys
 library = ctypes.CDLL(sys.argv[1])
 numbers = [ctypes.c_uint() for _ in range(3)]
@@ -47,14 +50,18 @@ print(numbers[0].value)
 
 HELP = (
     f"no libLLVM of version {LLVM_MINIMUM} or later was found, and Mitsuba's CPU variants need one.\n"
-    "On x86-64 Linux: pip install karellen-llvm-core. Elsewhere install LLVM (Debian: apt-get install libllvm19; "
-    f"macOS: brew install llvm) or set {LLVM_VARIABLE} to its library; mitsim doctor tells what it sees."
+    "On x86-64 Linux: pip install karellen-llvm-core. Elsewhere: install LLVM (Debian: apt-get install libllvm19; "
+    f"macOS: brew install llvm), or set {LLVM_VARIABLE} to the path of its library. mitsim doctor lists what it finds."
 )
 
 
 @dataclass(frozen=True)
 class Llvm:
-    """A libLLVM that was found: its path, major version (0 if it cannot be told) and where it came from."""
+    """A candidate libLLVM.
+
+    ``path``; major ``version``, 0 if unknown; ``origin`` of the path, in words; ``fault``: why it cannot be used, empty
+    if it can.
+    """
 
     path: Path
     version: int
@@ -68,9 +75,9 @@ class Llvm:
 
 
 def find_llvm() -> list[Llvm]:
-    """All libLLVM candidates, in the order in which they would be taken."""
-    if given := os.environ.get(LLVM_VARIABLE):
-        return [_inspect(Path(given), f"the environment variable {LLVM_VARIABLE}")]
+    """Return all candidates for libLLVM, in order of preference."""
+    if chosen := os.environ.get(LLVM_VARIABLE):
+        return [_inspect(Path(chosen), f"the environment variable {LLVM_VARIABLE}")]
     found = [_inspect(path, "pip package karellen-llvm-core") for path in _from_pip()]
     for folder in _SYSTEM_FOLDERS:
         found += [_inspect(path, "system") for path in sorted(Path(folder).glob("libLLVM*"), reverse=True)]
@@ -94,21 +101,21 @@ def _inspect(path: Path, origin: str) -> Llvm:
         return Llvm(path, 0, origin, "no such file")
     match = re.search(r"libLLVM[.-](?:so\.)?(\d+)", path.resolve().name)
     if match and int(match.group(1)) < LLVM_MINIMUM:
-        return Llvm(path, int(match.group(1)), origin, f"older than {LLVM_MINIMUM}: it would abort the process")
+        return Llvm(path, int(match.group(1)), origin, f"older than {LLVM_MINIMUM}: it could abort the process")
     if origin == "system" and not match:
-        return Llvm(path, 0, origin, "version not told by its name")
-    asked = subprocess.run(
-        [sys.executable, "-c", _ASK_VERSION, str(path)], capture_output=True, text=True, timeout=60, check=False
+        return Llvm(path, 0, origin, "its name does not state its version")
+    process = subprocess.run(
+        [sys.executable, "-c", _VERSION_SCRIPT, str(path)], capture_output=True, text=True, timeout=60, check=False
     )
-    if asked.returncode != 0:
-        fault = (asked.stderr.strip().splitlines() or ["it cannot be loaded"])[-1]
+    if process.returncode != 0:
+        fault = (process.stderr.strip().splitlines() or ["it cannot be loaded"])[-1]
         return Llvm(path, 0, origin, fault.removeprefix("OSError: "))
-    version = int(asked.stdout)
+    version = int(process.stdout)
     return Llvm(path, version, origin, "" if version >= LLVM_MINIMUM else f"older than {LLVM_MINIMUM}")
 
 
 def cuda_devices() -> int:
-    """How many CUDA devices the driver offers; 0 without a driver."""
+    """Return the number of CUDA devices that the driver offers, 0 without a driver."""
     try:
         driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
         count = ctypes.c_int()
@@ -119,27 +126,29 @@ def cuda_devices() -> int:
         return 0
 
 
-def choose_variant(wanted: str | None = None) -> str:
-    """The Mitsuba variant to run: the one asked for, else CUDA where there is a device, else LLVM.
+def choose_variant(requested: str | None = None) -> str:
+    """Return the Mitsuba variant to run: the requested one, else CUDA if there is a device, else LLVM.
+
+    Sets the environment variable ``LLVM_VARIABLE`` for LLVM.
 
     Raises
     ------
     InputError
-        For a variant that we do not support (colour and polarised variants would need other materials).
+        If the variant is not supported. Variants with colour or polarisation would need other materials.
     MissingEnvironmentError
         If the variant cannot run on this machine.
     """
-    if wanted is not None and wanted not in VARIANTS:
-        raise InputError("--variant", "", repr(wanted), ", ".join(VARIANTS))
-    if wanted == "cuda_ad_mono" and cuda_devices() == 0:
-        raise MissingEnvironmentError("cuda_ad_mono was asked for, but the NVIDIA driver offers no device")
-    if wanted == "cuda_ad_mono" or (wanted is None and cuda_devices() > 0):
+    if requested is not None and requested not in VARIANTS:
+        raise InputError("--variant", "", repr(requested), ", ".join(VARIANTS))
+    if requested == "cuda_ad_mono" and cuda_devices() == 0:
+        raise MissingEnvironmentError("cuda_ad_mono was requested, but the NVIDIA driver offers no device")
+    if requested == "cuda_ad_mono" or (requested is None and cuda_devices() > 0):
         return "cuda_ad_mono"
     candidates = find_llvm()
     best = next((c for c in candidates if c.usable), None)
     if best is None:
-        seen = "".join(f"\n  seen: {c.path} ({c.fault or 'LLVM ' + str(c.version)})" for c in candidates)
-        raise MissingEnvironmentError(HELP + seen)
+        found = "".join(f"\n  found: {c.path} ({c.fault or 'LLVM ' + str(c.version)})" for c in candidates)
+        raise MissingEnvironmentError(HELP + found)
     os.environ[LLVM_VARIABLE] = str(best.path)
     return "llvm_ad_mono"
 
@@ -147,14 +156,22 @@ def choose_variant(wanted: str | None = None) -> str:
 _active: str | None = None
 
 
-def activate(wanted: str | None = None) -> str:
-    """Start Mitsuba once, in the variant asked for; returns its name. Later calls must not ask for another."""
+def activate(requested: str | None = None) -> str:
+    """Start Mitsuba in the requested variant, once per process, and return the name of the variant.
+
+    Raises
+    ------
+    InputError
+        If the process already runs another variant, or the variant is not supported.
+    MissingEnvironmentError
+        If the variant cannot run on this machine.
+    """
     global _active
     if _active is not None:
-        if wanted not in (None, _active):
-            raise InputError("--variant", "", repr(wanted), f"{_active}, which this process already runs")
+        if requested not in (None, _active):
+            raise InputError("--variant", "", repr(requested), f"{_active}, which this process already runs")
         return _active
-    variant = choose_variant(wanted)
+    variant = choose_variant(requested)
     import mitsuba as mi
 
     mi.set_variant(variant)
@@ -164,19 +181,19 @@ def activate(wanted: str | None = None) -> str:
 
 
 def active() -> str | None:
-    """The variant that this process runs, None before one was chosen."""
+    """Return the variant that this process runs, None before one is chosen."""
     return _active
 
 
 def limit_threads(count: int) -> None:
-    """Have Dr.Jit compute in so many threads: what one of several processes of a machine may take."""
+    """Set the number of threads of Dr.Jit, so that several processes can share a machine."""
     import drjit as dr
 
     dr.set_thread_count(count)
 
 
 def __getattr__(name: str) -> Any:
-    """Give ``mi`` and ``dr``, starting the default variant if none was chosen yet."""
+    """Return ``mi`` or ``dr``; start the default variant if none is active."""
     if name == "mi":
         activate()
         import mitsuba

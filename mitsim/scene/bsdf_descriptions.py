@@ -1,4 +1,8 @@
-"""Descriptions of finishes in Mitsuba's words: stock BSDFs that reflect light as :mod:`mitsim.surface` says."""
+"""Describe finishes as Mitsuba BSDFs that reflect light as :mod:`mitsim.surface` computes.
+
+Signal chain: refractive index and :class:`~mitsim.surface.scatter.Scatter` of a finish -> widths, factors and blend
+weights of stock BSDFs -> dictionary for ``mi.load_dict``.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +16,15 @@ from mitsim.surface.microfacet import GGX_PER_BECKMANN, fresnel
 from mitsim.surface.paint import INDEX, surface_share
 from mitsim.surface.scatter import Scatter
 
-#: a coherent share that stays under this at every angle at which its law holds is not rendered
+#: a coherent share below this at every angle where its law holds is not rendered
 _LEAST_COHERENT = 0.005
 
-#: weight of a powder coat's surface lobe in its blend; its reflectance is divided by it, so it shapes nothing
+#: blend weight of a powder coat's surface lobe. Its reflectance is divided by the weight, so the weight has no effect
+#: on the BSDF, only on its sampling
 _COAT_WEIGHT = 0.1
 
-#: alpha -> by what the base of Mitsuba's ``roughplastic`` (Beckmann, 1.5, linear) must be multiplied for a white base
-#: to return all light at 30 deg; measured on Mitsuba 3.9.1
+#: alpha, and a factor on the base reflectance of Mitsuba's ``roughplastic`` (Beckmann, index 1.5, linear). With it, a
+#: white base returns all light at 30 deg. Measured on Mitsuba 3.9.1
 _PLASTIC_BASE = np.array(
     [
         (0.003, 1.0195),
@@ -34,10 +39,19 @@ _PLASTIC_BASE = np.array(
 
 
 def metal_bsdf(index: tuple[float, float], scatter: Scatter, reflected: float = 1.0) -> dict[str, Any]:
-    """Mitsuba description of a machined metal: up to two incoherent lobes, a coherent one, a wide-angle share.
+    """Return the Mitsuba description of a machined metal.
 
-    ``index`` (n, k). All lobes have the same, and no child is a delta, so blending them keeps the energy.
-    ``reflected`` is a factor on all of the light [1].
+    It blends up to two incoherent lobes, a coherent lobe and a diffuse wide-angle share. All lobes have the same
+    refractive index, and none is a delta function, so blending conserves energy.
+
+    Parameters
+    ----------
+    index
+        n and k of the metal [1].
+    scatter
+        Lobes and shares of the finish.
+    reflected
+        Factor on all reflected light [1].
     """
 
     def lobe(distribution: str, alphas: tuple[float, float], factor: float) -> dict[str, Any]:
@@ -72,7 +86,7 @@ def metal_bsdf(index: tuple[float, float], scatter: Scatter, reflected: float = 
 
 
 def gloss_paint_bsdf(reflectance: float, scatter: Scatter) -> dict[str, Any]:
-    """Mitsuba description of a gloss paint on a base of that reflectance [1]."""
+    """Return the Mitsuba description of a gloss paint whose base has this reflectance [1]."""
     return {
         "type": "roughplastic",
         "distribution": "beckmann",
@@ -88,7 +102,10 @@ def gloss_paint_bsdf(reflectance: float, scatter: Scatter) -> dict[str, Any]:
 
 
 def powder_coat_bsdf(reflectance: float, scatter: Scatter) -> dict[str, Any]:
-    """Mitsuba description of a powder coat: a conductor without absorption (k = 0) has a dielectric's Fresnel curve."""
+    """Return the Mitsuba description of a powder coat whose base has this reflectance [1].
+
+    A conductor without absorption (k = 0) has the Fresnel reflectance of a dielectric.
+    """
     alpha = scatter.ggx_alpha[0]
     body = reflectance * (1 - surface_share(GGX_PER_BECKMANN * scatter.alpha_u, "ggx"))
     coat = {
@@ -103,7 +120,10 @@ def powder_coat_bsdf(reflectance: float, scatter: Scatter) -> dict[str, Any]:
 
 
 def _blend(first: dict[str, Any], second: dict[str, Any], weight: float) -> dict[str, Any]:
-    """``blendbsdf`` gives its weight to the second child."""
+    """Blend two descriptions; ``weight`` is the share of the second [1], as in ``blendbsdf``.
+
+    A share below 1e-3 is dropped.
+    """
     if weight < 1e-3:
         return first
     if weight > 1 - 1e-3:
@@ -112,5 +132,5 @@ def _blend(first: dict[str, Any], second: dict[str, Any], weight: float) -> dict
 
 
 def diffuse_bsdf(reflectance: float) -> dict[str, Any]:
-    """Mitsuba description of a Lambertian surface of that reflectance [1]."""
+    """Return the Mitsuba description of a Lambertian surface of this reflectance [1]."""
     return {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}}

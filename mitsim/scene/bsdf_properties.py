@@ -1,4 +1,4 @@
-"""Properties of a BSDF in a scene file, checked: known names, choices, numbers within limits."""
+"""Read and check the properties of a BSDF in a scene file: names, choices and limits of numbers."""
 
 from __future__ import annotations
 
@@ -8,14 +8,20 @@ from mitsim.errors import InputError, nearest
 
 
 def only_known(props: Any, where: str, known: tuple[str, ...]) -> None:
-    """Raise an error for a property whose name is not known."""
+    """Raise :class:`InputError` if a BSDF has a property that is not ``known``."""
     for key in props.keys():  # noqa: SIM118 - not a dict
         if key not in known:
             raise InputError(where, str(key), "an unknown property", ", ".join(known), nearest(str(key), list(known)))
 
 
 def choice(props: Any, where: str, key: str, default: str, known: list[str]) -> str:
-    """Return the text of a property, one of those known."""
+    """Return a text property, which must be one of ``known``; ``default`` if it is not given.
+
+    Raises
+    ------
+    InputError
+        If the value is not one of ``known``.
+    """
     value = props.get(key, default)
     if value not in known:
         raise InputError(where, key, repr(value), ", ".join(known), nearest(str(value), known))
@@ -23,7 +29,13 @@ def choice(props: Any, where: str, key: str, default: str, known: list[str]) -> 
 
 
 def number_within(props: Any, where: str, key: str, default: float | None, low: float, high: float, unit: str) -> float:
-    """Return the number of a property, its default if the author wrote none."""
+    """Return a numeric property from ``low`` to ``high``; ``default`` if it is not given.
+
+    Raises
+    ------
+    InputError
+        If there is neither a value nor a default, or the value is no number or outside the limits.
+    """
     allowed = f"a number from {low:g} to {high:g} {unit}".rstrip()
     value = props.get(key, default)
     if value is None:

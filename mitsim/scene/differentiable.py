@@ -1,18 +1,18 @@
-"""The light of a flat coupon as a function of its lobe's width, with its derivative by automatic differentiation.
+"""Compute the light of a flat coupon as a function of its lobe width, and its derivative by automatic differentiation.
 
-Signal chain: unit directions toward camera and lamp at every pixel -> Mitsuba's stock lobes of a machined metal, their
-numbers attached to one variable -> pi f [1] and its derivative, in one forward pass of Dr.Jit.
+Signal chain: unit directions toward camera and light at each pixel -> Mitsuba's stock lobes of a machined metal, whose
+parameters depend on one variable -> pi f [1] and its derivative, in one forward pass of Dr.Jit.
 
-On a coupon the radiance L of a pixel is the product of two things. L_1 = E / pi is what a Lambertian coupon of
-reflectance 1 would send there: projector, pattern, lenses and pose are in it, and it is rendered once, by
-:mod:`mitsim.scene.light_transport.transport`. The finish is in pi f alone, f being its BRDF [1/sr]:
+The radiance L of a pixel on a coupon is a product. L_1 = E / pi is the radiance of a Lambertian coupon of reflectance
+1. It depends on projector, pattern, lenses and pose, and :mod:`mitsim.scene.light_transport.transport` renders it once.
+The finish enters only by pi f, where f is the BRDF [1/sr] at parameter theta:
 
-    L = L_1 pi f(theta; view, lamp)        dL/dtheta = L_1 pi df/dtheta
+    L = L_1 pi f(theta; view, light)        dL/dtheta = L_1 pi df/dtheta
 
-That holds as far as f does not vary inside a pixel and across the two apertures. Forward mode, because there is one
-variable and a value for every pixel. The lobes are ``roughconductor`` under a ``blendbsdf`` and a
-``coherent_blend``, as :func:`mitsim.scene.bsdf_descriptions.metal_bsdf` makes them, but never fewer: the tree must not
-change with the variable.
+This holds if f is constant inside a pixel and across the two apertures. Forward mode is used because there is one
+variable and one value per pixel. The lobes are ``roughconductor`` BSDFs in a ``blendbsdf`` and a ``coherent_blend``, as
+in :func:`mitsim.scene.bsdf_descriptions.metal_bsdf`. Here no lobe is dropped, because the tree must not change with the
+variable.
 """
 
 from __future__ import annotations
@@ -29,34 +29,50 @@ from mitsim.scene.coherent_blend import NAME, NUMBERS, register_coherent_blend
 from mitsim.scene.load import Scene, scene_from_dict
 from mitsim.surface.scatter import Scatter
 
-#: step of the variable over which the lobe's own numbers (energy, coherence) are differenced; their error is its square
+#: step of the central differences of the lobe's parameters (energy, coherence); the error is of the order of its square
 _STEP = 1e-3
 
 _INCOHERENT, _MIRROR = "lobe", "mirror"
 
 
 def lambertian_coupon(width: float, height: float, wavelength_nm: float) -> Scene:
-    """A flat coupon [mm] in the plane z = 0, centred, normal +z, that reflects all light evenly."""
+    """Return a scene with one white Lambertian coupon of reflectance 1.
+
+    Parameters
+    ----------
+    width, height
+        Size along x and y [mm]. The coupon lies in the plane z = 0, centred, with normal +z.
+    wavelength_nm
+        Wavelength of the sensor [nm].
+    """
     backend.activate()
-    place = mi.ScalarTransform4f().scale([width / 2, height / 2, 1.0])
+    to_world = mi.ScalarTransform4f().scale([width / 2, height / 2, 1.0])
     white = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 1.0}}
-    return scene_from_dict({"coupon": {"type": "rectangle", "to_world": place, "bsdf": white}}, wavelength_nm)
+    return scene_from_dict({"coupon": {"type": "rectangle", "to_world": to_world, "bsdf": white}}, wavelength_nm)
 
 
 class Directions:
-    """Unit directions (N, 3) from points of a coupon toward the camera and the lamp, in its frame (z the normal)."""
+    """Unit directions from points of a coupon, in its frame (z is the normal).
 
-    def __init__(self, view: NDArray[np.floating], lamp: NDArray[np.floating]) -> None:
-        if view.shape != lamp.shape or view.ndim != 2 or view.shape[1] != 3:
-            raise ValueError(f"directions {view.shape} and {lamp.shape}: both must be (N, 3)")
+    ``view`` (N, 3) toward the camera and ``light`` (N, 3) toward the projector.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ or are not (N, 3).
+    """
+
+    def __init__(self, view: NDArray[np.floating], light: NDArray[np.floating]) -> None:
+        if view.shape != light.shape or view.ndim != 2 or view.shape[1] != 3:
+            raise ValueError(f"directions {view.shape} and {light.shape}: both must be (N, 3)")
         self.count = len(view)
-        self.view, self.lamp = (mi.Vector3f(np.ascontiguousarray(d.T, np.float32)) for d in (view, lamp))
+        self.view, self.light = (mi.Vector3f(np.ascontiguousarray(d.T, np.float32)) for d in (view, light))
 
 
 class SpecularLobe:
-    """The specular light of a machined metal, all but its wide-angle share.
+    """The specular light of a machined metal: all reflected light except the wide-angle share.
 
-    ``index`` (n, k) of the metal. What the lobe is made of comes with each call, as a :class:`Scatter`.
+    ``index`` is n and k of the metal [1]. Each call gives the parameters of the lobes as a :class:`Scatter`.
     """
 
     def __init__(self, index: tuple[float, float]) -> None:
@@ -77,34 +93,34 @@ class SpecularLobe:
         incoherent = {"type": "blendbsdf", "weight": 0.5, "first": lobe("ggx"), "second": lobe("beckmann")}
         numbers = dict.fromkeys(NUMBERS, 0.0)
         tree = {"type": NAME, "phase_variance": 1.0, **numbers, "mirror": lobe("beckmann"), "lobe": incoherent}
-        self._bsdf = mi.load_dict(tree, optimize=False)  # equal textures must stay two
+        self._bsdf = mi.load_dict(tree, optimize=False)  # equal textures must not be merged
         self._parameters = mi.traverse(self._bsdf)
 
     def reflectance(self, scatter: Scatter, directions: Directions) -> NDArray[np.float64]:
-        """Pi f [1] of every pair of directions, (N,); 0 where either lies below the surface."""
+        """Return pi f [1] of each pair of directions, (N,); 0 where one is below the surface."""
         self._set({name: mi.Float(dr.opaque(mi.Float, value)) for name, value in _numbers(scatter).items()})
         return np.array(self._evaluate(directions), np.float64)
 
     def reflectance_and_slope(
         self, scatter_at: Callable[[float], Scatter], x: float, directions: Directions
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pi f [1] at ``scatter_at(x)``, and its derivative by x, both (N,).
+        """Return pi f [1] at ``scatter_at(x)`` and its derivative by x, (N,) each.
 
-        Dr.Jit differentiates what Mitsuba does with the lobe's numbers; how these follow from x, a few scalars, is
-        differenced.
+        Dr.Jit differentiates pi f by the parameters of the lobes. The derivatives of these few parameters by x are
+        central differences.
         """
         here, above, below = (_numbers(scatter_at(x + step)) for step in (0.0, _STEP, -_STEP))
-        moved = dr.opaque(mi.Float, 0.0)
-        dr.enable_grad(moved)
+        change = dr.opaque(mi.Float, 0.0)
+        dr.enable_grad(change)
         self._set(
             {
                 name: dr.opaque(mi.Float, value)
-                + moved * dr.opaque(mi.Float, (above[name] - below[name]) / (2 * _STEP))
+                + change * dr.opaque(mi.Float, (above[name] - below[name]) / (2 * _STEP))
                 for name, value in here.items()
             }
         )
         value = self._evaluate(directions)
-        dr.forward(moved)
+        dr.forward(change)
         slope = dr.grad(value)
         dr.eval(value, slope)
         return np.array(dr.detach(value), np.float64), np.array(slope, np.float64)
@@ -117,13 +133,13 @@ class SpecularLobe:
     def _evaluate(self, directions: Directions) -> Any:
         surface = dr.zeros(mi.SurfaceInteraction3f, directions.count)
         surface.wi = directions.view
-        value = self._bsdf.eval(mi.BSDFContext(), surface, directions.lamp)[0]  # with the cosine of the lamp
-        above = (directions.view.z > 0) & (directions.lamp.z > 0)
-        return dr.select(above, dr.pi * value / dr.maximum(directions.lamp.z, 1e-6), 0.0)
+        value = self._bsdf.eval(mi.BSDFContext(), surface, directions.light)[0]  # f times the cosine toward the light
+        above = (directions.view.z > 0) & (directions.light.z > 0)
+        return dr.select(above, dr.pi * value / dr.maximum(directions.light.z, 1e-6), 0.0)
 
 
 def _numbers(scatter: Scatter) -> dict[str, float]:
-    """What the tree's parameters are set to, by Mitsuba's names for them."""
+    """Return the values of the parameters of the BSDF tree, by their names in Mitsuba."""
     ggx, beckmann = f"{_INCOHERENT}.bsdf_0", f"{_INCOHERENT}.bsdf_1"
     (ggx_u, ggx_v), (mirror_u, mirror_v) = scatter.ggx_alpha, scatter.coherent_alpha
     return {

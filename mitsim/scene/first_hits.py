@@ -1,4 +1,8 @@
-"""First surfaces that rays meet, whichever side they show, and the view of a sensor's reference camera."""
+"""Find the first surfaces that rays meet, on either side, and those that a sensor's reference camera sees.
+
+Signal chain: rays -> nearest surface, its shape and side -> shadow rays to the other cameras and the projector ->
+surfaces that all of them see.
+"""
 
 from __future__ import annotations
 
@@ -17,27 +21,44 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Sight:
-    """Surfaces that the reference camera's own pixels see, (H, W) each.
+class VisibleSurfaces:
+    """Surfaces that the pixels of the reference camera see.
 
-    ``shape`` index of the first shape met, -1 for none, backs included; ``front`` whether its reflecting side is seen;
-    ``normal`` (H, W, 3) toward the camera and ``point`` (H, W, 3) [mm], both in the sensor frame; ``everyone`` whether
-    every other eye has a free line to it.
+    Attributes
+    ----------
+    shape
+        (H, W) index of the first shape on the ray, whichever side it shows; -1 for none.
+    front
+        (H, W) whether the reflecting side of the shape is seen.
+    normal
+        (H, W, 3) unit normal toward the camera, sensor frame; NaN without a shape.
+    point
+        (H, W, 3) [mm], sensor frame; NaN without a shape.
+    seen_by_all
+        (H, W) whether the front is seen and every other camera and the projector has a free line to the point.
     """
 
     shape: NDArray[np.int16]
     front: NDArray[np.bool_]
     normal: Floats
     point: Floats
-    everyone: NDArray[np.bool_]
+    seen_by_all: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Hits:
-    """First surfaces met by n rays.
+    """First surfaces on n rays.
 
-    ``shape`` (n,), -1 for none; ``front`` (n,) whether its reflecting side is met; ``normal`` (n, 3) toward the ray's
-    origin and ``distance`` (n,) [mm], NaN where nothing is met.
+    Attributes
+    ----------
+    shape
+        (n,) index of the shape; -1 for none.
+    front
+        (n,) whether the ray meets the reflecting side.
+    normal
+        (n, 3) unit normal on the side of the ray's origin, world frame; NaN without a surface.
+    distance
+        (n,) [mm]; NaN without a surface.
     """
 
     shape: NDArray[np.int16]
@@ -47,7 +68,10 @@ class Hits:
 
 
 def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.floating]) -> Hits:
-    """Follow n rays, (n, 3) each [mm, unit], world frame, to the first surface, whichever side it shows."""
+    """Trace n rays to the first surface, whichever side it shows.
+
+    ``origins`` (n, 3) [mm] and unit ``directions`` (n, 3), world frame.
+    """
     start, along = (np.asarray(a, np.float32).reshape(-1, 3).T for a in (origins, directions))
     ray = mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
     surface = scene.mitsuba.ray_intersect(ray)
@@ -55,33 +79,33 @@ def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.fl
     two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
     front = ~behind | two_sided
     normal = dr.select(behind, -surface.n, surface.n)
-    number = dr.select(surface.is_valid(), dr.reinterpret_array(mi.UInt32, surface.shape), 0)
+    shape_id_of_ray = dr.select(surface.is_valid(), dr.reinterpret_array(mi.UInt32, surface.shape), 0)
     distance = dr.select(surface.is_valid(), surface.t, dr.nan)
-    dr.eval(front, normal, number, distance)
-    numbers = np.array(number)
-    lookup = np.full(int(numbers.max(initial=0)) + 1, -1, np.int16)
-    for index, one in enumerate(scene.shapes):
-        own = int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(one))))[0])
-        if own < len(lookup):
-            lookup[own] = index
+    dr.eval(front, normal, shape_id_of_ray, distance)
+    ids = np.array(shape_id_of_ray)
+    lookup = np.full(int(ids.max(initial=0)) + 1, -1, np.int16)
+    for index, mitsuba_shape in enumerate(scene.shapes):
+        shape_id = int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(mitsuba_shape))))[0])
+        if shape_id < len(lookup):
+            lookup[shape_id] = index
     lookup[0] = -1
-    shape = lookup[numbers]
+    shape = lookup[ids]
     vectors = np.where((shape >= 0)[:, None], np.array(normal, float).T, np.nan)
     return Hits(shape, np.array(front, bool) & (shape >= 0), vectors, np.array(distance, float))
 
 
-def look(scene: Scene, rig: Rig, world_from_sensor: Transform) -> Sight:
+def visible_surfaces(scene: Scene, rig: Rig, world_from_sensor: Transform) -> VisibleSurfaces:
     """Return the surfaces that the pixels of a rig's reference camera see from one pose."""
     camera = rig.reference
     eyes = [*list(rig.cameras.values())[1:], *([rig.projector] if rig.projector else [])]
     directions = camera.sensor_from_camera.directions(camera.rays(camera.pixel_grid()))
-    size = directions.shape[:2]
+    shape = directions.shape[:2]
     origin = world_from_sensor.points(camera.centre)
     world = world_from_sensor.directions(directions.reshape(-1, 3))
     hits = trace(scene, np.broadcast_to(origin, world.shape), world)
-    rays = PixelRays(camera.centre, directions)  # PixelRays.of_camera, without undistorting all pixels once more
+    rays = PixelRays(camera.centre, directions)  # PixelRays.of_camera would undistort all pixels again
     seen = cast(scene, rays, world_from_sensor, np.array([eye.centre for eye in eyes])).seen
-    normal = world_from_sensor.inverse().directions(hits.normal).reshape(*size, 3)
-    point = camera.centre + directions * hits.distance.reshape(*size, 1)
-    everyone = np.asarray(hits.front.reshape(size) & seen.all(axis=0))
-    return Sight(hits.shape.reshape(size), hits.front.reshape(size), normal, point, everyone)
+    normal = world_from_sensor.inverse().directions(hits.normal).reshape(*shape, 3)
+    point = camera.centre + directions * hits.distance.reshape(*shape, 1)
+    seen_by_all = np.asarray(hits.front.reshape(shape) & seen.all(axis=0))
+    return VisibleSurfaces(hits.shape.reshape(shape), hits.front.reshape(shape), normal, point, seen_by_all)

@@ -1,8 +1,8 @@
-"""Facts about a scene's shapes: their material, their size, and the side that faces outward.
+"""Collect facts about the shapes of a scene: material, size, mesh, and the side that faces outward.
 
-Signal chain: scene XML -> Mitsuba's shapes -> triangles (:mod:`mitsim.scene.mesh_facts`), areas, boxes, material of
-each; rays from all around (:mod:`mitsim.scene.first_hits`) -> whether they meet its front or its back.
-:mod:`mitsim.authoring.check` judges the facts.
+Signal chain: scene XML -> Mitsuba's shapes -> triangles (:mod:`mitsim.scene.mesh_facts`), areas, boxes and materials;
+rays from all directions (:mod:`mitsim.scene.first_hits`) -> counts of hits on the front and back of each shape.
+:mod:`mitsim.authoring.check` evaluates the facts.
 """
 
 from __future__ import annotations
@@ -24,24 +24,52 @@ from mitsim.scene.mesh_facts import MeshFacts, mesh_facts
 
 Floats = NDArray[np.float64]
 
-#: points spread over each shape, and rays from each direction all around
+#: number of points on each shape; number of rays along one side of the square grid of each direction
 _SAMPLES, _ROW = 2048, 96
 
-#: vertices nearer than this share of the scene's size are one
+#: spacing of the grid in which vertices are merged, as a share of the size of the scene
 _MERGE = 1e-6
 
 
 @dataclass(frozen=True)
 class ShapeFacts:
-    """One shape of a scene.
+    """Facts about one shape of a scene.
 
-    ``named`` whether its author gave it an id; ``kind`` and ``bsdf`` the types in the XML (of the BSDF also where a
-    finish was made of it); ``finish`` None for a stock BSDF; ``alpha`` (u, v) in Beckmann's sense, NaN where there is
-    none, ``alpha_factor`` its one-sigma factor (NaN if not known) and ``provenance`` where it comes from; ``lay`` of
-    the marks; ``area`` [mm^2]; ``bounds`` (2, 3) [mm]; ``delta`` whether it only mirrors or refracts; ``two_sided``
-    whether its back reflects too; ``lamp`` whether it shines; ``mesh`` its triangles, None for a stock surface;
-    ``points``, ``normals`` (n, 3) spread over it, the normals on the reflecting side; ``fronts``, ``backs`` how many
-    rays from all around meet its front and back first, or, where none does, leave the scene from there.
+    Attributes
+    ----------
+    name
+        Name of the shape in the scene.
+    named
+        Whether its author gave it an id.
+    kind, bsdf
+        Types of the shape and its BSDF in the XML, also if the BSDF was replaced by a finish.
+    finish
+        Its finish; None for a stock BSDF.
+    alpha
+        Width of the lobe along u and v in Beckmann's sense [1]; NaN if there is none.
+    alpha_factor
+        One-sigma factor of alpha [1]; NaN if unknown.
+    provenance
+        Source of alpha, in words.
+    lay
+        Direction of the machining marks.
+    area
+        Surface area [mm^2].
+    bounds
+        (2, 3) corners of the bounding box [mm], world frame.
+    delta
+        Whether it only reflects as a mirror or refracts.
+    two_sided
+        Whether its back reflects too.
+    emitter
+        Whether it emits light.
+    mesh
+        Its triangles; None for a shape that is no mesh.
+    points, normals
+        (n, 3) points spread evenly over it [mm], world frame, and unit normals on the reflecting side.
+    front_hits, back_hits
+        Number of rays from all directions that meet its front and its back first. If no ray meets it: number of rays
+        that leave the scene from its front and its back.
     """
 
     name: str
@@ -57,52 +85,62 @@ class ShapeFacts:
     bounds: Floats
     delta: bool
     two_sided: bool
-    lamp: bool
+    emitter: bool
     mesh: MeshFacts | None
     points: Floats
     normals: Floats
-    fronts: int
-    backs: int
+    front_hits: int
+    back_hits: int
 
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """All shapes; ``bounds`` (2, 3) [mm] of the scene; ``together`` all meshes as one; ``emitters`` kind and flux.
+    """Facts about a scene.
 
-    The flux [W] is NaN for an emitter without a place (a sky, a distant lamp).
+    Attributes
+    ----------
+    shapes
+        Facts about each shape.
+    bounds
+        (2, 3) corners of the bounding box [mm], world frame.
+    merged_mesh
+        All meshes as one, without emitters; None if there are none.
+    emitters
+        Kind and flux [W] of each. The flux is NaN for an emitter without a position (sky, directional light).
     """
 
     shapes: tuple[ShapeFacts, ...]
     bounds: Floats
-    together: MeshFacts | None
+    merged_mesh: MeshFacts | None
     emitters: tuple[tuple[str, float], ...]
 
 
 def inspect(scene: Scene) -> SceneFacts:
-    """All facts about a scene that has been loaded."""
-    written = _written(Path(scene.where))
-    fronts, backs = _from_all_around(scene)
+    """Return all facts about a loaded scene."""
+    types = _types_in_xml(Path(scene.where))
+    front_hits, back_hits = _count_first_hits(scene)
     size = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0]))
-    rows = zip(scene.shapes, scene.names, scene.finishes, fronts.tolist(), backs.tolist(), strict=True)
-    shapes = tuple(_way_out(scene, _facts(*row, written, size * _MERGE), size) for row in rows)
-    return SceneFacts(shapes, scene.bounds, _together(shapes, size * _MERGE), _emitters(scene))
+    rows = zip(scene.shapes, scene.names, scene.finishes, front_hits.tolist(), back_hits.tolist(), strict=True)
+    shapes = tuple(_count_escaping_rays(scene, _facts(*row, types, size * _MERGE), size) for row in rows)
+    return SceneFacts(shapes, scene.bounds, _merged_mesh(shapes, size * _MERGE), _emitters(scene))
 
 
 def _facts(
     shape: Any,
     name: str,
     finish: Finish | None,
-    fronts: int,
-    backs: int,
-    written: dict[str, tuple[str, str]],
+    front_hits: int,
+    back_hits: int,
+    types: dict[str, tuple[str, str]],
     merge: float,
 ) -> ShapeFacts:
+    """Collect the facts about one shape; ``types`` are those of :func:`_types_in_xml`."""
     bsdf = shape.bsdf()
-    kind, plugin = written.get(shape.id(), (shape.class_name().lower(), bsdf.class_name()))
+    kind, plugin = types.get(shape.id(), (shape.class_name().lower(), bsdf.class_name()))
     flags = int(bsdf.flags())
     smooth = int(mi.BSDFFlags.Diffuse) | int(mi.BSDFFlags.Glossy)
     alpha, factor, provenance, lay = _roughness(finish, bsdf)
-    points, normals = _spread(shape)
+    points, normals = _points_on(shape)
     return ShapeFacts(
         name=name,
         named=bool(shape.id()),
@@ -117,35 +155,38 @@ def _facts(
         bounds=bounds_of(shape),
         delta=bool(flags & int(mi.BSDFFlags.Delta)) and not flags & smooth,
         two_sided=bool(flags & int(mi.BSDFFlags.BackSide)),
-        lamp=bool(shape.is_emitter()),
+        emitter=bool(shape.is_emitter()),
         mesh=_mesh(shape, merge),
         points=points,
         normals=normals,
-        fronts=fronts,
-        backs=backs,
+        front_hits=front_hits,
+        back_hits=back_hits,
     )
 
 
 def _roughness(finish: Finish | None, bsdf: Any) -> tuple[tuple[float, float], float, str, str]:
-    """Alpha (u, v), its one-sigma factor, where it comes from, and the lay."""
+    """Return alpha (u, v), its one-sigma factor, its source and the lay."""
     if finish is not None:
         scatter = finish.scatter
         if scatter is None:
             return (np.nan, np.nan), np.nan, "", "none"
         return (scatter.alpha_u, scatter.alpha_v), scatter.alpha_factor, scatter.provenance, scatter.lay
     values = mi.traverse(bsdf)
-    found = [
+    alphas = [
         float(np.ravel(values[key])[0])
         for key in ("alpha_u.value", "alpha_v.value", "alpha.value", "alpha")
         if key in values.keys()  # noqa: SIM118 - not a dict
     ]
-    if not found:
+    if not alphas:
         return (np.nan, np.nan), np.nan, "", "none"
-    return (found[0], found[min(1, len(found) - 1)]), np.nan, "written in the scene", "none"
+    return (alphas[0], alphas[min(1, len(alphas) - 1)]), np.nan, "written in the scene", "none"
 
 
-def _spread(shape: Any) -> tuple[Floats, Floats]:
-    """Points and normals spread evenly over a shape (the R2 sequence); none on shapes that cannot be sampled."""
+def _points_on(shape: Any) -> tuple[Floats, Floats]:
+    """Return points and normals (n, 3) spread evenly over a shape, by the R2 sequence; none if it cannot be sampled.
+
+    The R2 sequence: Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018.
+    """
     steps = np.arange(1, _SAMPLES + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])
     square = (0.5 + steps).astype(np.float64) % 1.0
     try:
@@ -153,7 +194,7 @@ def _spread(shape: Any) -> tuple[Floats, Floats]:
     except RuntimeError:
         return np.empty((0, 3)), np.empty((0, 3))
     points = np.array(sample.p, float).T
-    return points, np.broadcast_to(np.array(sample.n, float).T, points.shape)  # of a disk there is one normal
+    return points, np.broadcast_to(np.array(sample.n, float).T, points.shape)  # a disk returns one normal
 
 
 def _mesh(shape: Any, merge: float) -> MeshFacts | None:
@@ -167,9 +208,9 @@ def _mesh(shape: Any, merge: float) -> MeshFacts | None:
     return mesh_facts(vertices, triangles, merge, bool(shape.has_vertex_texcoords()), smooth)
 
 
-def _together(shapes: tuple[ShapeFacts, ...], merge: float) -> MeshFacts | None:
-    """All meshes as one, since a part cut into its faces is closed only as a whole."""
-    meshes = [one.mesh for one in shapes if one.mesh is not None and not one.lamp]
+def _merged_mesh(shapes: tuple[ShapeFacts, ...], merge: float) -> MeshFacts | None:
+    """Merge all meshes, because a part that is divided into faces is closed only as a whole."""
+    meshes = [one.mesh for one in shapes if one.mesh is not None and not one.emitter]
     if not meshes:
         return None
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])[:-1]
@@ -178,40 +219,51 @@ def _together(shapes: tuple[ShapeFacts, ...], merge: float) -> MeshFacts | None:
     return mesh_facts(vertices, triangles, 10 * merge)
 
 
-def _from_all_around(scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """How many rays meet the front and the back of each shape first, from 42 directions all around the scene."""
+def _count_first_hits(scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return how many rays meet the front and the back of each shape first, (shapes,) each.
+
+    Parallel rays arrive from 42 directions around the scene, on a square grid for each direction.
+    """
     radius = 0.51 * float(np.linalg.norm(scene.bounds[1] - scene.bounds[0]))
     steps = (np.arange(_ROW) + 0.5) / _ROW * 2 - 1
-    across = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * radius
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * radius
     origins, directions = [], []
     for direction in sphere_directions(1):
-        helper = np.eye(3)[np.argmin(np.abs(direction))]
-        first = np.cross(direction, helper)
+        axis = np.eye(3)[np.argmin(np.abs(direction))]
+        first = np.cross(direction, axis)
         first /= np.linalg.norm(first)
-        plane = across @ np.stack([first, np.cross(direction, first)])
-        origins.append(scene.centre + 2 * radius * direction + plane)
-        directions.append(np.broadcast_to(-direction, plane.shape))
+        offsets = grid @ np.stack([first, np.cross(direction, first)])
+        origins.append(scene.centre + 2 * radius * direction + offsets)
+        directions.append(np.broadcast_to(-direction, offsets.shape))
     hits = trace(scene, np.concatenate(origins), np.concatenate(directions))
     count = len(scene.names)
-    fronts = np.bincount(hits.shape[hits.front], minlength=count)
-    backs = np.bincount(hits.shape[(hits.shape >= 0) & ~hits.front], minlength=count)
-    return fronts, backs
+    front_hits = np.bincount(hits.shape[hits.front], minlength=count)
+    back_hits = np.bincount(hits.shape[(hits.shape >= 0) & ~hits.front], minlength=count)
+    return front_hits, back_hits
 
 
-def _way_out(scene: Scene, shape: ShapeFacts, size: float) -> ShapeFacts:
-    """Of a shape that rays from all around missed, as at the bottom of a bore: how many of its own leave the scene."""
-    if shape.fronts + shape.backs or not len(shape.points):
+def _count_escaping_rays(scene: Scene, shape: ShapeFacts, size: float) -> ShapeFacts:
+    """Count the rays that leave the scene from a shape that no ray from outside met, such as the bottom of a bore.
+
+    Returns the facts with these counts in place of ``front_hits`` and ``back_hits``, or unchanged.
+    """
+    if shape.front_hits + shape.back_hits or not len(shape.points):
         return shape
     points, normals = shape.points[:: _SAMPLES // 64], shape.normals[:: _SAMPLES // 64]
-    ways = np.vstack([sphere_directions(2), normals.mean(axis=0) / max(np.linalg.norm(normals.mean(axis=0)), 1e-9)])
-    facing = np.sign(normals @ ways.T)
-    origins = points[:, None] + 1e-5 * size * facing[..., None] * normals[:, None]
-    out = trace(scene, origins, np.broadcast_to(ways, origins.shape)).shape.reshape(facing.shape) < 0
-    return replace(shape, fronts=int((out & (facing > 0)).sum()), backs=int((out & (facing < 0)).sum()))
+    directions = np.vstack(
+        [sphere_directions(2), normals.mean(axis=0) / max(np.linalg.norm(normals.mean(axis=0)), 1e-9)]
+    )
+    side = np.sign(normals @ directions.T)
+    origins = points[:, None] + 1e-5 * size * side[..., None] * normals[:, None]
+    escaped = trace(scene, origins, np.broadcast_to(directions, origins.shape)).shape.reshape(side.shape) < 0
+    return replace(shape, front_hits=int((escaped & (side > 0)).sum()), back_hits=int((escaped & (side < 0)).sum()))
 
 
 def _emitters(scene: Scene) -> tuple[tuple[str, float], ...]:
-    """Kind and flux [W] of every emitter; a lamp with a surface sends pi L A, a point 4 pi I."""
+    """Return the kind and flux [W] of each emitter.
+
+    A surface of area A and radiance L emits pi L A, a point of intensity I emits 4 pi I.
+    """
     out = []
     for shape in scene.shapes:
         if shape.is_emitter():
@@ -223,17 +275,17 @@ def _emitters(scene: Scene) -> tuple[tuple[str, float], ...]:
     return tuple(out)
 
 
-def _value(thing: Any, key: str) -> float:
-    values = mi.traverse(thing)
+def _value(parent: Any, key: str) -> float:
+    values = mi.traverse(parent)
     return float(np.ravel(values[key])[0]) if key in values.keys() else np.nan  # noqa: SIM118 - not a dict
 
 
-def _written(path: Path) -> dict[str, tuple[str, str]]:
-    """Type of each named shape and of its BSDF, as the XML has them."""
+def _types_in_xml(path: Path) -> dict[str, tuple[str, str]]:
+    """Return the types of each named shape and of its BSDF in the XML, by the id of the shape."""
     try:
         root = ElementTree.parse(path).getroot()
     except (OSError, ElementTree.ParseError):
-        return {}  # a scene that was not made from a file
+        return {}  # the scene was not loaded from a file
     types = {str(e.get("id")): str(e.get("type")) for e in root.iter("bsdf")}
     out = {}
     for shape in root.iter("shape"):

@@ -1,6 +1,9 @@
-"""A scene: Mitsuba's geometry and materials, with the names that a measurement task uses.
+"""Load a scene: Mitsuba's geometry and materials, with the names that a measurement task uses.
 
-A shape's ``id`` in the XML is the feature's name; its BSDF carries the finish. Lengths are mm.
+Signal chain: scene XML, checked (:mod:`mitsim.scene.xml_check`) -> Mitsuba's parser, which makes BSDFs from finishes
+(:mod:`mitsim.scene.materials`) -> shapes with their names, finishes and bounds.
+
+The ``id`` of a shape in the XML is the name of a feature, and its BSDF is the finish. Lengths are in mm.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from numpy.typing import NDArray
 from mitsim.errors import InputError, nearest
 from mitsim.scene import backend
 from mitsim.scene.materials import Finish, loading, register
-from mitsim.scene.scene_errors import explained
+from mitsim.scene.scene_errors import explain_error
 from mitsim.scene.xml_check import checked_xml
 from mitsim.surface.scatter import NOMINAL, Deviation
 
@@ -27,8 +30,18 @@ _registered = False
 class Scene:
     """A loaded scene.
 
-    ``mitsuba`` is the ``mi.Scene``; ``names`` the shape ids in order; ``finishes`` one per shape (None for a stock
-    BSDF that we know nothing of); ``bounds`` (2, 3) [mm]; ``where`` the file it came from.
+    Attributes
+    ----------
+    mitsuba
+        The ``mi.Scene``.
+    names
+        Ids of the shapes, in Mitsuba's order.
+    finishes
+        Finish of each shape; None for a stock BSDF, about which nothing is known.
+    bounds
+        (2, 3) corners of the bounding box [mm], world frame.
+    where
+        File that it was loaded from, or a description.
     """
 
     mitsuba: Any = field(repr=False)
@@ -44,14 +57,14 @@ class Scene:
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """Middle of the bounding box, (3,) [mm]."""
+        """Centre of the bounding box, (3,) [mm]."""
         return np.asarray(self.bounds.mean(axis=0))
 
     def only(self, *names: str) -> Scene:
-        """The scene with nothing but some of its shapes, in the order given."""
+        """Return a scene with these shapes alone, in the order given."""
         chosen, shapes = [self.names.index(name) for name in names], self.shapes
-        alone = backend.mi.load_dict({"type": "scene", **{f"shape_{i}": shapes[i] for i in chosen}}, optimize=False)
-        return Scene(alone, names, tuple(self.finishes[i] for i in chosen), bounds_of(alone), self.where)
+        part = backend.mi.load_dict({"type": "scene", **{f"shape_{i}": shapes[i] for i in chosen}}, optimize=False)
+        return Scene(part, names, tuple(self.finishes[i] for i in chosen), bounds_of(part), self.where)
 
 
 def load_scene(
@@ -60,61 +73,83 @@ def load_scene(
     parameters: dict[str, str] | None = None,
     deviation: Deviation | Callable[[str], Deviation] = NOMINAL,
 ) -> Scene:
-    """Read a scene XML for a sensor of one wavelength [nm].
+    """Load a scene XML for a sensor of one wavelength [nm].
 
-    ``parameters`` set the ``<default>``s of the XML, as Mitsuba's ``-D name=value`` does. ``deviation`` moves every
-    finish, or each by its BSDF's id, away from its best guess, by what is not known of it.
+    Parameters
+    ----------
+    path, wavelength_nm
+        The scene XML, and the wavelength at which its materials are evaluated.
+    parameters
+        Values for the ``<default>`` elements of the XML, as by Mitsuba's option ``-D name=value``.
+    deviation
+        Deviation of all finishes from their best estimates, or a function from the id of a BSDF to its deviation.
 
     Raises
     ------
     InputError
-        If the file is missing, does not parse, uses something that Mitsuba does not know, or has a size that a part
-        in mm cannot have.
+        If the file is missing or does not parse, if Mitsuba rejects its content, or if a part in mm cannot have its
+        size.
     """
     path = Path(path)
     parameters = parameters or {}
     _check_xml(path, parameters)
     _prepare()
-    with loading(wavelength_nm, str(path), path.parent, deviation) as learnt:
+    with loading(wavelength_nm, str(path), path.parent, deviation) as state:
         try:
             scene = backend.mi.load_file(str(path), parallel=False, optimize=False, **parameters)
-        except Exception as error:  # Mitsuba raises bare RuntimeErrors for whatever an author may do wrong
-            told = InputError(path, "", _one_line(error), "a scene that Mitsuba 3 can load")
-            raise learnt.fault or explained(told, path) from None
-    return _wrap(scene, learnt.finishes, str(path))
+        except Exception as error:  # Mitsuba raises plain RuntimeErrors for errors in the file
+            mitsuba_error = InputError(path, "", _one_line(error), "a scene that Mitsuba 3 can load")
+            raise state.fault or explain_error(mitsuba_error, path) from None
+    return _wrap(scene, state.finishes, str(path))
 
 
 def scene_from_dict(description: dict[str, Any], wavelength_nm: float, where: str = "scene") -> Scene:
-    """Load a scene from Mitsuba's dictionary form; shapes are named by their keys."""
+    """Load a scene from a dictionary in Mitsuba's form; its keys are the names of the shapes.
+
+    Parameters
+    ----------
+    description
+        Shapes and emitters by name.
+    wavelength_nm
+        Wavelength at which the materials are evaluated [nm].
+    where
+        Description of the scene, for messages.
+
+    Raises
+    ------
+    InputError
+        If there is no shape, or a part in mm cannot have the size.
+    """
     _prepare()
-    with loading(wavelength_nm, where) as learnt:
+    with loading(wavelength_nm, where) as state:
         scene = backend.mi.load_dict({"type": "scene", **description}, optimize=False)
-    return _wrap(scene, learnt.finishes, where)
+    return _wrap(scene, state.finishes, where)
 
 
 def flat_coupon(finish: Finish, half_size: float, turn_deg: float = 0.0) -> Scene:
-    """A flat square in the plane z = 0, centred, in a finish that was loaded before; its side is 2 half_size [mm].
+    """Return a scene with a square coupon in a finish that was loaded before.
 
-    ``turn_deg`` turns it about its normal, and its lay with it.
+    The coupon lies in the plane z = 0, centred. Its side is 2 ``half_size`` [mm]. ``turn_deg`` rotates it, with its
+    lay, about its normal.
     """
     assert finish.description is not None
     _prepare()
-    place = backend.mi.ScalarTransform4f().rotate([0, 0, 1], turn_deg).scale([half_size, half_size, 1])
-    coupon = {"type": "rectangle", "to_world": place, "bsdf": finish.description}
-    alone = backend.mi.load_dict({"type": "scene", "coupon": coupon}, optimize=False)
-    return Scene(alone, ("coupon",), (finish,), bounds_of(alone), f"a coupon of {finish}")
+    to_world = backend.mi.ScalarTransform4f().rotate([0, 0, 1], turn_deg).scale([half_size, half_size, 1])
+    coupon = {"type": "rectangle", "to_world": to_world, "bsdf": finish.description}
+    loaded = backend.mi.load_dict({"type": "scene", "coupon": coupon}, optimize=False)
+    return Scene(loaded, ("coupon",), (finish,), bounds_of(loaded), f"a coupon of {finish}")
 
 
 def share_kernels(scene: Scene) -> Scene:
-    """Keep the numbers of a scene's materials out of its kernels, and return it.
+    """Make the parameters of a scene's materials inputs of its kernels, not constants in them, and return the scene.
 
-    A kernel that holds them as constants is compiled again for every other finish, which takes seconds; where several
-    finishes of one part are rendered, this is quicker.
+    With constants, Mitsuba compiles a kernel for each finish, which takes seconds. Inputs are faster if several
+    finishes of one part are rendered.
     """
     parameters = backend.mi.traverse(scene.mitsuba)
     for key in parameters.keys():  # noqa: SIM118 - not a dict
         value = parameters[key]
-        if isinstance(value, backend.mi.Float) and len(value) == 1:  # the vertices of a mesh are of that type too
+        if isinstance(value, backend.mi.Float) and len(value) == 1:  # a mesh's vertices have this type too
             parameters[key] = backend.dr.opaque(backend.mi.Float, float(value[0]))
     parameters.update()
     return scene
@@ -129,7 +164,7 @@ def _prepare() -> None:
 
 
 def bounds_of(one: Any) -> NDArray[np.float64]:
-    """Bounds (2, 3) [mm] of a scene or a shape of Mitsuba's."""
+    """Return the corners (2, 3) of the bounding box [mm] of a Mitsuba scene or shape."""
     box = one.bbox()
     return np.array([np.ravel(box.min), np.ravel(box.max)], float).reshape(2, 3)
 

@@ -1,13 +1,19 @@
-"""Materials that a scene's author names by what is written on the drawing: metal, process, Ra; paint and its gloss.
+"""Materials that a scene's author names as on a drawing: metal, process and Ra, or paint and gloss.
 
-Four BSDF types are added to Mitsuba. ``machined_metal`` becomes stock ``roughconductor`` lobes and a wide-angle
-share, ``gloss_paint`` a ``roughplastic``, ``powder_coat`` a ``diffuse`` under a dielectric lobe, ``matt_white`` a
-``diffuse``. The mirror-like lobe of a metal has a share that grows with the angle of incidence, which no stock BSDF can
-express: :mod:`mitsim.scene.coherent_blend`. :mod:`mitsim.surface` decides how they reflect light;
-:mod:`mitsim.scene.bsdf_descriptions` describes that in Mitsuba's words. A factory *returns* such an object, so a scene
-loads with plain ``mi.load_file`` once this module is imported.
+Signal chain: properties of a BSDF in the XML, checked -> :class:`~mitsim.surface.scatter.Scatter`
+(:mod:`mitsim.surface`) -> description of a Mitsuba BSDF (:mod:`mitsim.scene.bsdf_descriptions`) -> BSDF, and its
+:class:`Finish`.
 
-Each BSDF has a :class:`Finish`, the material it was made from; performance maps are looked up by it.
+Four types of BSDF are added to Mitsuba:
+
+- ``machined_metal``: ``roughconductor`` lobes and a diffuse wide-angle share. The coherent share of a metal grows with
+  the angle of incidence, which no stock BSDF can express: :mod:`mitsim.scene.coherent_blend`.
+- ``gloss_paint``: ``roughplastic``.
+- ``powder_coat``: ``diffuse``, blended with a dielectric lobe.
+- ``matt_white``: ``diffuse``.
+
+A factory *returns* such a BSDF, so ``mi.load_file`` loads a scene once :func:`register` was called. Performance maps
+are queried by the finish.
 """
 
 from __future__ import annotations
@@ -39,9 +45,18 @@ from mitsim.surface.seen import USUAL_REFLECTANCE, light_seen
 class Finish:
     """Material of a surface, as performance maps distinguish it.
 
-    ``name`` is the family (``matt_white``, ``aluminium/ground``); ``roughness`` Ra [um], NaN where it has no meaning;
-    ``scatter`` how it reflects light at the sensor's wavelength, ``light`` the part of it that a map stores, and
-    ``description`` the BSDF in Mitsuba's words; the three are no part of its identity.
+    Attributes
+    ----------
+    name
+        Family: ``matt_white``, ``aluminium/ground``.
+    roughness
+        Ra [um]; NaN if it has no meaning.
+    scatter
+        Scattering at the wavelength of the sensor. This and the next two do not count in comparisons.
+    light
+        The part of the scattering that a map stores.
+    description
+        Mitsuba description of the BSDF.
     """
 
     name: str
@@ -56,11 +71,20 @@ class Finish:
 
 @dataclass
 class Loading:
-    """State of the loading of one scene: its wavelength and file, and the finishes found so far.
+    """State while one scene is loaded.
 
-    ``folder`` holds the files that a material names; ``deviation`` of a finish from its best guess, by its BSDF's id;
-    ``finishes`` by BSDF id; ``fault`` the first thing that the author got wrong, because Mitsuba turns an exception of
-    ours into a text of its own.
+    Attributes
+    ----------
+    wavelength_nm, where
+        Wavelength [nm], and the scene's file for messages.
+    folder
+        Folder to which the file names of materials are relative.
+    deviation
+        Deviation of a finish from its best estimate, by the id of its BSDF.
+    finishes
+        Finishes loaded so far, by the id of the BSDF.
+    fault
+        First error of the author. It is kept here because Mitsuba replaces our exceptions by its own.
     """
 
     wavelength_nm: float = 850.0
@@ -71,9 +95,9 @@ class Loading:
     fault: InputError | None = None
 
 
-# Mitsuba makes BSDFs on threads of its own, so a context variable would not reach them
-_now = Loading()
-_one_at_a_time = threading.Lock()
+# Mitsuba makes BSDFs in its own threads, where a context variable would not be set
+_current = Loading()
+_lock = threading.Lock()
 _anonymous = itertools.count()
 
 
@@ -84,15 +108,19 @@ def loading(
     folder: str | Path = ".",
     deviation: Deviation | Callable[[str], Deviation] = NOMINAL,
 ) -> Iterator[Loading]:
-    """Within this block BSDFs are made for one wavelength [nm]; yields what is learnt on the way."""
-    global _now
-    with _one_at_a_time:
-        of = deviation if callable(deviation) else lambda _: deviation
-        before, _now = _now, Loading(wavelength_nm, where, Path(folder), of)
+    """Make BSDFs for one wavelength [nm] inside this block; yield the state, which collects the finishes.
+
+    ``folder`` and ``deviation`` are as in :class:`Loading`; one deviation applies to all finishes. Only one block is
+    active at a time; others wait.
+    """
+    global _current
+    with _lock:
+        deviation_of = deviation if callable(deviation) else lambda _: deviation
+        before, _current = _current, Loading(wavelength_nm, where, Path(folder), deviation_of)
         try:
-            yield _now
+            yield _current
         finally:
-            _now = before
+            _current = before
 
 
 _METAL_KEYS = (
@@ -147,23 +175,23 @@ def _machined_metal(props: Any) -> Any:
         alpha_factor=number_within(props, where, "alpha_factor", 1.0, 0.1, 10.0, ""),
         wide_angle=number("wide_angle_share", 0.0, 1.0, ""),
     )
-    deviation = _now.deviation(props.id())
-    scatter = machined(face, _now.wavelength_nm, where, deviation)
-    index = refractive_index(face.metal, _now.wavelength_nm)
+    deviation = _current.deviation(props.id())
+    scatter = machined(face, _current.wavelength_nm, where, deviation)
+    index = refractive_index(face.metal, _current.wavelength_nm)
     reflectance = float(fresnel(1.0, *index))
     reflected = deviation.reflected(reflectance)
     finish = _finish(
         "metal", reflectance * reflected, scatter, f"{face.metal}/{face.process_or_default}", face.roughness
     )
-    return _remember(props, metal_bsdf(index, scatter, reflected), finish)
+    return _make_bsdf(props, metal_bsdf(index, scatter, reflected), finish)
 
 
 def _matt_white(props: Any) -> Any:
     where = _where(props)
     only_known(props, where, ("reflectance",))
     reflectance = number_within(props, where, "reflectance", USUAL_REFLECTANCE["matt_white"], 0.01, 0.99, "")
-    reflectance *= _now.deviation(props.id()).reflected(reflectance)
-    return _remember(
+    reflectance *= _current.deviation(props.id()).reflected(reflectance)
+    return _make_bsdf(
         props, diffuse_bsdf(reflectance), _finish("matt", reflectance, matt_white(), "matt_white", math.nan)
     )
 
@@ -175,50 +203,55 @@ def _paint(kind: str, greatest: float, describe: Callable[[float, Scatter], dict
         reflectance = number_within(props, where, "reflectance", USUAL_REFLECTANCE[kind], 0.01, greatest, "")
         gloss = number_within(props, where, "gloss", None, 0.5, 100.0, "GU") if "gloss" in props else None
         alpha = number_within(props, where, "alpha", None, *ALPHA_RANGE[kind], "") if "alpha" in props else None
-        deviation = _now.deviation(props.id())
+        deviation = _current.deviation(props.id())
         scatter = paint(kind, reflectance, gloss, alpha, where, deviation)
         reflectance = min(reflectance * deviation.reflected(reflectance), greatest)
-        return _remember(props, describe(reflectance, scatter), _finish(kind, reflectance, scatter, kind, math.nan))
+        return _make_bsdf(props, describe(reflectance, scatter), _finish(kind, reflectance, scatter, kind, math.nan))
 
     return make
 
 
 def _finish(kind: str, reflectance: float, scatter: Scatter, name: str, roughness: float) -> Finish:
-    return Finish(name, roughness, scatter, light_seen(kind, reflectance, scatter, name, roughness, _now.wavelength_nm))
+    return Finish(
+        name, roughness, scatter, light_seen(kind, reflectance, scatter, name, roughness, _current.wavelength_nm)
+    )
 
 
-def _remember(props: Any, description: dict[str, Any], finish: Finish) -> Any:
+def _make_bsdf(props: Any, description: dict[str, Any], finish: Finish) -> Any:
+    """Make the BSDF of a description and store its finish under the id of the BSDF."""
     from mitsim.scene.backend import mi
 
     bsdf = mi.load_dict(description)
     bsdf.set_id(props.id() or f"finish_{next(_anonymous)}")
-    _now.finishes[bsdf.id()] = replace(finish, description=description)
+    _current.finishes[bsdf.id()] = replace(finish, description=description)
     return bsdf
 
 
 def register() -> None:
-    """Tell Mitsuba of our BSDF types; to be called once the variant is set."""
+    """Register the four types of BSDF with Mitsuba; call it after the variant is chosen."""
     from mitsim.scene.backend import mi
 
-    mi.register_bsdf("machined_metal", _telling(_machined_metal))
-    mi.register_bsdf("matt_white", _telling(_matt_white))
-    mi.register_bsdf("gloss_paint", _telling(_paint("gloss_paint", 0.95, gloss_paint_bsdf)))
-    mi.register_bsdf("powder_coat", _telling(_paint("powder_coat", 0.85, powder_coat_bsdf)))
+    mi.register_bsdf("machined_metal", _keeping_fault(_machined_metal))
+    mi.register_bsdf("matt_white", _keeping_fault(_matt_white))
+    mi.register_bsdf("gloss_paint", _keeping_fault(_paint("gloss_paint", 0.95, gloss_paint_bsdf)))
+    mi.register_bsdf("powder_coat", _keeping_fault(_paint("powder_coat", 0.85, powder_coat_bsdf)))
 
 
-def _telling(factory: Callable[[Any], Any]) -> Callable[[Any], Any]:
+def _keeping_fault(factory: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Wrap a factory so that its first error is kept in the state."""
+
     def make(props: Any) -> Any:
         try:
             return factory(props)
         except InputError as fault:
-            _now.fault = _now.fault or fault
+            _current.fault = _current.fault or fault
             raise
 
     return make
 
 
 def _where(props: Any) -> str:
-    return f"{_now.where}: bsdf {props.id()!r}" if props.id() else f"{_now.where}: a bsdf"
+    return f"{_current.where}: bsdf {props.id()!r}" if props.id() else f"{_current.where}: a bsdf"
 
 
 def _profile(props: Any, where: str, key: str) -> Profile | None:
@@ -242,4 +275,4 @@ def _path(props: Any, where: str, key: str, allowed: str) -> Path | None:
     value = props.get(key)
     if not isinstance(value, str) or not value:
         raise InputError(where, key, repr(value), allowed, f'write <string name="{key}" value="..."/>')
-    return _now.folder / value
+    return _current.folder / value

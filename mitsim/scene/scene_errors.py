@@ -1,7 +1,7 @@
-"""Mitsuba's complaints about a scene, told in our form: where, what was found, what is allowed, the nearest name.
+"""Translate Mitsuba's error messages about a scene: place, value found, values allowed, nearest valid name.
 
-Mitsuba names the fault and the place; it does not say what would have been right. Where its text is not known, it is
-passed on as it is.
+Mitsuba names the error and the place, but not the valid values. Messages that are not recognised are passed on
+unchanged.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from mitsim.errors import InputError, nearest
 
-#: what Mitsuba's plugins know that parts are made of (its documentation, version 3.9), for the nearest right name
+#: properties of the Mitsuba plugins that parts use (Mitsuba's documentation, version 3.9), to suggest the nearest name
 _EVERY_SHAPE = ("to_world", "flip_normals")
 _PROPERTIES: dict[str, tuple[str, ...]] = {
     "rectangle": _EVERY_SHAPE,
@@ -70,9 +70,9 @@ _PROPERTIES: dict[str, tuple[str, ...]] = {
 _PLUGINS = [*_PROPERTIES, "machined_metal", "matt_white", "gloss_paint", "powder_coat"]
 
 
-def explained(fault: InputError, path: Path) -> InputError:
-    """A fault that quotes Mitsuba, told in our form where its text is known; else the fault itself."""
-    text = str(fault.found)
+def explain_error(error: InputError, path: Path) -> InputError:
+    """Return an error that quotes Mitsuba in the form of our own errors, or unchanged if its text is not recognised."""
+    text = str(error.found)
     line = match[1] if (match := re.search(r"\(line (\d+)", text)) else ""
     where = f"{path}: line {line}" if line else str(path)
     if match := re.search(r'unreferenced propert(?:y|ies) in (\w+) plugin of type "(\w+)": - \w+ "([^"]+)"', text):
@@ -86,24 +86,25 @@ def explained(fault: InputError, path: Path) -> InputError:
         return InputError(where, "type", repr(match[1]), allowed, hint or nearest(match[1], _PLUGINS))
     if match := re.search(r'loading \w+ file "([^"]+)": file not found', text):
         file = Path(match[1])
-        folder = (path.parent / _written_name(path, file.name)).parent
-        there = sorted(p.name for p in folder.glob(f"*{file.suffix}")) if folder.is_dir() else []
+        folder = (path.parent / _name_in_xml(path, file.name)).parent
+        files = sorted(p.name for p in folder.glob(f"*{file.suffix}")) if folder.is_dir() else []
         allowed = f"a {file.suffix} file beside the scene"
-        return InputError(where, "filename", f"{file.name!r}, which does not exist", allowed, nearest(file.name, there))
+        return InputError(where, "filename", f"{file.name!r}, which does not exist", allowed, nearest(file.name, files))
     if match := re.search(r'duplicate ID: "([^"]+)" \(previous was at .*?\(line (\d+)', text):
         found = f"a second object of the id {match[1]!r} (the first is in line {match[2]})"
         return InputError(where, "id", found, "one id for one object", "a shape's id is the name of its feature")
     if match := re.search(r'reference to "([^"]+)"', text):
         ids = _ids(path)
         return InputError(where, "ref", repr(match[1]), f"ids in the file: {', '.join(ids)}", nearest(match[1], ids))
-    return fault
+    return error
 
 
-def _written_name(path: Path, name: str) -> str:
-    """Path of a file as the XML has it; Mitsuba tells its last part alone."""
-    values = [str(e.get("value")) for e in ElementTree.parse(path).getroot().iter("string")]
-    return next((value for value in values if Path(value).name == name), name)
+def _name_in_xml(path: Path, name: str) -> str:
+    """Return the path of a file as the XML has it; Mitsuba reports only its last part."""
+    names = [str(e.get("value")) for e in ElementTree.parse(path).getroot().iter("string")]
+    return next((candidate for candidate in names if Path(candidate).name == name), name)
 
 
 def _ids(path: Path) -> list[str]:
+    """Return the ids of all objects in the XML."""
     return [str(e.get("id")) for e in ElementTree.parse(path).getroot().iter() if e.get("id") and e.tag != "ref"]

@@ -1,6 +1,7 @@
-"""What a scene XML may be, checked before Mitsuba parses it: some of what it may hold ends the process instead.
+"""Check a scene XML before Mitsuba parses it, because some content ends the process or stops it.
 
-Nesting thousands deep and bitmaps without a file crash Mitsuba; BSDFs within BSDFs take minutes; a pipe is waited for.
+Mitsuba crashes on nesting thousands deep and on bitmaps without a file. BSDFs nested in BSDFs take minutes, and reading
+a pipe waits forever.
 """
 
 from __future__ import annotations
@@ -14,31 +15,34 @@ from typing import Any
 from characterisation.checked_files import read_bounded
 from mitsim.errors import InputError, nearest
 
-#: of one XML [bytes]; elements in it, and how deep they and BSDFs may be nested
+#: limits of one XML: size [bytes], number of elements, depth of nested elements and of nested BSDFs
 LARGEST_XML, MOST_ELEMENTS, DEEPEST, DEEPEST_BSDF = 16 * 1024**2, 200_000, 40, 6
 
-#: of a file that a scene names [bytes]
+#: largest file that a scene may refer to [bytes]
 LARGEST_NAMED_FILE = 1024**3
 
-#: plugins that read a file, which not all of them check
-_READ_A_FILE = {"bitmap", "envmap", "gridvolume", "measured", "ply", "obj", "serialized"}
+#: plugins that read a file; not all of them check that it exists
+_FILE_PLUGINS = {"bitmap", "envmap", "gridvolume", "measured", "ply", "obj", "serialized"}
 
-#: files that include one another this often are a circle
+#: deepest chain of includes; a longer one is taken for a cycle
 _MOST_INCLUDES = 16
 
 _ENCODING = re.compile(rb"""^[^>]*?encoding\s*=\s*["']([^"']*)["']""")
 
 
-def checked_xml(path: Path, inside: int = 0) -> ElementTree.Element:
-    """Read the XML of a scene, or one that it includes, and refuse what Mitsuba would not survive.
+def checked_xml(path: Path, include_depth: int = 0) -> ElementTree.Element:
+    """Read a scene XML and its includes, reject what Mitsuba cannot handle, and return the root element.
+
+    ``include_depth`` is the number of includes that lead to this file.
 
     Raises
     ------
     InputError
-        If it is missing, does not parse, is no UTF-8, is too large or nested too deep, or names a file that is none.
+        If a file is missing, does not parse, is not UTF-8, or is too large or too deeply nested. Also if it refers to
+        something that is not a regular file.
     """
-    there = _beside(path)
-    data = read_bounded(path, "a Mitsuba scene XML", nearest(path.name, there), LARGEST_XML)
+    xml_files = _xml_files_beside(path)
+    data = read_bounded(path, "a Mitsuba scene XML", nearest(path.name, xml_files), LARGEST_XML)
     declared = _ENCODING.match(data[:200].removeprefix(b"\xef\xbb\xbf")) if data.lstrip()[:5] != b"<scene" else None
     if declared is not None and declared[1].decode("ascii", "replace").lower() not in ("utf-8", "utf8", "us-ascii"):
         raise InputError(
@@ -59,22 +63,26 @@ def checked_xml(path: Path, inside: int = 0) -> ElementTree.Element:
             if bsdfs[child] > DEEPEST_BSDF:
                 raise InputError(path, "bsdf", f"BSDFs within BSDFs, over {DEEPEST_BSDF} deep", f"up to {DEEPEST_BSDF}")
     for element in root.iter():
-        names = [str(one.get("value")) for one in element.findall("string") if one.get("name") == "filename"]
-        if element.get("type") in _READ_A_FILE and not names:
+        names = [str(string.get("value")) for string in element.findall("string") if string.get("name") == "filename"]
+        if element.get("type") in _FILE_PLUGINS and not names:
             raise InputError(
                 path, f"{element.tag} {element.get('type')}", "no filename", "<string name='filename' value='...'/>"
             )
         for name in names:
             _check_named(path, name)
         if element.tag == "include":
-            if inside >= _MOST_INCLUDES:
+            if include_depth >= _MOST_INCLUDES:
                 raise InputError(path, "include", f"files that include one another over {_MOST_INCLUDES} deep", "fewer")
-            checked_xml(path.parent / str(element.get("filename")), inside + 1)
+            checked_xml(path.parent / str(element.get("filename")), include_depth + 1)
     return root
 
 
 def _parsed(path: Path, text: str) -> ElementTree.Element:
-    """The root element, read by events, so that depth and number are known before a tree is walked."""
+    """Return the root element of an XML text.
+
+    The text is parsed as a stream of events, so that depth and number of elements are checked before the tree is
+    complete.
+    """
     reader: Any = ElementTree.XMLPullParser(("start", "end"))
     depth = count = 0
     root: ElementTree.Element | None = None
@@ -99,18 +107,21 @@ def _parsed(path: Path, text: str) -> ElementTree.Element:
 
 
 def _check_named(path: Path, name: str) -> None:
-    """Refuse a pipe, a device and a huge file; Mitsuba tells of one that is missing."""
+    """Reject a pipe, a device and a huge file. Mitsuba itself reports a missing file."""
     try:
-        about = (path.parent / name).stat()
+        status = (path.parent / name).stat()
     except (OSError, ValueError):
         return
-    if not stat.S_ISREG(about.st_mode) or about.st_size > LARGEST_NAMED_FILE:
-        found = f"{name!r}, " + ("no plain file" if not stat.S_ISREG(about.st_mode) else f"{about.st_size} bytes")
+    if not stat.S_ISREG(status.st_mode) or status.st_size > LARGEST_NAMED_FILE:
+        found = f"{name!r}, " + (
+            "not a regular file" if not stat.S_ISREG(status.st_mode) else f"{status.st_size} bytes"
+        )
         raise InputError(path, "filename", found, f"a file of up to {LARGEST_NAMED_FILE} bytes")
 
 
-def _beside(path: Path) -> list[str]:
+def _xml_files_beside(path: Path) -> list[str]:
+    """Return the names of the XML files in the same folder, to suggest one of them."""
     try:
-        return sorted(one.name for one in path.parent.iterdir() if one.suffix == ".xml")
+        return sorted(file.name for file in path.parent.iterdir() if file.suffix == ".xml")
     except (OSError, ValueError):
         return []

@@ -1,1 +1,1 @@
-"""Captures simulated: a scene, a sensor and a pose to images, and to the truth beside them."""
+"""Simulation: from a scene, a sensor and a pose to a capture and its ground truth."""

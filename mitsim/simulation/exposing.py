@@ -1,7 +1,10 @@
-"""Light on the imagers of a sensor, and its exposure: radiance to the grey levels of every image.
+"""Expose the imagers of a sensor: from radiance to the grey levels of all images.
 
-The fixed pattern of an imager belongs to the device, not to the capture, and follows from the sensor's name. Every
-image has a stream of noise of its own.
+Signal chain: radiance -> electrons per second -> exposure -> fixed pattern of the unit, noise of each image -> grey
+levels.
+
+The fixed pattern of an imager belongs to the device, not to the capture; it is drawn from the name of the sensor. Each
+image has its own random stream of noise.
 """
 
 from __future__ import annotations
@@ -24,10 +27,23 @@ from mitsim.sensor.transforms import Transform
 
 @dataclass(frozen=True)
 class LightOnImagers:
-    """Light that reaches the imagers from one pose: all that a capture needs but the noise of the imagers.
+    """Light on the imagers from one pose: all inputs of a capture except the noise of the imagers.
 
-    ``radiance`` (P, h, w) of every camera [W / (mm^2 sr)] in its ``rois``; the ``exposures`` [s]; which ``noise`` is
-    on; ``rendered`` how: scene, samples_per_pixel, light_path_depth, and indirect_light where that is apart.
+    Attributes
+    ----------
+    radiance
+        (P, h, w) of each camera in its region [W / (mm^2 sr)].
+    rois
+        Region of each camera's image.
+    exposures
+        Exposure times [s].
+    noise
+        The sources of noise that are on.
+    world_from_sensor
+        Pose of the sensor.
+    rendered
+        Settings of the rendering: scene, samples_per_pixel, light_path_depth, and indirect_light if it is rendered
+        separately.
     """
 
     radiance: dict[str, NDArray[np.float32]]
@@ -40,10 +56,10 @@ class LightOnImagers:
 
 @dataclass(frozen=True)
 class UnitPatterns:
-    """Patterns of one unit's imager.
+    """Fixed patterns of the imager of one unit.
 
-    ``fixed`` pattern of its pixels; ``delays`` (H, W) that the pixels of a time-of-flight camera add to the optical
-    path [mm], None without any.
+    ``fixed``: the pattern of its pixels. ``delays`` (H, W) [mm]: optical path that the pixels of a time-of-flight
+    camera add; None without any.
     """
 
     fixed: FixedPattern
@@ -51,7 +67,7 @@ class UnitPatterns:
 
     @classmethod
     def of(cls, sensor: Sensor, index: int, name: str) -> UnitPatterns:
-        """Draw the patterns of a sensor's camera, number ``index``; they follow from the sensor's name."""
+        """Draw the patterns of a sensor's camera with this index; the seed is the name of the sensor."""
         camera, code = sensor.rig.cameras[name], sensor.pattern
         size, device = (camera.height, camera.width), [zlib.crc32(sensor.name.encode()), index]
         fixed = fixed_pattern(sensor.imager, size, np.random.default_rng(np.random.SeedSequence(device)))
@@ -59,44 +75,51 @@ class UnitPatterns:
             return cls(fixed, None)
         return cls(fixed, delay_pattern(code, size, np.random.default_rng(np.random.SeedSequence([*device, 1]))))
 
-    def moved(self, rows: int, columns: int) -> UnitPatterns:
-        """Return the patterns moved round by some rows and columns, as good as another unit's."""
+    def shifted(self, rows: int, columns: int) -> UnitPatterns:
+        """Return the patterns shifted cyclically by some rows and columns.
+
+        Pixels are independent, so this is equivalent to another unit's patterns.
+        """
         fixed, step = self.fixed, (rows, columns)
-        moved = FixedPattern(
+        rolled = FixedPattern(
             np.roll(fixed.offset, step, (0, 1)),
             np.roll(fixed.response, step, (0, 1)),
             np.roll(fixed.column, columns),
         )
-        return UnitPatterns(moved, None if self.delays is None else np.roll(self.delays, step, (0, 1)))
+        return UnitPatterns(rolled, None if self.delays is None else np.roll(self.delays, step, (0, 1)))
 
 
-def brightest(sensor: Sensor, radiance: dict[str, NDArray[np.float32]]) -> NDArray[np.float32] | None:
-    """Electrons per second of the brightest image of every camera, flat; None if the exposure does not depend on it."""
+def brightest_images(sensor: Sensor, radiance: dict[str, NDArray[np.float32]]) -> NDArray[np.float32] | None:
+    """Return the electrons per second of the brightest image of each camera, as one flat array.
+
+    None if the exposure is fixed.
+    """
     if sensor.exposure.base_s is not None:
         return None
     flat = []
     for name, stack in radiance.items():
         camera, image = sensor.rig.cameras[name], stack[np.argmax(stack.mean(axis=(1, 2)))]
-        # the rule asks for shares of the whole image: pixels that are not read out count as dark
+        # the exposure rule refers to the whole image: pixels that are not read out count as dark
         flat += [image.ravel(), np.zeros(camera.width * camera.height - image.size, np.float32)]
     return np.concatenate(flat) * np.float32(sensor.electrons())
 
 
-def exposed(
+def expose_camera(
     sensor: Sensor, light: LightOnImagers, camera: str, patterns: UnitPatterns, stream: np.random.SeedSequence
 ) -> NDArray[np.unsignedinteger[Any]]:
-    """Expose the imager of a camera: grey levels of every image at every exposure, all at the shortest first.
+    """Expose the imager of a camera; return its images as grey levels (count, H, W).
 
-    Pixels outside of the region that is read out are 0.
+    All images at the shortest exposure come first, then those at the next. Pixels outside the region that is read out
+    are 0. ``stream`` seeds the noise.
     """
     imager, scale, noise, inside = sensor.imager, sensor.electrons(), light.noise, light.rois[camera].slices
     radiance, exposures = light.radiance[camera], light.exposures
-    device, eye = patterns.fixed, sensor.rig.cameras[camera]
-    fixed = FixedPattern(device.offset[inside], device.response[inside], device.column[inside[1]])
+    unit, view = patterns.fixed, sensor.rig.cameras[camera]
+    fixed = FixedPattern(unit.offset[inside], unit.response[inside], unit.column[inside[1]])
     code, delays = sensor.pattern, patterns.delays
     levels = np.uint8 if converter(imager, noise).bits <= 8 else np.uint16
     count = len(radiance) if isinstance(code, AmplitudeModulation) else len(exposures) * len(radiance)
-    out = np.zeros((count, eye.height, eye.width), levels)  # memory that is not written to costs nothing
+    out = np.zeros((count, view.height, view.width), levels)  # memory that is never written needs no pages
     if isinstance(code, AmplitudeModulation):
         seconds = exposures[0]
         taps = radiance if delays is None or not noise.dsnu else delayed(radiance, code, delays[inside])
@@ -106,11 +129,11 @@ def exposed(
         return out
 
     def expose_image(image: tuple[int, np.random.SeedSequence]) -> None:
-        index, own = image
+        index, image_stream = image
         seconds = exposures[index // len(radiance)]
         electrons = radiance[index % len(radiance)] * np.float32(scale * seconds)
-        rng = np.random.Generator(np.random.SFC64(own))  # a quarter faster than the default
+        rng = np.random.Generator(np.random.SFC64(image_stream))  # a quarter faster than the default generator
         out[index][inside] = expose(electrons, imager, fixed, noise, rng, seconds)
 
-    in_threads(expose_image, enumerate(stream.spawn(count)))  # every image has a stream of its own
+    in_threads(expose_image, enumerate(stream.spawn(count)))  # each image has its own stream
     return out

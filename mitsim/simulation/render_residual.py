@@ -1,12 +1,16 @@
-"""How far a render is from the light that it stands for, beside the noise that the sensor adds to it.
+"""Measure the error of a rendering, relative to the noise that the sensor adds.
 
-Signal chain: the same camera rendered three times -> differences in electrons -> over the standard deviation of the
-imager's own temporal noise at that brightness.
+Signal chain: one camera rendered three times -> differences in electrons -> divided by the standard deviation of the
+imager's temporal noise at that brightness.
 
-Two things are left in a render. *Noise*: directions of later bounces and of lamps are drawn at random, and another seed
-gives another image; direct light from the projector has none. *Quadrature error*: a pixel is a mean over a few places
-in it, and more places give another mean; it is the same in every capture of a pose. Either would be read as the
-sensor's if it were not small.
+A rendering has two errors:
+
+- *Noise*. Directions of later bounces and of emitters are random, so another seed gives another image. Direct light
+  from the projector has no noise.
+- *Quadrature error*. A pixel is the mean over a few positions in it, and more positions give another mean. It is the
+  same in all captures of a pose.
+
+Either would be mistaken for an error of the sensor if it were not small.
 """
 
 from __future__ import annotations
@@ -25,20 +29,27 @@ from mitsim.sensor.transforms import Transform
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
-#: share of the sensor's noise that a render's own may reach before a command says so
+#: largest error of a rendering, over the sensor's noise, without a warning
 LIMIT = 0.2
 
-#: patterns that are looked at
+#: number of images that are compared
 IMAGES = 4
 
 
 @dataclass(frozen=True)
 class RenderResidual:
-    """Over lit pixels, in units of the imager's temporal noise in the same pixel [1]; NaN where nothing is lit.
+    """Errors of a rendering over lit pixels, relative to the imager's temporal noise in the same pixel [1].
 
-    ``noise`` of one render and ``quadrature`` error of its samples per pixel: what two thirds of the pixels stay under
-    (68.3 %, one standard deviation of a normal distribution). Interreflections on metal have far heavier tails, and so
-    have pixels on an edge; ``outliers`` is the share of pixels whose noise or error is over the sensor's own noise.
+    All are NaN if nothing is lit.
+
+    Attributes
+    ----------
+    noise, quadrature
+        Noise of one rendering, and error of its samples per pixel: 68.3 % of the pixels are below, which is one
+        standard deviation of a normal distribution. Interreflections on metal, and pixels at edges, have far heavier
+        tails.
+    outliers
+        Share of pixels whose noise or error exceeds the sensor's noise.
     """
 
     noise: float
@@ -47,13 +58,13 @@ class RenderResidual:
 
     @property
     def worst(self) -> float:
-        """The larger of the two."""
+        """The larger of noise and quadrature error."""
         return max(self.noise, self.quadrature)
 
     def __str__(self) -> str:
         return (
             f"render noise {self.noise:.3f}, quadrature error {self.quadrature:.3f} of the sensor's noise; "
-            f"either is over it in {100 * self.outliers:.1f} % of the pixels"
+            f"either exceeds it in {100 * self.outliers:.1f} % of the pixels"
         )
 
 
@@ -67,9 +78,16 @@ def render_residual(
     seed: int,
     around: NDArray[np.floating] | None = None,
 ) -> RenderResidual:
-    """Residual of one camera's images, the first to the last of a few, from two seeds and four times the samples.
+    """Return the errors of a camera's images, from two seeds and from four times the samples.
 
-    ``around`` are points (n, 3) in the sensor frame [mm] to whose part of the images it keeps; all of them if None.
+    Parameters
+    ----------
+    simulated, scene, world_from_sensor, camera, rendering
+        The rendering to check. Of its images a few are compared, from the first to the last.
+    seed
+        Seed of the first rendering.
+    around
+        (n, 3) points in the sensor frame [mm]; only the part of the images around them is rendered. All if None.
     """
     sensor = simulated.sensor
     roi = None if around is None else roi_around(sensor.rig.cameras[camera], around, 0)
@@ -77,13 +95,13 @@ def render_residual(
     # the first pattern is often the coarsest and the last the finest
     chosen = np.unique(np.linspace(0, simulated.patterns.count - 1, IMAGES).astype(int))
 
-    def electrons_per_s(number: int, places: int) -> NDArray[np.float32]:
-        own = replace(rendering, samples=places)
-        images = simulated.radiance(scene, world_from_sensor, camera, own, seed=seed + number, roi=roi)
-        some: NDArray[np.float32] = images[chosen]
-        del images  # all images of a sensor of 3 megapixels are 164 MB
-        some *= np.float32(scale)
-        return some
+    def electrons_per_s(offset: int, count: int) -> NDArray[np.float32]:
+        settings = replace(rendering, samples=count)
+        images = simulated.radiance(scene, world_from_sensor, camera, settings, seed=seed + offset, roi=roi)
+        selected: NDArray[np.float32] = images[chosen]
+        del images  # frees up to 164 MB, for a sensor of 3 megapixels
+        selected *= np.float32(scale)
+        return selected
 
     samples = rendering.samples
     one, other, finer = electrons_per_s(0, samples), electrons_per_s(1, samples), electrons_per_s(2, 4 * samples)
@@ -96,24 +114,27 @@ def render_residual(
     noise = (one - other) / np.sqrt(2.0) / temporal
     error = (0.5 * (one + other) - finer) / temporal
     size, error_size = np.percentile(np.abs(noise), 68.3), np.percentile(np.abs(error), 68.3)
-    # the three renders' own noise is in the error too: half of one's variance, and a quarter
+    # subtract the noise of the three renderings: 1/2 + 1/4 of the variance of one
     error_size = np.sqrt(max(error_size**2 - 0.75 * size**2, 0.0))
     return RenderResidual(float(size), float(error_size), float(np.mean(np.maximum(np.abs(noise), np.abs(error)) > 1)))
 
 
-def told(what: str, residual: RenderResidual) -> RenderResidual:
-    """The same residual, once the user has been told that it is over :data:`LIMIT`, if it is."""
+def warn_above_limit(subject: str, residual: RenderResidual) -> RenderResidual:
+    """Print a warning if a residual exceeds :data:`LIMIT`; return the residual."""
     if residual.worst > LIMIT:
-        say(f"{what}: {residual}; over {LIMIT}: take more samples_per_pixel")
+        say(f"{subject}: {residual}; above {LIMIT}: use more samples_per_pixel")
     return residual
 
 
-def worst_of(residuals: Iterable[RenderResidual]) -> RenderResidual | None:
-    """The worst; None if nothing was lit in any."""
+def largest_residual(residuals: Iterable[RenderResidual]) -> RenderResidual | None:
+    """Return the residual with the largest error; None if nothing was lit in any."""
     return max((one for one in residuals if one.worst >= 0), key=lambda one: one.worst, default=None)
 
 
 def temporal_noise(mean: NDArray[np.floating], imager: Imager) -> NDArray[np.float64]:
-    """Standard deviation [e-] of one pixel from image to image at a mean signal [e-] (EMVA 1288, linear model)."""
+    """Return the standard deviation [e-] of a pixel between images at a mean signal [e-].
+
+    Linear model of EMVA 1288: shot noise, read noise, row noise and quantisation. Dark current is left out.
+    """
     quantisation = 1.0 / (np.sqrt(12.0) * imager.gain)
     return np.asarray(np.sqrt(mean + imager.read_noise**2 + imager.row_noise**2 + quantisation**2))

@@ -1,4 +1,4 @@
-"""Settings of a capture's rendering."""
+"""Settings of the rendering of a capture."""
 
 from __future__ import annotations
 
@@ -12,42 +12,58 @@ from mitsim.simulation.indirect_light import IndirectLight
 
 
 @dataclass(frozen=True)
-class LaterLight:
-    """Light by way of other surfaces, rendered before by ``SimulatedSensor.later_light`` for every camera.
+class IndirectImages:
+    """Interreflections that ``SimulatedSensor.indirect_radiance`` rendered before, for each camera.
 
-    ``images`` (P, h, w) [W / (mm^2 sr)] of the ``rois`` of the images, before the lens; ``how`` they were rendered,
-    and over how many surfaces, ``depth``.
+    Attributes
+    ----------
+    images
+        (P, h, w) of each camera in its region, before the lens [W / (mm^2 sr)].
+    rois
+        Region of each camera's image.
+    settings
+        Settings with which they were rendered.
+    depth
+        Largest number of surfaces on a light path.
     """
 
     images: dict[str, NDArray[np.float32]]
     rois: dict[str, Roi]
-    how: IndirectLight
+    settings: IndirectLight
     depth: int
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """Light paths of a capture: ``samples`` per pixel, at most ``depth`` surfaces on a path, and ``indirect`` light.
+    """Light paths of a capture.
 
-    Without ``indirect``, light by way of other surfaces is rendered as direct light is. :class:`LaterLight` is that
-    light of the same scene, rendered before from a pose near by; its regions and its depth hold.
+    Attributes
+    ----------
+    samples
+        Number per pixel.
+    depth
+        Largest number of surfaces on a path.
+    indirect
+        None: interreflections are rendered together with direct light. :class:`IndirectLight`: they are rendered
+        separately and smoothed. :class:`IndirectImages`: they were rendered before, of the same scene from a near pose;
+        their regions and depth apply.
     """
 
     samples: int = 16
     depth: int = 1
-    indirect: IndirectLight | LaterLight | None = None
+    indirect: IndirectLight | IndirectImages | None = None
 
     @property
-    def before(self) -> LaterLight | None:
-        """The light by way of other surfaces that was rendered before."""
-        return self.indirect if isinstance(self.indirect, LaterLight) else None
+    def prerendered(self) -> IndirectImages | None:
+        """Interreflections that were rendered before, or None."""
+        return self.indirect if isinstance(self.indirect, IndirectImages) else None
 
     @property
     def surfaces(self) -> int:
-        """Most surfaces on a light path."""
-        return self.depth if self.before is None else self.before.depth
+        """Largest number of surfaces on a light path."""
+        return self.depth if self.prerendered is None else self.prerendered.depth
 
     @property
-    def indirectly(self) -> IndirectLight | None:
-        """How light by way of other surfaces is rendered; None as direct light is."""
-        return self.indirect.how if isinstance(self.indirect, LaterLight) else self.indirect
+    def indirect_settings(self) -> IndirectLight | None:
+        """Settings for interreflections that are rendered separately; None if they are not."""
+        return self.indirect.settings if isinstance(self.indirect, IndirectImages) else self.indirect

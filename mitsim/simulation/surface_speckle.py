@@ -1,11 +1,12 @@
-"""Speckle of a scene as one camera of a sensor sees it.
+"""Draw the speckle of a scene as one camera of a sensor sees it.
 
-Signal chain: what each shape is made of -> contrast C of its speckle at this camera -> C of every pixel -> one
-realisation for the pose: a gain, and an angle by which the code is read beside the point.
+Signal chain: finish of each shape -> contrast C of its speckle in this camera -> C of each pixel -> one realisation for
+the pose: a gain, and the angle between the point and the position at which the code is read.
 
-The lateral shift on the surface is C lambda / (2 pi sin u_obs), and sin u_obs is the radius of the lens over the
-distance: seen from the camera it is the angle C lambda / (pi D), whatever the distance. Likewise the ratio of the two
-apertures' half-angles is that of their diameters. So a scene of one material needs no ray to draw its speckle.
+The lateral shift on the surface is C lambda / (2 pi sin u_obs) (:mod:`mitsim.sensor.speckle`). sin u_obs is the radius
+of the lens, of diameter D, over the distance. Seen from the camera the shift is therefore the angle C lambda / (pi D)
+at any distance. Likewise, the ratio of the half-angles of both apertures is the ratio of their diameters. A scene of
+one material therefore needs no rays.
 """
 
 from __future__ import annotations
@@ -32,15 +33,15 @@ from mitsim.sensor.speckle import (
 )
 from mitsim.sensor.transforms import Transform
 
-#: spread of the path lengths inside white paint [um], in the place of a metal's Rq. Assumed
+#: spread of the path lengths inside white paint [um], used in place of a metal's Rq. Assumed
 PAINT_DEPTH_UM = 30.0
 
-#: rms height [um] of a surface that we know nothing of. Assumed
+#: rms height [um] of a surface without data (a stock BSDF). Assumed
 UNKNOWN_HEIGHT_UM = 1.0
 
 
 def finish_contrast(finish: Finish | None, sensor: Sensor, camera: Camera) -> float:
-    """Speckle contrast C of a finish in one camera's pixels [1]; 0 where the light's linewidth is not known."""
+    """Return the speckle contrast C of a finish in a camera's pixels [1]; 0 if the linewidth is not given."""
     if sensor.linewidth_nm is None:
         return 0.0
     scatter = finish.scatter if finish is not None else None
@@ -61,19 +62,19 @@ def finish_contrast(finish: Finish | None, sensor: Sensor, camera: Camera) -> fl
 
 
 def shift_angle(sensor: Sensor, camera: Camera) -> float:
-    """Standard deviation of the code's lateral shift at full contrast, as an angle seen from the camera [rad]."""
+    """Return the standard deviation of the lateral shift of the code at C = 1, seen from the camera [rad]."""
     return lateral_shift_std(1.0, sensor.wavelength_nm, 1.0) * 2.0 / sensor.pupil_mm(camera)
 
 
 def contrast_map(
     scene: Scene, sensor: Sensor, camera: Camera, rays: PixelRays, world_from_sensor: Transform
 ) -> float | NDArray[np.float32]:
-    """C of every pixel (H, W), or one number where the whole scene has the same."""
+    """Return C of each pixel (H, W), or one number if the whole scene has the same."""
     values = [finish_contrast(finish, sensor, camera) for finish in scene.finishes]
     if len(set(values)) == 1:
         return values[0]
     surfaces = cast(scene, rays, world_from_sensor, np.empty((0, 3)))
-    return np.array([*values, 0.0], np.float32)[surfaces.shape]  # -1, nothing there, takes the last
+    return np.array([*values, 0.0], np.float32)[surfaces.shape]  # index -1, for no surface, selects the last value
 
 
 def draw_speckle(
@@ -85,7 +86,10 @@ def draw_speckle(
     roi: Roi,
     rng: np.random.Generator,
 ) -> SpeckleField | None:
-    """Draw gain (h, w) and shift (2, h, w) [rad] of a region of one camera, for one pose; None without speckle."""
+    """Draw the speckle of a region of one camera's image for one pose; None without speckle.
+
+    The gain is (h, w) [1], the shift (2, h, w) [rad].
+    """
     values = contrast_map(scene, sensor, camera, rays, world_from_sensor)
     if not np.any(values):
         return None

@@ -1,10 +1,10 @@
-"""What is true at every pixel of a simulated camera: where it looks, what is there, and how light gets to it.
+"""Compute the ground truth of each pixel of a simulated camera: geometry, visibility and share of indirect light.
 
-Signal chain: scene and pose -> one ray through the middle of each pixel, distortion and all -> surface, its normal,
-shape and place in the projector's image; shadow ray to the projector. The share of indirect light is the one thing
-that needs a render: 1 - direct / all light under a white frame, at a chosen depth.
+Signal chain: scene and pose -> one ray through the centre of each pixel, with distortion -> surface, its normal, shape
+and position in the projector's image; shadow ray to the projector. Rendering of a white frame -> share of indirect
+light, 1 - direct light / all light, up to a chosen depth.
 
-A label or a depth that has been averaged over a pixel is no truth, so nothing here comes from a filtered image.
+An average of labels or depths over a pixel is no truth, so the geometry is never filtered.
 """
 
 from __future__ import annotations
@@ -27,24 +27,25 @@ from mitsim.simulation.simulate import SimulatedSensor
 
 @dataclass(frozen=True)
 class Truth:
-    """Truth of one camera's (H, W) pixels.
+    """Ground truth of the (H, W) pixels of one camera.
 
-    Parameters
+    Attributes
     ----------
     distance, depth
-        (H, W) float32 [mm], along the ray and along the camera's axis; NaN where there is nothing.
+        (H, W) float32 [mm], along the ray and along the camera's axis; NaN without a surface.
     normal
         (H, W, 3) float32, unit, sensor frame, toward the sensor.
     feature
-        (H, W) int16 index into ``feature_names``, -1 where there is nothing.
+        (H, W) int16 index into ``feature_names``; -1 without a surface.
+    feature_names
+        Names of the shapes of the scene.
     projector
-        (H, W, 2) float32 (column, row) of the projector pixel that looks at the same point, whether light from it
-        arrives or not; NaN where there is no point, or it lies behind the projector.
+        (H, W, 2) float32 (column, row) of the projector pixel that looks at the same point, whether or not its light
+        arrives. NaN without a surface, or if the point is behind the projector.
     lit
         (H, W) bool: inside the projector's image and not in shadow.
     indirect
-        (H, W) float32 [1], share of the light of a white frame that came by way of another surface; NaN where no
-        light comes.
+        (H, W) float32 [1]: share of the light of a white frame that is interreflected; NaN without light.
     """
 
     distance: NDArray[np.float32]
@@ -67,17 +68,20 @@ def true_image(
     depth: int = 3,
     seed: int = 1,
 ) -> Truth:
-    """Truth of one camera of a simulated sensor; ``samples``, ``depth`` and ``seed`` are of the indirect light."""
+    """Return the ground truth of one camera of a simulated sensor.
+
+    ``samples``, ``depth`` and ``seed`` apply to the share of indirect light.
+    """
     eye, projector = simulated.sensor.rig.cameras[camera], simulated.sensor.projector
     surfaces = cast(scene, PixelRays.of_camera(eye), world_from_sensor, projector.optics.centre[None])
     directions = eye.sensor_from_camera.directions(eye.rays(eye.pixel_grid()))
     points = eye.centre + directions * surfaces.distance[..., None].astype(float)
-    places = np.full((*surfaces.distance.shape, 2), np.nan)
-    there = np.isfinite(surfaces.distance)
-    places[there] = projector.optics.project(points[there])
+    projected = np.full((*surfaces.distance.shape, 2), np.nan)
+    valid = np.isfinite(surfaces.distance)
+    projected[valid] = projector.optics.project(points[valid])
     edge = np.array([projector.optics.width, projector.optics.height]) - 0.5
     with np.errstate(invalid="ignore"):
-        inside = np.all((places > -0.5) & (places < edge), axis=-1)
+        inside = np.all((projected > -0.5) & (projected < edge), axis=-1)
     axis = eye.sensor_from_camera.rotation[:, 2]
 
     size = (1, projector.optics.height, projector.optics.width)
@@ -93,23 +97,23 @@ def true_image(
         )
         return np.asarray(lit - ambient)
 
-    direct, everything = light(1), light(depth)
+    direct, total = light(1), light(depth)
     with np.errstate(invalid="ignore", divide="ignore"):
-        indirect = np.where(everything > 0, 1.0 - direct / everything, np.nan)
+        indirect = np.where(total > 0, 1.0 - direct / total, np.nan)
     return Truth(
         distance=surfaces.distance,
         depth=(surfaces.distance * (directions @ axis)).astype(np.float32),
         normal=surfaces.normal,
         feature=surfaces.shape,
         feature_names=scene.names,
-        projector=places.astype(np.float32),
+        projector=projected.astype(np.float32),
         lit=surfaces.seen[0] & inside,
         indirect=np.clip(indirect, 0.0, 1.0).astype(np.float32),
     )
 
 
 def encode_exr(truth: Truth) -> bytes:
-    """A truth as an OpenEXR image of named 32-bit float channels; the header names the features and the units."""
+    """Return an OpenEXR image of 32-bit float channels; the header has the names of the features and the units."""
     channels = {
         "distance": truth.distance,
         "Z": truth.depth,
@@ -136,6 +140,6 @@ def encode_exr(truth: Truth) -> bytes:
 
 
 def read_exr(path: str | Path) -> dict[str, NDArray[np.float32]]:
-    """Channels of a truth image by name, each (H, W) float32."""
+    """Return the channels of a ground-truth image by name, (H, W) float32 each."""
     with OpenEXR.File(str(path), separate_channels=True) as file:
         return {name: np.array(channel.pixels) for name, channel in file.channels().items()}

@@ -25,7 +25,7 @@ from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.vignetting import camera_illumination
-from mitsim.simulation.lens_blur import through_point_spread
+from mitsim.simulation.lens_blur import blur_by_lens
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.simulation.surface_speckle import draw_speckle
@@ -83,7 +83,7 @@ class Bench:
 
     def _through(self, sensor: Sensor, image: NDArray[np.float32]) -> NDArray[np.float32]:
         loss = camera_illumination(sensor.imager.corner_illumination, self.camera)
-        out = through_point_spread(image, sensor.imager, self.camera, self.roi)
+        out = blur_by_lens(image, sensor.imager, self.camera, self.roi)
         return out if loss is None else np.asarray(out * loss[self.roi.slices], np.float32)
 
     def _lit(self, sensor: Sensor, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -117,7 +117,7 @@ class Bench:
             simulated = self._of(one)
             pose = self.place.world_from_sensor
             rng = np.random.default_rng(np.random.SeedSequence([seed, 2]))
-            speckle = draw_speckle(self._scene, one, self.camera, simulated.middles[self.name], pose, self.roi, rng)
+            speckle = draw_speckle(self._scene, one, self.camera, simulated.pixel_rays[self.name], pose, self.roi, rng)
             still = None if speckle is None else replace(speckle, gain=np.ones_like(speckle.gain))
             radiance = simulated.radiance(
                 self._scene,

@@ -32,12 +32,12 @@ from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
 from mitsim.scene.load import Scene, load_scene, share_kernels
 from mitsim.scene.ray_casting.raycast import Surfaces
-from mitsim.scene.ray_casting.triangles import outermost
+from mitsim.scene.ray_casting.triangles import hull_corners
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
 from mitsim.simulation.exposing import LightOnImagers
-from mitsim.simulation.rendering import LaterLight, Rendering
+from mitsim.simulation.rendering import IndirectImages, Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import View
@@ -60,7 +60,7 @@ class _SharedLight:
 
     view: int
     finish: int
-    later: LaterLight
+    later: IndirectImages
     room: dict[str, NDArray[np.float32]]
 
 
@@ -99,7 +99,7 @@ class RenderedMeasurements:
         self.simulated = SimulatedSensor(study.sensor)
         self.geometry = sensor_geometry(study.sensor)
         self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
-        corners = outermost(study.scene)
+        corners = hull_corners(study.scene)
         reach = _PLACEMENTS * unknowns.table.pose.placement_mm if "pose" in unknowns.varied else 0.0
         self.corners = np.concatenate([corners + step for step in reach * _CUBE_CORNERS])
         self._scenes: dict[int, tuple[Scene, list[Floats]]] = {}
@@ -165,7 +165,7 @@ class RenderedMeasurements:
     def lit(self, view: View, world: World) -> Lit:
         """Trace the light of a world in a view, which all of its exposures share."""
         true, told = (motion.inverse() @ view.world_from_sensor for motion in (world.placed, world.told))
-        sensor = self.simulated.moved(world.rig, world.unit)
+        sensor = self.simulated.recalibrated(world.rig, world.unit)
         scene = self._scene(world.finish)[0]
         if self.apart:
             before = self._render_shared_light(sensor, true, view, world.finish, world.seed)
@@ -240,7 +240,7 @@ class RenderedMeasurements:
     ) -> _SharedLight:
         """Render interreflections and room light from a pose of a view, with the draws of a seed."""
         scene, albedos = self._scene(finish)
-        how = self.rendering.indirectly
+        how = self.rendering.indirect_settings
         assert how is not None  # rendering_of a study
         around = view.world_from_sensor.inverse().points(self.corners)
         images, rois, room = {}, {}, {}
@@ -249,14 +249,14 @@ class RenderedMeasurements:
             stream = np.random.SeedSequence([seed, view.number, finish + 1, index])
             if self.rendering.depth > 1:
                 seed_of_render = int(stream.generate_state(1)[0])
-                images[name] = simulated.later_light(
+                images[name] = simulated.indirect_radiance(
                     scene, pose, name, how, seed=seed_of_render, depth=self.rendering.depth, roi=roi
                 )
             else:
                 images[name] = np.zeros((0, roi.height, roi.width), np.float32)
-            lit = room_radiance(scene, albedos, simulated.middles[name], pose)[roi.slices]
-            rois[name], room[name] = roi, simulated.through_lens(lit, name, roi)
-        later = LaterLight(images, rois, how, self.rendering.depth)
+            lit = room_radiance(scene, albedos, simulated.pixel_rays[name], pose)[roi.slices]
+            rois[name], room[name] = roi, simulated.apply_lens(lit, name, roi)
+        later = IndirectImages(images, rois, how, self.rendering.depth)
         return _SharedLight(view.number, finish, later, room)
 
 

@@ -171,13 +171,13 @@ def test_the_sensor_chooses_how_fine_the_mesh_is(tmp_path):
 def test_nothing_is_wrong_with_a_bracket_and_its_seat(tmp_path, n10):
     from mitsim.authoring.check import findings, read_features
     from mitsim.authoring.part_folder import write_part
-    from mitsim.scene.first_hits import look
+    from mitsim.scene.first_hits import visible_surfaces
     from mitsim.sensor.working_volume import pose_at, usual_place
 
     write_part(write_step([("b", bracket(), None)], tmp_path / "b.step"), tmp_path / "made", None, Finishing())
     scene = load_scene(tmp_path / "made/made.xml", n10.wavelength_nm)
     facts, pose = inspect(scene), pose_at(n10, usual_place(n10, scene.centre), scene.centre)
     task = read_features(tmp_path / "made/task.toml")
-    found = findings(facts, n10, pose, look(scene, n10.rig, pose), False, task)
+    found = findings(facts, n10, pose, visible_surfaces(scene, n10.rig, pose), False, task)
     assert [str(one) for one in found if one.severity != "note"] == []
     assert not any("closed" in one.what for one in found)

@@ -50,7 +50,7 @@ def rays_alone(scene: Scene, predictor: Predictor, pose: Transform) -> None:
     """Primary ray of every pixel, and from every hit one to each other eye; what they meet stays on the device."""
     rays = predictor.rays
     frame = Eye(Transform(pose.rotation, pose.points(rays.origin)))
-    ray = mi.Ray3f(frame.position, frame.turn(rays.directions))
+    ray = mi.Ray3f(frame.position, frame.to_world(rays.directions))
     surface = scene.mitsuba.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True)
     free = []
     for eye in pose.points(np.array([eye.centre for eye in predictor.eyes])):

@@ -56,7 +56,7 @@ def main() -> None:
             mi.render(s, spp=SAMPLES, seed=seed)
         )
     jobs["later light of 24, depth 3"] = lambda pose, seed: trace(
-        scene, rays, lit[24], pose, LightPaths(samples=SAMPLES, seed=seed, depth=3, only_later=True)
+        scene, rays, lit[24], pose, LightPaths(samples=SAMPLES, seed=seed, depth=3, indirect_only=True)
     )
     jobs["all of 24 less direct, depth 3"] = lambda pose, seed: (
         trace(scene, rays, lit[24], pose, LightPaths(samples=SAMPLES, seed=seed, depth=3))
@@ -134,7 +134,7 @@ def bare_rays(scene, rays, lit, pose, seed):  # type: ignore[no-untyped-def]
 
     def step(sample, seen, random):  # type: ignore[no-untyped-def]
         local = mi.Vector3f(x + random.next_float32() * 1.6e-3, y + random.next_float32() * 1.6e-3, 1.0)
-        surface = scene.mitsuba.ray_intersect(mi.Ray3f(camera.position, camera.turn(dr.normalize(local))))
+        surface = scene.mitsuba.ray_intersect(mi.Ray3f(camera.position, camera.to_world(dr.normalize(local))))
         to_lamp = lamp.position - surface.p
         ray = surface.spawn_ray(dr.normalize(to_lamp))
         ray.maxt = dr.norm(to_lamp)

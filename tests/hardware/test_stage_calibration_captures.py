@@ -15,7 +15,7 @@ from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.transforms import Transform
-from mitsim.simulation.lens_blur import blurred
+from mitsim.simulation.lens_blur import gaussian_blur
 
 COLUMNS, ROWS, SQUARE, MARKER, TEXELS = 11, 8, 32.0, 19.0, 96
 STEP = np.radians(185.1428 / 3600)  # of a PTU-D46
@@ -52,7 +52,7 @@ def test_the_axes_come_back_from_rendered_captures_of_a_board(n10):
     poses, covariances = [], []
     for pose in axes.motion(read) @ zero:
         light = trace(scene, rays, white, Transform.from_matrix(pose).inverse(), LightPaths(samples=16, seed=1))[0]
-        light = blurred(light, n10.imager.blur_px)
+        light = gaussian_blur(light, n10.imager.blur_px)
         electrons = light / np.percentile(light, 99.9) * 0.9 * n10.imager.full_well
         noisy = [rng.poisson(electrons) + rng.normal(0, n10.imager.read_noise, light.shape) for _ in range(4)]
         grey = np.clip(np.rint(4 + np.mean(noisy, 0) / n10.imager.full_well * 251), 0, 255).astype(np.uint8)

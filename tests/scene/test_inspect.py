@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from mitsim.errors import InputError
-from mitsim.scene.first_hits import look, trace
+from mitsim.scene.first_hits import trace, visible_surfaces
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 from mitsim.scene.mesh_facts import mesh_facts
@@ -38,7 +38,7 @@ def test_areas_boxes_and_materials_of_the_artefact(scenes):
     assert (shapes["pillar1"].kind, shapes["pillar1"].bsdf) == ("cylinder", "machined_metal")
     assert shapes["pillar1"].alpha[0] < shapes["plane"].alpha[0]  # Ra 0.37 against 0.74 um
     assert all("prior" in shape.provenance and shape.alpha_factor > 1 for shape in facts.shapes)
-    assert not any(shape.delta or shape.two_sided or shape.lamp for shape in facts.shapes)
+    assert not any(shape.delta or shape.two_sided or shape.emitter for shape in facts.shapes)
 
 
 def test_points_spread_over_a_shape_lie_on_it_evenly(tmp_path):
@@ -62,7 +62,7 @@ def test_a_box_is_closed_and_each_fault_of_a_mesh_is_counted():
     open_box = mesh_facts(vertices, triangles[1:], 1e-6)
     assert (open_box.closed, open_box.open_edges, open_box.volume) == (False, 3, 0)
     twice = mesh_facts(vertices, np.vstack([triangles, triangles[:1]]), 1e-6)
-    assert (twice.duplicate, twice.crowded_edges, twice.closed) == (1, 3, False)
+    assert (twice.duplicate, twice.nonmanifold_edges, twice.closed) == (1, 3, False)
     line = mesh_facts(vertices, np.vstack([triangles, [[0, 1, 1]]]), 1e-6)
     assert (line.degenerate, line.closed) == (1, True)
 
@@ -87,24 +87,24 @@ def test_inward_cubes_show_their_backs_only(tmp_path):
     flipped = '<boolean name="flip_normals" value="true"/>'
     _, shapes = facts_of(tmp_path, f'<shape type="cube" id="in">{flipped}{TEN}{WHITE}</shape>')
     assert np.isclose(shapes["in"].mesh.volume, -8000)
-    assert shapes["in"].backs > 100000
-    assert shapes["in"].fronts < 0.001 * shapes["in"].backs
+    assert shapes["in"].back_hits > 100000
+    assert shapes["in"].front_hits < 0.001 * shapes["in"].back_hits
     _, shapes = facts_of(tmp_path, f'<shape type="cube" id="out">{TEN}{WHITE}</shape>')
     assert np.isclose(shapes["out"].mesh.volume, 8000)
-    assert shapes["out"].backs < 0.001 * shapes["out"].fronts
+    assert shapes["out"].back_hits < 0.001 * shapes["out"].front_hits
 
 
 def test_what_a_camera_sees_stands_where_the_shape_is(tmp_path, n10):
     scene = scene_of(tmp_path, f'<shape type="rectangle" id="r">{TEN}{WHITE}</shape>')
     pose = look_at((0, -300, 400), (0, 0, 0), (0, 0, 1))
-    sight = look(scene, n10.rig, pose)
-    mine = sight.shape == 0
+    visible = visible_surfaces(scene, n10.rig, pose)
+    mine = visible.shape == 0
     assert mine.sum() > 300
-    assert (sight.front[mine] & sight.everyone[mine]).all()
-    world = pose.points(sight.point[mine])
+    assert (visible.front[mine] & visible.seen_by_all[mine]).all()
+    world = pose.points(visible.point[mine])
     assert np.abs(world[:, 2]).max() < 1e-3
     assert np.abs(world[:, :2]).max() < 10.01
-    assert np.allclose(pose.directions(sight.normal[mine]), [0, 0, 1], atol=1e-5)
+    assert np.allclose(pose.directions(visible.normal[mine]), [0, 0, 1], atol=1e-5)
 
 
 def test_lamps_have_their_flux_and_delta_materials_are_known(tmp_path):
@@ -122,7 +122,7 @@ def test_lamps_have_their_flux_and_delta_materials_are_known(tmp_path):
     assert np.isclose(flux.pop("area"), np.pi * 0.01 * 400)
     assert np.isclose(flux.pop("PointLight"), 4 * np.pi * 2)
     assert np.isnan(list(flux.values())).all()
-    assert shapes["lamp"].lamp
+    assert shapes["lamp"].emitter
     unnamed = next(shape for shape in facts.shapes if not shape.named)
     assert unnamed.delta
     assert not shapes["rough"].delta
@@ -186,5 +186,5 @@ def test_the_bottom_of_a_deep_bore_is_seen_and_what_is_inside_is_not(tmp_path):
         '<shape type="cube" id="far"><transform name="to_world"><scale value="20"/><translate x="-900"/></transform>'
         f"{WHITE}</shape>",
     )
-    assert shapes["bottom"].fronts > 0
-    assert shapes["buried"].fronts + shapes["buried"].backs == 0
+    assert shapes["bottom"].front_hits > 0
+    assert shapes["buried"].front_hits + shapes["buried"].back_hits == 0

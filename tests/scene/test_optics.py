@@ -59,7 +59,7 @@ def test_the_lamp_projects_as_opencv_does(kind):
     points = place.points(seen * rng.uniform(300, 900, (500, 1)))
     local = place.inverse().points(points)
     x, y = (mi.Float((local[:, i] / local[:, 2]).astype(np.float32)) for i in (0, 1))
-    ours = np.stack([np.array(v) for v in lamp.bend.pixel(x, y)], axis=-1)
+    ours = np.stack([np.array(v) for v in lamp.distortion.pixel(x, y)], axis=-1)
     assert np.abs(ours - optics.project(points)).max() < 2e-3  # single precision of a coordinate up to 800
 
 

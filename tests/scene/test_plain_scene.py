@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport import transport
-from mitsim.scene.light_transport.plain_scene import lone_bsdf, lone_plane
+from mitsim.scene.light_transport.plain_scene import single_bsdf, single_plane
 from mitsim.scene.light_transport.projector_light import LitPatterns, independent
 from mitsim.scene.light_transport.transport import LightPaths, trace
 from mitsim.scene.load import load_scene, scene_from_dict
@@ -68,12 +68,12 @@ SCENES = {
 @pytest.mark.parametrize("depth", [1, 3])
 def test_the_short_way_finds_the_light_of_the_long_way(kind, depth, light, monkeypatch):
     scene = scene_from_dict(SCENES[kind](), 460)
-    assert (lone_plane(scene) is not None) == (len(scene.names) == 1)
-    assert lone_bsdf(scene) is not None
+    assert (single_plane(scene) is not None) == (len(scene.names) == 1)
+    assert single_bsdf(scene) is not None
     rays = CameraRays(pinhole(96, 64, 240.0), 4.0, 430.0)
     short = trace(scene, rays, light, POSE, LightPaths(samples=16, seed=1, depth=depth))
-    monkeypatch.setattr(transport, "lone_plane", lambda scene: None)
-    monkeypatch.setattr(transport, "lone_bsdf", lambda scene: None)
+    monkeypatch.setattr(transport, "single_plane", lambda scene: None)
+    monkeypatch.setattr(transport, "single_bsdf", lambda scene: None)
     long = trace(scene, rays, light, POSE, LightPaths(samples=16, seed=1, depth=depth))
     assert (long > 0).mean() > 0.2
     # roundings in single precision; of interreflections now and then a ray takes the other side of an edge
@@ -82,14 +82,16 @@ def test_the_short_way_finds_the_light_of_the_long_way(kind, depth, light, monke
 
 
 def test_scenes_that_are_not_plain_take_the_long_way(scenes):
-    assert lone_plane(load_scene(scenes / "two_pillars/two_pillars.xml", 850)) is None
+    assert single_plane(load_scene(scenes / "two_pillars/two_pillars.xml", 850)) is None
     lit = {"a": shape("rectangle"), "sky": {"type": "constant"}}
-    assert lone_plane(scene_from_dict(lit, 460)) is None
-    assert lone_plane(scene_from_dict({"a": shape("sphere")}, 460)) is None
+    assert single_plane(scene_from_dict(lit, 460)) is None
+    assert single_plane(scene_from_dict({"a": shape("sphere")}, 460)) is None
     askew = mi.ScalarTransform4f().rotate([1, 1, 0], 25)  # the axis is no unit vector
-    assert lone_plane(scene_from_dict({"a": shape("rectangle") | {"to_world": askew.scale([60, 40, 1])}}, 460)) is None
+    assert (
+        single_plane(scene_from_dict({"a": shape("rectangle") | {"to_world": askew.scale([60, 40, 1])}}, 460)) is None
+    )
     several = {"a": shape("rectangle"), "b": shape("rectangle", x=10.0, type="matt_white")}
-    assert lone_bsdf(scene_from_dict(several, 460)) is None
+    assert single_bsdf(scene_from_dict(several, 460)) is None
 
 
 @pytest.mark.parametrize("steps", [3, 8])

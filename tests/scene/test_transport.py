@@ -122,18 +122,18 @@ def test_direct_light_has_no_noise_and_a_small_quadrature_error(n10, scenes):
     assert (one - reference).std() < 0.003 * reference.mean()
 
 
-def test_later_light_is_all_light_less_direct_light(n10, scenes):
+def test_indirect_light_is_all_light_less_direct_light(n10, scenes):
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
     rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
     given = scene, rays, patterns, look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
     roi = Roi(300, 200, 120, 80)
     direct, both, later = (
-        trace(*given, LightPaths(16, 4, depth, only_later=only), roi)
+        trace(*given, LightPaths(16, 4, depth, indirect_only=only), roi)
         for depth, only in ((1, False), (2, False), (2, True))
     )
     assert later.mean() > 0.01 * direct.mean()
     np.testing.assert_allclose(direct + later, both, atol=1e-5 * both.max())
-    assert not trace(*given, LightPaths(16, 4, only_later=True), roi).any()
+    assert not trace(*given, LightPaths(16, 4, indirect_only=True), roi).any()
 
 
 @pytest.mark.parametrize("depth", [1, 3])
@@ -229,7 +229,7 @@ def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
 
 
 @pytest.mark.parametrize("lamp", ["sky", "bulb", "panel"])
-def test_later_light_of_the_scene_is_all_of_it_less_its_direct_light(lamp):
+def test_indirect_light_of_emitters_is_all_of_it_less_its_direct_light(lamp):
     """With the projector off; each is random by itself, so that means over blocks of pixels are held together."""
     scene, _ = _lit_corner([lamp], {"type": "matt_white"})
     rays = CameraRays(pinhole(48, 32, 85.0))
@@ -243,7 +243,7 @@ def test_later_light_of_the_scene_is_all_of_it_less_its_direct_light(lamp):
                     rays,
                     dark,
                     pose,
-                    LightPaths(samples=64, seed=s, depth=depth, with_ambient=True, only_later=only),
+                    LightPaths(samples=64, seed=s, depth=depth, with_ambient=True, indirect_only=only),
                 )[-1]
                 .reshape(4, 8, 6, 8)
                 .sum(axis=(1, 3))

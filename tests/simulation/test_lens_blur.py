@@ -9,7 +9,7 @@ from mitsim.sensor.camera import Camera
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
-from mitsim.simulation.lens_blur import blurred, through_point_spread
+from mitsim.simulation.lens_blur import blur_by_lens, gaussian_blur
 
 WIDTH, HEIGHT = 201, 161
 CAMERA = Camera(
@@ -39,7 +39,7 @@ def test_a_point_spreads_with_the_variance_of_its_place(column, row):
     """The variance of what becomes of one lit pixel is blur^2 + (corner^2 - blur^2) rho^2."""
     image = np.zeros((HEIGHT, WIDTH), np.float32)
     image[row, column] = 1.0
-    seen = through_point_spread(image, chip(0.8, 2.5), CAMERA, WHOLE).astype(float)
+    seen = blur_by_lens(image, chip(0.8, 2.5), CAMERA, WHOLE).astype(float)
     rho = ((column - 100) ** 2 + (row - 80) ** 2) / (100**2 + 80**2)
     across = np.arange(WIDTH) - column
     variance = (seen.sum(axis=0) * across**2).sum() / seen.sum()
@@ -48,16 +48,16 @@ def test_a_point_spreads_with_the_variance_of_its_place(column, row):
 
 def test_without_a_corner_it_is_the_even_blur_to_the_last_bit():
     image = np.random.default_rng(1).random((HEIGHT, WIDTH)).astype(np.float32)
-    even = blurred(image, 1.3)
+    even = gaussian_blur(image, 1.3)
     for corner in (None, 1.3):
-        assert np.array_equal(through_point_spread(image, chip(1.3, corner), CAMERA, WHOLE), even)
-    assert through_point_spread(image, chip(0.0, None), CAMERA, WHOLE) is image
+        assert np.array_equal(blur_by_lens(image, chip(1.3, corner), CAMERA, WHOLE), even)
+    assert blur_by_lens(image, chip(0.0, None), CAMERA, WHOLE) is image
 
 
 def test_a_part_is_that_of_the_whole():
     image = np.random.default_rng(2).random((HEIGHT, WIDTH)).astype(np.float32)
     part = Roi(110, 20, 70, 90)
     inner = np.s_[15:-15, 15:-15]
-    whole = through_point_spread(image, chip(0.5, 2.0), CAMERA, WHOLE)[part.slices]
-    alone = through_point_spread(np.ascontiguousarray(image[part.slices]), chip(0.5, 2.0), CAMERA, part)
+    whole = blur_by_lens(image, chip(0.5, 2.0), CAMERA, WHOLE)[part.slices]
+    alone = blur_by_lens(np.ascontiguousarray(image[part.slices]), chip(0.5, 2.0), CAMERA, part)
     assert np.allclose(whole[inner], alone[inner], atol=1e-6)

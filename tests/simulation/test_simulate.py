@@ -16,7 +16,7 @@ from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.lens_blur import blurred
+from mitsim.simulation.lens_blur import gaussian_blur
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
@@ -29,7 +29,7 @@ def test_the_lens_blurs_with_its_point_spread_as_scipy_does(height, width, sigma
     expected = image.astype(float)
     for axis in (0, 1):
         expected = correlate1d(expected, point_spread(sigma), axis)
-    found = blurred(image, sigma)
+    found = gaussian_blur(image, sigma)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
@@ -37,8 +37,8 @@ def test_the_lens_blurs_with_its_point_spread_as_scipy_does(height, width, sigma
 @given(st.integers(0, 30), st.integers(0, 40), st.integers(13, 30), st.integers(13, 40), st.floats(0.05, 1.3))
 def test_a_blur_keeps_a_part_of_an_image_as_it_is_in_the_whole(row, column, height, width, sigma):
     image = np.random.default_rng(1).random((60, 80), dtype=np.float32)
-    part = blurred(image[row : row + height, column : column + width], sigma)
-    whole = blurred(image, sigma)[row : row + height, column : column + width]
+    part = gaussian_blur(image[row : row + height, column : column + width], sigma)
+    whole = gaussian_blur(image, sigma)[row : row + height, column : column + width]
     np.testing.assert_array_equal(part[6:-6, 6:-6], whole[6:-6, 6:-6])  # the reach of 1.3 px
 
 

@@ -16,7 +16,7 @@ from mitsim.errors import InputError
 from mitsim.report.scene_preview import preview_figure
 from mitsim.report.scene_table import as_data, as_text
 from mitsim.report.style import write_png
-from mitsim.scene.first_hits import look
+from mitsim.scene.first_hits import visible_surfaces
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 from mitsim.sensor.working_volume import common_view, field_of_view, in_image, in_working_volume, pose_at, usual_place
@@ -37,9 +37,9 @@ class Checked:
         place = usual_place(sensor, self.scene.centre) if position is None else np.asarray(position, float)
         aim = self.scene.centre if position is None else np.asarray(target, float)
         self.pose = pose_at(sensor, place, aim)
-        self.sight = look(self.scene, sensor.rig, self.pose)
+        self.visible = visible_surfaces(self.scene, sensor.rig, self.pose)
         self.task = task
-        self.found = findings(self.facts, sensor, self.pose, self.sight, position is not None, task)
+        self.found = findings(self.facts, sensor, self.pose, self.visible, position is not None, task)
 
     def says(self, severity, about, text):
         return any(f.severity == severity and f.about == about and text in f"{f.what}. {f.advice}" for f in self.found)
@@ -252,8 +252,8 @@ def test_a_point_far_beside_the_image_does_not_fold_back_into_it(n10):
 
 def test_text_and_data_say_the_same(scenes, n10):
     checked = Checked(scenes / "two_pillars/two_pillars.xml", n10)
-    text = as_text(checked.facts, checked.sight, checked.found)
-    data = as_data(checked.facts, checked.sight, checked.found)
+    text = as_text(checked.facts, checked.visible, checked.found)
+    data = as_data(checked.facts, checked.visible, checked.found)
     lines = text.splitlines()
     assert lines[0].split()[:2] == ["feature", "material"]
     assert lines[-1] == "no problems found"
@@ -268,7 +268,7 @@ def test_text_and_data_say_the_same(scenes, n10):
 
 def test_the_picture_shows_every_feature_in_a_colour_of_its_own(scenes, n10, tmp_path):
     checked = Checked(scenes / "two_pillars/two_pillars.xml", n10)
-    figure = preview_figure(checked.scene, checked.facts, n10, checked.pose, checked.sight, ["pillar1"])
+    figure = preview_figure(checked.scene, checked.facts, n10, checked.pose, checked.visible, ["pillar1"])
     image = imread(write_png(figure, tmp_path / "preview.png"))[..., :3]
     assert image.shape[1] == 1200
     labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
@@ -294,7 +294,7 @@ def test_a_part_out_of_sight_and_one_of_many_shapes_are_drawn_too(check, n10, tm
     )
     for options in ({}, {"position": (0, -500, 900), "target": (0, -900, 900)}):
         checked = check(row, **options)
-        figure = preview_figure(checked.scene, checked.facts, n10, checked.pose, checked.sight)
+        figure = preview_figure(checked.scene, checked.facts, n10, checked.pose, checked.visible)
         write_png(figure, tmp_path / "row.png")
         labels = [text.get_text() for text in figure.legends[0].get_texts()]
         assert labels[-1] == "5 more shapes"

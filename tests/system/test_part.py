@@ -275,15 +275,15 @@ def test_the_folder_holds_a_scene_that_loads_and_a_task_that_fits_it(plate):
     task = read_features(plate / "plate/task.toml")
     assert set(task.features) == set(scene.names)
     facts = inspect(scene)
-    assert facts.together.closed
-    assert facts.together.volume == pytest.approx(plate_with_pillar().volume, rel=1e-5)
+    assert facts.merged_mesh.closed
+    assert facts.merged_mesh.volume == pytest.approx(plate_with_pillar().volume, rel=1e-5)
     for shape in facts.shapes:
         nominal = task.features[shape.name].nominal()
         # the task is written to 0.1 um, and single precision knows 50 mm to 4e-6 mm
         assert np.abs(surface_distance(nominal, shape.mesh.vertices)).max() < 1e-3
         assert shape.mesh.texture
         assert shape.mesh.smooth
-        assert shape.backs <= 0.001 * max(shape.fronts, 1000)
+        assert shape.back_hits <= 0.001 * max(shape.front_hits, 1000)
     example_lines = [line[2:] for line in (plate / "plate/task.toml").read_text().splitlines() if line.startswith("# ")]
     measured = tomllib.loads("\n".join(example_lines[example_lines.index("[measurements.boss_30mm_radius]") :]))
     assert measured["measurements"]["boss_30mm_radius"]["nominal"] == 15.0

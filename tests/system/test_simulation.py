@@ -26,7 +26,7 @@ from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import mean_run_length
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.render_residual import LIMIT, RenderResidual, told, worst_of
+from mitsim.simulation.render_residual import LIMIT, RenderResidual, largest_residual, warn_above_limit
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import read_study
@@ -263,12 +263,15 @@ def test_a_render_that_is_too_coarse_for_its_sensor_is_told(small, scenes, simul
     coarse = coupon_residuals(simulated, plan)
     assert len(coarse) == 1
     assert coarse[0].worst > LIMIT
-    assert f"matt_white: {coarse[0]}; over {LIMIT}: take more samples_per_pixel" in capsys.readouterr().err
-    told("fine", RenderResidual(0.0, 0.1, 0.0))
-    told("dark", RenderResidual(math.nan, math.nan, math.nan))
+    assert f"matt_white: {coarse[0]}; above {LIMIT}: use more samples_per_pixel" in capsys.readouterr().err
+    warn_above_limit("fine", RenderResidual(0.0, 0.1, 0.0))
+    warn_above_limit("dark", RenderResidual(math.nan, math.nan, math.nan))
     assert not capsys.readouterr().err
-    assert worst_of([RenderResidual(math.nan, math.nan, math.nan), *coarse, RenderResidual(0.0, 0.1, 0.0)]) == coarse[0]
-    assert worst_of([]) is None
+    assert (
+        largest_residual([RenderResidual(math.nan, math.nan, math.nan), *coarse, RenderResidual(0.0, 0.1, 0.0)])
+        == coarse[0]
+    )
+    assert largest_residual([]) is None
 
 
 def test_a_map_knows_its_exposure_and_source(small):

@@ -24,7 +24,7 @@ from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.rig_parameters import parameter_differences
 from mitsim.sensor.transforms import Transform, look_at
-from mitsim.simulation.lens_blur import blurred
+from mitsim.simulation.lens_blur import gaussian_blur
 
 COLUMNS, ROWS, SQUARE, MARKER, TEXELS = 11, 8, 32.0, 19.0, 96
 MIDDLE = np.array([COLUMNS * SQUARE / 2, ROWS * SQUARE / 2, 0.0])
@@ -68,7 +68,7 @@ def corners(n10):
     found = {name: [] for name in rays}
     for pose in poses():
         for name in rays:
-            light = blurred(
+            light = gaussian_blur(
                 trace(scene, rays[name], white, pose, LightPaths(samples=36, seed=1))[0], n10.imager.blur_px
             )
             electrons = light / np.percentile(light, 99.9) * 0.9 * n10.imager.full_well

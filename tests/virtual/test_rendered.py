@@ -18,7 +18,7 @@ from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.simulation.indirect_light import IndirectLight
-from mitsim.simulation.rendering import LaterLight, Rendering
+from mitsim.simulation.rendering import IndirectImages, Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import StudyFile, open_study
 from mitsim.virtual.plan import measurements_of, trial_digest
@@ -150,8 +150,8 @@ def test_light_that_was_rendered_before_is_the_same_light():
     images = {}
     for index, name in enumerate(sensor.sensor.rig.cameras):
         seed = int(np.random.SeedSequence([5, index]).spawn(3)[0].generate_state(1)[0])
-        images[name] = sensor.later_light(scene, pose, name, how, seed=seed, depth=2)
-    before = LaterLight(images, {name: sensor.rays[name].whole for name in images}, how, 2)
+        images[name] = sensor.indirect_radiance(scene, pose, name, how, seed=seed, depth=2)
+    before = IndirectImages(images, {name: sensor.rays[name].whole for name in images}, how, 2)
     again = sensor.light(scene, pose, rendering=Rendering(samples=4, indirect=before), seed=5)
     for name, image in at_once.radiance.items():
         np.testing.assert_allclose(again.radiance[name], image, rtol=1e-6, atol=1e-15)
@@ -164,23 +164,23 @@ def test_rays_of_a_moved_camera(name):
     names = [f"{eye}.{one}" for one in ("focal_x_px", "principal_y_px", "k1", "p2")]
     rig = moved(sensor.rig, names, [0.4, -0.3, 2e-3, 1e-4])
     camera = rig.cameras[eye]
-    quick, exact = CameraRays(sensor.rig.cameras[eye]).moved(camera), CameraRays(camera)
+    quick, exact = CameraRays(sensor.rig.cameras[eye]).recalibrated(camera), CameraRays(camera)
     focal = camera.matrix[0, 0]
     for one, other in ((quick.x, exact.x), (quick.y, exact.y)):  # a tenth of what a matcher resolves
         assert focal * np.abs(np.array(one) - np.array(other)).max() < 1e-2
-    same = CameraRays(sensor.rig.cameras[eye]).moved(sensor.rig.cameras[eye])
-    assert same.bend is not None and same.camera is sensor.rig.cameras[eye]
+    same = CameraRays(sensor.rig.cameras[eye]).recalibrated(sensor.rig.cameras[eye])
+    assert same.distortion is not None and same.camera is sensor.rig.cameras[eye]
 
 
 def test_another_unit_has_another_fixed_pattern_of_the_same_size():
     sensor = SimulatedSensor(load_sensor("ensenso-n10"))
-    other = sensor.moved(sensor.sensor.rig, unit=3)
+    other = sensor.recalibrated(sensor.sensor.rig, unit=3)
     for name, patterns in sensor.units.items():
         pattern, moved = patterns.fixed, other.units[name].fixed
         assert not np.array_equal(moved.offset, pattern.offset)
         assert np.std(moved.offset) == pytest.approx(np.std(pattern.offset))
         assert abs(np.corrcoef(moved.response.ravel(), pattern.response.ravel())[0, 1]) < 0.02
-    assert sensor.moved(sensor.sensor.rig).units is sensor.units
+    assert sensor.recalibrated(sensor.sensor.rig).units is sensor.units
 
 
 def test_a_path_that_is_read_too_long_moves_points_along_their_rays(fringes):

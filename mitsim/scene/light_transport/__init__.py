@@ -1,1 +1,1 @@
-"""Light paths from projector and lamps by way of a scene to a camera."""
+"""Light paths from the projector and the emitters, over the scene, to a camera."""

@@ -1,8 +1,11 @@
-"""Light from the emitters that a scene's author put there: lamps, windows, a sky.
+"""Light from the emitters that the author of a scene added: lamps, windows, a sky.
 
-It is the same in every image of a capture, whatever the projector shows. A surface's share of it is found in two ways,
-by aiming at an emitter and by following the BSDF until one is hit, and the two are weighed by the balance heuristic
-(Veach & Guibas 1995), so that neither a small lamp over a dull face nor a large window in a shiny one is noisy.
+Signal chain: surface point -> an emitter chosen at random, if nothing blocks it; or the emitter that a BSDF sample
+meets -> weights of the balance heuristic -> radiance.
+
+The light is the same in all images of a capture, whatever the projector shows. Two methods estimate it: sampling an
+emitter, and following the BSDF until it meets one. The balance heuristic (Veach and Guibas, SIGGRAPH 1995) weights
+them. Without it, either a small lamp over a matt face or a large window in a glossy one would be noisy.
 """
 
 from __future__ import annotations
@@ -14,31 +17,32 @@ from mitsim.scene.load import Scene
 
 
 def has_emitters(scene: Scene) -> bool:
-    """Whether the author lit the scene."""
+    """Whether the scene has emitters of its own."""
     return len(scene.mitsuba.emitters()) > 0
 
 
-def aimed(scene: Scene, surface: Any, bsdf: Any, random: Any, active: Any) -> Any:
-    """Radiance toward the ray that comes of one emitter chosen at random [W / (mm^2 sr)]."""
-    place = mi.Point2f(random.next_float32(), random.next_float32())
-    sample, weight = scene.mitsuba.sample_emitter_direction(surface, place, True, active)
+def sampled_emitter_light(scene: Scene, surface: Any, bsdf: Any, random: Any, active: Any) -> Any:
+    """Return the reflected radiance of one emitter, chosen at random [W / (mm^2 sr)]."""
+    point = mi.Point2f(random.next_float32(), random.next_float32())
+    sample, weight = scene.mitsuba.sample_emitter_direction(surface, point, True, active)
     usable = active & (sample.pdf != 0.0)
     toward = surface.to_local(sample.d)
     reflected, pdf = bsdf.eval_pdf(mi.BSDFContext(), surface, toward, usable)
-    share = dr.select(sample.delta, 1.0, sample.pdf / (sample.pdf + pdf))
-    return dr.select(usable, reflected[0] * weight[0] * share, 0.0)
+    heuristic = dr.select(sample.delta, 1.0, sample.pdf / (sample.pdf + pdf))
+    return dr.select(usable, reflected[0] * weight[0] * heuristic, 0.0)
 
 
-def met(scene: Scene, surface: Any, origin: Any, pdf: Any, first: Any) -> Any:
-    """Radiance of an emitter that the ray has run into [W / (mm^2 sr)].
+def hit_emitter_light(scene: Scene, surface: Any, origin: Any, pdf: Any, first: Any) -> Any:
+    """Return the weighted radiance of an emitter that the ray meets [W / (mm^2 sr)].
 
-    ``pdf`` of the direction in which the ray left ``origin``; a camera's own rays (``first``) were not sampled.
+    ``pdf`` is the density of the direction in which the ray left ``origin`` [1/sr]. Rays from the camera (``first``)
+    have no such density and the weight 1.
     """
     emitter = surface.emitter(scene.mitsuba)
     emitted = emitter.eval(surface)[0]
     reference = dr.zeros(mi.Interaction3f)
     reference.p = origin
     sample = mi.DirectionSample3f(scene.mitsuba, surface, reference)
-    other = scene.mitsuba.pdf_emitter_direction(reference, sample, ~first)
-    share = dr.select(first, 1.0, pdf / (pdf + other))
-    return dr.select(emitted > 0, emitted * share, 0.0)
+    emitter_pdf = scene.mitsuba.pdf_emitter_direction(reference, sample, ~first)
+    heuristic = dr.select(first, 1.0, pdf / (pdf + emitter_pdf))
+    return dr.select(emitted > 0, emitted * heuristic, 0.0)

@@ -1,12 +1,12 @@
-"""The projector as light: what of it reaches a surface, and what code that light carries.
+"""Compute the light of the projector on a surface, and the code that it carries.
 
-Signal chain: surface point -> a place in the projector's aperture, if nothing is in between -> ideal image point in
-the plane of focus -> distortion (:mod:`mitsim.scene.ray_casting.distortion`) -> projector coordinate (u, v) and
-irradiance -> value of every image's code.
+Signal chain: surface point -> position in the projector's aperture, if nothing blocks it -> ideal image point in the
+plane of focus -> distortion (:mod:`mitsim.scene.ray_casting.distortion`) -> projector coordinate (u, v) and irradiance
+-> value of the code of each image.
 
-A code is a function of (u, v), for patterns (:class:`LitPatterns`), or of the optical length L from the projector by
-way of the scene to the camera, for a time-of-flight sensor (:class:`ModulatedLight`). Both are evaluated on the same
-paths by the same loop.
+The code of patterns is a function of (u, v): :class:`LitPatterns`. The code of a time-of-flight sensor is a function of
+L, the optical length from the projector over the scene to the camera: :class:`ModulatedLight`. The same loop evaluates
+both on the same paths. The radiometry is that of :mod:`mitsim.sensor.projector`.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from mitsim.sensor.modulation import LIGHT_MM_S
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.transforms import Transform
 
-#: largest error of a pattern that is summed of others, relative to white: a few roundings in single precision
+#: largest error of a pattern that is a sum of others, relative to white: a few roundings in single precision
 _LOOKUP_ERROR = 5e-7
 
-#: weights of such sums under this are roundings
+#: weights of such sums below this are rounding errors
 _NO_WEIGHT = 1e-10
 
-#: values of patterns that are taken to double precision at once
+#: number of values of patterns that are converted to double precision at once
 _VALUES_AT_ONCE = 1 << 22
 
-#: share of its size by which the rectangle that photons are sent through exceeds the projector's image on every side
+#: margin on each side of the rectangle that photons pass through, as a share of the size of the projector's image
 _MARGIN = 2e-3
 
 
@@ -52,20 +52,23 @@ class Light(Protocol):
     codes: int
 
     def values(self, uv: Any, length: Any, active: Any) -> list[Any]:
-        """Relative light of each code at texture place ``uv`` and optical length ``length`` [mm]."""
+        """Return the relative light of each code at texture coordinate ``uv`` and optical length ``length`` [mm]."""
 
     def images(self, codes: list[Any]) -> list[Any]:
-        """What each image has of something of which ``codes`` says what each code has; numbers or arrays."""
+        """Return a quantity of each image from that of each code, numbers or arrays."""
 
 
 class LitPatterns:
-    """Patterns laid on the device: (P, H, W) values 0..1 relative to white.
+    """Patterns (P, H, W) of values 0..1, relative to white, on the device.
 
-    Between the middles of projector pixels the light is interpolated; with a pixel gap every pixel is a square with
-    dark lines around it, as bright as keeps the flux.
+    The light is interpolated between the centres of projector pixels. With a pixel gap each pixel is a square with dark
+    lines around it, brighter by the factor that keeps the flux. Patterns that are sums of others are not stored: only
+    three steps of a sinusoid are independent. Patterns with equal rows are stored as one row.
 
-    Only patterns that are no sums of others are looked up: of the steps of a sinusoid there are three. Patterns that
-    are the same in every row are looked up along the row.
+    Raises
+    ------
+    InputError
+        If the patterns do not have the size of the projector.
     """
 
     def __init__(self, patterns: NDArray[np.floating], projector: Projector) -> None:
@@ -75,16 +78,16 @@ class LitPatterns:
         self.count = patterns.shape[0]
         self.projector = projector
         self.along_row = bool((patterns == patterns[:, :1]).all())
-        sent = projector.emit(patterns[:, :1] if self.along_row else patterns)
-        chosen, self.weights = independent(sent)
+        emitted = projector.emit(patterns[:, :1] if self.along_row else patterns)
+        chosen, self.weights = independent(emitted)
         self.codes = len(chosen)
-        stack = np.ascontiguousarray(np.moveaxis(sent[chosen], 0, -1))
+        stack = np.ascontiguousarray(np.moveaxis(emitted[chosen], 0, -1))
         kind, stack = (mi.Texture1f, stack[0]) if self.along_row else (mi.Texture2f, stack)
-        pixels = dr.FilterMode.Nearest if projector.pixel_gap > 0 else dr.FilterMode.Linear
-        self.texture = kind(mi.TensorXf(stack), wrap_mode=dr.WrapMode.Clamp, filter_mode=pixels)
+        filter_mode = dr.FilterMode.Nearest if projector.pixel_gap > 0 else dr.FilterMode.Linear
+        self.texture = kind(mi.TensorXf(stack), wrap_mode=dr.WrapMode.Clamp, filter_mode=filter_mode)
 
     def values(self, uv: Any, length: Any, active: Any) -> list[Any]:
-        """Relative light of each independent pattern at texture place ``uv``."""
+        """Return the relative light of each independent pattern at texture coordinate ``uv``."""
         gap = float(self.projector.pixel_gap)
         values = list(self.texture.eval(mi.Array1f(uv.x) if self.along_row else uv, active))
         if gap > 0:
@@ -99,45 +102,62 @@ class LitPatterns:
         return values
 
     def images(self, codes: list[Any]) -> list[Any]:
-        """Every pattern's share of something, from that of the independent ones."""
+        """Return the quantity of each pattern from that of the independent ones."""
         terms = [[code * w for code, w in zip(codes, row, strict=True) if w != 0.0] for row in self.weights.tolist()]
         return [reduce(add, row) if row else 0.0 * codes[0] for row in terms]
 
 
 def independent(patterns: NDArray[np.float32]) -> tuple[list[int], NDArray[np.float64]]:
-    """Patterns of which all others are sums, and the weights (P, chosen) of the sums.
+    """Return the indices of patterns of which all others are sums, and the weights (P, chosen) of the sums.
 
-    The error is at most ``_LOOKUP_ERROR`` of white. QR decomposition with column pivoting of the Gram matrix (Golub &
-    Van Loan, Matrix Computations, 4th ed., section 5.4.2) says in which order patterns add the most.
+    The error is at most ``_LOOKUP_ERROR`` of white. QR decomposition of the Gram matrix with column pivoting sorts the
+    patterns by their contribution (Golub and Van Loan, Matrix Computations, 4th ed., section 5.4.2).
     """
     count, parts = len(patterns), np.array_split(patterns, -(-patterns.size // _VALUES_AT_ONCE), axis=1)
 
-    def precise() -> Iterator[NDArray[np.float64]]:
+    def double_parts() -> Iterator[NDArray[np.float64]]:
         return (part.reshape(count, -1).astype(np.float64) for part in parts)
 
     gram = np.zeros((count, count))
-    for part in precise():
+    for part in double_parts():
         gram += part @ part.T
     order = qr(gram, mode="r", pivoting=True)[1]
     for size in range(1, count):
         chosen = sorted(int(index) for index in order[:size])
         weights = np.asarray(np.linalg.lstsq(gram[np.ix_(chosen, chosen)], gram[chosen], rcond=None)[0].T, np.float64)
-        # the mean square of what is left, without a look at the patterns
+        # the residual sum of squares follows from the Gram matrix alone
         if (gram.diagonal() - (weights * gram[:, chosen]).sum(axis=1)).max() > _LOOKUP_ERROR**2 * patterns[0].size:
             continue
         weights[chosen] = np.eye(size)
         weights[np.abs(weights) < _NO_WEIGHT] = 0.0
-        if all(np.abs(part - weights @ part[chosen]).max(initial=0.0) <= _LOOKUP_ERROR for part in precise()):
+        if all(np.abs(part - weights @ part[chosen]).max(initial=0.0) <= _LOOKUP_ERROR for part in double_parts()):
             return chosen, weights
     return list(range(count)), np.eye(count)
 
 
 class ModulatedLight:
-    """Light whose power is modulated in time, and the correlations that a time-of-flight imager takes.
+    """Light whose power is modulated in time, and the correlations that a time-of-flight imager measures.
 
-    Image k is the mean of the arriving light times the imager's demodulation, 1 + m_k cos(2 pi f_k L / c - delta_k):
-    for continuous-wave modulation with frequency f, contrast m (of light and pixel together; one number, or one for
-    each image) and reference phase delta (Lange & Seitz, IEEE J. Quantum Electron. 37, 2001).
+    Image k is the mean of the received light times the demodulation of the imager, per unit of light:
+
+        c_k = 1 + m_k cos(2 pi f_k L / c - delta_k)
+
+    for continuous-wave modulation of frequency f and reference phase delta (Lange and Seitz, IEEE J. Quantum Electron.
+    37, 2001). The contrast m is that of light and pixel together.
+
+    Parameters
+    ----------
+    projector
+        The light source.
+    frequencies_hz, phases
+        f [Hz] and delta [rad], one for each image.
+    contrast
+        m [1], one number or one for each image.
+
+    Raises
+    ------
+    InputError
+        If a frequency is not positive, or there is not one phase for each frequency.
     """
 
     def __init__(self, projector: Projector, frequencies_hz: ArrayLike, phases: ArrayLike, contrast: ArrayLike) -> None:
@@ -157,23 +177,23 @@ class ModulatedLight:
         self.deltas = [dr.opaque(mi.Float, float(d)) for d in deltas]
 
     def values(self, uv: Any, length: Any, active: Any) -> list[Any]:
-        """Relative correlation of each image for light of optical length ``length`` [mm]."""
+        """Return the relative correlation of each image for light of optical length ``length`` [mm]."""
         out = []
         for turns, delta, contrast in zip(self.turns_per_mm, self.deltas, self.contrasts, strict=True):
             phase = length * turns
-            phase -= dr.floor(phase)  # whole turns off first: single precision
+            phase -= dr.floor(phase)  # without whole turns, for single precision
             out.append(1.0 + contrast * dr.cos(2.0 * dr.pi * phase - delta))
         return out
 
     def images(self, codes: list[Any]) -> list[Any]:
-        """Every image is a code of its own."""
+        """Return the codes: each image has its own."""
         return codes
 
 
 class ProjectorLight(Eye):
     """A projector at a pose, seen from a surface.
 
-    ``bounds`` (2, 3) [mm] of the scene, in the world: photons are sent there alone.
+    ``bounds`` (2, 3) [mm] of the scene, world frame; photons are emitted only toward them.
     """
 
     def __init__(
@@ -182,13 +202,13 @@ class ProjectorLight(Eye):
         optics = projector.optics
         super().__init__(world_from_sensor @ optics.sensor_from_camera)
         self.size = (optics.width, optics.height)
-        self.bend = Distortion(optics)
+        self.distortion = Distortion(optics)
         self.irradiance = dr.opaque(mi.Float, projector.plane_irradiance)
         self.radius = float(0.5 * projector.aperture_mm)
         self.inverse_focus = float(1.0 / projector.focus_mm)
-        world_from_lamp = world_from_sensor @ optics.sensor_from_camera
-        low, high = _beam(self.bend, projector, world_from_lamp, bounds)
-        self.bounds = [
+        world_from_projector = world_from_sensor @ optics.sensor_from_camera
+        low, high = _photon_rectangle(self.distortion, projector, world_from_projector, bounds)
+        self.extents = [
             (dr.opaque(mi.Float, float(a)), dr.opaque(mi.Float, float(b - a))) for a, b in zip(low, high, strict=True)
         ]
         self.area = dr.opaque(mi.Float, float(np.prod(high - low)))
@@ -200,37 +220,48 @@ class ProjectorLight(Eye):
     def light(
         self, scene: Any, surface: Any, ray_direction: Any, lens: Any, shift: Any, active: Any
     ) -> tuple[Any, Any, Any, Any]:
-        """Light that arrives at a surface by way of one place of the aperture.
+        """Return the light that arrives at a surface from one position in the aperture.
 
         Parameters
         ----------
         scene
-            That may stand in between; None where nothing can.
+            Mitsuba scene whose shapes can block the light; None if nothing can.
+        surface, ray_direction
+            Surface interaction, and unit direction of the ray that met it, world frame.
         lens
-            Place in the unit disc of the aperture.
+            Position in the unit disc of the aperture.
         shift
-            Displacement [mm], world, at which the code is read, or None: speckle moves it.
+            Displacement [mm], world frame, of the point at which the code is evaluated; None for none. Speckle causes
+            it.
+        active
+            Mask of the lanes.
 
         Returns
         -------
-        toward, arriving, uv, distance
-            Unit direction to the lamp; radiant intensity / r^2 [W/mm^2], 0 in shadow; texture place; [mm].
+        toward
+            Unit direction to the projector, world frame.
+        arriving
+            Radiant intensity / distance^2 [W/mm^2], 0 in shadow.
+        uv
+            Texture coordinate.
+        distance
+            Distance to the position in the aperture [mm].
         """
         position = self.position
         if self.radius > 0:
             position = position + self.axes[0] * (lens.x * self.radius) + self.axes[1] * (lens.y * self.radius)
-        to_lamp = position - surface.p
-        distance = dr.norm(to_lamp)
-        toward = to_lamp / distance
-        local = self.local(-to_lamp)
+        to_projector = position - surface.p
+        distance = dr.norm(to_projector)
+        toward = to_projector / distance
+        local = self.to_local(-to_projector)
         in_front = active & (local.z > 0)
         z = dr.select(in_front, local.z, 1.0)
-        read = local if shift is None else local + self.local(shift)
-        x, y = read.x / z, read.y / z
-        if self.radius > 0:  # where the ray from the lens crosses the plane of focus, as seen from the lens's middle
+        code_point = local if shift is None else local + self.to_local(shift)
+        x, y = code_point.x / z, code_point.y / z
+        if self.radius > 0:  # the point where the ray crosses the plane of focus, as seen from the centre of the lens
             x += lens.x * (self.radius * self.inverse_focus)
             y += lens.y * (self.radius * self.inverse_focus)
-        u, v, inside = self.bend.image(x, y, in_front)
+        u, v, inside = self.distortion.image(x, y, in_front)
         facing = inside & (dr.dot(surface.n, toward) * dr.dot(surface.n, -ray_direction) > 0)
         if scene is not None:
             facing &= ~scene.ray_test(shadow_ray(surface, toward, distance), facing)
@@ -240,23 +271,28 @@ class ProjectorLight(Eye):
             arriving *= self._corner_loss(u, v)
         return toward, dr.select(facing, arriving, 0.0), self._texture(u, v), distance
 
-    def send(self, place: Any, lens: Any) -> tuple[Any, Any, Any, Any]:
-        """A photon: one place in the image and one in the aperture make a ray.
+    def emit_photon(self, position: Any, lens: Any) -> tuple[Any, Any, Any, Any]:
+        """Return the ray of a photon from one position in the image and one in the aperture.
 
         Parameters
         ----------
-        place
-            In the unit square, which is laid over the rectangle that photons go through in the ideal image plane.
+        position
+            Position in the unit square, which is mapped to the rectangle in the ideal image plane that photons pass
+            through.
         lens
-            Place in the unit disc of the aperture.
+            Position in the unit disc of the aperture.
 
         Returns
         -------
-        origin, direction, flux, uv
-            Ray in the world; radiant intensity over the density of directions [W], 0 beside the image; texture place.
+        origin, direction
+            Ray in the world frame [mm, unit].
+        flux
+            Radiant intensity over the density of directions [W]; 0 outside the image.
+        uv
+            Texture coordinate.
         """
-        x, y = (low + p * extent for p, (low, extent) in zip((place.x, place.y), self.bounds, strict=True))
-        u, v, inside = self.bend.image(x, y, True)
+        x, y = (low + p * extent for p, (low, extent) in zip((position.x, position.y), self.extents, strict=True))
+        u, v, inside = self.distortion.image(x, y, True)
         flux = self.irradiance * self.area
         if self.vignetting > 0:
             flux *= self._corner_loss(u, v)
@@ -264,12 +300,12 @@ class ProjectorLight(Eye):
         if self.radius > 0:
             origin = origin + self.axes[0] * (lens.x * self.radius) + self.axes[1] * (lens.y * self.radius)
             local -= mi.Vector3f(lens.x, lens.y, 0.0) * (self.radius * self.inverse_focus)
-        return origin, self.turn(dr.normalize(local)), dr.select(inside, flux, 0.0), self._texture(u, v)
+        return origin, self.to_world(dr.normalize(local)), dr.select(inside, flux, 0.0), self._texture(u, v)
 
     def density(self, toward: Any, distance: Any) -> Any:
-        """Photons of :meth:`send` on a surface across their way, per area and photon [1/mm^2].
+        """Return the density of the photons of :meth:`emit_photon` on a surface across their direction [1/mm^2].
 
-        A cos^3(theta) d^2 is the area that one photon stands for, if A is that of the rectangle in the plane z = 1.
+        One photon represents the area A cos^3(theta) d^2, where A is the area of the rectangle in the plane z = 1.
         """
         cosine = dr.maximum(-dr.dot(self.axes[2], toward), 1e-6)
         return 1.0 / (self.area * dr.square(cosine) * cosine * dr.square(distance))
@@ -282,23 +318,26 @@ class ProjectorLight(Eye):
         return mi.Point2f((u + 0.5) / self.size[0], (v + 0.5) / self.size[1])
 
 
-def _beam(
-    bend: Distortion, projector: Projector, world_from_lamp: Transform, bounds: NDArray[np.floating] | None
+def _photon_rectangle(
+    distortion: Distortion, projector: Projector, world_from_projector: Transform, bounds: NDArray[np.floating] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rectangle (low, high) in the ideal image plane that holds the image, or the scene if that is less."""
-    low, high = bend.border.min(axis=0), bend.border.max(axis=0)
-    margin = _MARGIN * (high - low)  # the border is known at 65 points a side, and bends between them
+    """Return the rectangle (low, high) in the ideal image plane that photons pass through.
+
+    It contains the image, or the scene if that is smaller.
+    """
+    low, high = distortion.border.min(axis=0), distortion.border.max(axis=0)
+    margin = _MARGIN * (high - low)  # the border is computed at 65 points per side and is curved between them
     low, high = low - margin, high + margin
     if bounds is None:
         return low, high
     corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(8, 3)
-    local = world_from_lamp.inverse().points(corners)
+    local = world_from_projector.inverse().points(corners)
     if local[:, 2].min() <= 0:
         return low, high
-    # from another place of the aperture the same point lies elsewhere in the image, unless it is in focus
+    # out of focus, a point has another image from each position in the aperture
     blur = 0.5 * projector.aperture_mm * np.abs(1.0 / projector.focus_mm - 1.0 / local[:, 2:])
-    seen = local[:, :2] / local[:, 2:]
-    near, far = np.min(seen - blur, axis=0) - margin, np.max(seen + blur, axis=0) + margin
-    # a scene beside the image is lit by nothing, but the rectangle must not be empty
+    projected = local[:, :2] / local[:, 2:]
+    near, far = np.min(projected - blur, axis=0) - margin, np.max(projected + blur, axis=0) + margin
+    # a scene outside the image receives no light, but the rectangle must not be empty
     inner_low, inner_high = np.clip(near, low, high), np.clip(far, low, high)
     return inner_low, np.maximum(inner_high, inner_low + margin)

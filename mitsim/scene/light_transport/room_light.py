@@ -1,11 +1,11 @@
-"""Light of a room that comes from all sides, as a camera sees it on a part.
+"""Compute the light of a room, which comes from all sides, as a camera sees it on a part.
 
-Signal chain: finish -> share of diffuse light that it returns toward each angle (directional albedo) -> shape and
-angle that each pixel shows -> radiance per unit of irradiance.
+Signal chain: BSDF -> share of diffuse light that it returns toward each angle (directional albedo) -> shape and angle
+at each pixel -> radiance per unit of irradiance.
 
-The room is taken as equally bright all around. Shading of one face by another, and light that goes from face to face,
-are left out: on bright metal they nearly cancel (in a furnace whose walls all have one radiance, a part that absorbs
-nothing cannot be seen).
+The room is *assumed* to be equally bright on all sides. Shading of one face by another and interreflections are left
+out. On bright metal they nearly cancel: inside a furnace whose walls have one radiance, a part that absorbs nothing
+cannot be seen.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ _SAMPLES = 8192
 def room_radiance(
     scene: Scene, albedos: list[NDArray[np.float64]], rays: PixelRays, world_from_sensor: Transform
 ) -> NDArray[np.float32]:
-    """Radiance (H, W) [1/sr] per unit of irradiance on a freely turned surface; 0 where the part is not seen.
+    """Return the radiance (H, W) [1/sr] per unit of irradiance on a surface with a free view; 0 outside the part.
 
-    ``albedos`` of the scene's shapes, from :func:`directional_albedos`.
+    ``albedos`` are those of the scene's shapes, from :func:`directional_albedos`.
     """
-    seen = cast(scene, rays, world_from_sensor, np.empty((0, 3)))
-    out = np.zeros(seen.shape.shape, np.float32)
+    surfaces = cast(scene, rays, world_from_sensor, np.empty((0, 3)))
+    out = np.zeros(surfaces.shape.shape, np.float32)
     cosines = _cosines()
     directions = np.array(rays.directions, np.float32).T.reshape(*rays.size, 3)
     for index, albedo in enumerate(albedos):
-        here = seen.shape == index
-        facing = np.abs((seen.normal[here] * directions[here]).sum(axis=-1))
-        out[here] = np.interp(facing, cosines[::-1], albedo[::-1]) / np.pi
+        pixels = surfaces.shape == index
+        cosine = np.abs((surfaces.normal[pixels] * directions[pixels]).sum(axis=-1))
+        out[pixels] = np.interp(cosine, cosines[::-1], albedo[::-1]) / np.pi
     return out
 
 
 def directional_albedos(scene: Scene) -> list[NDArray[np.float64]]:
-    """:func:`directional_albedo` of every shape; shapes of one BSDF share it."""
+    """Return the :func:`directional_albedo` of each shape; shapes with one BSDF share it."""
     known: dict[str, NDArray[np.float64]] = {}
     bsdfs = [shape.bsdf() for shape in scene.shapes]
     for bsdf in bsdfs:
@@ -53,10 +53,10 @@ def directional_albedos(scene: Scene) -> list[NDArray[np.float64]]:
 
 
 def directional_albedo(bsdf: Any) -> NDArray[np.float64]:
-    """Share of light from all sides that a BSDF returns toward each of a few angles, (m,), steep ones last.
+    """Return the share of light from all sides that a BSDF returns toward some angles, (m,), grazing angles last.
 
-    By reciprocity it is the share of light from that angle that is returned to all sides: the mean weight of the
-    BSDF's own samples, over the azimuth too, with a fixed seed.
+    By reciprocity it equals the share of light from that angle that is returned to all sides. It is the mean weight of
+    samples of the BSDF, over the azimuth too, with a fixed seed.
     """
     cosines = _cosines()
     count = len(cosines) * _SAMPLES
@@ -66,10 +66,11 @@ def directional_albedo(bsdf: Any) -> NDArray[np.float64]:
     sine = dr.sqrt(1 - dr.square(cosine))
     surface = dr.zeros(mi.SurfaceInteraction3f, count)
     surface.wi = mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), cosine)
-    pick, place = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
-    _, weight = bsdf.sample(mi.BSDFContext(), surface, pick, place)
+    sample1, sample2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
+    _, weight = bsdf.sample(mi.BSDFContext(), surface, sample1, sample2)
     return np.asarray(np.array(weight[0], float).reshape(len(cosines), _SAMPLES).mean(axis=1))
 
 
 def _cosines() -> NDArray[np.float64]:
+    """Return the cosines of the angles to the normal, from 0 to 88 deg."""
     return np.cos(np.linspace(0, np.radians(88), _ANGLES))

@@ -1,18 +1,20 @@
-"""Light transport: every image of one camera from one tracing of the light paths.
+"""Render all images of one camera from one tracing of the light paths.
 
-Signal chain, per pixel and sample: a place inside the pixel, a place in the lens -> camera ray -> surface -> a place
-in the projector's aperture and the coordinate (u, v) that lights the surface from there, if no shadow -> BSDF ->
-radiance per unit of code value, optical length L -> one accumulator per image.
+Signal chain, for each pixel and sample: position in the pixel and in the lens -> camera ray -> surface -> position in
+the projector's aperture, and coordinate (u, v) whose light arrives from there, if nothing blocks it -> BSDF -> radiance
+per unit of code value, optical length L -> one sum per image.
 
-An image's code is a function of (u, v) or of L (:mod:`mitsim.scene.light_transport.projector_light`), so all images of
-a capture are looked up on the same paths: one kernel, one thread per pixel, the loop over samples inside, no film and
-no atomics. Direct light from a projector carries no light-sampling noise, and the places inside a pixel stand on a
-raster, those in the two apertures are a fixed set: direct light is rendered without noise that could be mistaken for
-the sensor's. What is left is the error of a quadrature rule, the same in every capture of a pose. ``jitter`` takes the
-places at random, for comparison with other renderers. Later bounces go through the same loop: a lane whose path has
-ended starts its next sample. Of their light, part is left to photons from the projector
-(:mod:`mitsim.scene.light_transport.light_tracing`), which find what camera paths find badly. Emitters in the scene
-(:mod:`mitsim.scene.light_transport.ambient`) add the same light to every image.
+The code of an image is a function of (u, v) or of L (:mod:`mitsim.scene.light_transport.projector_light`). All images
+of a capture are therefore evaluated on the same paths, in one kernel. It has one lane per pixel and contains the loop
+over samples. It needs no film and no atomic additions.
+
+Direct light from the projector is free of noise, which could be mistaken for the sensor's. The positions inside a pixel
+form a raster, and those in the two apertures are a fixed set. The remaining error is that of a quadrature rule, the
+same in every capture of a pose. ``jitter`` draws the positions at random, for comparison with other renderers.
+
+Later bounces use the same loop: a lane whose path has ended starts its next sample. Photons from the projector carry a
+part of their light, on paths that are rarely found from the camera (:mod:`mitsim.scene.light_transport.light_tracing`).
+Emitters of the scene add the same light to all images (:mod:`mitsim.scene.light_transport.ambient`).
 
 Radiometry: code value x plane irradiance E_1 [W] -> radiance [W / (mm^2 sr)], see :mod:`mitsim.sensor.projector`.
 """
@@ -26,50 +28,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.light_transport.ambient import aimed, has_emitters, met
+from mitsim.scene.light_transport.ambient import has_emitters, hit_emitter_light, sampled_emitter_light
 from mitsim.scene.light_transport.aperture_samples import aperture_samples
 from mitsim.scene.light_transport.light_tracing import Photons, add_photons
-from mitsim.scene.light_transport.low_discrepancy import evenly, z_order
-from mitsim.scene.light_transport.plain_scene import lone_bsdf, lone_plane, meet
+from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
+from mitsim.scene.light_transport.plain_scene import intersect_plane, single_bsdf, single_plane
 from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
 from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.camera_rays import CameraRays, between, pixel_area
+from mitsim.scene.ray_casting.camera_rays import CameraRays, bilinear, pixel_area
 from mitsim.scene.ray_casting.eye import Eye
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
-#: floats that the images of one launch may fill; a larger capture is traced in bands of rows. 64 MiB, and the device
-#: holds a few times that
+#: number of floats in the images of one launch (64 MiB); a larger capture is traced in bands of rows. The device needs
+#: a few times this memory
 LARGEST_LAUNCH = 1 << 24
 
-#: photons for each sample of the whole image, unless told otherwise
+#: default number of photons for each sample of the whole image
 PHOTONS_PER_SAMPLE = 0.25
 
-#: odds over this are cut: they must stay finite
-_CERTAIN = 1e30
+#: largest ratio of densities, so that it stays finite
+_LARGEST_RATIO = 1e30
 
 
 @dataclass(frozen=True)
 class LightPaths:
-    """Which light paths :func:`trace` follows.
+    """The light paths that :func:`trace` follows.
 
     Attributes
     ----------
     samples
-        Per pixel; rounded up to a square number, because they stand on a raster.
+        Number per pixel, rounded up to a square number, because they form a raster.
     seed
-        Of the directions of later bounces, and of the jitter; give every camera and pose its own.
+        Seed of the directions of later bounces, and of the jitter; use another for each camera and pose.
     depth
-        Surfaces on a light path: 1 is direct light, 3 adds two interreflections.
+        Largest number of surfaces on a path: 1 is direct light, 3 adds two interreflections.
     jitter
-        Place the samples at random within their cells and lenses, rather than at fixed places.
+        Whether the positions are random within their cells and lenses, instead of fixed.
     photons
-        That the projector sends for light of two and more surfaces; by default in proportion to the samples of the
-        *whole* image, whatever the region; rounded up to a square number. 0 leaves all of it to paths from the camera.
-    only_later
-        Leave out direct light, and render light that has met two surfaces or more, on the same paths.
+        Number of photons for light of two and more surfaces, rounded up to a square number. By default it is
+        proportional to the samples of the *whole* image, whatever the region. 0 leaves all light to camera paths.
+    indirect_only
+        Render only light that has met two surfaces or more, on the same paths.
     with_ambient
-        Give one more image, the last: the light of the scene's own emitters alone, with the projector off.
+        Add a last image: the light of the scene's own emitters alone, with the projector off.
     """
 
     samples: int
@@ -77,16 +79,16 @@ class LightPaths:
     depth: int = 1
     jitter: bool = False
     photons: int | None = None
-    only_later: bool = False
+    indirect_only: bool = False
     with_ambient: bool = False
 
     @property
     def side(self) -> int:
-        """Samples along one side of a pixel's raster."""
+        """Number of samples along one side of a pixel's raster."""
         return int(np.ceil(np.sqrt(self.samples)))
 
-    def sent(self, pixels: int) -> int:
-        """Photons to send for an image of so many pixels; a square number."""
+    def photon_count(self, pixels: int) -> int:
+        """Return the number of photons for an image of ``pixels`` pixels, a square number."""
         if self.depth == 1:
             return 0
         photons = int(PHOTONS_PER_SAMPLE * self.side**2 * pixels) if self.photons is None else self.photons
@@ -102,18 +104,22 @@ def trace(
     roi: Roi | None = None,
     shift: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float32]:
-    """Radiance that one camera sees in each image of a capture.
+    """Return the radiance that one camera sees in each image of a capture.
 
     Parameters
     ----------
+    scene, rays, world_from_sensor
+        The scene, the camera's rays, and the pose of the sensor.
     light
         The projector with its codes: :class:`~mitsim.scene.light_transport.projector_light.LitPatterns` or
         :class:`~mitsim.scene.light_transport.projector_light.ModulatedLight`.
+    paths
+        The light paths.
     roi
-        Trace only this region of the image. Its pixels come out as they would in the whole image.
+        Region of the image to trace, by default all of it. Its pixels are the same as in the whole image.
     shift
-        (2, height, width) [rad] of the region, along the camera's x and y: how far beside the surface point, seen from
-        the camera, its direct light is read from the code. Speckle does that.
+        (2, height, width) [rad] of the region, along the x and y axes of the camera. The code of direct light is
+        evaluated at this angle, seen from the camera, beside the surface point. Speckle causes it.
 
     Returns
     -------
@@ -121,18 +127,18 @@ def trace(
         (P, height, width), or (P + 1, height, width), of the region, float32 [W / (mm^2 sr)].
     """
     roi = roi or rays.whole
-    photons = paths.sent(rays.camera.width * rays.camera.height)
+    photons = paths.photon_count(rays.camera.width * rays.camera.height)
     images = np.empty((light.count + paths.with_ambient, roi.height, roi.width), np.float32)
     rows = max(1, LARGEST_LAUNCH // (roi.width * (light.count + 1)))
     for first in range(0, roi.height, rows):
         band = Roi(roi.left, roi.top + first, roi.width, min(rows, roi.height - first))
-        moved = None if shift is None else shift[:, first : first + band.height]
-        traced = _launch(scene, rays, light, world_from_sensor, paths, band, moved)
-        for image, values in zip(images, traced, strict=False):  # the ambient image is the last, wanted or not
+        band_shift = None if shift is None else shift[:, first : first + band.height]
+        traced = _launch(scene, rays, light, world_from_sensor, paths, band, band_shift)
+        for image, values in zip(images, traced, strict=False):  # the ambient image comes last and may be unused
             image[first : first + band.height] = np.asarray(values).reshape(band.height, band.width)
     if photons:
-        sent = Photons(photons, paths.depth, paths.seed, paths.side**2)
-        add_photons(images[: light.count], scene, rays, light, world_from_sensor, sent, roi)
+        request = Photons(photons, paths.depth, paths.seed, paths.side**2)
+        add_photons(images[: light.count], scene, rays, light, world_from_sensor, request, roi)
     return images
 
 
@@ -145,11 +151,11 @@ def _launch(
     roi: Roi,
     shift: NDArray[np.floating] | None,
 ) -> list[Any]:
-    """All images, and the ambient one, of a region, as arrays on the device; one kernel."""
+    """Return all images of a region, and the ambient one, as arrays on the device; one kernel."""
     side, depth, seed, jitter = paths.side, paths.depth, paths.seed, paths.jitter
-    photons = paths.sent(rays.camera.width * rays.camera.height)
+    photons = paths.photon_count(rays.camera.width * rays.camera.height)
     camera = Eye(world_from_sensor @ rays.camera.sensor_from_camera)
-    lamp = ProjectorLight(world_from_sensor, light.projector, scene.bounds)
+    projector = ProjectorLight(world_from_sensor, light.projector, scene.bounds)
 
     count = roi.width * roi.height
     index = dr.arange(mi.UInt32, count)
@@ -161,20 +167,20 @@ def _launch(
     displacement = None if shift is None else _displacement(shift, camera, index)
 
     random = mi.PCG32(initstate=dr.opaque(mi.UInt64, seed), initseq=mi.UInt64(pixel))
-    shuffle, order = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), z_order(column, row)
+    sequence_seed, z_index = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), z_order(column, row)
     total = dr.opaque(mi.UInt32, side * side)
-    # n midpoints in a row have a second moment too small by 1/n^2; spread that much wider they are exact to the third
-    # order, and of two they make Gauss's rule
+    # the second moment of n midpoints in a row is too small by the factor 1 - 1/n^2. Stretched to the right moment they
+    # integrate cubics exactly, and two of them are Gauss's rule
     stretch = 1.0 if jitter or side == 1 else float(1.0 / np.sqrt(1.0 - side**-2))
-    thin = rays.aperture_mm > 0
+    has_aperture = rays.aperture_mm > 0
     pupils = _Pupils(side * side, jitter)
-    lit_by_author = has_emitters(scene)
-    plane, finish = lone_plane(scene), lone_bsdf(scene)
-    blockers = scene.mitsuba if plane is None else None
-    rival = dr.opaque(mi.Float, photons / side**2)
+    has_ambient = has_emitters(scene)
+    plane, shared_bsdf = single_plane(scene), single_bsdf(scene)
+    occluders = scene.mitsuba if plane is None else None
+    photons_per_sample = dr.opaque(mi.Float, photons / side**2)
     area = pixel_area(x, y)
-    sums = [dr.zeros(mi.Float, count) for _ in range(light.codes + 1)]  # the last: ambient light
-    start_of_all = _Path(
+    sums = [dr.zeros(mi.Float, count) for _ in range(light.codes + 1)]  # the last is ambient light
+    initial = _PathState(
         sample=mi.UInt32(dr.zeros(mi.UInt32, count)),
         bounce=mi.UInt32(dr.zeros(mi.UInt32, count)),
         origin=dr.zeros(mi.Point3f, count),
@@ -182,108 +188,132 @@ def _launch(
         weight=dr.ones(mi.Float, count),
         pdf=dr.ones(mi.Float, count),
         length=dr.zeros(mi.Float, count),
-        odds=dr.zeros(mi.Float, count),
+        ratio=dr.zeros(mi.Float, count),
         random=random,
         sums=sums,
     )
 
-    def running(path: _Path) -> Any:
+    def running(path: _PathState) -> Any:
         return path.sample < total
 
-    def step(path: _Path) -> tuple[_Path]:
+    def step(path: _PathState) -> tuple[_PathState]:
         sample, bounce, origin, direction = path.sample, path.bounce, path.origin, path.direction
-        weight, pdf, length, odds, random, sums = path.weight, path.pdf, path.length, path.odds, path.random, path.sums
-        # a lane at bounce 0 begins a path in the next cell of its pixel's side x side raster
-        fresh = bounce == 0
+        weight, pdf, length, ratio = path.weight, path.pdf, path.length, path.ratio
+        random, sums = path.random, path.sums
+        # a lane at bounce 0 starts a path in the next cell of its pixel's raster of side x side
+        at_first = bounce == 0
         a = 0.5 + stretch * ((mi.Float(sample % side) + (random.next_float32() if jitter else 0.5)) / side - 0.5)
         b = 0.5 + stretch * ((mi.Float(sample // side) + (random.next_float32() if jitter else 0.5)) / side - 0.5)
-        local = mi.Vector3f(between(x, a, b), between(y, a, b), 1.0)
+        local = mi.Vector3f(bilinear(x, a, b), bilinear(y, a, b), 1.0)
         start = camera.position
-        if thin:
-            place = pupils.camera(sample, random) * (0.5 * rays.aperture_mm)
-            start = start + camera.axes[0] * place.x + camera.axes[1] * place.y
-            local -= mi.Vector3f(place.x, place.y, 0.0) * (1.0 / rays.focus_mm)
-        origin = dr.select(fresh, start, origin)
-        direction = dr.select(fresh, camera.turn(dr.normalize(local)), direction)
-        weight = dr.select(fresh, 1.0, weight)
+        if has_aperture:
+            in_lens = pupils.camera(sample, random) * (0.5 * rays.aperture_mm)
+            start = start + camera.axes[0] * in_lens.x + camera.axes[1] * in_lens.y
+            local -= mi.Vector3f(in_lens.x, in_lens.y, 0.0) * (1.0 / rays.focus_mm)
+        origin = dr.select(at_first, start, origin)
+        direction = dr.select(at_first, camera.to_world(dr.normalize(local)), direction)
+        weight = dr.select(at_first, 1.0, weight)
 
         ray = mi.Ray3f(origin, direction)
-        surface = scene.mitsuba.ray_intersect(ray) if plane is None else meet(plane, ray)
-        if lit_by_author:
-            ambient = weight * met(scene, surface, origin, pdf, fresh)
-            if paths.only_later:  # what is met behind the first surface is direct light of it
+        surface = scene.mitsuba.ray_intersect(ray) if plane is None else intersect_plane(plane, ray)
+        if has_ambient:
+            ambient = weight * hit_emitter_light(scene, surface, origin, pdf, at_first)
+            if paths.indirect_only:  # an emitter behind the first surface is its direct light
                 ambient = dr.select(bounce > 1, ambient, 0.0)
         hit = surface.is_valid() & (bounce < depth)
-        length = dr.select(fresh, 0.0, length) + dr.select(hit, surface.t, 0.0)
+        length = dr.select(at_first, 0.0, length) + dr.select(hit, surface.t, 0.0)
         context = mi.BSDFContext()
-        bsdf = surface.bsdf() if finish is None else finish
-        counts = hit & ~fresh if paths.only_later else hit
+        bsdf = surface.bsdf() if shared_bsdf is None else shared_bsdf
+        contributes = hit & ~at_first if paths.indirect_only else hit
 
-        lens = pupils.projector(sample, random) if lamp.radius > 0 else None
-        moved = None if displacement is None else displacement * dr.select(fresh, surface.t, 0.0)
-        toward, lit, uv, distance = lamp.light(blockers, surface, direction, lens, moved, counts)
-        reflected = bsdf.eval(context, surface, surface.to_local(toward), counts & (lit > 0))[0]
-        radiance = weight * reflected * lit
-        if photons:  # odds: n_L p_L over n_C p_C of the surfaces so far
-            seen = dr.abs(dr.dot(surface.n, direction))
+        lens = pupils.projector(sample, random) if projector.radius > 0 else None
+        shift_mm = None if displacement is None else displacement * dr.select(at_first, surface.t, 0.0)
+        toward, irradiance, uv, distance = projector.light(occluders, surface, direction, lens, shift_mm, contributes)
+        reflected = bsdf.eval(context, surface, surface.to_local(toward), contributes & (irradiance > 0))[0]
+        radiance = weight * reflected * irradiance
+        if photons:  # ratio: n_L p_L / (n_C p_C) of the surfaces so far
+            cosine_in = dr.abs(dr.dot(surface.n, direction))
             cosine = dr.dot(direction, camera.axes[2])
-            footprint = rival * area * dr.square(cosine) * cosine * dr.square(surface.t)
-            odds = dr.select(fresh, footprint, odds) / dr.maximum(seen, 1e-9)
-            back = _toward_camera(bsdf, surface, surface.to_local(toward), hit & ~fresh & (lit > 0))
-            back *= lamp.density(toward, distance) * dr.abs(dr.dot(surface.n, toward))
-            radiance *= dr.select(fresh, 1.0, 1.0 / (1.0 + odds * back))
-        values = light.values(uv, length + distance, counts & (radiance > 0))
+            footprint = photons_per_sample * area * dr.square(cosine) * cosine * dr.square(surface.t)
+            ratio = dr.select(at_first, footprint, ratio) / dr.maximum(cosine_in, 1e-9)
+            reverse_density = _density_to_camera(
+                bsdf, surface, surface.to_local(toward), hit & ~at_first & (irradiance > 0)
+            )
+            reverse_density *= projector.density(toward, distance) * dr.abs(dr.dot(surface.n, toward))
+            radiance *= dr.select(at_first, 1.0, 1.0 / (1.0 + ratio * reverse_density))
+        values = light.values(uv, length + distance, contributes & (radiance > 0))
         added = [dr.select(radiance > 0, radiance * value, 0.0) for value in values]
-        if lit_by_author:
-            ambient += dr.select(counts, weight * aimed(scene, surface, bsdf, random, counts), 0.0)
-        sums = [s + a for s, a in zip(sums, [*added, ambient if lit_by_author else 0.0], strict=True)]
+        if has_ambient:
+            ambient += dr.select(
+                contributes, weight * sampled_emitter_light(scene, surface, bsdf, random, contributes), 0.0
+            )
+        sums = [s + a for s, a in zip(sums, [*added, ambient if has_ambient else 0.0], strict=True)]
 
-        if depth == 1 and not lit_by_author:
-            return (_Path(sample + 1, bounce, origin, direction, weight, pdf, length, odds, random, sums),)
-        pick, place = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
-        if not jitter:  # the first bounce decides most of what is left
-            first, where = evenly(order * total + sample, shuffle, 0)
-            pick, place = dr.select(fresh, first, pick), dr.select(fresh, where, place)
-        # the author's emitters may be met one ray after the last surface
-        alive = hit & (bounce + 1 < (depth + 1 if lit_by_author else depth))
-        further, factor = bsdf.sample(context, surface, pick, place, alive)
-        alive &= factor[0] > 0
-        onward = surface.spawn_ray(surface.to_world(further.wo))
-        if photons:  # none follows a delta lobe
-            back = dr.select(fresh, 1.0, _toward_camera(bsdf, surface, further.wo, alive & ~fresh))
-            narrow = mi.has_flag(further.sampled_type, mi.BSDFFlags.Delta)
-            odds *= dr.select(narrow, 0.0, back * dr.abs(dr.dot(surface.n, onward.d)) / further.pdf)
-            odds = dr.select(alive, dr.minimum(odds, _CERTAIN), 0.0)
-        onward_path = _Path(
-            sample=dr.select(alive, sample, sample + 1),
-            bounce=dr.select(alive, bounce + 1, 0),
-            origin=dr.select(alive, onward.o, origin),
-            direction=dr.select(alive, onward.d, direction),
-            weight=dr.select(alive, weight * factor[0], 1.0),
-            pdf=further.pdf,
+        if depth == 1 and not has_ambient:
+            return (_PathState(sample + 1, bounce, origin, direction, weight, pdf, length, ratio, random, sums),)
+        sample1, sample2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
+        if not jitter:  # most of the remaining error is that of the first bounce
+            even1, even2 = r3_point(z_index * total + sample, sequence_seed, 0)
+            sample1, sample2 = dr.select(at_first, even1, sample1), dr.select(at_first, even2, sample2)
+        # the ray from the last surface may meet an emitter of the scene
+        continues = hit & (bounce + 1 < (depth + 1 if has_ambient else depth))
+        sampled, bsdf_weight = bsdf.sample(context, surface, sample1, sample2, continues)
+        continues &= bsdf_weight[0] > 0
+        next_ray = surface.spawn_ray(surface.to_world(sampled.wo))
+        if photons:  # photons end at a delta lobe
+            reverse_density = dr.select(
+                at_first, 1.0, _density_to_camera(bsdf, surface, sampled.wo, continues & ~at_first)
+            )
+            is_delta = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
+            ratio *= dr.select(is_delta, 0.0, reverse_density * dr.abs(dr.dot(surface.n, next_ray.d)) / sampled.pdf)
+            ratio = dr.select(continues, dr.minimum(ratio, _LARGEST_RATIO), 0.0)
+        next_path = _PathState(
+            sample=dr.select(continues, sample, sample + 1),
+            bounce=dr.select(continues, bounce + 1, 0),
+            origin=dr.select(continues, next_ray.o, origin),
+            direction=dr.select(continues, next_ray.d, direction),
+            weight=dr.select(continues, weight * bsdf_weight[0], 1.0),
+            pdf=sampled.pdf,
             length=length,
-            odds=odds,
+            ratio=ratio,
             random=random,
             sums=sums,
         )
-        return (onward_path,)
+        return (next_path,)
 
-    (ended,) = dr.while_loop((start_of_all,), running, step, labels=("path",), label="transport")
-    sums = ended.sums
+    (final,) = dr.while_loop((initial,), running, step, labels=("path",), label="transport")
+    sums = final.sums
     scale = dr.opaque(mi.Float, 1.0 / (side * side))
     *code_sums, ambient_sum = sums
     images = [(s + ambient_sum) * scale for s in light.images(code_sums)] + [ambient_sum * scale]
-    dr.eval(images)  # all at once: one kernel, whatever the number of images
+    dr.eval(images)  # all at once: one kernel for any number of images
     return images
 
 
 @dataclass
-class _Path:
-    """State of the light paths of one launch, a lane per pixel, as Dr.Jit's loop carries it.
+class _PathState:
+    """State of the light paths of one launch, one lane per pixel, in Dr.Jit's loop.
 
-    ``sample`` of the pixel, ``bounce`` on its path; ``origin`` and ``direction`` of the next ray; ``weight`` of its
-    light; ``pdf`` of its direction; optical ``length`` so far; ``odds`` of photons against paths of the camera;
-    ``random`` numbers; ``sums`` of the light of each code, the last of ambient light.
+    Attributes
+    ----------
+    sample
+        Index of the sample in its pixel.
+    bounce
+        Number of surfaces met before.
+    origin, direction
+        The next ray.
+    weight
+        Weight of its light.
+    pdf
+        Density of its direction [1/sr].
+    length
+        Optical length so far [mm].
+    ratio
+        n_L p_L / (n_C p_C) so far, of photons over camera paths.
+    random
+        Generator of random numbers.
+    sums
+        Light of each code, and of the emitters as the last.
     """
 
     sample: Any
@@ -293,42 +323,48 @@ class _Path:
     weight: Any
     pdf: Any
     length: Any
-    odds: Any
+    ratio: Any
     random: Any
     sums: Any
 
 
-def _toward_camera(bsdf: Any, surface: Any, lampward: Any, active: Any) -> Any:
-    """Density with which a photon that came from ``lampward``, local, goes on toward the camera [1/sr]."""
+def _density_to_camera(bsdf: Any, surface: Any, toward_projector: Any, active: Any) -> Any:
+    """Return the density with which a photon continues to the camera [1/sr].
+
+    It arrives from ``toward_projector``, in the local frame.
+    """
     view = mi.SurfaceInteraction3f(surface)
-    view.wi = lampward
+    view.wi = toward_projector
     return bsdf.pdf(mi.BSDFContext(), view, surface.wi, active)
 
 
 class _Pupils:
-    """Where the rays of a sample pass through the lenses of camera and projector, in the unit disc."""
+    """Positions in the unit discs of the lenses of camera and projector for each sample."""
 
     def __init__(self, count: int, jitter: bool) -> None:
         self.jitter = jitter
-        self.tables = [mi.Point2f(places) for places in aperture_samples(count)]
+        self.tables = [mi.Point2f(positions) for positions in aperture_samples(count)]
 
     def camera(self, sample: Any, random: Any) -> Any:
-        """Place in the camera's lens."""
-        return self._place(0, sample, random)
+        """Return the position in the camera's lens."""
+        return self._position(0, sample, random)
 
     def projector(self, sample: Any, random: Any) -> Any:
-        """Place in the projector's lens."""
-        return self._place(1, sample, random)
+        """Return the position in the projector's lens."""
+        return self._position(1, sample, random)
 
-    def _place(self, which: int, sample: Any, random: Any) -> Any:
+    def _position(self, lens: int, sample: Any, random: Any) -> Any:
         if self.jitter:
             return mi.warp.square_to_uniform_disk_concentric(mi.Point2f(random.next_float32(), random.next_float32()))
-        return dr.gather(mi.Point2f, self.tables[which], sample)
+        return dr.gather(mi.Point2f, self.tables[lens], sample)
 
 
 def _displacement(shift: NDArray[np.floating], camera: Eye, index: Any) -> Any:
-    """Displacement of the code in the world for each pixel of a region, per distance from the camera [rad]."""
-    # gathered, not loaded: a kernel that loads is compiled anew for each alignment that an array of NumPy may have
+    """Return the displacement of the code for each pixel of a region, world frame.
+
+    It is per unit of distance from the camera [rad].
+    """
+    # a gather, because a kernel that loads is compiled for each possible alignment of a NumPy array
     along = mi.Float(np.ravel(shift).astype(np.float32))
     below = index + dr.opaque(mi.UInt32, shift[0].size)
     return camera.axes[0] * dr.gather(mi.Float, along, index) + camera.axes[1] * dr.gather(mi.Float, along, below)

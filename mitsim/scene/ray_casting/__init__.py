@@ -1,1 +1,1 @@
-"""Rays of cameras and what they meet in a scene: positions, normals, shapes, map values."""
+"""Rays of cameras and the surfaces that they meet: positions, normals, shapes and values of maps."""

@@ -1,9 +1,9 @@
-"""A camera's distortion on the device, in both models of OpenCV.
+"""Apply the distortion of a camera on the device, by both models of OpenCV.
 
 Signal chain: ideal image point (x/z, y/z) -> lens distortion -> pixel (column, row).
 
-The light of a projector and the paths that are followed from it to a camera need the way from space to pixel; the way
-back, from pixel to ray, is tabulated by :mod:`mitsim.scene.ray_casting.camera_rays`.
+Projected light, and light paths that are traced from the projector to a camera, need this direction, from space to
+pixel. :mod:`mitsim.scene.ray_casting.camera_rays` tabulates the inverse, from pixel to ray.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from mitsim.scene.backend import dr
 from mitsim.sensor.camera import Camera
 
-#: points this far beyond the image's border still have a pixel, in shares of the farthest corner's ideal radius; beyond
-#: it a distortion polynomial may fold back into the image
+#: largest radius that is projected, over the ideal radius of the farthest corner. Beyond it, a distortion polynomial
+#: may fold back into the image
 _BEYOND = 1.02
 
 
 class Distortion:
-    """OpenCV's forward camera model on the device: ideal image point -> pixel.
+    """OpenCV's forward camera model on the device: from ideal image point to pixel.
 
-    Rational radial k1..k6, tangential p1 p2, thin prism s1..s4, tilt tx ty (OpenCV, calib3d), or the fisheye model
-    (Kannala & Brandt 2006).
+    The perspective model has the coefficients k1..k6 (rational radial), p1 p2 (tangential), s1..s4 (thin prism) and tx
+    ty (tilt): OpenCV, module calib3d. The fisheye model has k1..k4 (Kannala and Brandt, IEEE TPAMI 28, 2006).
     """
 
     def __init__(self, optics: Camera) -> None:
@@ -40,7 +40,7 @@ class Distortion:
         self.reach = float(np.linalg.norm(self.border, axis=1).max()) * _BEYOND
 
     def pixel(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Pixel (column, row) of the ideal image point (x, y)."""
+        """Return the pixel (column, row) of the ideal image point (x, y)."""
         if self.fisheye:
             x, y = self._fisheye(x, y)
         elif any(self.coefficients):
@@ -48,7 +48,7 @@ class Distortion:
         return self.focal[0] * x + self.principal[0], self.focal[1] * y + self.principal[1]
 
     def image(self, x: Any, y: Any, active: Any) -> tuple[Any, Any, Any]:
-        """Pixel (column, row) of the ideal image point (x, y), and whether it lies in the image."""
+        """Return the pixel (column, row) of the ideal image point (x, y), and whether it lies in the image."""
         near = active & (dr.square(x) + dr.square(y) < self.reach**2)
         u, v = self.pixel(x, y)
         return u, v, near & (u > -0.5) & (u < self.size[0] - 0.5) & (v > -0.5) & (v < self.size[1] - 0.5)
@@ -79,7 +79,10 @@ class Distortion:
 
 
 def _tilt(tx: float, ty: float) -> list[list[float]] | None:
-    """Homography of an imager tilted by ``tx``, ``ty`` [rad] about x and y (OpenCV's tauX, tauY)."""
+    """Return the homography of an imager that is tilted by ``tx``, ``ty`` [rad] about x and y.
+
+    OpenCV calls the angles tauX and tauY.
+    """
     if tx == 0 and ty == 0:
         return None
     about_x = np.array([[1, 0, 0], [0, np.cos(tx), np.sin(tx)], [0, -np.sin(tx), np.cos(tx)]])
@@ -90,7 +93,7 @@ def _tilt(tx: float, ty: float) -> list[list[float]] | None:
 
 
 def ideal_border(optics: Camera) -> NDArray[np.float64]:
-    """Ideal image points (260, 2) along the border of an image."""
+    """Return ideal image points (260, 2) along the border of an image, 65 on each side."""
     columns, rows = np.linspace(-0.5, optics.width - 0.5, 65), np.linspace(-0.5, optics.height - 0.5, 65)
     border = np.concatenate(
         [

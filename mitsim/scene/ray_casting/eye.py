@@ -1,4 +1,4 @@
-"""A camera's or projector's place in the world, as numbers on the device."""
+"""Frames of cameras and projectors on the device, and shadow rays toward them."""
 
 from __future__ import annotations
 
@@ -7,28 +7,34 @@ from typing import Any
 from mitsim.scene.backend import dr, mi
 from mitsim.sensor.transforms import Transform
 
-#: a shadow ray ends this share of its length before the eye, and starts off the surface by Mitsuba's own rule
+#: share of its length by which a shadow ray ends before the eye. Mitsuba offsets its start from the surface
 _SHADOW_END = 1e-4
 
 
 def shadow_ray(surface: Any, toward: Any, distance: Any) -> Any:
-    """Ray from a surface along the unit direction ``toward`` to an eye ``distance`` [mm] away, short of the eye."""
+    """Return the ray from a surface toward an eye, which ends just before the eye.
+
+    ``toward`` is a unit vector, ``distance`` that of the eye [mm].
+    """
     ray = surface.spawn_ray(toward)
     ray.maxt = distance * (1.0 - _SHADOW_END)
     return ray
 
 
 class Eye:
-    """A frame on the device; its numbers are opaque, so that another pose does not mean another kernel."""
+    """Frame of a camera or projector on the device.
+
+    ``position`` [mm] and ``axes``, in the world frame. They are opaque to Dr.Jit, so that all poses share one kernel.
+    """
 
     def __init__(self, world_from_eye: Transform) -> None:
         self.position = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in world_from_eye.translation])
         self.axes = [mi.Vector3f(*[dr.opaque(mi.Float, float(v)) for v in axis]) for axis in world_from_eye.rotation.T]
 
-    def turn(self, local: Any) -> Any:
-        """Direction of the eye's frame in the world."""
+    def to_world(self, local: Any) -> Any:
+        """Rotate a direction from the eye's frame to the world frame."""
         return self.axes[0] * local.x + self.axes[1] * local.y + self.axes[2] * local.z
 
-    def local(self, direction: Any) -> Any:
-        """Direction of the world in the eye's frame."""
+    def to_local(self, direction: Any) -> Any:
+        """Rotate a direction from the world frame to the eye's frame."""
         return mi.Vector3f(*[dr.dot(axis, direction) for axis in self.axes])

@@ -1,13 +1,15 @@
-r"""F and sigma of the faces of a scene on the device: a performance map that rides along with the rays.
+"""Look up F and sigma of surfaces in a performance map, on the device.
 
-Signal chain: fields of each surface (:class:`characterisation.maps.tables.Surface`) -> one flat table, a row of four
-for each interval of distances and node: probit of F at both its ends, ln sigma at both -> |V|, N and number of the
-surface -> rows of the four nodes about N, gathered at once -> along ln |V|, then bilinear over the normal -> F, sigma.
+Signal chain: fields of each surface (:class:`characterisation.maps.tables.Surface`) -> one flat table -> four rows for
+a query (|V|, N, number of the surface) -> interpolation along ln |V|, then bilinear over the normal -> F, sigma.
 
-The rule of what is known is that of :mod:`characterisation.maps.tables`, which stays the reference and alone knows of
-errors: F must be known at both distances, and at nodes that hold half of the weight; where sigma is unknown on one
-side, the other's is taken. Here all is single precision: F agrees to 1e-5, sigma to 1e-5 of itself, 4e-5 where it
-changes most from node to node (see the tests).
+The table has a row for each interval of distances and each node: probit of F at both ends, ln sigma at both ends. The
+four rows are those of the nodes around N.
+
+The rules for unknown values are those of :mod:`characterisation.maps.tables`, which is the reference and also gives
+errors. F must be known at both distances, and at nodes with half of the weight. If sigma is unknown at one distance or
+node, the other values are used. All numbers here are in single precision. F agrees with the reference to 1e-5, sigma to
+a relative 1e-5, or 4e-5 where it changes most between nodes (see the tests).
 """
 
 from __future__ import annotations
@@ -22,14 +24,14 @@ from numpy.typing import NDArray
 from characterisation.maps.tables import AT_KNOT, PROBIT_MARGIN, ROUNDED, Surface
 from mitsim.scene.backend import dr, mi
 
-#: the outermost nodes lie on the limit itself, which a rounding may miss [nodes]
+#: tolerance for rounding at the outermost nodes, which lie on the limit itself [nodes]
 _BEYOND = 1e-4
 
 
 class MapTables:
-    """Look-up of F and sigma of numbered surfaces of one map.
+    """Tables of F and sigma of the surfaces of one map.
 
-    ``surfaces`` share their distances and nodes, as those of one map do; there is at least one.
+    ``surfaces``, at least one, share their distances and nodes. A query gives their index as ``number``.
     """
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
@@ -38,8 +40,8 @@ class MapTables:
         self.origin = float(first.first / first.step)
         knots = first.knots
         self.intervals = max(len(knots) - 1, 1)
-        self.ends = _singles_between(knots)
-        self.inner = [float(np.float32(math.exp(knot))) for knot in knots[1:-1]]
+        self.distance_range = _single_precision_range(knots)
+        self.inner_knots = [float(np.float32(math.exp(knot))) for knot in knots[1:-1]]
         width = np.diff(knots) if len(knots) > 1 else np.ones(1)
         low, high = (np.exp(knots[i : i + self.intervals]) for i in (0, min(1, len(knots) - 1)))
         self.knots = mi.Float(np.stack([low, high, 1 / width], axis=-1).astype(np.float32).ravel())
@@ -48,61 +50,70 @@ class MapTables:
         dr.eval(self.knots, self.table)
 
     def look_up(self, number: Any, distance: Any, normal: Any, active: Any) -> tuple[Any, Any]:
-        """F and sigma [mm] at |V| [mm] and N in the view frame, of surfaces by number; NaN where unknown."""
+        """Return F [1] and sigma [mm] of surfaces by number; NaN if unknown.
+
+        ``distance`` is |V| [mm], ``normal`` N in the view frame.
+        """
         scale = dr.sqrt(2 / (1 + normal.z)) / self.step
         column, row = normal.x * scale - self.origin, normal.y * scale - self.origin
         last = float(self.count - 1)
-        within = active & (distance >= self.ends[0]) & (distance <= self.ends[1]) & (normal.z > 0)
+        within = active & (distance >= self.distance_range[0]) & (distance <= self.distance_range[1]) & (normal.z > 0)
         within &= (dr.minimum(column, row) >= -_BEYOND) & (dr.maximum(column, row) <= last + _BEYOND)
-        interval, t = self._along(distance, within)
+        interval, t = self._distance_interval(distance, within)
         left, u = self._cell(column)
         low, v = self._cell(row)
         base = ((number * self.intervals + interval) * self.count + low) * self.count + left
         near, far = t < AT_KNOT, t > 1 - AT_KNOT
         probit, probit_weight, log_sigma, sigma_weight = (mi.Float(0) for _ in range(4))
         corners = ((0, (1 - u) * (1 - v)), (1, u * (1 - v)), (self.count, (1 - u) * v), (self.count + 1, u * v))
-        for step, share in corners:
-            z0, z1, s0, s1 = dr.gather(mi.Vector4f, self.table, base + step, within)
+        for offset, weight in corners:
+            z0, z1, s0, s1 = dr.gather(mi.Vector4f, self.table, base + offset, within)
             z = dr.select(near, z0, dr.select(far, z1, z0 + t * (z1 - z0)))
             between = dr.select(dr.isnan(s0), s1, dr.select(dr.isnan(s1), s0, s0 + t * (s1 - s0)))
             s = dr.select(near, s0, dr.select(far, s1, between))
-            told, weighted = dr.isfinite(z) & (share > 0), dr.isfinite(s) & (share > 0)
-            probit += dr.select(told, share * z, 0)
-            probit_weight += dr.select(told, share, 0)
-            log_sigma += dr.select(weighted, share * s, 0)
-            sigma_weight += dr.select(weighted, share, 0)
-        answered = within & (probit_weight >= 0.5)
-        fraction = dr.select(answered, _from_probit(probit / probit_weight), dr.nan)
-        sigma = dr.select(answered & (sigma_weight > 0), dr.exp(log_sigma / sigma_weight), dr.nan)
+            fraction_known, sigma_known = dr.isfinite(z) & (weight > 0), dr.isfinite(s) & (weight > 0)
+            probit += dr.select(fraction_known, weight * z, 0)
+            probit_weight += dr.select(fraction_known, weight, 0)
+            log_sigma += dr.select(sigma_known, weight * s, 0)
+            sigma_weight += dr.select(sigma_known, weight, 0)
+        known = within & (probit_weight >= 0.5)
+        fraction = dr.select(known, _from_probit(probit / probit_weight), dr.nan)
+        sigma = dr.select(known & (sigma_weight > 0), dr.exp(log_sigma / sigma_weight), dr.nan)
         return fraction, sigma
 
-    def _along(self, distance: Any, within: Any) -> tuple[Any, Any]:
-        """Interval of distances, and the way between its knots."""
+    def _distance_interval(self, distance: Any, within: Any) -> tuple[Any, Any]:
+        """Return the interval of distances, and the position between its knots, 0 to 1 in ln |V|."""
         interval = mi.UInt32(0)
-        for knot in self.inner:
+        for knot in self.inner_knots:
             interval += dr.select(distance > knot, mi.UInt32(1), mi.UInt32(0))
         low, high, per_width = dr.gather(mi.Vector3f, self.knots, interval, within)
         t = dr.clip(dr.log(distance / low) * per_width, 0, 1)
-        # a logarithm is not exact, and at a knot the other one must not speak
+        # the logarithm is not exact, but at a knot the other knot must have no weight
         return interval, dr.select(distance == low, 0, dr.select(distance == high, 1, t))
 
-    def _cell(self, place: Any) -> tuple[Any, Any]:
-        """Node below, and the way to the next."""
-        place = dr.clip(place, 0, float(self.count - 1))
-        below = dr.minimum(mi.UInt32(place), self.count - 2)
-        return below, place - mi.Float(below)
+    def _cell(self, position: Any) -> tuple[Any, Any]:
+        """Return the node below, and the position between it and the next, 0 to 1."""
+        position = dr.clip(position, 0, float(self.count - 1))
+        below = dr.minimum(mi.UInt32(position), self.count - 2)
+        return below, position - mi.Float(below)
 
 
 def _rows(surface: Surface, intervals: int) -> NDArray[np.float32]:
-    """(interval, node, 4): probit of F at the near and far distance, ln sigma at both; one distance is both."""
+    """Return rows (interval x node, 4): probit of F at the near and far distance, ln sigma at both.
+
+    If there is one distance, it is both.
+    """
     far = min(1, len(surface.knots) - 1)
     probit, log_sigma = surface.fields[:2]
     ends = [field[i : i + intervals] for field in (probit, log_sigma) for i in (0, far)]
     return np.stack(ends, axis=-1).astype(np.float32).reshape(-1, 4)
 
 
-def _singles_between(knots: NDArray[np.float64]) -> tuple[float, float]:
-    """Least and largest distance [mm] in single precision that the map answers, by its rule of 1e-9 of an interval."""
+def _single_precision_range(knots: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the least and the largest distance [mm] in single precision for which the map has values.
+
+    The map's tolerance is 1e-9 of an interval.
+    """
     slack = 1e-9 * (np.diff(knots) if len(knots) > 1 else np.ones(1))
     low, high = math.exp(knots[0] - slack[0]), math.exp(knots[-1] + slack[-1])
     least, largest = np.float32(low), np.float32(high)
@@ -114,7 +125,7 @@ def _singles_between(knots: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def _from_probit(z: Any) -> Any:
-    """F of a probit, as :func:`characterisation.maps.tables.from_probit`."""
+    """Return F of a probit, as :func:`characterisation.maps.tables.from_probit` does."""
     share = 0.5 + 0.5 * dr.erf(z * math.sqrt(0.5))
     fraction = (share - PROBIT_MARGIN) / (1 - 2 * PROBIT_MARGIN)
     return dr.select(fraction < ROUNDED, 0, dr.select(fraction > 1 - ROUNDED, 1, fraction))

@@ -1,6 +1,9 @@
-"""Rays against the geometry alone: truth for every pixel, and the ideal cloud that a map then makes real.
+"""Cast rays at the geometry of a scene, for ground truth and ideal clouds.
 
-One centred ray per pixel, never a filtered image: a label that has been averaged is no label.
+Signal chain: one ray through the centre of each pixel -> nearest surface -> distance, normal and shape; shadow rays to
+the other cameras and the projector -> visibility.
+
+There is one ray per pixel and no filter, because an average of labels is no label.
 """
 
 from __future__ import annotations
@@ -21,12 +24,18 @@ from mitsim.sensor.transforms import Transform
 
 @dataclass(frozen=True)
 class Surfaces:
-    """What the rays meet, all in the sensor frame.
+    """Surfaces that the rays meet, in the sensor frame.
 
-    ``distance`` (H, W) |V| [mm], NaN where there is nothing, or only the back of a one-sided face, which renders
-    black; ``normal`` (H, W, 3) unit, toward the sensor; ``shape`` (H, W) int16 index into the scene's names, -1 where
-    there is nothing; ``seen`` (E, H, W) bool, whether each of the eyes asked for has a free line of sight to the point,
-    and is on its front side.
+    Attributes
+    ----------
+    distance
+        (H, W) |V| [mm]. NaN without a surface, or where only the back of a one-sided face is seen, which renders black.
+    normal
+        (H, W, 3) unit normal, toward the sensor.
+    shape
+        (H, W) index into the names of the scene; -1 where the distance is NaN.
+    seen
+        (E, H, W) whether each of the given eyes is on the front side and has a free line of sight to the point.
     """
 
     distance: NDArray[np.float32]
@@ -36,47 +45,50 @@ class Surfaces:
 
 
 class PixelRays:
-    """Rays from one point, laid on the device once.
+    """Rays from one point, on the device.
 
-    ``origin`` (3,) [mm] and ``directions`` (H, W, 3), unit, both in the sensor frame.
+    ``origin`` (3,) [mm] and unit ``directions`` (H, W, 3), both in the sensor frame.
     """
 
     def __init__(self, origin: NDArray[np.floating], directions: NDArray[np.floating]) -> None:
         self.origin = np.asarray(origin, float)
         self.size = (directions.shape[0], directions.shape[1])
         columns = np.ascontiguousarray(np.asarray(directions, np.float32).reshape(-1, 3).T)
-        self.directions = mi.Vector3f(*[mi.Float(one) for one in columns])  # an array of three would bake its size in
+        # an array (3, n) would compile its size into the kernel
+        self.directions = mi.Vector3f(*[mi.Float(one) for one in columns])
 
     def frame(self, world_from_sensor: Transform) -> Eye:
-        """Where they start from in the world, and the sensor's axes there."""
+        """Return the origin of the rays and the axes of the sensor, in the world frame."""
         return Eye(Transform(world_from_sensor.rotation, world_from_sensor.points(self.origin)))
 
     @staticmethod
     def of_grid(grid: ViewGrid) -> PixelRays:
-        """The rays of a cloud's grid."""
+        """Return the rays of a cloud's grid."""
         return PixelRays(grid.origin, grid.rays())
 
     @staticmethod
     def of_camera(camera: Camera) -> PixelRays:
-        """The rays of a camera's pixel centres, with its distortion."""
+        """Return the rays of a camera's pixel centres, with its distortion."""
         rays = camera.rays(camera.pixel_grid())
         return PixelRays(camera.centre, camera.sensor_from_camera.directions(rays))
 
 
 def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDArray[np.floating]) -> Surfaces:
-    """Look at a scene along given rays.
+    """Return the surfaces that given rays meet.
 
     Parameters
     ----------
+    scene, rays, world_from_sensor
+        The scene, the rays, and the pose of the sensor.
     eyes
         (E, 3) [mm], sensor frame: optical centres of the other cameras and the projector.
     """
     frame = rays.frame(world_from_sensor)
-    surface = scene.mitsuba.ray_intersect(mi.Ray3f(frame.position, frame.turn(rays.directions)))
-    facing = dr.select(dr.dot(surface.n, frame.turn(rays.directions)) > 0, -1.0, 1.0)
+    surface = scene.mitsuba.ray_intersect(mi.Ray3f(frame.position, frame.to_world(rays.directions)))
+    facing = dr.select(dr.dot(surface.n, frame.to_world(rays.directions)) > 0, -1.0, 1.0)
     two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
     hit = surface.is_valid() & ((facing > 0) | two_sided)
-    normal = frame.local(surface.n * facing)
+    normal = frame.to_local(surface.n * facing)
     shape = dr.select(hit, dr.reinterpret_array(mi.UInt32, surface.shape), 0)
     distance = dr.select(hit, surface.t, dr.nan)
     seen = []
@@ -98,26 +110,29 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
 
 
 def shapes_met(scene: Scene, rays: PixelRays, world_from_sensor: Transform) -> NDArray[np.int16]:
-    """Index (H, W) of the shape that rays meet, its front or its back, -1 nothing, at a tenth of a :func:`cast`."""
+    """Return the index (H, W) of the shape that rays meet, front or back; -1 for none.
+
+    It takes a tenth of the time of :func:`cast`.
+    """
     frame = rays.frame(world_from_sensor)
-    met = scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(frame.position, frame.turn(rays.directions)))
+    met = scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(frame.position, frame.to_world(rays.directions)))
     return _indices(scene, dr.reinterpret_array(mi.UInt32, met.shape)).reshape(rays.size)
 
 
 def _indices(scene: Scene, numbers: Any) -> NDArray[np.int16]:
-    """Indices (n,) into the scene's names of Mitsuba's own numbers of shapes."""
+    """Return the indices (n,) into the names of the scene of Mitsuba's shape numbers."""
     ids = np.array(numbers)
     lookup = np.full(int(ids.max(initial=0)) + 1, -1, np.int16)
-    for index, one in enumerate(scene.shapes):
-        number = registered(one)
-        if number < len(lookup):
-            lookup[number] = index
+    for index, shape in enumerate(scene.shapes):
+        id_of_shape = shape_number(shape)
+        if id_of_shape < len(lookup):
+            lookup[id_of_shape] = index
     lookup[0] = -1
     return np.asarray(lookup[ids])
 
 
-def registered(shape: Any) -> int:
-    """Mitsuba's own number of a shape; 0 is none."""
+def shape_number(shape: Any) -> int:
+    """Return Mitsuba's number of a shape, which is 1 or more."""
     return int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))))[0])
 
 
@@ -128,5 +143,5 @@ def _stack(masks: list[Any], size: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 def cloud_points(surfaces: Surfaces, grid: ViewGrid) -> NDArray[np.float64]:
-    """Points where the rays meet the surfaces, (H, W, 3) [mm], sensor frame, NaN where they meet nothing."""
+    """Return the points where rays meet surfaces, (H, W, 3) [mm], sensor frame; NaN without a surface."""
     return np.asarray(grid.origin + grid.rays() * surfaces.distance[..., None].astype(float))

@@ -1,4 +1,7 @@
-"""Whether any face of a part can see another: only then can light go from face to face."""
+"""Decide whether the faces of a part can see each other: only then are there interreflections.
+
+Signal chain: triangles -> random points on them -> directions by the cosine law -> share of rays that meet the part.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +11,18 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.triangles import triangles
 
-#: rays that are sent from the faces, outward
+#: number of rays that leave the faces outward
 _RAYS = 20_000
 
-#: a ray starts so far off its face, as a share of the scene's size: faces are triangles of what may be round
+#: offset of the start of a ray from its face, as a share of the size of the scene. Triangles approximate round faces
 _OFFSET = 2e-3
 
 
 def sees_itself(scene: Scene, seed: int = 0) -> bool:
-    """Return whether one of many random rays that leave the faces outward meets a face again.
+    """Return whether more than one in 1000 random rays that leave the faces outward meets a face again.
 
-    Places are even over the area, directions after the cosine law, so the share of rays that meet something estimates
-    the share of reflected light that does; a share below 1e-3 may pass as none.
+    Points are uniform over the area and directions follow the cosine law. The share of rays that meet a face therefore
+    estimates the share of reflected light that does.
     """
     corners = triangles(scene)
     if not len(corners):
@@ -37,5 +40,5 @@ def sees_itself(scene: Scene, seed: int = 0) -> bool:
     size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
     start = a + u * (b - a) + v * (c - a) + _OFFSET * size * normal
     rays = mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), dr.normalize(mi.Vector3f(*direction.T.astype(np.float32))))
-    met = np.array(scene.mitsuba.ray_test(rays), bool)
-    return bool(met.mean() > 1e-3)
+    blocked = np.array(scene.mitsuba.ray_test(rays), bool)
+    return bool(blocked.mean() > 1e-3)

@@ -1,8 +1,11 @@
-"""All solid surfaces of a scene as triangles: what a housing could bump into.
+"""Return all solid surfaces of a scene as triangles, to test a housing for collisions.
 
-A mesh gives its own triangles. Of a sphere, cylinder or disk there are the triangles of a raster with 128 corners
-around: the corners lie on it, all else up to 6e-4 of its radius inside. Of any other shape (an instance, curves, a
-signed distance grid) there is the box around it, which is larger than it is.
+Signal chain: shape -> its own triangles, a grid on a sphere, cylinder or disk, or the bounding box -> triangles in the
+world frame -> corners of their convex hull.
+
+A sphere, cylinder or disk is approximated with 128 corners around. The corners lie on the surface; the triangles lie up
+to 6e-4 of the radius inside it. Any other shape that is no mesh (an instance, curves, a signed distance grid) is
+replaced by its bounding box, which is larger.
 """
 
 from __future__ import annotations
@@ -25,23 +28,23 @@ _ANGLES = np.linspace(0, 2 * np.pi, 129)
 
 
 def triangles(scene: Scene) -> Floats:
-    """Triangles (n, 3, 3) [mm], world frame, corners anticlockwise as seen from the side that the normal is on.
+    """Return triangles (n, 3, 3) [mm], world frame, with corners anticlockwise as seen from the side of the normal.
 
-    Of every shape but those whose BSDF lets all light through unchanged (``null``): such a face bounds a medium and is
-    no solid. Glass is one.
+    Shapes whose BSDF transmits all light unchanged (``null``) are left out, because they bound a medium and are not
+    solid. Glass is solid.
     """
     parts = [_of_shape(shape) for shape in scene.shapes if _solid(shape)]
     return np.concatenate([np.empty((0, 3, 3)), *parts])
 
 
 def triangles_by_shape(scene: Scene) -> dict[str, Floats]:
-    """:func:`triangles` apart, by the name of the shape; a shape that is no solid is left out."""
+    """Return the :func:`triangles` of each solid shape, by its name."""
     named = zip(scene.names, scene.shapes, strict=True)
     return {name: _of_shape(shape) for name, shape in named if _solid(shape)}
 
 
-def outermost(scene: Scene) -> Floats:
-    """Corners (k, 3) [mm] of the convex hull of all solid surfaces, world frame."""
+def hull_corners(scene: Scene) -> Floats:
+    """Return the corners (k, 3) [mm], world frame, of the convex hull of all solid surfaces."""
     corners = np.unique(triangles(scene).reshape(-1, 3), axis=0)
     try:
         return np.asarray(corners[ConvexHull(corners).vertices])
@@ -51,8 +54,8 @@ def outermost(scene: Scene) -> Floats:
 
 def _solid(shape: Any) -> bool:
     flags = int(shape.bsdf().flags())
-    bent = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Delta1D
-    return any(flags & int(flag) for flag in (mi.BSDFFlags.Smooth, *bent))
+    delta_lobes = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Delta1D
+    return any(flags & int(flag) for flag in (mi.BSDFFlags.Smooth, *delta_lobes))
 
 
 def _of_shape(shape: Any) -> Floats:
@@ -64,14 +67,14 @@ def _of_shape(shape: Any) -> Floats:
         return np.asarray(trimesh.creation.box(bounds=bounds_of(shape)).triangles, float)
     kind = shape.class_name()
     world = np.array(mi.traverse(shape)["to_world"].matrix, float).reshape(4, 4)
-    raster = _UNIT[kind]() @ world[:3, :3].T + world[:3, 3]
-    mirrored = kind != "Cylinder" and np.linalg.det(world[:3, :3]) < 0  # which a cylinder's own flag counts in
-    turned = mirrored != shape.has_flipped_normals()
-    return np.asarray(raster[:, ::-1] if turned else raster)
+    corners = _UNIT[kind]() @ world[:3, :3].T + world[:3, 3]
+    mirrored = kind != "Cylinder" and np.linalg.det(world[:3, :3]) < 0  # a cylinder's flag includes this
+    flipped = mirrored != shape.has_flipped_normals()
+    return np.asarray(corners[:, ::-1] if flipped else corners)
 
 
-def _raster(corners: Floats) -> Floats:
-    """Two triangles for each cell of a raster of corners (m, n, 3); one where two of its corners are one."""
+def _grid_triangles(corners: Floats) -> Floats:
+    """Return two triangles for each cell of a grid of corners (m, n, 3), without those that have no area."""
     a, b, c, d = corners[:-1, :-1], corners[1:, :-1], corners[1:, 1:], corners[:-1, 1:]
     both = np.concatenate([np.stack([a, b, c], axis=-2), np.stack([a, c, d], axis=-2)]).reshape(-1, 3, 3)
     size = np.linalg.norm(np.cross(both[:, 1] - both[:, 0], both[:, 2] - both[:, 0]), axis=1)
@@ -80,18 +83,18 @@ def _raster(corners: Floats) -> Floats:
 
 def _sphere() -> Floats:
     around, down = np.meshgrid(_ANGLES, np.linspace(np.pi, 0, len(_ANGLES) // 2 + 1), indexing="ij")
-    places = [np.sin(down) * np.cos(around), np.sin(down) * np.sin(around), np.cos(down)]
-    return _raster(np.stack(places, axis=-1))
+    coordinates = [np.sin(down) * np.cos(around), np.sin(down) * np.sin(around), np.cos(down)]
+    return _grid_triangles(np.stack(coordinates, axis=-1))
 
 
 def _cylinder() -> Floats:
     around, up = np.meshgrid(_ANGLES, [0.0, 1.0], indexing="ij")
-    return _raster(np.stack([np.cos(around), np.sin(around), up], axis=-1))
+    return _grid_triangles(np.stack([np.cos(around), np.sin(around), up], axis=-1))
 
 
 def _disk() -> Floats:
     out, around = np.meshgrid([0.0, 1.0], _ANGLES, indexing="ij")
-    return _raster(np.stack([out * np.cos(around), out * np.sin(around), np.zeros_like(out)], axis=-1))
+    return _grid_triangles(np.stack([out * np.cos(around), out * np.sin(around), np.zeros_like(out)], axis=-1))
 
 
 #: Mitsuba's stock surfaces before ``to_world``: radius 1, about z, the cylinder from z = 0 to 1
