@@ -15,7 +15,7 @@ from mitsim.exposures.exposure_sweep import FeatureLook, Look
 from mitsim.exposures.planned import plan_document, write_plan_csv
 from mitsim.hardware.stage_connection import BAUD
 from mitsim.measuring.document import measured_document
-from mitsim.measuring.result import Repeated, Result
+from mitsim.measuring.result import Repeatability, Result
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import UnknownsTable
@@ -66,8 +66,8 @@ def test_keys_of_a_plan_of_exposures(tmp_path):
 
 def test_keys_of_measurements_on_stdout():
     one = Result("radius", "mm", 20.0)
-    repeated = Repeated("radius", "mm", 2, 2, 20.0, 0.1, 0.1, 20.0)
-    written = measured_document([(Path("a.ply"), "ensenso-n10", "simulated")], [[one]], [repeated])
+    repeatability = Repeatability("radius", "mm", 2, 2, 20.0, 0.1, 0.1, 20.0)
+    written = measured_document([(Path("a.ply"), "ensenso-n10", "simulated")], [[one]], [repeatability])
     assert first_column("columns: measure") == set(written)
     assert first_column("columns: measure cloud") == set(written["clouds"][0])
     assert first_column("columns: measure measurement") == set(written["clouds"][0]["measurements"][0])
