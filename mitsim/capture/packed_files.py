@@ -149,9 +149,9 @@ def check_image(
         raise InputError(where, "pixel value", image.max(), f"0 to {2**bits - 1}, since bits is {bits}")
 
 
-def _check_name(name: str, folder: Path, field: str, what: str) -> None:
+def _check_name(name: str, folder: Path, field: str, description: str) -> None:
     if not SAFE_NAME.fullmatch(name):
-        raise InputError(folder, field, repr(name), f"{what} of letters, digits, dot, dash, underscore")
+        raise InputError(folder, field, repr(name), f"{description} of letters, digits, dot, dash, underscore")
 
 
 def _json(value: Any, folder: Path, field: str) -> bytes:

@@ -34,7 +34,7 @@ def repeatability_table(found: Sequence[Repeatability]) -> str:
     """Return the table of the repeatability over several clouds, one line for each measurement."""
     nominal = any(math.isfinite(one.nominal) for one in found)
     rows = [
-        ["measurement", "n", "mean", "standard deviation", "unit", "u (mean of fits)", *(["error"] if nominal else [])]
+        ["measurement", "n", "mean", "standard deviation", "unit", "u (rms of fits)", *(["error"] if nominal else [])]
     ]
     for one in found:
         rows.append(

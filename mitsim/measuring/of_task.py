@@ -257,5 +257,5 @@ def _number(value: Any) -> float:
     return math.nan if value is None else float(value)
 
 
-def _json(path: Path, what: str) -> dict[str, Any]:
-    return read_json_object(path, what)
+def _json(path: Path, description: str) -> dict[str, Any]:
+    return read_json_object(path, description)

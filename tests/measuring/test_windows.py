@@ -9,7 +9,8 @@ from seen_shapes import GRID, cloud_of, cylinder, plane, sphere
 from characterisation.errors import InputError
 from characterisation.features.fits import fit_cylinder
 from characterisation.features.starts import cylinder_start
-from mitsim.measuring.result import repeatability
+from mitsim.measuring.document import repeatability_table
+from mitsim.measuring.result import Result, repeatability
 from mitsim.measuring.windows import WindowPlan, measure_windows
 from mitsim.sensor.roi import Roi
 
@@ -90,6 +91,12 @@ def test_repeatability_is_mean_and_standard_deviation_over_clouds(trials):
     assert over["ball diameter"].count == over["ball diameter"].asked == 60
     assert over["ball diameter"].mean == pytest.approx(np.mean(values))
     assert over["ball diameter"].deviation == pytest.approx(np.std(values, ddof=1))
+
+
+def test_the_uncertainty_of_repeats_is_the_root_mean_square_of_those_of_the_fits():
+    (over,) = repeatability([[Result("a", "mm", 1.0, 0.3, "fit")], [Result("a", "mm", 2.0, 0.4, "fit")]])
+    assert over.uncertainty == pytest.approx(np.sqrt(0.125))
+    assert "u (rms of fits)" in repeatability_table([over])
 
 
 def test_a_window_that_shows_something_else_has_no_value_and_says_so(rng):
