@@ -1,16 +1,16 @@
 """Find the fewest exposures that bring every feature of a view to its limits of points and uncertainty u.
 
 Signal chain: single exposures, from the sensor's own to shorter and longer ones of the device -> greedy sets of several
-exposures that together recover most points -> limits of each feature: the most points and the smallest u of all these
--> fewest exposures that reach all limits within a share, the shortest of equally few -> result of the first exposure,
-of the first two, and so on, with new noise.
+exposures that together recover most points -> the best of these, decoded again with other noise -> limits of each
+feature: its most points and its smallest u -> fewest exposures that reach all limits within a share, the shortest of
+equally few -> result of the first exposure, of the first two, and so on, with new noise.
 
 The projector keeps its full power, unless the shortest exposure of the device is too bright. A lower power would only
 require a longer exposure, in which the room adds more light.
 
 The predicted points of a set are those that at least one of its exposures recovers alone. Sets that could reach the
 limits are decoded. The best of many noisy results is biased. So the search uses few noise samples, and the decision
-more samples of independent noise. A set misses a limit only if the difference exceeds twice its standard error.
+more samples of independent noise. A set misses a limit of u only if the difference exceeds twice its standard error.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ STEP, LARGEST_RATIO = math.sqrt(2.0), 64.0
 #: least power of a projector in a plan [1]; *assumed*, since no maker of the presets states one
 LEAST_POWER = 0.1
 
-#: a sweep ends after this number of exposures with less than this share of the best number of points on any feature
+#: a sweep ends after this number of exposures with, on every feature, at most this share of its best number of points
 STOP_STEPS, STOP_SHARE = 3, 0.3
 
 #: number of sets of one size that are decoded, and how many of them take part in the decision
