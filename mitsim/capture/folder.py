@@ -252,6 +252,7 @@ def _parse(data: bytes, where: Path) -> dict[str, Any]:
 
 
 def _read_index(folder: Path) -> tuple[CaptureDocument, Path]:
+    """Return the checked index of a folder, and its path; raise an InputError if it is damaged, changed or too new."""
     where = folder / "capture.json"
     table = _parse(read_bounded(where, "a complete capture folder"), where)
     version = table.get("schema_version")
@@ -268,6 +269,7 @@ def _read_index(folder: Path) -> tuple[CaptureDocument, Path]:
 
 
 def _read_checked(folder: Path, entry: FileEntry, field: str, where: Path) -> bytes:
+    """Return the bytes of a file of the folder; raise an InputError if it is outside, missing or changed."""
     path = PurePosixPath(entry.path)
     if path.is_absolute() or not path.parts or not all(SAFE_NAME.fullmatch(part) for part in path.parts):
         raise InputError(where, f"{field}.path", repr(entry.path), "a file inside the folder, of plain names")

@@ -73,7 +73,13 @@ def read_grey(path: Path, *, green: bool = False, channel: int | None = None) ->
 
 
 def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel: int | None = None) -> Image:
-    """Read a grey image from the bytes of a file, as :func:`read_grey` does; messages name ``where``."""
+    """Read a grey image from the bytes of a file, as :func:`read_grey` does; messages name ``where``.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_grey`.
+    """
     is_png = data.startswith(PNG_SIGNATURE)
     if is_png:
         png_chunks(data, where)  # OpenCV would decode the undamaged part of a damaged PNG

@@ -120,6 +120,7 @@ def metal_finish(finish: Finish, wavelength_nm: float, where: str) -> MetalFinis
 
 @lru_cache(maxsize=16)
 def _family(metal: str, process: str, wavelength_nm: float) -> MetalFinish:
+    """Return the finishes of a metal and process at all alphas, from a table over the usual Ra of the process."""
     low, high = PROCESSES[process].usual
     heights = np.geomspace(low, high, _PLACES)
     faces = [machined(Face(metal=metal, process=process, Ra=float(ra)), wavelength_nm) for ra in heights]

@@ -205,6 +205,10 @@ class _Seen:
         white: Floats,
         corner_loss: NDArray[np.float32] | None,
     ) -> _Seen:
+        """Intersect the view rays of a region with the plane of the coupon, and select the pixels inside its edge.
+
+        ``read_out`` is the region that the camera read out, None for the whole image.
+        """
         pose = place.world_from_sensor
         centre, lamp = pose.points(camera.centre), pose.points(sensor.projector.optics.centre)
         columns, rows = roi.pixels()
@@ -245,6 +249,7 @@ class _Blocks:
 
     @classmethod
     def of(cls, seen: _Seen, images: NDArray[np.unsignedinteger[Any]], chip: Imager, width: int) -> _Blocks:
+        """Group the pixels on the coupon in blocks of ``width`` px, without saturated blocks and their neighbours."""
         rows, columns = np.nonzero(seen.inside)
         shape = tuple(-(-size // width) for size in seen.inside.shape)
         number = (rows // width) * shape[1] + columns // width
