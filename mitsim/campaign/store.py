@@ -141,7 +141,7 @@ _AGAIN = "remove this folder, and run the same command again to repeat the captu
 
 def _document(folder: Path) -> ShotDocument:
     where = folder / "shot.json"
-    data = read_bounded(where, "a whole capture folder", _AGAIN)
+    data = read_bounded(where, "a complete capture folder", _AGAIN)
     try:
         table = json.loads(data.decode())
     except (ValueError, RecursionError):
@@ -161,7 +161,7 @@ def _checked(folder: Path, path: str, entry: KeptFile) -> bytes:
     file = folder / path
     if not is_inside(file, folder):
         raise InputError(folder / "shot.json", f"files.{path}", "a path outside the folder", "a file of the shot")
-    data = read_bounded(file, "a whole capture folder", _AGAIN)
+    data = read_bounded(file, "a complete capture folder", _AGAIN)
     if len(data) != entry.bytes:
         raise InputError(file, "size", f"{len(data)} bytes", f"{entry.bytes} bytes, as written", _AGAIN)
     if hashlib.sha256(data).hexdigest() != entry.sha256:

@@ -1,1 +1,1 @@
-"""The capture: images with their cameras and settings, and the folder that keeps them."""
+"""Describe a capture, its images with cameras and settings, and read and write its folder."""

@@ -1,4 +1,8 @@
-"""The calibration of a capture as a JSON document: cameras in order (the first is the reference), projector, pair."""
+"""Describe the calibration and the pose of a capture as JSON documents, and convert them.
+
+A calibration has the cameras in order; the first is the reference. It may have a projector, and the rectification of a
+stereo pair. Matrices are written by rows. Lengths are in mm.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +34,7 @@ def _rotation(rows: tuple[Row3, Row3, Row3]) -> tuple[Row3, Row3, Row3]:
 def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]:
     _rotation((rows[0][:3], rows[1][:3], rows[2][:3]))
     if rows[3] != (0, 0, 0, 1):
-        raise ValueError("a rigid motion, 4 x 4, by rows, the last being 0 0 0 1")
+        raise ValueError("a rigid motion, 4 x 4, by rows, with the last row 0 0 0 1")
     return rows
 
 
@@ -38,7 +42,7 @@ def _covariance(rows: tuple[Row6, ...]) -> tuple[Row6, ...]:
     matrix = np.array(rows)
     largest = np.abs(matrix).max()
     if np.abs(matrix - matrix.T).max() > 1e-9 * largest or np.linalg.eigvalsh(matrix).min() < -1e-9 * largest:
-        raise ValueError("a covariance, 6 x 6, by rows: symmetric, no variance under 0")
+        raise ValueError("a covariance matrix, 6 x 6, by rows: symmetric, with no negative eigenvalue")
     return rows
 
 
@@ -55,7 +59,7 @@ IntrinsicRows = Annotated[tuple[Row3, Row3, Row3], AfterValidator(_intrinsic)]
 
 
 class CameraDocument(Document):
-    """A :class:`~mitsim.sensor.camera.Camera`: matrices by rows, ``sensor_from_camera`` [mm]."""
+    """A :class:`~mitsim.sensor.camera.Camera`, size and ``matrix`` in px; ``sensor_from_camera`` is in mm."""
 
     name: str = Field(pattern="^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")
     model: Literal["perspective", "fisheye"]
@@ -66,7 +70,7 @@ class CameraDocument(Document):
     sensor_from_camera: RigidRows
 
     @model_validator(mode="after")
-    def _known_distortion(self) -> CameraDocument:
+    def _check_distortion(self) -> CameraDocument:
         allowed = (4,) if self.model == "fisheye" else (0, 4, 5, 8, 12, 14)
         if len(self.distortion) not in allowed:
             raise ValueError(f"a {self.model} camera with {' or '.join(map(str, allowed))} distortion coefficients")
@@ -74,7 +78,7 @@ class CameraDocument(Document):
 
 
 class RectificationDocument(Document):
-    """A :class:`~mitsim.sensor.camera.Rectification`: matrices by rows, ``baseline`` [mm]."""
+    """A :class:`~mitsim.sensor.camera.Rectification`, size and matrices in px; ``baseline`` is in mm."""
 
     matrix_left: IntrinsicRows
     matrix_right: IntrinsicRows
@@ -94,34 +98,35 @@ class CalibrationDocument(Document):
 
     @field_validator("cameras")
     @classmethod
-    def _named_once(cls, cameras: tuple[CameraDocument, ...]) -> tuple[CameraDocument, ...]:
+    def _check_names(cls, cameras: tuple[CameraDocument, ...]) -> tuple[CameraDocument, ...]:
         if len({camera.name for camera in cameras}) < len(cameras):
             raise ValueError("cameras of different names")
         return cameras
 
 
 class PoseDocument(Document):
-    """Content of ``pose.json``; null where the pose, or how well, is not known.
+    """Content of ``pose.json``; null means unknown.
 
-    ``covariance`` of the rotation vector about the world's axes [rad] and the sensor's place in the world [mm].
+    ``world_from_sensor`` is 4 x 4 [mm]. ``covariance`` is 6 x 6: rotation vector about the world's axes [rad], and
+    position of the sensor in the world [mm].
     """
 
     world_from_sensor: RigidRows | None
     covariance: CovarianceRows | None = None
 
     @model_validator(mode="after")
-    def _of_a_pose(self) -> PoseDocument:
+    def _check_pose(self) -> PoseDocument:
         if self.covariance is not None and self.world_from_sensor is None:
             raise ValueError("no covariance without a pose")
         return self
 
     def transform(self) -> Transform | None:
-        """Pose, if known."""
+        """Return ``world_from_sensor``, None if unknown."""
         return None if self.world_from_sensor is None else Transform.from_matrix(self.world_from_sensor)
 
 
 def calibration_table(rig: Rig) -> dict[str, Any]:
-    """Content of ``calibration.json`` for a rig, not yet checked."""
+    """Return the content of ``calibration.json`` for a rig, not yet checked."""
     pair = rig.rectification
     return {
         "cameras": [_camera_table(name, camera) for name, camera in rig.cameras.items()],
@@ -141,7 +146,7 @@ def calibration_table(rig: Rig) -> dict[str, Any]:
 
 
 def pose_table(pose: Transform | None, covariance: NDArray[np.float64] | None = None) -> dict[str, Any]:
-    """Content of ``pose.json``, not yet checked."""
+    """Return the content of ``pose.json``, not yet checked: ``world_from_sensor``, and its covariance (6, 6)."""
     return {
         "world_from_sensor": None if pose is None else _rows(pose.matrix()),
         "covariance": None if covariance is None else _rows(covariance),
@@ -149,7 +154,7 @@ def pose_table(pose: Transform | None, covariance: NDArray[np.float64] | None = 
 
 
 def rig_of(document: CalibrationDocument) -> Rig:
-    """Rig of a document."""
+    """Return the rig that a calibration document describes."""
     pair = document.rectification
     return Rig(
         cameras={camera.name: _camera(camera) for camera in document.cameras},

@@ -1,7 +1,7 @@
-"""A capture: the raw images of one measurement with everything needed to decode them.
+"""Describe a capture: the raw images of one measurement, with everything needed to decode them.
 
-A simulated and a real capture are the same thing; ``source`` says which it is and is carried into all that is made
-from it. Where a device gives maps of depth, disparity or points, with its images or without, they are ``derived``.
+Simulated and real captures have the same type. Their ``source`` distinguishes them, and is passed on to every cloud,
+map and report. Maps of depth, disparity or points that a device computes itself are ``derived``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Source = Literal["simulated", "device", "replay", "emulator"]
 SOURCES: tuple[Source, ...] = ("simulated", "device", "replay", "emulator")
 
-#: maps that a capture may hold, and their units
+#: maps that a capture may contain, and their units
 DERIVED_UNITS = {"depth": "mm", "disparity": "px", "points": "mm"}
 
 
@@ -36,31 +36,38 @@ class Capture:
     sensor
         Preset or model name (``ensenso-n10``, ``N35-604-16-BL``).
     technology
-        How it is decoded: ``active_stereo``; an entry of :data:`mitsim.reconstruction.decoder_registry.TECHNOLOGIES`.
+        Measuring principle, which selects the decoder, such as ``active_stereo``: a key of
+        :data:`mitsim.reconstruction.decoder_registry.TECHNOLOGIES`.
     source
-        Where the images came from.
+        Origin of the images: one of :data:`SOURCES`.
     rig
-        Calibration of cameras and projector.
+        Calibration of cameras and projector [px, mm]; the first camera is the reference.
     images
-        Camera name -> (frames, H, W) uint8 or uint16 [DN], in the order in which they were taken. Empty where the
-        device gave none.
+        By camera name, (frames, H, W) uint8 or uint16 [DN] in the order of acquisition. Empty if the device gave
+        none.
     bits
-        Bits per pixel of the camera; full scale is 2**bits - 1.
+        Bits per pixel of the cameras; full scale is 2**bits - 1 DN.
     settings
-        Exposure, gain and so on, as plain JSON values with units in their names (``exposure_s``).
+        Exposure, gain and others, as JSON values with units in their names (``exposure_s``).
     world_from_sensor
-        Pose, if known.
+        Pose of the sensor in the world frame [mm], None if unknown.
     serial
         Serial number of the device, or "".
     derived
-        What the device itself made of its images, float32, NaN where it has nothing: ``depth`` (H, W) along the axis
-        [mm], ``disparity`` (H, W) of the rectified left image [px], ``points`` (H, W, 3) in the sensor frame [mm].
+        Maps that the device itself computed, float32, NaN where a value is missing. ``depth`` (H, W) is along the
+        axis [mm]. ``disparity`` (H, W) is of the rectified left image [px]. ``points`` (H, W, 3) are in the sensor
+        frame [mm].
     pose_covariance
-        (6, 6) of the pose, if known: rotation vector about the world's axes [rad], place of the sensor's origin in the
-        world [mm].
+        (6, 6) covariance of the pose, None if unknown: rotation vector about the world's axes [rad], and position of
+        the sensor's origin in the world [mm].
     taken_by
-        The sensor that took it, where this process simulated it: :meth:`cloud` decodes with its settings. It is not
+        The sensor that this process simulated, None otherwise. :meth:`cloud` decodes with its settings. It is not
         written to a folder.
+
+    Raises
+    ------
+    ValueError
+        If the source is unknown, an image or map has the wrong shape or type, or a covariance has no pose.
     """
 
     sensor: str
@@ -82,14 +89,16 @@ class Capture:
         for name, stack in self.images.items():
             camera = self.rig.cameras[name]
             if stack.ndim != 3 or stack.shape[1:] != (camera.height, camera.width):
-                raise ValueError(f"images of {name}: {stack.shape}, the camera is {camera.height} x {camera.width}")
+                raise ValueError(
+                    f"images of {name}: shape {stack.shape}, but the camera has {camera.height} x {camera.width} pixels"
+                )
         for name, values in self.derived.items():
             if name not in DERIVED_UNITS:
                 raise ValueError(f"map {name!r}: allowed are {', '.join(DERIVED_UNITS)}")
             if values.dtype != np.float32 or values.shape[2:] != ((3,) if name == "points" else ()) or values.ndim < 2:
-                raise ValueError(f"map of {name}: {values.dtype} {values.shape}")
+                raise ValueError(f"map of {name}: {values.dtype} of shape {values.shape}")
         if self.pose_covariance is not None and self.world_from_sensor is None:
-            raise ValueError("the covariance of a pose that is not known")
+            raise ValueError("a pose covariance without a pose")
 
     def cloud(
         self, sensor: Sensor | str | Path | None = None, *, range_mm: tuple[float, float] | None = None
@@ -99,20 +108,20 @@ class Capture:
         Parameters
         ----------
         sensor
-            Decode with the settings of this sensor: loaded, a preset's name, or the path of a sensor TOML file. Left
-            out, those of the sensor that was rendered, the capture's own, or those of the preset that it names.
+            Sensor whose settings are used: loaded, the name of a preset, or the path of a sensor TOML file. By default
+            they are those of the simulated sensor, those of the capture, or those of the preset that it names.
         range_mm
-            Nearest and farthest depth [mm] to be decoded, in place of the sensor's.
+            Nearest and farthest depth to decode [mm], instead of the sensor's.
 
         Returns
         -------
         PointCloud
-            Points (H, W, 3) float32 [mm] in the sensor frame, NaN where missing; ``status`` (H, W) says why.
+            Points (H, W, 3) float32 [mm] in the sensor frame, NaN where missing; ``status`` (H, W) is the reason.
 
         Raises
         ------
         InputError
-            If the sensor is not known or of another technology, or the range makes no sense.
+            If the sensor is unknown or of another technology, or the range is invalid.
 
         Examples
         --------
@@ -123,7 +132,7 @@ class Capture:
         >>> round(float(cloud.valid.mean()), 1) > 0
         True
         """
-        # decoders are not needed to hold a capture
+        # imported here because a capture alone does not need the decoders
         from mitsim.reconstruction.cloud import capture_cloud, decoder_settings, in_range
         from mitsim.reconstruction.noise import known_noise
 

@@ -1,7 +1,7 @@
-"""``capture.json``: what a capture folder is and holds, as a checked document, and its JSON schema.
+"""Describe ``capture.json``, the index of a capture folder, as a checked document, and write its JSON schema.
 
-``python -m mitsim.capture.capture_document > docs/reference/capture.schema.json`` writes the schema. What one key asks
-of another it does not know; reading a folder checks that.
+``python -m mitsim.capture.capture_document > docs/reference/capture.schema.json`` writes the schema. The schema does
+not contain conditions between keys; :func:`mitsim.capture.folder.read_capture` checks them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pydantic import Field
 
 from characterisation.documents import Document, Name
 
-#: written; 1, without derived maps and units, is still read
+#: version that is written. Version 1, without derived maps and units, can still be read
 SCHEMA_VERSION = 2
 FRAME = "opencv: x right, y down, z forward, pixel centres at integers"
 UNITS = {"length": "mm", "pixel_value": "DN", "angle_in_files": "deg"}
@@ -22,11 +22,11 @@ Role = Literal["calibration", "settings", "pose", "image", "derived", "truth", "
 
 
 class FileEntry(Document):
-    """One file of a capture.
+    """One file of a capture folder.
 
-    ``image``s say which camera and frame they are, ``derived`` maps by ``name`` what they are of; both have ``dtype``
-    and ``shape`` (rows, columns, channels if more than one) as in the file. A stored number times ``scale`` [1] is in
-    ``unit``; ``invalid`` is the stored number, or "nan", that stands where there is no value.
+    An ``image`` has ``camera`` and ``frame``; a ``derived`` map has a ``name``. Both have the ``dtype`` and ``shape``
+    (rows, columns, channels if more than one) of the stored array. A stored number times ``scale`` is in ``unit``.
+    ``invalid`` is the stored number, or "nan", that marks a missing value.
     """
 
     path: str
@@ -43,7 +43,7 @@ class FileEntry(Document):
 
 
 class CaptureDocument(Document):
-    """Content of ``capture.json``; ``checksum`` is that of all the rest of it.
+    """Content of ``capture.json``. Its ``checksum`` covers all other keys.
 
     See :func:`characterisation.checked_files.content_checksum`.
     """
@@ -62,7 +62,7 @@ class CaptureDocument(Document):
 
 
 def capture_schema() -> dict[str, Any]:
-    """JSON schema (draft 2020-12) of ``capture.json``."""
+    """Return the JSON schema (draft 2020-12) of ``capture.json``."""
     schema = CaptureDocument.model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["title"] = "mitsim capture"
@@ -70,7 +70,7 @@ def capture_schema() -> dict[str, Any]:
 
 
 def schema_text() -> str:
-    """The schema as it stands in ``docs/reference/capture.schema.json``."""
+    """Return the text of ``docs/reference/capture.schema.json``."""
     return json.dumps(capture_schema(), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 

@@ -1,18 +1,18 @@
-"""A capture as a folder of plain files: written whole or not at all, and read with every file checked.
+"""Write a capture as a folder of plain files, completely or not at all, and read it with a check of every file.
 
 ::
 
     capture_0007/
-      capture.json       what it is, and every other file with its size, type and SHA-256
+      capture.json       sensor, source and units, and every other file with its shape, type and SHA-256
       calibration.json   cameras, projector, rectification
-      settings.json      exposure, gain and so on, units in the names
+      settings.json      exposure, gain and others, with units in the names
       pose.json          world_from_sensor, 4 x 4 [mm], and its covariance, or null
       images/left_000.png  raw, lossless, 8 or 16 bits: <camera>_<frame>.png
-      derived/depth.npy  what the device itself made of them, where it did: depth, disparity or points
-      truth/left.exr     what is true at each pixel, for simulated captures that were asked for it
-      vendor/            the maker's own files, untouched, where there are any
+      derived/depth.npy  map that the device itself computed: depth, disparity or points
+      truth/left.exr     true values at each pixel, in simulated captures that request them
+      vendor/            the maker's own files, unchanged, if there are any
 
-The format is written down in docs/reference/formats/capture-folder.md.
+The format is described in docs/reference/formats/capture-folder.md.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from mitsim.capture.packed_files import SAFE_NAME, check_image, files_of, packed
 from mitsim.capture.png import decode_png
 from mitsim.sensor.transforms import Transform
 
-#: the largest capture that is believed [bytes]
+#: largest allowed size of all files of a capture [bytes]
 LARGEST_CAPTURE = 8 * 1024**3
 
 
@@ -50,82 +50,90 @@ def write_capture(
     vendor: Mapping[str, bytes] | None = None,
     truth: Mapping[str, bytes] | None = None,
 ) -> Path:
-    """Write a capture, all of it or nothing.
+    """Write a capture to a folder, completely or not at all.
 
     Parameters
     ----------
     capture
-        What to write.
+        Capture to write.
     folder
-        To be made. Its files are first written beside it and moved there in one step.
+        New or empty folder. Its files are first written beside it, and moved there in one step.
     overwrite
-        Replace a capture that is there already; anything else that is there is never replaced.
+        Replace an existing capture. Other files are never replaced.
     vendor
-        The maker's own files by name, kept as they are.
+        The maker's own files by name, kept unchanged.
     truth
         OpenEXR images by camera, see :func:`mitsim.simulation.truth.encode_exr`.
+
+    Returns
+    -------
+    Path
+        The folder, as an absolute path.
 
     Raises
     ------
     InputError
-        If the folder is taken or cannot be written, or something in the capture has no place in a file.
+        If the folder is not free or cannot be written, or something in the capture cannot be written to a file.
     OSError
-        If there is no room for it.
+        If the disk is full.
     """
     return write_packed(packed(capture, folder, vendor=vendor, truth=truth), folder, overwrite=overwrite)
 
 
 def write_packed(files: Mapping[str, bytes], folder: str | Path, *, overwrite: bool = False) -> Path:
-    """Write what :func:`packed` gives, all of it or nothing.
+    """Write the files of :func:`~mitsim.capture.packed_files.packed` to a folder, completely or not at all.
 
     Raises
     ------
     InputError
-        If the folder is taken or cannot be written.
+        If the folder is not free or cannot be written.
     OSError
-        If there is no room for it.
+        If the disk is full.
     """
     folder = Path(folder).absolute()
-    refuse_taken(folder, overwrite)
+    check_free(folder, overwrite)
     try:
         write_folder(folder, files, overwrite=overwrite)
     except OSError as error:
         if error.errno in FULL:
             raise
-        raise InputError(folder, "", f"a folder that cannot be written ({error})", "a place to write to") from None
+        raise InputError(
+            folder, "", f"a folder that cannot be written ({error})", "a folder with write permission"
+        ) from None
     return folder
 
 
 def is_written(capture: Capture, folder: str | Path, vendor: Mapping[str, bytes] | None = None) -> bool:
-    """Whether a folder holds this very capture, whole; which software wrote it does not matter.
+    """Return whether a folder contains exactly this capture. The versions of the software may differ.
 
     Raises
     ------
     InputError
-        If it does, and a file of it is missing, damaged or changed since.
+        If the index of the folder cannot be read, or the capture could not be written. Also if the folder contains this
+        capture, but a file of it is missing, damaged or changed.
     """
     folder = Path(folder).absolute()
     if not (folder / "capture.json").is_file():
         return False
     files = files_of(capture, {("vendor", name): data for name, data in (vendor or {}).items()}, folder)
-    mine = json.loads(files["capture.json"])
-    there = _read_index(folder)[0].model_dump(mode="json")
-    paths = [{entry["path"]: entry["sha256"] for entry in index["files"]} for index in (mine, there)]
-    same = ("sensor", "technology", "source", "serial", "bits")
-    if paths[0] != paths[1] or any(mine[key] != there[key] for key in same):
+    own_index = json.loads(files["capture.json"])
+    found_index = _read_index(folder)[0].model_dump(mode="json")
+    paths = [{entry["path"]: entry["sha256"] for entry in index["files"]} for index in (own_index, found_index)]
+    compared = ("sensor", "technology", "source", "serial", "bits")
+    if paths[0] != paths[1] or any(own_index[key] != found_index[key] for key in compared):
         return False
     read_capture(folder)
     return True
 
 
 def read_capture(folder: str | Path) -> Capture:
-    """Read a capture folder back, checking each file.
+    """Read a capture folder, and check each file.
 
     Raises
     ------
     InputError
-        If anything is missing, damaged, changed since it was written, of the wrong size or of a newer format; file
-        and field are named.
+        If a file is missing, damaged, changed since it was written, of the wrong size or of a newer format. The error
+        names file and field.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -190,12 +198,12 @@ def read_capture(folder: str | Path) -> Capture:
 
 
 def read_settings_and_pose(folder: str | Path) -> tuple[str, dict[str, Any], Transform | None]:
-    """Name of the sensor, settings and ``world_from_sensor`` of a capture, without reading its images.
+    """Return the sensor's name, settings and ``world_from_sensor`` of a capture folder, without reading its images.
 
     Raises
     ------
     InputError
-        As :func:`read_capture`, for what is read.
+        As :func:`read_capture`, for the files that are read.
     """
     folder = Path(folder)
     document, where = _read_index(folder)
@@ -210,32 +218,32 @@ def read_settings_and_pose(folder: str | Path) -> tuple[str, dict[str, Any], Tra
 
 
 def _derived_map(data: bytes, entry: FileEntry, field: str, where: Path, file: Path) -> NDArray[np.float32]:
-    """A map as float32 in its unit, NaN where invalid, from whatever numbers it is stored in."""
+    """Return a derived map as float32 in its unit, NaN where invalid, from any allowed type of stored numbers."""
     assert entry.name is not None
     stored = decode_npy(data, file)
     if str(stored.dtype) != entry.dtype or stored.shape != entry.shape:
         found, allowed = f"{entry.dtype} {entry.shape}", f"{stored.dtype} {stored.shape}, as in the file"
         raise InputError(where, field, found, allowed)
     if stored.shape[2:] != ((3,) if entry.name == "points" else ()):
-        raise InputError(where, f"{field}.shape", entry.shape, "rows and columns, and of points 3 channels")
+        raise InputError(where, f"{field}.shape", entry.shape, "rows and columns, and 3 channels for points")
     if entry.unit != DERIVED_UNITS[entry.name]:
         raise InputError(where, f"{field}.unit", repr(entry.unit), DERIVED_UNITS[entry.name])
     if entry.scale is None:
-        raise InputError(where, f"{field}.scale", "nothing", f"what a stored 1 is in {entry.unit}")
+        raise InputError(where, f"{field}.scale", "nothing", f"the value of a stored 1 in {entry.unit}")
     values = stored.astype(np.float32) * np.float32(entry.scale)
     if isinstance(entry.invalid, int):
         values[(stored == entry.invalid).reshape(*stored.shape[:2], -1).all(axis=-1)] = np.nan
     if np.isinf(values).any():
-        raise InputError(file, "", "infinite numbers", "finite ones, or NaN")
+        raise InputError(file, "", "infinite numbers", "finite numbers or NaN")
     return values
 
 
 def _parse(data: bytes, where: Path) -> dict[str, Any]:
-    def refuse(constant: str) -> None:
+    def reject(constant: str) -> None:
         raise ValueError(f"{constant} is not a JSON number")
 
     try:
-        table = json.loads(data.decode(), parse_constant=refuse)
+        table = json.loads(data.decode(), parse_constant=reject)
     except (ValueError, RecursionError) as error:
         raise InputError(where, "", f"text that is not JSON ({error})", "JSON in UTF-8") from None
     if not isinstance(table, dict):
@@ -244,8 +252,9 @@ def _parse(data: bytes, where: Path) -> dict[str, Any]:
 
 
 def _read_index(folder: Path) -> tuple[CaptureDocument, Path]:
+    """Return the checked index of a folder, and its path; raise an InputError if it is damaged, changed or too new."""
     where = folder / "capture.json"
-    table = _parse(read_bounded(where, "a whole capture folder"), where)
+    table = _parse(read_bounded(where, "a complete capture folder"), where)
     version = table.get("schema_version")
     if type(version) is int and version > SCHEMA_VERSION:
         raise InputError(
@@ -255,38 +264,37 @@ def _read_index(folder: Path) -> tuple[CaptureDocument, Path]:
     if document.source not in SOURCES:
         raise InputError(where, "source", repr(document.source), " | ".join(SOURCES))
     if document.checksum != content_checksum(table):
-        raise InputError(where, "checksum", "another content than was written", "an unchanged file")
+        raise InputError(where, "checksum", "content that differs from what was written", "an unchanged file")
     return document, where
 
 
 def _read_checked(folder: Path, entry: FileEntry, field: str, where: Path) -> bytes:
+    """Return the bytes of a file of the folder; raise an InputError if it is outside, missing or changed."""
     path = PurePosixPath(entry.path)
     if path.is_absolute() or not path.parts or not all(SAFE_NAME.fullmatch(part) for part in path.parts):
         raise InputError(where, f"{field}.path", repr(entry.path), "a file inside the folder, of plain names")
     file = folder / path
     if not is_inside(file, folder):
         raise InputError(where, f"{field}.path", repr(entry.path), "a file inside the folder, not a link")
-    data = read_bounded(file, "a whole capture folder")
+    data = read_bounded(file, "a complete capture folder")
     if hashlib.sha256(data).hexdigest() != entry.sha256:
         raise InputError(
-            file, "sha256", "another content than was written", "an unchanged file: copy the capture again"
+            file, "sha256", "content that differs from what was written", "an unchanged file: copy the capture again"
         )
     return data
 
 
-def refuse_taken(folder: Path, overwrite: bool = False) -> None:
-    """Refuse a folder that holds something, or a capture that is not to be replaced.
+def check_free(folder: Path, overwrite: bool = False) -> None:
+    """Check that a capture can be written to a folder: it is missing, empty, or has a capture to ``overwrite``.
 
     Raises
     ------
     InputError
-        If it does.
+        If it is not free.
     """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     if not (folder / "capture.json").is_file():
-        raise InputError(folder, "", "something there that is no capture", "a new or empty folder")
+        raise InputError(folder, "", "a file or folder that is not a capture", "a new or empty folder")
     if not overwrite:
-        raise InputError(
-            folder, "", "another capture that is there already", "a new folder", "or remove this one first"
-        )
+        raise InputError(folder, "", "an existing capture", "a new folder", "or remove this one first")

@@ -1,4 +1,8 @@
-"""Grey images in any of the usual files, read with suspicion."""
+"""Read grey images from common image files, and check them.
+
+Signal chain: bytes -> chunks of a PNG, checked -> decoded image -> one channel of colour images, if requested -> grey
+image (H, W) of 8 or 16 bits.
+"""
 
 from __future__ import annotations
 
@@ -14,23 +18,23 @@ from characterisation.checked_files import LARGEST_FILE, read_bounded
 from characterisation.errors import InputError
 from mitsim.capture.png import LONGEST_SIDE_PX, PNG_SIGNATURE, decode_png, png_chunks
 
-#: kinds of file that are read
+#: suffixes of the image files that are read
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
 
 Image = NDArray[np.unsignedinteger[Any]]
 
 
-#: channels of a colour image as OpenCV orders them
+#: channels of a colour image, in the order of OpenCV
 CHANNELS = {"blue": 0, "green": 1, "red": 2}
 
 
 def channel_of(name: str | None) -> int:
-    """Number of a channel by its name; green if none is named: it has half of the pixels of a Bayer pattern.
+    """Return the number of a channel by its name; None is green, which has half of the pixels of a Bayer pattern.
 
     Raises
     ------
     InputError
-        For another name.
+        For an unknown name.
     """
     if name is not None and name not in CHANNELS:
         raise InputError("--channel", "", repr(name), " | ".join(CHANNELS))
@@ -38,12 +42,12 @@ def channel_of(name: str | None) -> int:
 
 
 def channel_name(channel: int) -> str:
-    """Name of a channel by its number."""
+    """Return the name of a channel by its number."""
     return next(name for name, number in CHANNELS.items() if number == channel)
 
 
 def is_colour(path: Path) -> bool:
-    """Whether an image that can be read has channels that differ."""
+    """Return whether an image file can be read and has channels that differ."""
     try:
         read_grey(path)
     except InputError as error:
@@ -52,14 +56,15 @@ def is_colour(path: Path) -> bool:
 
 
 def read_grey(path: Path, *, green: bool = False, channel: int | None = None) -> Image:
-    """A grey image (H, W), uint8 or uint16; colour only if all three channels are the same, or one is wanted.
+    """Read a grey image (H, W), uint8 or uint16.
 
-    ``channel`` of colour images to take, see :data:`CHANNELS`; ``green``: that one.
+    A colour image is read only if its colour channels are equal, or if one is selected. ``channel`` selects it by
+    number (:data:`CHANNELS`); ``green`` selects the green channel.
 
     Raises
     ------
     InputError
-        If it cannot be read, or is nothing of the kind.
+        If the file cannot be read, is not an image, or has channels that differ.
     """
     data = read_bounded(path)
     if not data:
@@ -68,15 +73,21 @@ def read_grey(path: Path, *, green: bool = False, channel: int | None = None) ->
 
 
 def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel: int | None = None) -> Image:
-    """Read a grey image from the bytes of a file; ``where`` names it. See :func:`read_grey`."""
+    """Read a grey image from the bytes of a file, as :func:`read_grey` does; messages name ``where``.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_grey`.
+    """
     is_png = data.startswith(PNG_SIGNATURE)
     if is_png:
-        png_chunks(data, where)  # OpenCV decodes a damaged PNG as far as it can
+        png_chunks(data, where)  # OpenCV would decode the undamaged part of a damaged PNG
     image = None
-    with suppress(cv2.error):  # told below, as what OpenCV gives None for
+    with suppress(cv2.error):  # reported below, as where OpenCV returns None
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if image is None:
-        raise InputError(where, "", "a file that is no image, or damaged", f"one of {', '.join(SUFFIXES)}")
+        raise InputError(where, "", "a file that is not an image, or is damaged", f"one of {', '.join(SUFFIXES)}")
     if image.ndim == 3:
         colours = image[..., :3] if image.shape[2] >= 3 else image[..., :1]
         if green:
@@ -84,7 +95,7 @@ def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel:
         if channel is not None and image.shape[2] >= 3:
             return np.ascontiguousarray(_checked(image[..., channel], where))
         if (colours != colours[..., :1]).any():
-            hint = "convert it without changing its levels; of a colour camera take one channel, or its raw image"
+            hint = "convert it without changing its levels; for a colour camera, take one channel or the raw image"
             raise InputError(where, "colour", f"{image.shape[2]} channels that differ", "a grey image", hint)
         image = np.ascontiguousarray(image[..., 0])
     elif is_png:
@@ -94,7 +105,7 @@ def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel:
 
 def _checked(image: NDArray[Any], where: str | Path) -> Image:
     if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(where, "depth", image.dtype, "8 or 16 bits, without sign")
+        raise InputError(where, "depth", image.dtype, "8 or 16 bits, unsigned")
     if max(image.shape) > LONGEST_SIDE_PX:
         raise InputError(where, "size", f"{image.shape[1]} x {image.shape[0]} px", f"up to {LONGEST_SIDE_PX} px a side")
     return np.asarray(image)

@@ -1,4 +1,8 @@
-"""The files of a capture's folder in memory: each by its path, and the index that lists them with their checksums."""
+"""Make the files of a capture's folder in memory: their bytes by path, and the index with their checksums.
+
+Signal chain: capture -> documents of calibration, settings and pose; images as PNG; maps as ``.npy`` -> SHA-256 of each
+file -> ``capture.json``, the index.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,7 @@ from mitsim.capture.npy import encode_npy
 from mitsim.capture.png import LONGEST_SIDE_PX, encode_png
 from mitsim.version import __version__
 
-#: names of cameras and files
+#: allowed names of cameras and files
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
@@ -35,20 +39,30 @@ def packed(
     vendor: Mapping[str, bytes] | None = None,
     truth: Mapping[str, bytes] | None = None,
 ) -> dict[str, bytes]:
-    """Every file of a capture's folder by its path in it; messages name ``folder``.
+    """Return the bytes of every file of a capture's folder, by path in the folder; messages name ``folder``.
+
+    ``vendor`` are the maker's files by name; ``truth`` are OpenEXR images by camera.
 
     Raises
     ------
     InputError
-        If something in the capture has no place in a file.
+        If something in the capture cannot be written to a file.
     """
-    beside = {("vendor", name): data for name, data in (vendor or {}).items()}
-    beside |= {("truth", f"{camera}.exr"): data for camera, data in (truth or {}).items()}
-    return files_of(capture, beside, Path(folder))
+    extra = {("vendor", name): data for name, data in (vendor or {}).items()}
+    extra |= {("truth", f"{camera}.exr"): data for camera, data in (truth or {}).items()}
+    return files_of(capture, extra, Path(folder))
 
 
-def files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder: Path) -> dict[str, bytes]:
-    """Every file of the folder, by path; ``capture.json`` last. Files that could not be read back are an error."""
+def files_of(capture: Capture, extra: Mapping[tuple[str, str], bytes], folder: Path) -> dict[str, bytes]:
+    """Return the bytes of every file of the folder, by path, ``capture.json`` last.
+
+    ``extra`` are further files by role and name.
+
+    Raises
+    ------
+    InputError
+        If a file could not be read back.
+    """
     calibration = calibration_table(capture.rig)
     pose = pose_table(capture.world_from_sensor, capture.pose_covariance)
     validate(folder / "calibration.json", calibration, CalibrationDocument)
@@ -76,7 +90,10 @@ def files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder: 
     for name, values in capture.derived.items():
         if np.isinf(values).any() or values.size == 0 or max(values.shape) > LONGEST_SIDE_PX:
             raise InputError(
-                folder, f"derived.{name}", f"{values.shape}, or infinite", "a map of finite numbers or NaN"
+                folder,
+                f"derived.{name}",
+                f"shape {values.shape}, empty, too large or with infinite numbers",
+                f"a map of finite numbers or NaN, up to {LONGEST_SIDE_PX} a side",
             )
         path = f"derived/{name}.npy"
         files[path] = encode_npy(values)
@@ -84,7 +101,7 @@ def files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder: 
             {"path": path, "role": "derived", "name": name, "dtype": str(values.dtype), "shape": list(values.shape)}
             | {"unit": DERIVED_UNITS[name], "scale": 1.0, "invalid": "nan"}
         )
-    for (role, name), data in beside.items():
+    for (role, name), data in extra.items():
         parts = PurePosixPath(name).parts
         for part in parts or ("",):
             _check_name(part, folder, role, "the name of a file")
@@ -117,18 +134,24 @@ def files_of(capture: Capture, beside: Mapping[tuple[str, str], bytes], folder: 
 
 
 def check_image(
-    image: NDArray[np.unsignedinteger[Any]], before: list[NDArray[np.unsignedinteger[Any]]], bits: int, where: Path
+    image: NDArray[np.unsignedinteger[Any]], frames: list[NDArray[np.unsignedinteger[Any]]], bits: int, where: Path
 ) -> None:
-    """Raise an error for an image of another type than the frames before, or with values over its bits."""
-    if before and before[0].dtype != image.dtype:
-        raise InputError(where, "dtype", image.dtype, f"{before[0].dtype}, as the first frame")
+    """Check that an image has the type of the earlier ``frames`` and no value above its ``bits``.
+
+    Raises
+    ------
+    InputError
+        If it does not; the error names the file ``where``.
+    """
+    if frames and frames[0].dtype != image.dtype:
+        raise InputError(where, "dtype", image.dtype, f"{frames[0].dtype}, as in the first frame")
     if image.max() > 2**bits - 1:
         raise InputError(where, "pixel value", image.max(), f"0 to {2**bits - 1}, since bits is {bits}")
 
 
-def _check_name(name: str, folder: Path, field: str, what: str) -> None:
+def _check_name(name: str, folder: Path, field: str, description: str) -> None:
     if not SAFE_NAME.fullmatch(name):
-        raise InputError(folder, field, repr(name), f"{what} of letters, digits, dot, dash, underscore")
+        raise InputError(folder, field, repr(name), f"{description} of letters, digits, dot, dash, underscore")
 
 
 def _json(value: Any, folder: Path, field: str) -> bytes:

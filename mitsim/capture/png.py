@@ -1,7 +1,10 @@
-"""Grey PNG images, 8 or 16 bits, read with suspicion.
+"""Read and write grey PNG images of 8 or 16 bits, and check all that is read.
 
-OpenCV decodes a damaged PNG as far as it can and says so only on stderr; a half-black image would then be measured.
-Here every chunk's checksum and the length of the compressed pixels are checked before OpenCV sees the file.
+Signal chain: bytes -> chunks, their lengths and checksums compared -> size and type of the image -> number of bytes of
+its pixels -> image, decoded by OpenCV.
+
+OpenCV decodes the undamaged part of a damaged PNG, and reports the damage only on stderr. The half-black image would
+then be measured. So the file is checked before OpenCV decodes it.
 """
 
 from __future__ import annotations
@@ -22,15 +25,21 @@ Image = NDArray[np.unsignedinteger[Any]]
 #: first bytes of every PNG
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
-#: longest side of an image that is believed [px]
+#: largest allowed side of an image [px]
 LONGEST_SIDE_PX = 16384
 
-#: most pixels of an image that is believed
+#: largest allowed number of pixels of an image
 MOST_PIXELS = 64_000_000
 
 
 def encode_png(image: Image) -> bytes:
-    """Lossless PNG of an image (H, W), uint8 or uint16."""
+    """Return an image (H, W), uint8 or uint16, as the bytes of a lossless PNG.
+
+    Raises
+    ------
+    ValueError
+        If OpenCV cannot write the image.
+    """
     done, data = cv2.imencode(".png", image)
     if not done:
         raise ValueError(f"OpenCV cannot write an image of {image.shape}, {image.dtype} as PNG")
@@ -38,12 +47,14 @@ def encode_png(image: Image) -> bytes:
 
 
 def decode_png(data: bytes, where: str | Path, size: tuple[int, int] | None = None) -> Image:
-    """Image (H, W), uint8 or uint16, of a PNG file's bytes; ``size`` (H, W) if it is known.
+    """Return the image (H, W), uint8 or uint16, in the bytes of a PNG file; messages name ``where``.
+
+    ``size`` is the expected (H, W); None allows any size.
 
     Raises
     ------
     InputError
-        If the bytes are no whole, grey PNG of 8 or 16 bits, or the image is not of the expected size.
+        If the bytes are not a complete grey PNG of 8 or 16 bits, or the image has another size than expected.
     """
     chunks = png_chunks(data, where)
     width, height, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", chunks[0][1])
@@ -55,42 +66,42 @@ def decode_png(data: bytes, where: str | Path, size: tuple[int, int] | None = No
             "colour",
             f"type {colour}, {depth} bits, interlace {interlace}",
             "grey (type 0) of 8 or 16 bits, not interlaced",
-            "colour cameras are not read",
+            "colour images are not read",
         )
     _check_pixels(b"".join(body for kind, body in chunks if kind == b"IDAT"), height * (1 + width * depth // 8), where)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise InputError(where, "", f"a PNG that OpenCV refuses ({error})", "a whole PNG") from None
+        raise InputError(where, "", f"a PNG that OpenCV cannot read ({error})", "a complete PNG") from None
     if image is None or image.shape != (height, width) or image.dtype.itemsize != depth // 8:
         raise InputError(where, "", "a PNG that OpenCV cannot read", "a grey PNG of 8 or 16 bits")
     return np.asarray(image)
 
 
 def png_chunks(data: bytes, where: str | Path) -> list[tuple[bytes, bytes]]:
-    """Kind and content of every chunk of a PNG of any kind, header first and end last, with their checksums checked.
+    """Return type and content of every chunk of a PNG, grey or colour, from header to end, after checks.
 
     Raises
     ------
     InputError
-        If it is no PNG, cut off, damaged, or larger than is believed.
+        If the file is not a PNG, is cut off or damaged, or exceeds :data:`LONGEST_SIDE_PX` or :data:`MOST_PIXELS`.
     """
     if not data.startswith(PNG_SIGNATURE):
         raise InputError(where, "", "a file that is not a PNG", "a grey PNG of 8 or 16 bits")
     chunks, at = [], len(PNG_SIGNATURE)
     while at < len(data):
         if at + 12 > len(data):
-            raise InputError(where, "", f"a PNG cut off after {len(data)} bytes", "a whole PNG: copy the file again")
+            raise InputError(where, "", f"a PNG cut off after {len(data)} bytes", "a complete PNG: copy the file again")
         (length,) = struct.unpack(">I", data[at : at + 4])
         kind, body, end = data[at + 4 : at + 8], data[at + 8 : at + 8 + length], at + 12 + length
         if end > len(data):
-            raise InputError(where, "", f"a PNG cut off after {len(data)} bytes", "a whole PNG: copy the file again")
+            raise InputError(where, "", f"a PNG cut off after {len(data)} bytes", "a complete PNG: copy the file again")
         if struct.pack(">I", zlib.crc32(kind + body)) != data[end - 4 : end]:
-            raise InputError(where, "", f"a damaged PNG (chunk at byte {at})", "a whole PNG: copy the file again")
+            raise InputError(where, "", f"a damaged PNG (chunk at byte {at})", "a complete PNG: copy the file again")
         chunks.append((kind, body))
         at = end
     if len(chunks) < 3 or chunks[0][0] != b"IHDR" or len(chunks[0][1]) != 13 or chunks[-1][0] != b"IEND":
-        raise InputError(where, "", "a PNG without its header or end", "a whole PNG: copy the file again")
+        raise InputError(where, "", "a PNG without its header or end", "a complete PNG: copy the file again")
     width, height = struct.unpack(">II", chunks[0][1][:8])
     if not (0 < width <= LONGEST_SIDE_PX and 0 < height <= LONGEST_SIDE_PX):
         raise InputError(where, "size", f"{width} x {height} px", f"1 to {LONGEST_SIDE_PX} px a side")
@@ -100,11 +111,11 @@ def png_chunks(data: bytes, where: str | Path) -> list[tuple[bytes, bytes]]:
 
 
 def _check_pixels(compressed: bytes, expected: int, where: str | Path) -> None:
-    """Inflate to see that there are as many bytes as pixels need; never more than that plus one."""
+    """Check that the compressed pixels expand to ``expected`` bytes. At most one byte more is expanded."""
     inflate = zlib.decompressobj()
     try:
         found = len(inflate.decompress(compressed, expected + 1))
     except zlib.error as error:
-        raise InputError(where, "", f"a damaged PNG ({error})", "a whole PNG: copy the file again") from None
+        raise InputError(where, "", f"a damaged PNG ({error})", "a complete PNG: copy the file again") from None
     if found != expected:
-        raise InputError(where, "", f"a PNG with {found} bytes of pixels", f"{expected} bytes, as its header says")
+        raise InputError(where, "", f"a PNG with {found} bytes of pixels", f"{expected} bytes, as stated in its header")

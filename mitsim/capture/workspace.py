@@ -1,7 +1,8 @@
-"""The frame in which a capture's cloud is written: that of the sensor, or of the device's workspace.
+"""Choose the frame in which a capture's cloud is written: the sensor's, or that of the device's workspace.
 
-Signal chain: ``sensor_from_workspace`` in a capture's settings, which the import of a device with a ``Link`` keeps
-(:mod:`mitsim.recordings.nxlib_calibration`) -> its inverse -> :class:`~characterisation.cloud_files.WrittenFrame`.
+Signal chain: ``sensor_from_workspace`` in a capture's settings -> its inverse ->
+:class:`~characterisation.cloud_files.WrittenFrame`. The setting comes from a recording whose device has a ``Link``
+(:mod:`mitsim.recordings.nxlib_calibration`).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from characterisation.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.sensor.transforms import Transform
 
-#: names that ``mitsim decode --points-in`` takes
+#: frames that ``mitsim decode --points-in`` accepts
 FRAMES = ("sensor", "workspace")
 
 _KEY = "sensor_from_workspace"
@@ -27,14 +28,14 @@ def written_frame(capture: Capture, frame: str, where: str | Path) -> WrittenFra
     Raises
     ------
     InputError
-        If ``frame`` is not known, or the capture at ``where`` does not tell its workspace by a rigid transform.
+        If ``frame`` is unknown, or the capture at ``where`` has no rigid transform to its workspace.
     """
     if frame not in FRAMES:
         raise InputError("--points-in", "", repr(frame), " | ".join(FRAMES))
     if frame == "sensor":
         return None
     allowed = "a rigid transform, 4 x 4 by rows [mm]"
-    hint = "import a recording whose Link has a target, or leave --points-in out"
+    hint = "import a recording whose Link has a target, or omit --points-in"
     stored = capture.settings.get(_KEY)
     if stored is None:
         raise InputError(where, f"settings.{_KEY}", "none: no workspace is known", allowed, hint)
@@ -44,10 +45,12 @@ def written_frame(capture: Capture, frame: str, where: str | Path) -> WrittenFra
         matrix = np.empty(0)
     rigid = matrix.shape == (4, 4) and bool(np.isfinite(matrix).all()) and matrix[3].tolist() == [0, 0, 0, 1]
     if rigid:
-        turn = matrix[:3, :3]
-        rigid = np.abs(turn @ turn.T - np.eye(3)).max() < 1e-6 and bool(np.linalg.det(turn) > 0)
+        rotation = matrix[:3, :3]
+        rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-6 and bool(np.linalg.det(rotation) > 0)
     if not rigid:
-        raise InputError(where, f"settings.{_KEY}", "no rigid transform", allowed, "import the recording again")
-    target = ascii(str(capture.settings.get("link_target") or "workspace")[:80])  # stays one line of the header
+        raise InputError(
+            where, f"settings.{_KEY}", "a matrix that is not a rigid transform", allowed, "import the recording again"
+        )
+    target = ascii(str(capture.settings.get("link_target") or "workspace")[:80])  # one line of the header
     name = f"of the workspace {target} of the device's Link"
     return WrittenFrame(name, Transform.from_matrix(matrix).inverse().matrix())

@@ -48,7 +48,7 @@ def acceptance(
     from mitsim.measuring.acceptance import cloud_figures, joint_figures, read_artefacts
     from mitsim.measuring.clouds import cloud_paths, read_cloud
     from mitsim.measuring.document import measured_document, result_table, result_tables, result_values, summary
-    from mitsim.measuring.result import repeated
+    from mitsim.measuring.result import repeatability
     from mitsim.progress import say
 
     artefacts = read_artefacts(plane or [], sphere or [], spacing or [])
@@ -58,7 +58,7 @@ def acceptance(
     results = [cloud_figures(one.cloud, artefacts, baseline) for one in given]
     several = len(given) > 1
     together = joint_figures([one.cloud for one in given], artefacts) if several else []
-    over = repeated(results) if several else []
+    over = repeatability(results) if several else []
     if as_json:
         whose = [(one.path, one.cloud.sensor, one.cloud.source) for one in given]
         document = measured_document(whose, results, over) | {"all_clouds": [result_values(one) for one in together]}

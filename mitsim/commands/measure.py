@@ -12,7 +12,7 @@ from mitsim.commands.options import Clouds, DecodedAs, Defines, Json, Variant, c
 from mitsim.errors import InputError
 
 if TYPE_CHECKING:
-    from mitsim.measuring.clouds import GivenCloud
+    from mitsim.measuring.clouds import InputCloud
     from mitsim.measuring.result import Result
 
 _WINDOW = "NAME=COLUMN,ROW,WIDTH,HEIGHT"
@@ -105,11 +105,11 @@ def measure(
     """
     from mitsim.measuring.clouds import cloud_paths, read_cloud
     from mitsim.measuring.document import measured_document, result_tables, summary
-    from mitsim.measuring.request import read_asked
-    from mitsim.measuring.result import LEAVES_OUT, repeated
+    from mitsim.measuring.request import read_request
+    from mitsim.measuring.result import NOT_INCLUDED, repeatability
     from mitsim.progress import say
 
-    asked = read_asked(
+    request = read_request(
         {"plane": plane or [], "sphere": sphere or [], "cylinder": cylinder or []},
         {"angle": angle or [], "distance": distance or []},
         dots or [],
@@ -122,7 +122,7 @@ def measure(
         raise InputError(f"--{given}", "", "no --task", "a task for the scene: --task task.toml")
     if task is not None and scene is None:
         raise InputError("--scene", "", "none", "the scene of the task's part: --scene part.xml")
-    if asked.empty and task is None and picture is None:
+    if request.empty and task is None and picture is None:
         allowed = "--plane, --sphere, --cylinder, --dots, --task, --against or --picture"
         raise InputError("mitsim measure", "", "nothing to measure", allowed, "see mitsim measure --help")
     if picture is not None:
@@ -139,7 +139,7 @@ def measure(
         if len(paths) > 1:
             say(f"{path} ({number + 1}/{len(paths)})")
         one = read_cloud(path, sensor)
-        found, drawn = asked.measured(one, reference)
+        found, drawn = request.measure(one, reference)
         if of_task is not None:
             found += of_task(one)
         if picture is not None:
@@ -150,15 +150,15 @@ def measure(
             say(f"picture: {place}")
         whose.append((path, one.cloud.sensor, one.cloud.source))
         results.append(found)
-    over = repeated(results) if len(results) > 1 else []
+    over = repeatability(results) if len(results) > 1 else []
     if as_json:
         print(json.dumps(measured_document(whose, results, over), indent=2, ensure_ascii=False, allow_nan=False))
-    elif asked.empty and of_task is None:
+    elif request.empty and of_task is None:
         pass
     else:
         print(result_tables(paths, results, over))
         if any(result.origin == "fit" for found in results for result in found):
-            left_out = "; ".join(LEAVES_OUT)
+            left_out = "; ".join(NOT_INCLUDED)
             say(f"u: standard uncertainty (k = 1) from the covariance of the fit; it does not include: {left_out}")
         if correct is not None:
             say(f"u of the task: standard uncertainty after correction, including that of the bias, from {correct}")
@@ -178,21 +178,21 @@ def _task(
 ) -> Any:
     """Return the function that measures a task in a cloud."""
     from characterisation.tasks.task_reading import check_features, read_task
-    from mitsim.measuring.of_task import measure_task, read_pose, read_stated_view
+    from mitsim.measuring.of_task import measure_task, read_pose, read_view_statement
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
 
-    asked = read_task(task)
+    definition = read_task(task)
     # feature positions do not depend on the finish, so any wavelength serves to load the scene
     loaded = load_scene(scene, load_sensor("ensenso-n10").wavelength_nm, defined)
-    check_features(asked, task, loaded.names)
-    stated = None if correct is None else read_stated_view(correct)
-    told = None if pose is None else read_pose(pose, view)
+    check_features(definition, task, loaded.names)
+    statement = None if correct is None else read_view_statement(correct)
+    given_pose = None if pose is None else read_pose(pose, view)
 
-    def measured(one: GivenCloud) -> list[Result]:
-        stood = told or (None if one.capture is None else one.capture.world_from_sensor)
-        if stood is None:
+    def measured(one: InputCloud) -> list[Result]:
+        world_from_sensor = given_pose or (None if one.capture is None else one.capture.world_from_sensor)
+        if world_from_sensor is None:
             raise InputError(one.path, "pose", "none", "the pose of the sensor: --pose FILE")
-        return measure_task(one.cloud, asked, loaded, stood, stated, one.margin_px)
+        return measure_task(one.cloud, definition, loaded, world_from_sensor, statement, one.margin_px)
 
     return measured

@@ -102,7 +102,7 @@ def render(
     from math import isfinite
 
     from mitsim.campaign.many import Job, digest_of, origin_of
-    from mitsim.capture.folder import read_capture, refuse_taken, write_capture
+    from mitsim.capture.folder import check_free, read_capture, write_capture
     from mitsim.interface import captures as interface
     from mitsim.progress import say
     from mitsim.sensor.noise_sources import Noise
@@ -135,7 +135,7 @@ def render(
         read_capture(output)
         say(f"capture: {output}, finished before")
         return
-    refuse_taken(output)
+    check_free(output)
     capture = interface.render(loaded, chosen, pose, seed=seed, samples=samples, depth=depth, noise=noise)
     simulated = interface.laid_out(chosen)
     first = next(iter(chosen.rig.cameras))

@@ -1,1 +1,1 @@
-"""Exposures of a study: swept from one tracing, planned, and measured together."""
+"""Simulate, plan and use the exposures of a study's views."""

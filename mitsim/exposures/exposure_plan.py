@@ -1,17 +1,16 @@
-"""The shortest set of exposures that brings every feature of a view to its limit.
+"""Find the fewest exposures that bring every feature of a view to its limits of points and uncertainty u.
 
-Signal chain: single exposures from the sensor's own outward, within what the device can do -> greedy sets of several
-that together bring most points -> the best points and u of every feature that any of these gives: its limit -> the
-fewest exposures, and of as few the shortest, that reach all limits to within a share -> the same exposures one after
-the other on fresh noise: what each adds.
+Signal chain: single exposures, from the sensor's own to shorter and longer ones of the device -> greedy sets of several
+exposures that together recover most points -> the best of these, decoded again with other noise -> limits of each
+feature: its most points and its smallest u -> fewest exposures that reach all limits within a share, the shortest of
+equally few -> result of the first exposure, of the first two, and so on, with new noise.
 
-The projector's power stays full as long as the shortest exposure is not too bright: less of it only asks for a longer
-exposure, in which the room adds more light. Below the shortest exposure it is lowered.
+The projector keeps its full power, unless the shortest exposure of the device is too bright. A lower power would only
+require a longer exposure, in which the room adds more light.
 
-Of several exposures the predicted points are those that any of them alone brings back; sets that so could reach the
-limits are decoded. The best of many noisy figures flatters: so the search is done with few draws of noise, and what
-decides with more draws of other noise. A set is worse than a limit only if it is so by more than twice the standard
-error that these leave.
+The predicted points of a set are those that at least one of its exposures recovers alone. Sets that could reach the
+limits are decoded. The best of many noisy results is biased. So the search uses few noise samples, and the decision
+more samples of independent noise. A set misses a limit of u only if the difference exceeds twice its standard error.
 """
 
 from __future__ import annotations
@@ -24,31 +23,31 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.exposures.exposure_sweep import FeatureLook, Look
+from mitsim.exposures.exposure_sweep import ExposureResult, FeatureResult
 from mitsim.sensor.exposure import PlannedExposure
 
-#: ratio of single exposures that stand side by side, and the largest ratio to the sensor's own that is tried
-STEP, REACH = math.sqrt(2.0), 64.0
+#: ratio of neighbouring single exposures, and their largest ratio to the sensor's own exposure
+STEP, LARGEST_RATIO = math.sqrt(2.0), 64.0
 
-#: least power of a projector that is asked for [1]; *assumed*: no maker of the presets states one
+#: least power of a projector in a plan [1]; *assumed*, since no maker of the presets states one
 LEAST_POWER = 0.1
 
-#: a sweep ends where so many exposures in a row bring less than this share of the best points of every feature
-ENOUGH_STEPS, ENOUGH_SHARE = 3, 0.3
+#: a sweep ends after this number of exposures with, on every feature, at most this share of its best number of points
+STOP_STEPS, STOP_SHARE = 3, 0.3
 
-#: sets of one size that are decoded in search of one that reaches the limits, and how many are looked at again
+#: number of sets of one size that are decoded, and how many of them take part in the decision
 TRIED, FINALISTS = 8, 5
 
-#: numbers of the noise of the search, of the decision, and of what a plan is told from
-SEARCH, DECISION, TOLD = 0, 1, 2
+#: numbers of the independent noise of the search, of the decision, and of the reported results
+SEARCH, DECISION, REPORT = 0, 1, 2
 
-#: draws of noise of each
-DRAWS = {SEARCH: 2, DECISION: 6, TOLD: 6}
+#: number of noise samples of each
+DRAWS = {SEARCH: 2, DECISION: 6, REPORT: 6}
 
 
 @dataclass(frozen=True)
 class PlanRules:
-    """``most`` exposures of a set; ``within`` share of points and u by which a limit may be missed [1]."""
+    """Rules of a plan: at most ``most`` exposures; ``within`` is the share by which a limit may be missed [1]."""
 
     most: int = 3
     within: float = 0.1
@@ -56,38 +55,41 @@ class PlanRules:
 
 @dataclass(frozen=True)
 class ExposurePlan:
-    """Exposures of one view, and what they give.
+    """Planned exposures of one ``view``, and their results.
 
-    ``exposure`` chosen; ``added`` what its exposures give one after the other, the most useful first, each with those
-    before it, on fresh noise; ``own`` what the sensor's own rule gives on the same noise; ``limits`` points and u of
-    every feature that can be measured; ``reached`` whether the plan, as it was chosen, reached them all; ``unseen``
-    features that no exposure brings enough points of.
+    - ``exposure``: the planned exposures and power.
+    - ``added``: exposure [s], and the result of it with all before it, the most useful first; with new noise.
+    - ``own``: result of the sensor's own exposure rule, with the same noise.
+    - ``limits``: most points and smallest u of every feature that can be measured.
+    - ``reached``: whether the plan reached all limits when it was chosen.
+    - ``unseen``: features with too few points at every exposure.
+    - ``sets_tried``: number of decoded sets, single exposures included.
     """
 
     view: int
     exposure: PlannedExposure
-    added: tuple[tuple[float, Look], ...]
-    own: Look
-    limits: dict[str, FeatureLook]
+    added: tuple[tuple[float, ExposureResult], ...]
+    own: ExposureResult
+    limits: dict[str, FeatureResult]
     reached: bool
     unseen: tuple[str, ...]
     sets_tried: int
 
 
-class _Looks:
-    """Looks of one noise that were taken, each once."""
+class _Results:
+    """Results with one noise, each computed once: call it with a set of exposures. ``known`` has all of them."""
 
-    def __init__(self, look: Callable[[PlannedExposure, int, int], Look], noise: int) -> None:
-        self.take, self.noise, self.known = look, noise, dict[PlannedExposure, Look]()
+    def __init__(self, evaluate: Callable[[PlannedExposure, int, int], ExposureResult], noise: int) -> None:
+        self.evaluate, self.noise, self.known = evaluate, noise, dict[PlannedExposure, ExposureResult]()
 
-    def __call__(self, exposure: PlannedExposure) -> Look:
+    def __call__(self, exposure: PlannedExposure) -> ExposureResult:
         if exposure not in self.known:
-            self.known[exposure] = self.take(exposure, self.noise, DRAWS[self.noise])
+            self.known[exposure] = self.evaluate(exposure, self.noise, DRAWS[self.noise])
         return self.known[exposure]
 
 
 def plan_exposures(
-    look: Callable[[PlannedExposure, int, int], Look],
+    evaluate: Callable[[PlannedExposure, int, int], ExposureResult],
     own: PlannedExposure,
     limits_s: tuple[float, float],
     rules: PlanRules,
@@ -98,72 +100,90 @@ def plan_exposures(
 
     Parameters
     ----------
-    look
-        What a set of exposures gives, with the number of the noise and how often it is drawn.
+    evaluate
+        Function of a set of exposures, the number of the noise and the number of its samples, which returns the result.
     own
         The sensor's own exposures, from which the search starts.
     limits_s
         Shortest and longest exposure of the device [s].
+    rules
+        Largest number of exposures, and the share by which a limit may be missed.
     dimmable
-        Whether the power may be lowered where the shortest exposure is too bright.
+        Whether the power may be lowered if the shortest exposure is too bright.
+    view
+        Number of the view, for the plan.
     """
-    looks, again, told = (_Looks(look, noise) for noise in (SEARCH, DECISION, TOLD))
-    singles = _swept(looks, own, limits_s, dimmable)
+    search, decision, report = (_Results(evaluate, noise) for noise in (SEARCH, DECISION, REPORT))
+    singles = _sweep(search, own, limits_s, dimmable)
     names = list(singles[0].features)
-    full = [one for one in singles if one.exposure.power == 1.0]
-    sets = [_greedy(looks, start, names, rules.most) for start in (full, full[::2])]  # sets of neighbours differ
-    rough = _needed(_limits(list(looks.known.values()), names))
-    for exposure in {own, *(one.exposure for one in _nearest(singles, rough)), *(one for some in sets for one in some)}:
-        again(exposure)
-    limits = _needed(_limits(list(again.known.values()), names))
-    chosen, reached = _fewest(looks, again, full, limits, rules) if limits else (again(own), False)
+    full_power = [one for one in singles if one.exposure.power == 1.0]
+    # with half of the exposures, the greedy search finds other sets
+    sets = [_greedy_sets(search, start, names, rules.most) for start in (full_power, full_power[::2])]
+    first_limits = _measurable(_limits(list(search.known.values()), names))
+    for exposure in {
+        own,
+        *(one.exposure for one in _nearest(singles, first_limits)),
+        *(one for results in sets for one in results),
+    }:
+        decision(exposure)
+    limits = _measurable(_limits(list(decision.known.values()), names))
+    chosen, reached = (
+        _fewest_exposures(search, decision, full_power, limits, rules) if limits else (decision(own), False)
+    )
     added = []
-    for prefix in _in_order(again, chosen.exposure, limits or _limits([chosen], names)):
-        added.append((prefix[-1], told(PlannedExposure(tuple(sorted(prefix)), chosen.exposure.power))))
+    for prefix in _by_usefulness(decision, chosen.exposure, limits or _limits([chosen], names)):
+        added.append((prefix[-1], report(PlannedExposure(tuple(sorted(prefix)), chosen.exposure.power))))
     unseen = tuple(name for name in names if name not in limits)
     return ExposurePlan(
-        view, chosen.exposure, tuple(added), told(own), limits, reached, unseen, len(looks.known | again.known)
+        view, chosen.exposure, tuple(added), report(own), limits, reached, unseen, len(search.known | decision.known)
     )
 
 
-def shortfall(one: Look, limits: dict[str, FeatureLook]) -> float:
-    """How far a look is from all limits: the largest of n_limit / n - 1 and u / u_limit - 1 of the features.
+def shortfall(one: ExposureResult, limits: dict[str, FeatureResult]) -> float:
+    """Return by which share a result misses its limits, 0 if it reaches them all.
 
-    What the draws of noise leave open counts in favour of the look, by two standard errors of the difference.
+    It is the largest value, over all features, of n_limit / n - 1 and of u / (u_limit (1 + 2 e)) - 1. Here n is the
+    number of points, and e is the relative standard error of u / u_limit from the finite number of noise samples.
     """
     worst = 0.0
     for name, limit in limits.items():
         known = one.features[name]
-        few = limit.points / known.points - 1 if known.points > 0 else math.inf
-        open_ = 2 * math.hypot(known.error, limit.error)
-        worst = max(worst, few, known.u / limit.u / (1 + open_) - 1)
+        missing_points = limit.points / known.points - 1 if known.points > 0 else math.inf
+        allowance = 2 * math.hypot(known.error, limit.error)
+        worst = max(worst, missing_points, known.u / limit.u / (1 + allowance) - 1)
     return worst
 
 
-def _swept(looks: _Looks, own: PlannedExposure, limits_s: tuple[float, float], dimmable: bool) -> list[Look]:
-    """Single exposures, shortest first, from the sensor's own outward, until all is found and they bring nothing."""
+def _sweep(
+    search: _Results, own: PlannedExposure, limits_s: tuple[float, float], dimmable: bool
+) -> list[ExposureResult]:
+    """Return the results of single exposures, shortest first.
+
+    The sweep goes from the sensor's own exposure to longer and to shorter ones. It ends if every feature has been found
+    and further exposures recover too few points, or at the limits of the device.
+    """
     middle = math.exp(np.mean(np.log(own.exposures_s)))
     shortest, longest = limits_s
     best: dict[str, float] = {}
-    found = [looks(PlannedExposure((middle,)))]
+    found = [search(PlannedExposure((middle,)))]
 
-    def worth(one: Look) -> bool:
+    def is_useful(one: ExposureResult) -> bool:
         for name, known in one.features.items():
             best[name] = max(best.get(name, 0.0), known.points if math.isfinite(known.u) else 0.0)
-        return any(known.points > ENOUGH_SHARE * best[name] > 0 for name, known in one.features.items())
+        return any(known.points > STOP_SHARE * best[name] > 0 for name, known in one.features.items())
 
-    worth(found[0])
-    steps = math.floor(math.log(REACH) / math.log(STEP))
+    is_useful(found[0])
+    steps = math.floor(math.log(LARGEST_RATIO) / math.log(STEP))
     for direction in (1, -1):
-        barren = 0
+        useless_steps = 0
         for k in range(1, steps + 1):
-            exposure = _within(middle * STEP ** (direction * k), shortest, longest, dimmable)
+            exposure = _feasible_exposure(middle * STEP ** (direction * k), shortest, longest, dimmable)
             if exposure is None:
                 break
-            one = looks(exposure)
+            one = search(exposure)
             found.append(one)
-            barren = 0 if worth(one) else barren + 1
-            if barren >= ENOUGH_STEPS and all(best.values()):
+            useless_steps = 0 if is_useful(one) else useless_steps + 1
+            if useless_steps >= STOP_STEPS and all(best.values()):
                 break
             if exposure.exposures_s[0] >= longest:
                 break
@@ -171,8 +191,11 @@ def _swept(looks: _Looks, own: PlannedExposure, limits_s: tuple[float, float], d
     return sorted(unique.values(), key=_product)
 
 
-def _within(seconds: float, shortest: float, longest: float, dimmable: bool) -> PlannedExposure | None:
-    """A single exposure of a device that gives this product of time and power; None where it cannot."""
+def _feasible_exposure(seconds: float, shortest: float, longest: float, dimmable: bool) -> PlannedExposure | None:
+    """Return a single exposure with this product of time [s] and power, if possible at full power.
+
+    It is the longest exposure if the product is larger. It is None if the product is too small.
+    """
     if seconds >= longest:
         return PlannedExposure((longest,))
     if seconds >= shortest:
@@ -182,118 +205,138 @@ def _within(seconds: float, shortest: float, longest: float, dimmable: bool) -> 
 
 
 def _rounded(seconds: float) -> float:
-    """Two digits more than any device needs: what is planned can be typed in."""
+    """Return an exposure [s] rounded to three significant digits, so that a user can type it in."""
     return float(f"{seconds:.3g}")
 
 
-def _product(one: Look) -> float:
+def _product(one: ExposureResult) -> float:
+    """Return total exposure times power [s]."""
     return one.exposure.seconds * one.exposure.power
 
 
-def _greedy(looks: _Looks, singles: Sequence[Look], names: Sequence[str], most: int) -> list[PlannedExposure]:
-    """Decode sets of two and more of the single exposures that bring most points together, each one more."""
-    chosen, sets = list[Look](), list[PlannedExposure]()
+def _greedy_sets(
+    search: _Results, singles: Sequence[ExposureResult], names: Sequence[str], most: int
+) -> list[PlannedExposure]:
+    """Decode sets of two to ``most`` single exposures, and return them.
+
+    Each set adds to the one before it the exposure with which the worst feature has the largest share of its points.
+    """
+    chosen, sets = list[ExposureResult](), list[PlannedExposure]()
     possible = {name: float(_union(singles, name).sum()) for name in names}
-    seen = [name for name in names if possible[name] > 0]
+    recovered = [name for name in names if possible[name] > 0]
     for size in range(1, min(most, len(singles)) + 1):
-        free = [one for one in singles if one not in chosen]
+        unused = [one for one in singles if one not in chosen]
         chosen.append(
             max(
-                free,
+                unused,
                 key=lambda one: min(
-                    (_union([*chosen, one], name).sum() / possible[name] for name in seen), default=0.0
+                    (_union([*chosen, one], name).sum() / possible[name] for name in recovered), default=0.0
                 ),
             )
         )
         if size > 1:
-            sets.append(_set_of(chosen))
-            looks(sets[-1])
+            sets.append(_merged_set(chosen))
+            search(sets[-1])
     return sets
 
 
-def _union(some: Sequence[Look], name: str) -> NDArray[np.bool_]:
-    return np.asarray(np.any([one.seen[name] for one in some], axis=0))
+def _union(results: Sequence[ExposureResult], name: str) -> NDArray[np.bool_]:
+    """Return the mask of the possible points of a feature that any of the results recovered."""
+    return np.asarray(np.any([one.recovered[name] for one in results], axis=0))
 
 
-def _set_of(some: Sequence[Look]) -> PlannedExposure:
-    return PlannedExposure(tuple(sorted(one.exposure.exposures_s[0] for one in some)))
+def _merged_set(results: Sequence[ExposureResult]) -> PlannedExposure:
+    """Return the set of several single exposures at full power."""
+    return PlannedExposure(tuple(sorted(one.exposure.exposures_s[0] for one in results)))
 
 
-def _limits(some: Sequence[Look], names: Sequence[str]) -> dict[str, FeatureLook]:
-    """Most points and least u of every feature, each of any look."""
+def _limits(results: Sequence[ExposureResult], names: Sequence[str]) -> dict[str, FeatureResult]:
+    """Return the most points and the smallest u of every feature, which may be of different results."""
     out = {}
     for name in names:
-        rows = [one.features[name] for one in some]
+        rows = [one.features[name] for one in results]
         most = max(rows, key=lambda row: row.points)
         least = min(rows, key=lambda row: row.u)
-        out[name] = FeatureLook(most.points, most.fraction, least.u, least.scatter, least.error)
+        out[name] = FeatureResult(most.points, most.fraction, least.u, least.scatter, least.error)
     return out
 
 
-def _needed(limits: dict[str, FeatureLook]) -> dict[str, FeatureLook]:
-    """Those of the features that can be measured at any exposure."""
+def _measurable(limits: dict[str, FeatureResult]) -> dict[str, FeatureResult]:
+    """Return the limits of those features that can be measured at some exposure."""
     return {name: one for name, one in limits.items() if math.isfinite(one.u)}
 
 
-def _nearest(some: Sequence[Look], limits: dict[str, FeatureLook]) -> list[Look]:
-    """The few that come nearest to the limits."""
-    return sorted(some, key=lambda one: (shortfall(one, limits), one.exposure.seconds))[:FINALISTS]
+def _nearest(results: Sequence[ExposureResult], limits: dict[str, FeatureResult]) -> list[ExposureResult]:
+    """Return the :data:`FINALISTS` results with the smallest shortfall."""
+    return sorted(results, key=lambda one: (shortfall(one, limits), one.exposure.seconds))[:FINALISTS]
 
 
-def _fewest(
-    looks: _Looks, again: _Looks, full: Sequence[Look], limits: dict[str, FeatureLook], rules: PlanRules
-) -> tuple[Look, bool]:
-    """The fewest exposures that reach the limits, of as few the shortest; else of those that come about as near."""
+def _fewest_exposures(
+    search: _Results,
+    decision: _Results,
+    full_power: Sequence[ExposureResult],
+    limits: dict[str, FeatureResult],
+    rules: PlanRules,
+) -> tuple[ExposureResult, bool]:
+    """Return the result with the fewest exposures that reaches the limits, and True; of equally few, the shortest.
+
+    If no set reaches them, return the one with the fewest exposures of those that come nearly as close as the best, and
+    False.
+    """
     for size in range(1, rules.most + 1):
         if size > 1:
-            wanted = [looks(exposure) for exposure in _promising(full, size, limits, rules.within)]
-            for one in _nearest(wanted, limits):
-                again(one.exposure)
-        able = [
+            candidates = [search(exposure) for exposure in _candidate_sets(full_power, size, limits, rules.within)]
+            for one in _nearest(candidates, limits):
+                decision(one.exposure)
+        sufficient = [
             one
-            for one in again.known.values()
+            for one in decision.known.values()
             if len(one.exposure.exposures_s) == size and shortfall(one, limits) <= rules.within
         ]
-        if able:
-            return min(able, key=lambda one: one.exposure.seconds), True
-    least = min(shortfall(one, limits) for one in again.known.values())
-    near = [one for one in again.known.values() if shortfall(one, limits) <= least + rules.within]
+        if sufficient:
+            return min(sufficient, key=lambda one: one.exposure.seconds), True
+    least = min(shortfall(one, limits) for one in decision.known.values())
+    near = [one for one in decision.known.values() if shortfall(one, limits) <= least + rules.within]
     return min(near, key=lambda one: (len(one.exposure.exposures_s), one.exposure.seconds)), False
 
 
-def _promising(full: Sequence[Look], size: int, limits: dict[str, FeatureLook], within: float) -> list[PlannedExposure]:
-    """Sets of a size that together may bring the points that are asked for, the shortest first."""
+def _candidate_sets(
+    full_power: Sequence[ExposureResult], size: int, limits: dict[str, FeatureResult], within: float
+) -> list[PlannedExposure]:
+    """Return sets of a size that are predicted to recover enough points, the shortest first; then the closest ones."""
     sets = list[tuple[float, float, PlannedExposure]]()
-    for some in combinations(full, size):
-        share = min(float(_union(some, name).sum()) / limit.points for name, limit in limits.items())
-        sets.append((share, sum(one.exposure.seconds for one in some), _set_of(some)))
-    able = sorted((one for one in sets if one[0] >= 1 / (1 + within)), key=lambda one: one[1])
-    if len(able) < TRIED:  # none is predicted to: those that come nearest
-        able += sorted((one for one in sets if one[0] < 1 / (1 + within)), key=lambda one: -one[0])
-    return [one[2] for one in able[:TRIED]]
+    for results in combinations(full_power, size):
+        share = min(float(_union(results, name).sum()) / limit.points for name, limit in limits.items())
+        sets.append((share, sum(one.exposure.seconds for one in results), _merged_set(results)))
+    sufficient = sorted((one for one in sets if one[0] >= 1 / (1 + within)), key=lambda one: one[1])
+    if len(sufficient) < TRIED:  # too few sets are predicted to: add those that come closest
+        sufficient += sorted((one for one in sets if one[0] < 1 / (1 + within)), key=lambda one: -one[0])
+    return [one[2] for one in sufficient[:TRIED]]
 
 
-def _in_order(looks: _Looks, exposure: PlannedExposure, limits: dict[str, FeatureLook]) -> list[tuple[float, ...]]:
-    """Longer and longer sets of a plan's exposures, each with the one more that helps most."""
-    left, chosen, out = list(exposure.exposures_s), list[float](), list[tuple[float, ...]]()
-    while left:
-        if len(left) == 1:
-            best = left[0]
+def _by_usefulness(
+    search: _Results, exposure: PlannedExposure, limits: dict[str, FeatureResult]
+) -> list[tuple[float, ...]]:
+    """Return sets of one, two and more of a plan's exposures; each adds the exposure that helps most."""
+    remaining, chosen, out = list(exposure.exposures_s), list[float](), list[tuple[float, ...]]()
+    while remaining:
+        if len(remaining) == 1:
+            best = remaining[0]
         else:
             best = min(
-                left,
-                key=lambda seconds: _missing(
-                    looks(PlannedExposure(tuple(sorted([*chosen, seconds])), exposure.power)), limits
+                remaining,
+                key=lambda seconds: _shortage(
+                    search(PlannedExposure(tuple(sorted([*chosen, seconds])), exposure.power)), limits
                 ),
             )
-        left.remove(best)
+        remaining.remove(best)
         chosen.append(best)
         out.append(tuple(chosen))
     return out
 
 
-def _missing(one: Look, limits: dict[str, FeatureLook]) -> tuple[float, float]:
-    """How many features have no u, and the mean share of points that is missing."""
+def _shortage(one: ExposureResult, limits: dict[str, FeatureResult]) -> tuple[float, float]:
+    """Return the number of features without u, and minus the mean share of the points at the limits."""
     without = sum(not math.isfinite(one.features[name].u) for name in limits)
     shares = [one.features[name].points / max(limits[name].points, 1.0) for name in limits]
     return float(without), -float(np.mean(shares))

@@ -1,7 +1,7 @@
-"""Exposures of a study's virtual measurements: planned for a view, kept in its folder, told as a table.
+"""Plan the exposures of a study's views, store the plans, and make virtual measurements with them.
 
 Signal chain: study and view -> plan (:mod:`mitsim.exposures.exposure_plan`), or the exposures that the study gives ->
-``exposures/view_0012.json`` -> maker of the same virtual measurements with them, and trials of their own.
+``exposures/view_0012.json`` -> the same virtual measurements with these exposures, and separate trials.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from characterisation.checked_files import read_json_object
 from characterisation.documents import Document, validate
 from characterisation.errors import InputError
 from mitsim.exposures.exposure_plan import ExposurePlan, PlanRules, plan_exposures
-from mitsim.exposures.exposure_sweep import ExposureSweep, Look
+from mitsim.exposures.exposure_sweep import ExposureResult, ExposureSweep
 from mitsim.progress import say
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import ExposureTable, Study
@@ -30,52 +30,71 @@ from mitsim.virtual.race import Maker
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.trials import TrialFolder
 
-#: limits of exposures that a sensor file has if it says nothing: no device's
+#: default exposure limits of a sensor file [s], which are not those of a device
 _NO_LIMITS = (1e-9, 1e3)
 
-#: raised when the same light would be planned otherwise
+#: version of the planning rules; a stored plan of another version is not used
 PLAN_VERSION = 1
 
 
 @runtime_checkable
 class Exposable(Protocol):
-    """A maker whose exposure can be chosen."""
+    """Virtual measurements whose exposure can be set."""
 
     def exposed_as(self, planned: PlannedExposure | None) -> Maker:
-        """The same measurements, exposed otherwise."""
+        """Return the same measurements with other exposures; None is the sensor's own rule."""
 
 
 @dataclass(frozen=True)
 class Exposed:
-    """What makes the trials of one view, its ``digest``, and how they are exposed; ``planned`` None by the sensor."""
+    """Virtual measurements of one view with their exposures.
+
+    - ``maker``: makes the trials.
+    - ``digest``: identifies everything that determines them.
+    - ``planned``: exposures, None for the sensor's own rule.
+    """
 
     maker: Maker
     digest: str
     planned: PlannedExposure | None
 
     def trials(self, study: Study, folder: Path, own: TrialFolder) -> TrialFolder:
-        """Where the trials are kept in a folder: of the sensor's own exposure with all others, in its ``own``."""
+        """Return the folder of the trials: ``own`` for the sensor's own exposure, otherwise one inside ``folder``."""
         if self.planned is None:
             return own
         return TrialFolder(folder / "planned_trials", self.digest, list(study.task.measurements))
 
 
 def exposed_for(
-    study: Study, view: View, here: RenderedMeasurements | MappedMeasurements, maker: Maker, digest: str, folder: Path
+    study: Study,
+    view: View,
+    measurements: RenderedMeasurements | MappedMeasurements,
+    maker: Maker,
+    digest: str,
+    folder: Path,
 ) -> Exposed:
-    """The measurements of a view with the exposure that the study asks for: see :func:`planned_for`.
+    """Return the virtual measurements of a view with the exposures of the study: see :func:`planned_for`.
 
-    ``maker`` makes the trials of ``digest``, ``here`` or in other processes.
+    Parameters
+    ----------
+    measurements
+        The measurements of this process, with which exposures are planned.
+    maker
+        The same measurements, in this process or spread over several; it makes the trials.
+    digest
+        Identifies everything but the exposures that determines a trial.
+    folder
+        Keeps the plans.
     """
-    planned = planned_for(study, view, here, digest, folder)
+    planned = planned_for(study, view, measurements, digest, folder)
     if planned is None:
         return Exposed(maker, digest, None)
-    assert isinstance(maker, Exposable)  # a map was refused
+    assert isinstance(maker, Exposable)  # planned_for rejects a map
     return Exposed(maker.exposed_as(planned), with_exposure(digest, planned), planned)
 
 
-class _Kept(Document):
-    """The part of a kept plan that virtual measurements need."""
+class _StoredPlan(Document):
+    """The keys of a stored plan that virtual measurements need."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
@@ -85,75 +104,77 @@ class _Kept(Document):
 
 
 def planned_for(
-    study: Study, view: View, here: RenderedMeasurements | MappedMeasurements, digest: str, folder: Path
+    study: Study, view: View, measurements: RenderedMeasurements | MappedMeasurements, digest: str, folder: Path
 ) -> PlannedExposure | None:
-    """How captures of a view are exposed: as the study says, or as planned; None by the sensor's own rule.
+    """Return the exposures of a view's captures: those of the study, or planned ones; None for the sensor's own rule.
 
-    A plan that the ``folder`` keeps of the same ``digest`` is not made again.
+    A plan in ``folder`` with the same ``digest`` is used again.
 
     Raises
     ------
     InputError
-        If measurements come from a map, which has the exposure that it was made with.
+        If the measurements are drawn from a map, which holds only for the exposure that it was made with. Also if the
+        sensor cannot take or merge the exposures of the study.
     """
     table = study.file.exposure
     if table is None:
         return None
-    maker = rendered(study, here)
+    maker = rendered(study, measurements)
     if table.exposures_s is not None:
         given = PlannedExposure(tuple(sorted(table.exposures_s)), table.power)
         _check_given(study, given, table)
         return given
     rules = PlanRules(table.most, table.within)
     path = plan_path(folder, view.number)
-    told = with_exposure(digest, None, asdict(rules))
+    digest_of_plan = with_exposure(digest, None, asdict(rules))
     if path.exists():
         try:
-            kept = validate(path, read_json_object(path), _Kept)
+            stored = validate(path, read_json_object(path), _StoredPlan)
         except InputError:
-            kept = None
-        if kept is not None and kept.digest == told:
-            return PlannedExposure(tuple(kept.exposures_s), kept.power)
+            stored = None
+        if stored is not None and stored.digest == digest_of_plan:
+            return PlannedExposure(tuple(stored.exposures_s), stored.power)
     plan = plan_view(study, maker, view, rules)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, plan_document(study, plan) | {"digest": told})
+    write_json(path, plan_document(study, plan) | {"digest": digest_of_plan})
     say(f"view {view.number}: {plan_in_words(plan)}")
     return plan.exposure
 
 
 def plan_view(study: Study, maker: RenderedMeasurements, view: View, rules: PlanRules) -> ExposurePlan:
-    """Plan the exposures of one view, from one tracing of its light."""
+    """Plan the exposures of one view; its light is traced once."""
     policy = study.sensor.exposure
     if policy.limits_s == _NO_LIMITS:
-        say(f"{study.sensor.name} states no limits of its exposure: any is taken as possible")
+        say(f"{study.sensor.name} states no exposure limits: any exposure is allowed")
     own = PlannedExposure(policy.exposures(None, float(study.sensor.imager.full_well)))
     sweep = ExposureSweep(maker, view)
     if not study.sensor.merges_exposures:
-        say(f"{study.sensor.name} cannot merge exposures: one is planned")
+        say(f"{study.sensor.name} cannot merge exposures: the plan has one exposure")
         rules = PlanRules(1, rules.within)
-    return plan_exposures(sweep.look, own, policy.limits_s, rules, sweep.dimmable, view.number)
+    return plan_exposures(sweep.evaluate, own, policy.limits_s, rules, sweep.dimmable, view.number)
 
 
-def rendered(study: Study, here: RenderedMeasurements | MappedMeasurements) -> RenderedMeasurements:
-    """The maker, if it renders.
+def rendered(study: Study, measurements: RenderedMeasurements | MappedMeasurements) -> RenderedMeasurements:
+    """Return the virtual measurements, if they are rendered.
 
     Raises
     ------
     InputError
-        If it draws clouds from a map.
+        If they are drawn from a map.
     """
-    if not isinstance(here, RenderedMeasurements):
+    if not isinstance(measurements, RenderedMeasurements):
         raise InputError(
             study.path,
             "exposure",
-            "exposures to be planned, and measurements drawn from a map",
-            "measurements that are rendered",
-            'a map has the exposure that it was made with: set measure.by = "render"',
+            "exposures, and measurements that are drawn from a map",
+            "rendered measurements",
+            'a map holds only for the exposure that it was made with: set measure.by = "render"',
         )
-    return here
+    return measurements
 
 
 def _check_given(study: Study, given: PlannedExposure, table: ExposureTable) -> None:
+    """Check that a sensor can take and merge the exposures of a study; raise an InputError if not."""
     shortest, longest = study.sensor.exposure.limits_s
     for seconds in given.exposures_s:
         if not shortest <= seconds <= longest:
@@ -162,7 +183,7 @@ def _check_given(study: Study, given: PlannedExposure, table: ExposureTable) -> 
                 "exposure.exposures_s",
                 f"{seconds:g} s",
                 f"{shortest:g} to {longest:g} s",
-                f"what {study.sensor.name} can do",
+                f"these are the limits of {study.sensor.name}",
             )
     if len(given.exposures_s) > 1 and not study.sensor.merges_exposures:
         raise InputError(
@@ -170,23 +191,23 @@ def _check_given(study: Study, given: PlannedExposure, table: ExposureTable) -> 
             "exposure.exposures_s",
             f"{len(given.exposures_s)} exposures",
             "one",
-            f"{study.sensor.name} cannot merge any",
+            f"{study.sensor.name} cannot merge exposures",
         )
 
 
 def plan_path(folder: Path, view: int) -> Path:
-    """Where a folder keeps the plan of a view."""
+    """Return the path of the plan of a view in a folder."""
     return folder / "exposures" / f"view_{view:04d}.json"
 
 
 def with_exposure(digest: str, planned: PlannedExposure | None, more: Any = None) -> str:
-    """Sixteen hexadecimal digits of a trial's digest and of how it is exposed."""
-    told = repr([PLAN_VERSION, digest, None if planned is None else asdict(planned), more])
-    return hashlib.sha256(told.encode()).hexdigest()[:16]
+    """Return the digest of trials with their exposures: 16 hexadecimal digits of a SHA-256."""
+    content = repr([PLAN_VERSION, digest, None if planned is None else asdict(planned), more])
+    return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
 def plan_document(study: Study, plan: ExposurePlan) -> dict[str, Any]:
-    """A plan as JSON values; see docs/reference/formats/exposures.md."""
+    """Return a plan as JSON values; the keys are in docs/reference/formats/exposures.md."""
     return {
         "schema_version": 1,
         "study": str(study.path),
@@ -202,17 +223,17 @@ def plan_document(study: Study, plan: ExposurePlan) -> dict[str, Any]:
             name: {"points": one.points, "fraction": one.fraction, "u_mm": _number(one.u)}
             for name, one in plan.limits.items()
         },
-        "own": _look(plan.own),
-        "added": [{"exposure_s": seconds} | _look(look) for seconds, look in plan.added],
+        "own": _result_values(plan.own),
+        "added": [{"exposure_s": seconds} | _result_values(result) for seconds, result in plan.added],
     }
 
 
-def _look(look: Look) -> dict[str, Any]:
+def _result_values(result: ExposureResult) -> dict[str, Any]:
     return {
-        "exposures_s": list(look.exposure.exposures_s),
+        "exposures_s": list(result.exposure.exposures_s),
         "features": {
             name: {"points": round(one.points, 1), "fraction": round(one.fraction, 4), "u_mm": _number(one.u)}
-            for name, one in look.features.items()
+            for name, one in result.features.items()
         },
     }
 
@@ -222,14 +243,22 @@ def _number(value: float) -> float | None:
 
 
 def plan_table(plan: ExposurePlan) -> str:
-    """A plan as a table of text: what to type in, and what each exposure adds."""
+    """Return a plan as a table of text: the exposures to set, and the result that each adds."""
     names = list(plan.own.features)
     head = ("capture", "exposure [ms]", "power", *(f"{name}: points, F, u [um]" for name in names))
-    rows = [head, ("sensor's own", *_typed(plan.own.exposure), *(_cell(plan.own, name) for name in names))]
-    for k, (seconds, look) in enumerate(plan.added):
-        what = "1" if k == 0 else f"and {k + 1}, merged"
+    rows = [
+        head,
+        ("sensor's own", *_settings_text(plan.own.exposure), *(_feature_text(plan.own, name) for name in names)),
+    ]
+    for k, (seconds, result) in enumerate(plan.added):
+        step_name = "1" if k == 0 else f"and {k + 1}, merged"
         rows.append(
-            (what, f"{1e3 * seconds:.3g}", f"{100 * plan.exposure.power:.0f} %", *(_cell(look, name) for name in names))
+            (
+                step_name,
+                f"{1e3 * seconds:.3g}",
+                f"{100 * plan.exposure.power:.0f} %",
+                *(_feature_text(result, name) for name in names),
+            )
         )
     limit = [
         f"{one.points:.0f}  {one.fraction:.2f}  {1e3 * one.u:.1f}" if (one := plan.limits.get(name)) else "not reached"
@@ -240,14 +269,15 @@ def plan_table(plan: ExposurePlan) -> str:
 
 
 def write_plan_csv(path: Path, plan: ExposurePlan) -> None:
-    """The exposures and what each adds as a CSV file: a row for each feature of each step."""
+    """Write a plan as a CSV file, with one row for each feature of each step."""
     lines = ["step,exposure_ms,power,feature,points,fraction,u_mm"]
     steps = [("own", ";".join(f"{1e3 * one:.4g}" for one in plan.own.exposure.exposures_s), plan.own, 1.0)]
     steps += [
-        (str(k), f"{1e3 * seconds:.4g}", look, plan.exposure.power) for k, (seconds, look) in enumerate(plan.added, 1)
+        (str(k), f"{1e3 * seconds:.4g}", result, plan.exposure.power)
+        for k, (seconds, result) in enumerate(plan.added, 1)
     ]
-    for step, exposure, look, power in steps:
-        for name, one in look.features.items():
+    for step, exposure, result, power in steps:
+        for name, one in result.features.items():
             u = f"{one.u:.4g}" if math.isfinite(one.u) else ""
             lines.append(f"{step},{exposure},{power:g},{name},{one.points:.1f},{one.fraction:.4f},{u}")
     with atomic_write(path) as file:
@@ -255,7 +285,7 @@ def write_plan_csv(path: Path, plan: ExposurePlan) -> None:
 
 
 def exposure_in_words(planned: PlannedExposure) -> str:
-    """Like ``0.82 and 3.3 ms, merged, at full power``."""
+    """Return exposures in words, such as ``0.82 and 3.3 ms, merged, at full power``."""
     times = [f"{1e3 * seconds:.3g}" for seconds in planned.exposures_s]
     several = f"{', '.join(times[:-1])} and {times[-1]} ms, merged" if len(times) > 1 else f"{times[0]} ms"
     power = "full power" if planned.power == 1 else f"{100 * planned.power:.0f} % of the power"
@@ -263,24 +293,24 @@ def exposure_in_words(planned: PlannedExposure) -> str:
 
 
 def plan_in_words(plan: ExposurePlan) -> str:
-    """One line: what to set, and whether that is all that can be had."""
+    """Return one line: the exposures to set, and whether they reach all limits."""
     if not plan.limits:
-        return f"no exposure brings enough points of any feature that is needed: {', '.join(plan.unseen)}"
+        return f"no exposure gives enough points on any feature that the task needs: {', '.join(plan.unseen)}"
     count = len(plan.exposure.exposures_s)
-    said = f"expose {exposure_in_words(plan.exposure)}: "
+    text = f"expose {exposure_in_words(plan.exposure)}: "
     if plan.reached:
-        said += "every feature" if not plan.unseen else "every other feature"
-        said += f" is at its limit with {count} exposure{'s' if count > 1 else ''}"
+        text += "every feature" if not plan.unseen else "every other feature"
+        text += f" is at its limit with {count} exposure{'s' if count > 1 else ''}"
     else:
-        said += "the limits are not all reached, and no other set that was tried comes much nearer"
-    return said + (f"; out of reach from here at any exposure: {', '.join(plan.unseen)}" if plan.unseen else "")
+        text += "not all limits are reached, and no other set that was tried comes much closer"
+    return text + (f"; too few points from this view at any exposure: {', '.join(plan.unseen)}" if plan.unseen else "")
 
 
-def _typed(planned: PlannedExposure) -> tuple[str, str]:
+def _settings_text(planned: PlannedExposure) -> tuple[str, str]:
     return ", ".join(f"{1e3 * one:.3g}" for one in planned.exposures_s), f"{100 * planned.power:.0f} %"
 
 
-def _cell(look: Look, name: str) -> str:
-    one = look.features[name]
+def _feature_text(result: ExposureResult, name: str) -> str:
+    one = result.features[name]
     u = f"{1e3 * one.u:.1f}" if math.isfinite(one.u) else "-"
     return f"{one.points:.0f}  {one.fraction:.2f}  {u}"

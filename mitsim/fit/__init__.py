@@ -1,1 +1,1 @@
-"""The simulator fitted to captures of a flat coupon: width of the lobe, power of the projector, residual."""
+"""Fit the simulation to captures of a flat coupon: width of its lobe, power of the projector, residuals."""

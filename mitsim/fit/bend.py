@@ -1,10 +1,12 @@
-"""The bend of a sheet that should be flat: a low-order surface over its plane.
+"""Fit the bend of a nominally flat sheet, a low-order surface over its plane.
 
-Signal chain: points of the cloud in the plane's frame -> medians of the cells of a raster -> Legendre polynomials of
-total degree d by least squares, for every d that is tried -> the d whose leave-one-out error is smallest -> heights.
+Signal chain: points of the cloud in the plane's frame -> median heights of square cells -> Legendre polynomials of
+total degree d by least squares, for several d -> degree with the smallest leave-one-out error -> heights.
 
-The leave-one-out error is PRESS, sum of (r_i / (1 - h_ii))^2, h the leverages (Allen, Technometrics 16 (1974) 125): a
-higher degree wins only if it predicts cells that it has not seen. So a flat plate stays flat, but for its noise.
+The leave-one-out residuals are r_i / (1 - h_ii), with h_ii the leverages (Allen, Technometrics 16 (1974) 125). Allen's
+PRESS is the sum of their squares. The median of the squares is used here, so that a few wrong cells do not choose the
+degree. A higher degree is chosen only if it predicts cells that were not used in its fit. So a flat plate stays flat
+within its noise.
 """
 
 from __future__ import annotations
@@ -17,10 +19,10 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-#: total degrees that are tried; cells of the raster along the longer side, and points that one must hold
+#: total degrees; number of cells along the longer side, and least number of points in a cell
 DEGREES, _CELLS, _LEAST = (1, 2, 3, 4, 5, 6), 28, 20
 
-#: cells for each coefficient, below which a degree is not tried
+#: least number of cells for each coefficient of a degree
 _CELLS_PER_TERM = 5
 
 
@@ -28,8 +30,9 @@ _CELLS_PER_TERM = 5
 class Bend:
     """Heights over the plane z = 0 of a place.
 
-    ``middle``, ``half`` (2,) [mm] of the extent in x and y; ``coefficients`` (k,) [mm] of the Legendre polynomials of
-    total degree ``degree``; ``rms`` [mm] of the heights at the cells that it was fitted to.
+    - ``middle``, ``half`` (2,) [mm]: centre and half the size of the extent in x and y.
+    - ``coefficients`` (k,) [mm] of the Legendre polynomials up to the total degree ``degree``.
+    - ``rms`` [mm] of the heights at the fitted cells.
     """
 
     middle: Floats
@@ -39,12 +42,12 @@ class Bend:
     rms: float
 
     def heights(self, xy: Floats) -> Floats:
-        """Heights (...) [mm] at places (..., 2) [mm] of the plane; beyond the extent the nearest edge goes on."""
+        """Return heights (...) [mm] at points (..., 2) [mm] of the plane; outside the extent, those of its edge."""
         return np.asarray(_terms((xy - self.middle) / self.half, self.degree) @ self.coefficients)
 
 
 def fit_bend(points: Floats) -> Bend | None:
-    """Fit the bend of points (n, 3) [mm] in the frame of their plane, its normal z; None of too few."""
+    """Fit the bend of points (n, 3) [mm] in the frame of their plane, with z along its normal; None for too few."""
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     cell = float((high - low).max()) / _CELLS
     if not cell > 0:
@@ -61,7 +64,7 @@ def fit_bend(points: Floats) -> Bend | None:
         q, r = np.linalg.qr(terms)
         coefficients = np.linalg.solve(r, q.T @ heights)
         left_out = (heights - terms @ coefficients) / (1 - np.minimum((q**2).sum(axis=1), 0.99))
-        # the median square, not the mean: a cell that a matcher got wrong must not choose the degree
+        # the median square, not the sum: a false match in a cell must not choose the degree
         error = float(np.median(left_out**2))
         if best is None or error < best[0]:
             best = error, degree, coefficients
@@ -72,7 +75,7 @@ def fit_bend(points: Floats) -> Bend | None:
 
 
 def _cell_medians(points: Floats, low: Floats, cell: float) -> tuple[Floats, Floats]:
-    """Middles (m, 2) of the cells that hold enough points, and their median heights (m,)."""
+    """Return the centres (m, 2) of the cells with enough points, and their median heights (m,), all in mm."""
     columns, rows = np.floor((points[:, :2] - low) / cell).astype(int).T
     number = rows * (columns.max() + 1) + columns
     order = np.lexsort((points[:, 2], number))
@@ -85,7 +88,7 @@ def _cell_medians(points: Floats, low: Floats, cell: float) -> tuple[Floats, Flo
 
 
 def _terms(places: Floats, degree: int) -> Floats:
-    """Legendre polynomials (..., k) of total degree up to ``degree`` at places (..., 2) in -1..1."""
+    """Return Legendre polynomials (..., k) up to the total degree ``degree`` at points (..., 2) in -1..1."""
     inside = np.clip(places, -1.0, 1.0)
     every = legvander2d(inside[..., 0], inside[..., 1], [degree, degree])
     power = np.add.outer(np.arange(degree + 1), np.arange(degree + 1)).reshape(-1)

@@ -1,12 +1,12 @@
-"""Dots of an unknown pattern against those of the sensor file: how strong they are, and how sharp.
+"""Compare strength and sharpness of the dots of an unknown pattern with those of the sensor file.
 
-Signal chain: pixels of a view, over the low-passed light of the projector -> less the mean of their block -> variance
-V and mean square difference G of neighbours, both less the imager's noise. The same of one frame of the file's
-pattern, blurred by a Gaussian of width b on the image.
+Signal chain: pixels of a view, divided by the low-passed light of the projector -> minus the mean of their block ->
+variance V, and mean square difference G of neighbours, both minus the imager's noise -> blur b and relative power. The
+same quantities are computed for one frame of the file's pattern, blurred by a Gaussian of standard deviation b [px].
 
-G / V falls as dots grow blurrier and knows nothing of how bright they are: it gives b. Then the ratio of the V's is the
-square of the projector's relative power times the albedo. No light of the room is in it, as there is none in dots; but
-all of the pattern's contrast is: run length, bright share, black level, blur.
+G / V decreases with the blur and does not depend on the brightness, so it gives b. Then the ratio of the two variances
+V is the square of the relative power times the albedo. Uniform light of the room has no influence on it. But the
+contrast of the file's pattern has: run length, bright share, black level, blur.
 """
 
 from __future__ import annotations
@@ -21,17 +21,19 @@ from scipy.optimize import brentq
 from mitsim.fit.observation import Floats, View
 from mitsim.fit.white_coupon import Bench, coupon_roi
 
-#: blurs [px] that are tried
+#: largest blur [px]
 _LARGEST_BLUR = 4.0
 
 
 @dataclass(frozen=True)
 class Dots:
-    """The dots of one view, recorded against those of the sensor file.
+    """Recorded dots of one view, compared with those of the sensor file.
 
-    ``contrast`` rms over the local mean [1] as recorded, of all light; ``file_contrast`` of the file's pattern alone;
-    ``blur_px`` by which these must be blurred to be as sharp as recorded, 0 if the recorded ones are sharper still;
-    ``power`` relative, times the albedo, by the strength of the dots. The last two are NaN where there are none.
+    - ``contrast``: recorded rms over the mean [1], in all light; ``file_contrast``: that of the file's pattern alone.
+    - ``blur_px``: blur [px] with which the file's dots are as sharp as the recorded ones, 0 if these are sharper.
+    - ``power``: relative power times the albedo [1], from the strength of the dots.
+
+    ``blur_px`` and ``power`` are NaN if there are no dots.
     """
 
     camera: str
@@ -42,7 +44,11 @@ class Dots:
 
 
 def compare_dots(view: View, bench: Bench) -> Dots:
-    """Hold the dots of a view (its ``unit`` light low-passed) against the first frame of the sensor's own pattern."""
+    """Compare the dots of a view with those of the first frame of the sensor's own pattern.
+
+    ``view`` comes from :func:`~mitsim.fit.observation.observe` with the pattern ``level``, so that its ``unit`` light
+    has no dots.
+    """
     camera = bench.sensor.rig.cameras[view.camera]
     roi = coupon_roi(camera, view.place)
     spectrum = np.fft.fft2(bench.white(view.place, view.camera, roi, "first") * view.exposure_s)
@@ -50,7 +56,7 @@ def compare_dots(view: View, bench: Bench) -> Dots:
     pairs, none = _neighbours(view), np.zeros(len(view.unit))
 
     def own(blur: float) -> Floats:
-        # by its spectrum: a Gaussian that is sampled at whole pixels is too narrow under half a pixel
+        # in the frequency domain: a Gaussian sampled at whole pixels is too narrow below half a pixel
         image = np.fft.ifft2(fourier_gaussian(spectrum, blur)).real
         return np.asarray(image[rows, columns] / view.unit)
 
@@ -77,9 +83,9 @@ def compare_dots(view: View, bench: Bench) -> Dots:
 
 
 def _strength(view: View, values: Floats, noise: Floats, pairs: NDArray[np.int64]) -> tuple[float, float]:
-    """Variance V inside the blocks, and G / V; ``noise`` the variance of each pixel, taken off."""
+    """Return the variance V inside the blocks, and G / V, both without ``noise``, the variance of each pixel (N,)."""
     off = values - view.means(values)[view.block]
-    # a block's own mean takes one degree of freedom
+    # the mean of a block uses one degree of freedom
     lost = 1.0 - view.size / len(values)
     variance = float(np.mean(off**2)) / lost - float(np.mean(noise))
     first, second = pairs
@@ -88,7 +94,7 @@ def _strength(view: View, values: Floats, noise: Floats, pairs: NDArray[np.int64
 
 
 def _neighbours(view: View) -> NDArray[np.int64]:
-    """Pixels (2, K) that lie side by side in one block."""
+    """Return the indices (2, K) of neighbouring pixels in one block."""
     low_row, low_column = view.rows.min(), view.columns.min()
     index = np.full((view.rows.max() - low_row + 2, view.columns.max() - low_column + 2), -1)
     index[view.rows - low_row, view.columns - low_column] = np.arange(len(view.rows))

@@ -1,12 +1,13 @@
-"""Grey levels of a capture back to photo-electrons, and the noise of their mean over its images.
+"""Convert the grey levels of a capture to photo-electrons, and compute the noise of their mean over its images.
 
-Signal chain: grey levels [DN] -> companding or gamma undone -> less black, over the gain -> electrons [e-]. The noise
-of a pixel's mean over n images [e-^2], by EMVA 1288 (:mod:`mitsim.sensor.image_formation`), q the grey level's width:
+Signal chain: grey levels [DN] -> companding or gamma inverted -> black level subtracted, divided by the gain ->
+electrons [e-]. EMVA 1288 (:mod:`mitsim.sensor.image_formation`) gives the variance of a pixel's mean over n images
+[e-^2]. With q the width of a grey level [e-]:
 
     v = (mu + D t + read^2 + q^2 / 12) / n + dsnu^2 + (prnu mu)^2
 
-The device's fixed pattern is not known, so it counts as noise; rows and columns are shared by the pixels of a block.
-Above the first knee of a companding curve, and with a gamma, a level is wider than q: there v is too small.
+The device's fixed pattern is not known, so it counts as noise. The pixels of a block share row and column noise. Above
+the first knee of a companding curve, and with a gamma, a grey level is wider than q, so v is too small there.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ Floats = NDArray[np.float64]
 class PixelNoise:
     """Variance of a pixel's mean over the images [e-^2]: ``fixed`` + ``shot`` mu + ``relative`` mu^2.
 
-    ``row`` and ``column`` [e-^2] are shared by a row and a column. ``gain`` [DN/e-] of the converter.
+    ``row`` and ``column`` [e-^2] are the variances of noise that a whole row or column shares. ``gain`` [DN/e-] is that
+    of the converter.
     """
 
     fixed: float
@@ -41,17 +43,21 @@ class PixelNoise:
     gain: float
 
     def variance(self, electrons: Floats) -> Floats:
-        """Of independent noise at mean electrons."""
+        """Return the variance [e-^2] of the noise that is independent between pixels, at mean ``electrons`` [e-]."""
         mu = np.maximum(electrons, 0.0)
         return np.asarray(self.fixed + self.shot * mu + self.relative * mu**2)
 
 
 def pixel_noise(imager: Imager, chip: Imager, count: int, exposure_s: float, ambient: bool) -> PixelNoise:
-    """Noise of the mean of ``count`` images, less one of the scene's own light if there is such."""
+    """Return the noise of the mean of ``count`` images of one exposure [s].
+
+    With ``ambient``, an image with the projector off is subtracted. Its read noise adds, and the fixed pattern cancels.
+    The shot noise of the scene's own light is neglected. ``chip`` is the imager with the capture's number of bits.
+    """
     per_image = 1.0 / count + (1.0 if ambient else 0.0)
     level = 1.0 / chip.gain  # e- of a grey level
     temporal = imager.read_noise**2 + imager.dark_current * exposure_s + level**2 / 12
-    # what does not change with the images cancels against the dark one
+    # the fixed pattern of offsets cancels in the difference from the dark image
     offset, column = (0.0, 0.0) if ambient else (imager.dsnu**2, imager.column_pattern**2)
     return PixelNoise(
         temporal * per_image + offset, 1.0 / count, imager.prnu**2, imager.row_noise**2 * per_image, column, chip.gain
@@ -59,11 +65,11 @@ def pixel_noise(imager: Imager, chip: Imager, count: int, exposure_s: float, amb
 
 
 def linearised(levels: NDArray[np.unsignedinteger[Any]] | Floats, chip: Imager) -> Floats:
-    """Photo-electrons [e-] of grey levels [DN]: the imager's curve undone."""
+    """Return the photo-electrons [e-] of grey levels [DN], by the inverse of the imager's response curve."""
     values = np.asarray(levels, np.float64)
     if chip.companding:
         known = np.array([(0.0, 0.0), *chip.companding])
-        # a level stands for the converter's levels that the curve cuts off to it
+        # a level represents all levels of the converter that the curve rounds down to it
         inner = np.interp(values + 0.5, known[:, 1], known[:, 0]) - 0.5
         return np.asarray((inner - chip.converter_black) / chip.gain)
     if chip.gamma == 1.0:
@@ -73,12 +79,12 @@ def linearised(levels: NDArray[np.unsignedinteger[Any]] | Floats, chip: Imager) 
 
 
 def chip_of(capture: Capture, imager: Imager, where: str) -> Imager:
-    """The imager whose grey levels the capture has.
+    """Return the imager with the capture's number of bits: the sensor's, or its converter before companding.
 
     Raises
     ------
     InputError
-        If they have another number of bits than the sensor's.
+        If neither has this number of bits.
     """
     for chip in (imager, converter(imager, Noise.without("quantisation"))):
         if chip.bits == capture.bits:

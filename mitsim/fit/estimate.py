@@ -1,18 +1,19 @@
-r"""The estimator: width of the lobe and power of the projector from the blocks of some views.
+r"""Estimate the width of the lobe and the power of the projector from the blocks of several views.
 
-Signal chain: blocks (:mod:`mitsim.fit.observation`) and their model (:mod:`mitsim.fit.problem`) -> scan of alpha, the
-two amplitudes solved for at each -> weighted Gauss-Newton from every local minimum, the Jacobian by forward-mode
-differentiation -> noise and grain from the best prediction, and again -> covariance, jackknife.
+Signal chain: blocks (:mod:`mitsim.fit.observation`) and their model (:mod:`mitsim.fit.problem`) -> scan of alpha, with
+the two amplitudes solved at each value -> weighted Gauss-Newton from every local minimum, with the Jacobian from
+forward-mode differentiation -> noise and grain from the best prediction, and repetition -> covariance, jackknife.
 
     p = a_s + a_w, relative power of the projector             w = a_w / p, wide-angle share
 
-The model is linear in a_s and a_w, so only alpha needs a start. Weights come from the prediction, never from the datum
-itself: noise must not choose its own weight.
+The model is linear in a_s and a_w, so only alpha needs an initial estimate. Weights follow from the prediction, not
+from the measured values: noise would otherwise influence its own weight.
 
-**Uncertainty.** Two estimates, and the larger is reported: (J^T J)^-1 times the reduced chi-square where that is over
-1; and the jackknife over captures, (n-1)/n sum (q_i - mean q)^2 of the results without one of them (Efron & Stein,
-Ann. Statist. 9, 1981), which includes errors that all blocks of a pose share. With fewer than three captures the
-quarters of each view are left out instead: that includes errors that vary over the coupon, but not those of the pose.
+**Uncertainty.** The larger of two variances is reported. The first is that of least squares, (J^T J)^-1 times the
+reduced chi-square if that exceeds 1. The second is that of the jackknife over n captures, (n-1)/n sum (q_i - mean q)^2
+(Efron & Stein, Ann. Statist. 9, 1981). Here q_i is the result without capture i. The jackknife contains errors that all
+blocks of a pose share. With fewer than three captures, the quarters of each view are left out instead. This contains
+errors that vary over the coupon, but not those of the pose.
 """
 
 from __future__ import annotations
@@ -29,19 +30,19 @@ from mitsim.fit.finish import LOG_ALPHA_RANGE, MetalFinish
 from mitsim.fit.observation import Floats, View
 from mitsim.fit.problem import FIRST_GRAIN, Problem, Residual
 
-#: alphas of the scan
+#: number of alphas in the scan
 _SCAN = 16
-#: rounds of weights and fit
+#: number of repetitions of weights and fit
 _ROUNDS = 3
-#: fewer captures than this say nothing of their spread
+#: least number of captures for a jackknife over captures
 _FEWEST_CAPTURES = 3
-#: fewer blocks than this cannot carry three parameters and their residual
+#: least number of blocks to fit three parameters and their residual
 FEWEST_BLOCKS = 12
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A fitted quantity: its value, standard uncertainty by covariance and by jackknife."""
+    """A fitted quantity: its value, and its standard uncertainties from covariance and jackknife."""
 
     value: float
     by_covariance: float
@@ -49,7 +50,7 @@ class Parameter:
 
     @property
     def uncertainty(self) -> float:
-        """The larger of the two."""
+        """The larger of the two standard uncertainties."""
         return max(self.by_covariance, self.by_jackknife)
 
 
@@ -57,11 +58,13 @@ class Parameter:
 class Fit:
     """Result of a fit.
 
-    ``log_alpha`` natural logarithm (None of a diffuse sheet), ``log_power`` of the relative power, times the albedo of
-    a diffuse sheet; ``wide_angle`` share (None of a diffuse sheet); ``ambient`` light of the room in the middle of the
-    image [e-/s] (None where there is none); ``reduced_chi_square`` of ``blocks``; ``grain`` C [1];
-    ``neighbours`` correlation of the residuals of neighbouring blocks [1]; ``at_limit`` whether alpha ran to the end
-    of its range; ``residuals`` by view; ``pixels`` compared.
+    - ``log_power``: natural logarithm of the relative power; for a diffuse sheet, of the power times the albedo.
+    - ``log_alpha``: natural logarithm of alpha; ``wide_angle``: share [1]. Both are None for a diffuse sheet.
+    - ``ambient``: light of the room in the middle of the image [e-/s], None if not fitted.
+    - ``reduced_chi_square`` of all ``blocks``, which contain ``pixels``.
+    - ``grain`` C [1]; ``neighbours``: correlation of the residuals of neighbouring blocks [1].
+    - ``at_limit``: whether alpha reached an end of its range.
+    - ``residuals`` by view.
     """
 
     log_power: Parameter
@@ -78,12 +81,14 @@ class Fit:
 
 
 def fit_views(views: Sequence[View], finish: MetalFinish | None, where: str = "captures") -> Fit:
-    """Fit what is not known of a coupon to its views; ``finish`` is None for a diffuse sheet.
+    """Fit alpha, the power and the wide-angle share of a coupon to its views.
+
+    ``finish`` is the metal and process of the coupon, None for a diffuse sheet. Messages name ``where``.
 
     Raises
     ------
     InputError
-        If too few blocks are neither saturated nor beside the coupon.
+        If too few blocks on the coupon are free of saturation.
     """
     problem = Problem(views, finish)
     if problem.count < FEWEST_BLOCKS:
@@ -128,7 +133,7 @@ def fit_views(views: Sequence[View], finish: MetalFinish | None, where: str = "c
 
 
 def _first(problem: Problem, use: NDArray[np.bool_]) -> Floats:
-    """Parameters to begin with: the best of all local minima along alpha, by Gauss-Newton from each."""
+    """Return initial estimates of the parameters: the best local minimum along alpha, after Gauss-Newton from each."""
     measured = np.maximum(problem.measured, 0.0)
     noise = np.concatenate(
         [
@@ -152,22 +157,22 @@ def _first(problem: Problem, use: NDArray[np.bool_]) -> Floats:
 
 
 def _amplitudes(columns: Floats, measured: Floats, weight: Floats) -> tuple[Floats, float]:
-    """Amplitudes of 0 or more that fit best, and the misfit that they leave."""
+    """Return the non-negative amplitudes of the weighted least-squares fit, and the norm of its residuals."""
     weighted = columns * weight[:, None]
-    # of like size, or the solver takes a dim column for rounding
+    # columns of equal norm, so that the solver does not take a dim one for rounding errors
     scale = np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)
     amplitudes, misfit = nnls(weighted / scale, measured * weight)
     return np.asarray(amplitudes / scale), float(misfit)
 
 
 def _refine(problem: Problem, start: Floats, variance: Floats, use: NDArray[np.bool_]) -> Floats:
-    """Weighted least squares over the blocks of ``use``: trust-region Gauss-Newton (SciPy's ``trf``)."""
+    """Return the parameters of weighted least squares over the blocks of ``use``, by SciPy's ``trf`` method."""
     low, high, inner = np.zeros(len(start)), np.full(len(start), np.inf), start.copy()
     first = 0
     if problem.finish is not None:
         first, (low[0], high[0]) = 1, LOG_ALPHA_RANGE
         inner[0] = np.clip(inner[0], low[0] + 1e-4, high[0] - 1e-4)
-    # strictly inside the bounds: an amplitude of 0 is given a ten-thousandth of what it would need to explain all
+    # start strictly inside the bounds: least amplitude, 1e-4 of the one that alone would explain the mean
     most = problem.measured.mean() / np.maximum(problem.linear_means.mean(axis=0), 1e-300)
     least = 1e-4 * np.abs(most if first == 0 else np.array([most[0], *most]))
     inner[first:] = np.maximum(inner[first:], least)
@@ -186,7 +191,7 @@ def _refine(problem: Problem, start: Floats, variance: Floats, use: NDArray[np.b
 
 
 def _jackknife(problem: Problem, values: Floats, variance: Floats) -> Floats:
-    """Standard uncertainties of the results by leaving out one capture, or one quarter of a view, at a time."""
+    """Return the jackknife's standard uncertainties of the results: one capture, or quarter of a view, is left out."""
     group = problem.capture if len(np.unique(problem.capture)) >= _FEWEST_CAPTURES else problem.quarters()
     without = np.array(
         [problem.results(_refine(problem, values, variance, group != left_out))[0] for left_out in np.unique(group)]

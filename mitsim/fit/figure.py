@@ -1,4 +1,4 @@
-"""A fit for the eye: its table, what is odd about it, and image, model and residual of its worst view."""
+"""Show a fit: its table, remarks, and a figure with image, model and residuals of the worst view."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from mitsim.fit.run import CouponFit
 from mitsim.report.numbers import two_digits
 from mitsim.report.style import FIELD, drawing
 
-#: the residual's colours end at so many standard deviations, or at what is there if that is more
+#: least range of the residual's colours, in standard deviations
 _LEAST_REACH = 3.0
 
-#: neighbouring blocks that correlate by more show something that the model lacks
+#: correlation of neighbouring blocks above which a remark is printed: the model is then incomplete
 _ALIKE = 0.3
 
 
 def fit_table(found: CouponFit) -> str:
-    """What was found, a line for each quantity, and then a line for each view, separated by tabs."""
+    """Return the fitted quantities, one line for each, then one line for each view, with cells separated by tabs."""
     fit, lines = found.fit, []
     if fit.log_alpha is not None:
         spread = f"covariance {_percent(fit.log_alpha.by_covariance)}, jackknife {_percent(fit.log_alpha.by_jackknife)}"
@@ -62,33 +62,35 @@ def fit_table(found: CouponFit) -> str:
 
 
 def remarks(found: CouponFit) -> list[str]:
-    """What a reader should know before the numbers are used."""
+    """Return remarks that limit the use of the results."""
     fit, told = found.fit, []
     if found.metal is not None and fit.log_alpha is not None:
         low, high = found.metal.alpha_range
         if fit.at_limit:
-            told.append("alpha ran to the end of its range: these poses do not show the lobe's width")
+            told.append("alpha reached the end of its range: these poses do not determine the width of the lobe")
         elif fit.log_alpha.uncertainty > 0.3:
-            told.append("alpha is hardly determined: take poses nearer the mirror direction, or shorter exposures")
+            told.append("alpha is very uncertain: use poses closer to the mirror direction, or shorter exposures")
         if math.isnan(found.roughness[0]):
             ends = [f"{end:g}" for end in np.round(found.metal.roughness_range, 3)]
             told.append(
                 f"no Ra-equivalent: {found.finish} has alpha {low:.3f} to {high:.3f}, of Ra {' to '.join(ends)} um"
             )
     if fit.reduced_chi_square > 2:
-        told.append("the model misses more than the noise explains: uncertainties are widened, the bias is not known")
+        told.append("the residuals exceed the noise: uncertainties are increased accordingly, but the bias is unknown")
     if fit.neighbours > _ALIKE:
-        told.append("neighbouring blocks miss alike: light, form or lobe differ from the model's")
+        told.append("residuals of neighbouring blocks are correlated: light, form or lobe differ from the model")
     if found.pattern_unknown:
-        told.append("the pattern is not the sensor file's: block means were compared, not dots")
+        told.append("the pattern is not known to be that of the sensor file: block means were compared, not dots")
     if any(not math.isnan(place.off_plane) for place in found.places):
         worst = max(place.off_plane for place in found.places if not math.isnan(place.off_plane))
-        told.append(f"without a pose the coupon is the plane of its cloud: {worst:.2g} mm rms off it")
+        told.append(
+            f"the place of the coupon is the plane of its cloud, which scatters by up to {worst:.2g} mm about it"
+        )
     return told
 
 
 def fit_figure(found: CouponFit) -> Figure:
-    """Image and model [DN over black] of the worst view, and the residual of its blocks in standard deviations."""
+    """Draw image and model of the worst view [DN over black], and its residuals in standard deviations of a block."""
     worst = found.worst
     view, gain = worst.view, worst.view.noise.gain
     image, model = _picture(found, view.electrons * gain), _picture(found, worst.pixels * gain)
@@ -121,7 +123,7 @@ def fit_figure(found: CouponFit) -> Figure:
 
 
 def _picture(found: CouponFit, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values (N,) of the worst view's pixels at their places; NaN where nothing was compared."""
+    """Return values (N,) of the worst view's pixels as an image, NaN where no pixel was compared."""
     view = found.worst.view
     low = view.rows.min(), view.columns.min()
     out = np.full((int(np.ptp(view.rows)) + 1, int(np.ptp(view.columns)) + 1), np.nan)
@@ -130,7 +132,7 @@ def _picture(found: CouponFit, values: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def _with(value: float, uncertainty: float) -> str:
-    """A value with as many places as its uncertainty's two digits have."""
+    """Return a value with the decimals of its uncertainty, which is rounded to two digits."""
     if not math.isfinite(value):
         return "none"
     if not math.isfinite(uncertainty) or uncertainty <= 0:

@@ -1,10 +1,10 @@
-"""The noise of an image from its finest detail: what changes sign from pixel to pixel, which few lenses pass.
+"""Estimate the noise of an image from its finest detail, at spatial frequencies that few lenses transmit.
 
-Signal chain: image -> weights 1 -4 6 -4 1 along both axes, of unit gain for white noise -> squares, by level of the
-local mean -> robust variance of every level -> a + b mu by weighted least squares.
+Signal chain: image -> filter with weights 1 -4 6 -4 1 along both axes, which keeps the variance of white noise ->
+squares, in bins of the local mean -> robust variance of every bin -> a + b mu by weighted least squares.
 
-The transfer of the weights for each axis is (2 - 2 cos w)^4 / 70: 0.014 of full strength at a period of 6 px, so
-of edges and dots little is left, and what is left stands out and is passed over by the median.
+The power transfer of the weights along one axis is (2 - 2 cos w)^4 / 70, with w the angular frequency; its mean over w
+is 1. At a period of 6 px it is 0.014, so little remains of edges and dots. The median suppresses this remainder.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from scipy.ndimage import correlate1d, uniform_filter
 
 Floats = NDArray[np.float64]
 
-#: weights along either axis, of unit gain for white noise
+#: weights along each axis, which keep the variance of white noise
 FINEST = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)
 
 #: median of chi-square with one degree of freedom
 _MEDIAN_SQUARE = 0.45493642311957283
 
-#: bins of equal count by local mean; pixels without which there is one bin
+#: largest number of bins of equal count by local mean, and least number of pixels for each
 _BINS, _PIXELS_PER_BIN = 8, 400
 
 #: side of the window of the local mean [px]
@@ -31,15 +31,19 @@ _MEAN_PX = 5
 
 
 def finest_detail(image: Floats) -> Floats:
-    """Filter an image (H, W): white noise keeps its variance, and shapes are gone."""
+    """Return an image (H, W) after a filter that keeps the variance of white noise and suppresses coarser detail."""
     return np.asarray(correlate1d(correlate1d(np.asarray(image, float), FINEST, axis=0), FINEST, axis=1))
 
 
 def level_variances(image: Floats, there: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
-    """Mean level, variance of the noise and count of independent pixels (n,) of the bins of an image's pixels."""
+    """Return level, noise variance and number of pixels (n,) of bins of an image's pixels by their local mean.
+
+    ``there`` (H, W) selects the pixels. The level of a bin is the median of the local means. The variance is the median
+    of the squared detail over 0.455, the median of chi-square with one degree of freedom.
+    """
     mean, squares = uniform_filter(np.asarray(image, float), _MEAN_PX), finest_detail(image) ** 2
     rim = _MEAN_PX // 2
-    if min(there.shape) > 4 * _MEAN_PX:  # at the image's own rim the weights meet mirrored pixels
+    if min(there.shape) > 4 * _MEAN_PX:  # at the image's edges the filter uses mirrored pixels
         there = there & np.pad(np.ones((there.shape[0] - 2 * rim, there.shape[1] - 2 * rim), bool), rim)
     level, square = mean[there], squares[there]
     bins = int(np.clip(len(level) // _PIXELS_PER_BIN, 1, _BINS))
@@ -53,7 +57,7 @@ def level_variances(image: Floats, there: NDArray[np.bool_]) -> tuple[Floats, Fl
 
 
 def noise_of_levels(image: Floats, there: NDArray[np.bool_]) -> Callable[[Floats], Floats]:
-    """Variance of the noise of an image as a function of the level, never under 0."""
+    """Return a function of the level that gives the noise variance of an image, never below 0."""
     levels, variances, counts = level_variances(image, there)
     if len(levels) < 3 or np.ptp(levels) <= 0:
         flat = float(np.median(variances)) if len(variances) else 0.0

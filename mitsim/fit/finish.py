@@ -1,12 +1,13 @@
-"""A finish as a function of its lobe's width alpha, and the Ra that has such a lobe.
+"""Describe a finish as a function of its lobe's width alpha, and find the Ra with this lobe.
 
-Signal chain: metal, process, wavelength -> alpha(Ra) by :func:`mitsim.surface.machined.machined` -> the branch on
-which alpha rises with Ra -> its inverse: alpha -> Ra-equivalent -> height, and with it the coherent shares -> a
+Signal chain: metal, process, wavelength -> alpha(Ra) by :func:`mitsim.surface.machined.machined` -> range in which
+alpha increases with Ra -> its inverse: alpha -> Ra-equivalent -> height, and from it the coherent shares -> a
 :class:`~mitsim.surface.scatter.Scatter` for any alpha.
 
-Below a shortest alpha and beyond ``ALPHA_LARGEST`` no Ra has the lobe, and where A is large a smoother face may have a
-wider lobe; there the Ra-equivalent is NaN. The relation itself is a prior with a one-sigma factor of 1.6 for most
-processes: the Ra-equivalent is the Ra with which ``machined_metal`` renders the fitted lobe, and no measurement of Ra.
+The Ra-equivalent is the Ra with which ``machined_metal`` renders the fitted lobe; it is not a measurement of Ra. The
+relation has a one-sigma factor of 1.6 for most processes. The Ra-equivalent is NaN below a least alpha and beyond
+``ALPHA_LARGEST``, where no Ra has the lobe. It is also NaN where alpha does not increase with Ra: with a large coherent
+share A, a smoother face may have a wider lobe.
 """
 
 from __future__ import annotations
@@ -29,20 +30,21 @@ from mitsim.surface.processes import PROCESSES
 from mitsim.surface.roughness import ALPHA_LARGEST
 from mitsim.surface.scatter import Scatter
 
-#: range in which alpha is looked for [1]
+#: range of alpha in a fit [1]
 ALPHA_RANGE = (0.01, 0.6)
 LOG_ALPHA_RANGE = (math.log(ALPHA_RANGE[0]), math.log(ALPHA_RANGE[1]))
 
-#: places at which alpha(Ra) is tabulated
+#: number of values in the table of alpha(Ra)
 _PLACES = 64
 
 
 @dataclass(frozen=True)
 class MetalFinish:
-    """A machined metal of which the lobe's width is not known.
+    """A machined metal with an unknown width of its lobe.
 
-    ``metal``, ``process``; ``wavelength_nm``; ``index`` (n, k); ``normal_reflectance`` F0 [1], which is also the
-    albedo of the wide-angle share. ``log_alpha`` (n,), ``log_ra`` (n,) of Ra [um]: the rising branch of alpha(Ra).
+    - ``metal``, ``process``, ``wavelength_nm``; ``index`` (n, k): refractive index.
+    - ``normal_reflectance``: F0 [1], which is also the albedo of the wide-angle share.
+    - ``log_alpha``, ``log_ra`` (n,): table of alpha(Ra) where it increases, as natural logarithms; Ra is in um.
     """
 
     metal: str
@@ -57,7 +59,10 @@ class MetalFinish:
     _template: Scatter = field(repr=False)
 
     def scatter(self, x: float) -> Scatter:
-        """What a face whose lobe has the width alpha = exp(x) does with light; outside the branch as at its end."""
+        """Return the scattering of a face whose lobe has the width alpha = exp(x).
+
+        Outside the table, height, coherent width and share of Beckmann's distribution keep their values at its end.
+        """
         alpha = math.exp(x)
         height, beckmann, mirror = (
             float(np.interp(x, self.log_alpha, self._along[name])) for name in ("log_height", "beckmann", "log_mirror")
@@ -75,18 +80,18 @@ class MetalFinish:
 
     @property
     def alpha_range(self) -> tuple[float, float]:
-        """Alphas [1] that have a Ra-equivalent."""
+        """Least and largest alpha [1] with a Ra-equivalent."""
         return float(np.exp(self.log_alpha[0])), float(np.exp(self.log_alpha[-1]))
 
     @property
     def roughness_range(self) -> tuple[float, float]:
-        """Ra-equivalents [um] that there are."""
+        """Least and largest Ra-equivalent [um]."""
         return float(np.exp(self.log_ra[0])), float(np.exp(self.log_ra[-1]))
 
     def roughness(self, alpha: float, relative_uncertainty: float) -> tuple[float, float]:
-        """Ra-equivalent [um] of an alpha and its standard uncertainty; both NaN where no Ra has that lobe.
+        """Return the Ra-equivalent [um] of an alpha, and its standard uncertainty; both NaN if no Ra has this lobe.
 
-        The uncertainty is that of alpha alone, not that of the relation.
+        The uncertainty follows from that of alpha alone, and does not include that of the relation.
         """
         x = math.log(alpha)
         if not self.log_alpha[0] <= x <= self.log_alpha[-1]:
@@ -97,30 +102,31 @@ class MetalFinish:
 
 
 def metal_finish(finish: Finish, wavelength_nm: float, where: str) -> MetalFinish:
-    """The family of finishes that a scene's coupon belongs to.
+    """Return the finishes of all alphas with the metal and process of a scene's coupon; messages name ``where``.
 
     Raises
     ------
     InputError
-        For a finish that is no machined metal, or one with a lay.
+        For a finish that is not a machined metal, or has a lay.
     """
     metal, _, process = finish.name.partition("/")
     if metal not in CONSTANTS or process not in PROCESSES or finish.scatter is None:
         raise InputError(where, "bsdf", finish.name, "machined_metal, or matt_white for a diffuse sheet")
     if finish.scatter.alpha_u != finish.scatter.alpha_v:
         found = f"alpha {finish.scatter.alpha_u:.3g} along u and {finish.scatter.alpha_v:.3g} along v"
-        raise InputError(where, "lay", found, "a round lobe", "one width is fitted: write no lay")
+        raise InputError(where, "lay", found, "a round lobe", "only one width is fitted: omit the lay")
     return _family(metal, process, wavelength_nm)
 
 
 @lru_cache(maxsize=16)
 def _family(metal: str, process: str, wavelength_nm: float) -> MetalFinish:
+    """Return the finishes of a metal and process at all alphas, from a table over the usual Ra of the process."""
     low, high = PROCESSES[process].usual
     heights = np.geomspace(low, high, _PLACES)
     faces = [machined(Face(metal=metal, process=process, Ra=float(ra)), wavelength_nm) for ra in heights]
     widths = np.array([face.alpha_u for face in faces])
     last = int(np.argmax(widths >= ALPHA_LARGEST)) if (widths >= ALPHA_LARGEST).any() else len(widths)
-    # the rough end of the table, down to where alpha stops falling with Ra
+    # the part of the table above the last Ra at which alpha decreases with Ra
     falling = np.flatnonzero(np.diff(widths[:last]) <= 0)
     rising = slice(int(falling[-1]) + 1 if len(falling) else 0, last)
     branch = faces[rising]

@@ -1,17 +1,17 @@
-"""Blocks of pixels on a coupon in a capture, beside those that a white coupon would have shown.
+"""Average the pixels of a coupon in blocks, for comparison with those of a white coupon.
 
-Signal chain: images [DN] -> photo-electrons, by the imager's curve undone -> mean of the images, less the scene's own
-light -> the pixels inside the coupon -> blocks. Beside it: radiance L_1 of a white coupon at the same pose, through the
-same lenses (:mod:`mitsim.fit.white_coupon`) -> electrons per unit of pi f and of relative power; directions toward
-camera and lamp at every pixel.
+Signal chain: images [DN] -> photo-electrons, by the inverse response curve -> mean of the images, minus the scene's own
+light -> pixels on the coupon -> blocks.
 
-**Low pass.** Only the mean over the images of a capture is compared.
+Signal chain of the comparison: radiance L_1 of a white coupon at the same pose, through the same lenses
+(:mod:`mitsim.fit.white_coupon`) -> electrons per unit of pi f and of relative power. Directions toward camera and
+projector are computed at every pixel.
 
-**Light of the room.** A simulated scene without an ambient image is dark. A device's is not: there the room adds a
-radiance that is the same all over the coupon, of unknown size, less the lens's loss toward the corners.
-
-**Censoring.** A block with a saturated pixel in any image is left out, and so are its eight neighbours: next to the
-limit, saturation cuts off the bright half of grain and noise, so their mean would be too dark.
+- **Low pass.** Only the mean over the images of a capture is compared.
+- **Light of the room.** A simulated scene without an ambient image is dark. The scene of a device is not. There the
+  room adds an unknown radiance that is uniform over the coupon; the lens reduces it toward the corners.
+- **Censoring.** A block with a saturated pixel in any image is excluded, with its eight neighbours. Near full scale,
+  saturation removes the bright half of grain and noise, so the mean of a block would be too low.
 
 The noise of a pixel is that of :mod:`mitsim.fit.electrons`.
 """
@@ -38,25 +38,30 @@ from mitsim.sensor.roi import Roi
 
 Floats = NDArray[np.float64]
 
-#: pixels beside the coupon's edge that its blur may reach
+#: margin inside the coupon's edge that its blur may reach [px]
 _EDGE_PX = 5.0
-#: a block must have this share of its pixels inside the coupon
+#: least share of a block's pixels on the coupon
 _BLOCK_SHARE = 0.5
-#: light of a pixel relative to the brightest under which the projector does not reach it
+#: least light of a pixel relative to the brightest; with less, the projector does not reach it
 _UNLIT = 1e-3
 
 
 @dataclass(frozen=True)
 class View:
-    """A coupon as one camera saw it at one exposure: N pixels in ``size`` blocks.
+    """A coupon in the images of one camera at one exposure: N pixels in ``size`` blocks.
 
-    ``capture`` index and ``name`` of the capture, ``camera``, ``exposure_s``; ``columns``, ``rows`` (N,) [px];
-    ``block`` (N,) index of the block, ``size`` of them, each ``width`` pixels wide and at ``grid`` (size, 2), row and
-    column in blocks; ``electrons`` (N,) [e-] mean over the images; ``unit`` (N,) [e-] that pi f = 1 would give at the
-    file's power; ``ambient`` (N,) [s] what light of the room that gives the middle of the image 1 e-/s would add, 0
-    where there is none or it was taken off; ``view``, ``lamp`` (N, 3) unit directions in the coupon's frame; ``noise``
-    of the imager; ``whole`` blocks on the coupon, of which the share ``censored`` is left out; ``place`` of the coupon;
-    ``nothing``: why there is no block, "" if there are any.
+    - ``capture``: index of the capture; ``name``: its name in messages; ``camera``; ``exposure_s`` [s].
+    - ``columns``, ``rows`` (N,) [px] in the camera's image.
+    - ``block`` (N,): index of each pixel's block; ``width``: side of a block [px].
+    - ``grid`` (size, 2): row and column of each block.
+    - ``electrons`` (N,) [e-]: mean over the images.
+    - ``unit`` (N,) [e-]: electrons for pi f = 1 at the power of the sensor file.
+    - ``ambient`` (N,) [s]: electrons from the light of the room, over its e-/s in the middle of the image. It is 0 if
+      there is none, or if it was subtracted.
+    - ``view``, ``lamp`` (N, 3): unit directions toward camera and projector, in the frame of the coupon.
+    - ``noise`` of a pixel's mean.
+    - ``whole``: number of blocks on the coupon, saturated ones included; ``place`` of the coupon.
+    - ``nothing``: reason why there is no block on the coupon, "" otherwise.
     """
 
     capture: int
@@ -80,25 +85,25 @@ class View:
 
     @property
     def size(self) -> int:
-        """How many blocks there are."""
+        """Number of blocks."""
         return len(self.grid)
 
     @property
     def censored(self) -> float:
-        """Share of the blocks that saturation leaves out."""
+        """Share of the blocks that are excluded for saturation [1]."""
         return 1.0 - self.size / self.whole if self.whole else 0.0
 
     def means(self, values: Floats) -> Floats:
-        """Mean over the pixels of each block, (size,)."""
+        """Return the mean of pixel values (N,) in each block, (size,)."""
         return np.asarray(np.bincount(self.block, values, self.size) / self.counts)
 
     @property
     def counts(self) -> Floats:
-        """Pixels of each block, (size,)."""
+        """Number of pixels of each block, (size,)."""
         return np.bincount(self.block, minlength=self.size).astype(float)
 
     def off_mirror(self) -> tuple[float, float]:
-        """Smallest and largest angle between the half vector and the normal [rad], over the pixels."""
+        """Return the least and largest angle between half vector and normal [rad], over the pixels."""
         half = self.view + self.lamp
         angle = np.arccos(np.clip(half[:, 2] / np.linalg.norm(half, axis=1), -1.0, 1.0))
         return float(angle.min()), float(angle.max())
@@ -106,7 +111,7 @@ class View:
 
 @dataclass(frozen=True)
 class CouponCapture:
-    """A capture of a coupon: its ``place``, the ``index`` of the capture among several, ``where`` it is in messages."""
+    """A capture of a coupon: its ``place``, the ``index`` of the capture, and its name ``where`` in messages."""
 
     capture: Capture
     place: Place
@@ -117,15 +122,25 @@ class CouponCapture:
 def observe(
     taken: CouponCapture, bench: Bench, block_px: int, *, pattern: Pattern, lit_room: bool = False
 ) -> list[View]:
-    """Every camera's view of a coupon, at every exposure.
+    """Return the view of a coupon by every camera at every exposure.
 
-    ``pattern`` is ``mean`` if the capture has the sensor's own, else ``level``; ``lit_room`` if the images have other
-    light than the projector's.
+    Parameters
+    ----------
+    taken
+        Capture, and place of the coupon in it.
+    bench
+        Renders the white coupon; its sensor has the cameras of the capture.
+    block_px
+        Side of a block [px].
+    pattern
+        ``mean`` if the capture has the sensor's own pattern, otherwise ``level``.
+    lit_room
+        Whether the images contain other light than that of the projector.
 
     Raises
     ------
     InputError
-        If the capture is of another kind than can be compared, or says too little of how it was taken.
+        If the capture is one of time of flight or has no images, or its exposures or its number of images are wrong.
     """
     sensor, capture, place, where = bench.sensor, taken.capture, taken.place, taken.where
     if isinstance(sensor.pattern, AmplitudeModulation):
@@ -163,10 +178,12 @@ def observe(
 
 @dataclass(frozen=True)
 class _Seen:
-    """A coupon in a region (h, w) of a camera's image: which pixels are inside, where they meet the plane.
+    """A coupon in a region (h, w) of a camera's image.
 
-    ``white`` (h, w) [e-/s] of a white coupon; ``loss`` (h, w) of the lens toward the corners; centres of camera and
-    lamp in the coupon's frame [mm].
+    - ``inside`` (h, w): pixels on the coupon, inside its edge.
+    - ``points`` (h, w, 3) [mm]: where the view rays meet the plane, in the frame of the coupon.
+    - ``white`` (h, w) [e-/s] of a white coupon; ``loss`` (h, w) [1]: relative illumination of the lens.
+    - ``camera_centre``, ``lamp_centre`` (3,) [mm]: centres of camera and projector, in the frame of the coupon.
     """
 
     roi: Roi
@@ -188,6 +205,10 @@ class _Seen:
         white: Floats,
         corner_loss: NDArray[np.float32] | None,
     ) -> _Seen:
+        """Intersect the view rays of a region with the plane of the coupon, and select the pixels inside its edge.
+
+        ``read_out`` is the region that the camera read out, None for the whole image.
+        """
         pose = place.world_from_sensor
         centre, lamp = pose.points(camera.centre), pose.points(sensor.projector.optics.centre)
         columns, rows = roi.pixels()
@@ -207,14 +228,17 @@ class _Seen:
         return cls(roi, inside, points, white, loss, centre, lamp)
 
     def toward(self, centre: Floats, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
-        """Unit directions (N, 3) from the points of some pixels toward a place."""
+        """Return unit directions (N, 3) from the points of pixels toward a ``centre`` (3,) [mm]."""
         out = centre - self.points[rows, columns]
         return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
 
 @dataclass(frozen=True)
 class _Blocks:
-    """The pixels of a region that are compared: ``rows``, ``columns`` (N,) in it, ``block`` (N,), ``grid`` (B, 2)."""
+    """The pixels of a region that are compared: ``rows``, ``columns`` (N,) in it, ``block`` (N,), ``grid`` (B, 2).
+
+    ``width``: side of a block [px]; ``whole``: number of blocks on the coupon, saturated ones included.
+    """
 
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
@@ -225,6 +249,7 @@ class _Blocks:
 
     @classmethod
     def of(cls, seen: _Seen, images: NDArray[np.unsignedinteger[Any]], chip: Imager, width: int) -> _Blocks:
+        """Group the pixels on the coupon in blocks of ``width`` px, without saturated blocks and their neighbours."""
         rows, columns = np.nonzero(seen.inside)
         shape = tuple(-(-size // width) for size in seen.inside.shape)
         number = (rows // width) * shape[1] + columns // width
@@ -241,10 +266,11 @@ class _Blocks:
 
 @dataclass(frozen=True)
 class _Frames:
-    """Images of one camera at one exposure, of its region.
+    """A region of the images of one camera at one exposure.
 
-    ``lit`` (F, h, w) [DN]; ``dark`` (h, w) with the projector off, None without such an image; ``chip`` that took them;
-    ``seconds`` of exposure, ``room_seconds`` in which light of the room is in them, 0 if there is none.
+    - ``lit`` (F, h, w) [DN]; ``dark`` (h, w) [DN]: image with the projector off, None without one.
+    - ``chip``: imager with the capture's number of bits.
+    - ``seconds``: exposure [s]; ``room_seconds``: exposure to light of the room that must be fitted [s], 0 without it.
     """
 
     lit: NDArray[np.unsignedinteger[Any]]
@@ -254,7 +280,7 @@ class _Frames:
     room_seconds: float
 
     def electrons(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
-        """Mean photo-electrons (N,) of some pixels, less those of the dark image."""
+        """Return the mean photo-electrons (N,) [e-] of pixels, minus those of the dark image."""
         mean = linearised(self.lit[:, rows, columns], self.chip).mean(axis=0)
         return np.asarray(mean if self.dark is None else mean - linearised(self.dark[rows, columns], self.chip))
 
@@ -284,15 +310,15 @@ def _view(taken: CouponCapture, camera: str, seen: _Seen, blocks: _Blocks, frame
 
 
 def _why_nothing(seen: _Seen, place: Place, width: int) -> str:
-    """Why a camera has no block on a coupon, in words."""
+    """Return the reason why a camera has no block on a coupon, in words."""
     met = np.isfinite(seen.points).all(axis=-1) & place.holds(
         seen.points[..., :2].reshape(-1, 2), np.zeros(seen.points[..., 0].size)
     ).reshape(seen.points.shape[:2])
     if not met.any():
-        return "the coupon is not in the image: its pose, or the plane that was found, lies elsewhere"
+        return "the coupon is not in the image: its pose, or the plane of its cloud, is elsewhere"
     lit = seen.white > _UNLIT * max(float(seen.white.max()), np.finfo(float).tiny)
     if not (met & lit).any():
-        return "the projector of the sensor file does not light the coupon"
+        return "the projector of the sensor file does not illuminate the coupon"
     if not seen.inside.any():
         return f"within {2 * _EDGE_PX:g} px the coupon has two edges: it is too small, or was not read out"
     inside = int(seen.inside.sum())
@@ -300,6 +326,6 @@ def _why_nothing(seen: _Seen, place: Place, width: int) -> str:
 
 
 def _read_out(capture: Capture, camera: str) -> Roi | None:
-    """Region of a camera's image that was read out, None for the whole image."""
+    """Return the region of a camera's image that was read out, None for the whole image."""
     region = capture.settings.get("read_out", {}).get(camera)
     return None if region is None else Roi(*region)

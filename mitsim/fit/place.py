@@ -1,8 +1,10 @@
-"""Where a coupon lies before a sensor: by the capture's pose, or by a plane through its decoded cloud.
+"""Find plane and outline of a coupon, from the capture's pose, or from a plane through its decoded cloud.
 
-Signal chain, pose known: the coupon's own frame. Signal chain, pose unknown: cloud -> plane through most of its points
-(RANSAC, Fischler & Bolles, Commun. ACM 24, 1981; then least squares) -> frame with z along the normal, toward the
-sensor -> a raster of cells in the plane that hold points, holes filled, the largest piece.
+Signal chain with a known pose: the coupon's own frame.
+
+Signal chain without a pose: cloud -> plane through most of its points, by RANSAC, then by least squares -> frame with z
+along the normal, toward the sensor -> cells of a grid in the plane that contain points -> holes filled -> largest
+connected region. RANSAC: Fischler & Bolles, Commun. ACM 24, 1981.
 """
 
 from __future__ import annotations
@@ -18,25 +20,27 @@ from mitsim.errors import InputError
 from mitsim.fit.bend import Bend
 from mitsim.sensor.transforms import Transform
 
-#: cells of a raster along the longer side of what was seen
+#: number of cells along the longer side of the recovered points
 _CELLS = 120
-#: a point is of the plane if it is this share of its distance from it: a sheet may be bent
+#: largest distance of a point from the plane, as a share of its distance from the sensor; a sheet may be bent
 _FLAT = 0.01
 _TRIALS = 200
 _ROUNDS = 3
-#: a cell of the sheet holds this share of the points of the fullest: stray points of a matcher lie thinner
+#: least number of points in a cell, as a share of the 95th percentile of all cells; false matches are sparser
 _DENSE = 0.3
-#: fewer points of a plane are none
+#: least number of points of a plane
 _FEWEST = 500
 
 
 @dataclass(frozen=True)
 class Place:
-    """A flat coupon in the plane z = 0 of its frame, its normal +z toward the sensor.
+    """A flat coupon in the plane z = 0 of its own frame, with the normal +z toward the sensor.
 
-    ``world_from_sensor`` takes the sensor frame to that of the coupon. ``occupied`` (R, C) says which cells of the
-    plane belong to it, the first at ``low`` (x, y) [mm], each ``cell`` (x, y) [mm] large. ``off_plane`` [mm] rms of
-    the cloud, NaN where the pose was known. ``bend`` of the sheet over that plane, None for flat.
+    - ``world_from_sensor``: transform from the sensor frame to the frame of the coupon [mm].
+    - ``occupied`` (R, C): cells of the plane that belong to the coupon.
+    - ``low`` (x, y) [mm]: corner of the first cell; ``cell`` (x, y) [mm]: size of a cell.
+    - ``off_plane`` [mm]: scatter of the cloud's points about the plane, NaN if the pose was known.
+    - ``bend``: heights of the coupon over the plane, None for a flat one.
     """
 
     world_from_sensor: Transform
@@ -48,19 +52,22 @@ class Place:
 
     @property
     def size(self) -> tuple[float, float]:
-        """Width and height of a rectangle about the origin that holds it [mm]."""
+        """Width and height [mm] of a rectangle, centred at the origin, that contains the coupon."""
         high = self.low + self.cell * self.occupied.shape[::-1]
         width, height = 2 * np.maximum(np.abs(self.low), np.abs(high))
         return float(width), float(height)
 
     def corners(self) -> NDArray[np.float64]:
-        """Corners of all cells together, (4, 3) [mm], in the sensor frame."""
+        """Return the corners (4, 3) [mm] of the rectangle of all cells, in the sensor frame."""
         high = self.low + self.cell * self.occupied.shape[::-1]
         xs, ys = np.meshgrid([self.low[0], high[0]], [self.low[1], high[1]])
         return self.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1).reshape(-1, 3))
 
     def holds(self, points: NDArray[np.floating], margin: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Which points (N, 2) [mm] of the plane belong to the coupon, and all those ``margin`` (N,) beside them."""
+        """Return which points (N, 2) [mm] of the plane lie on the coupon, ``margin`` (N,) [mm] or more inside its edge.
+
+        The margin is tested at four positions, in both directions of x and y.
+        """
         inside = np.ones(len(points), bool)
         for along, across in ((1, 0), (-1, 0), (0, 1), (0, -1)):
             beside = points + margin[:, None] * np.array([along, across])
@@ -73,13 +80,15 @@ class Place:
 
 
 def known_place(world_from_sensor: Transform, width: float, height: float) -> Place:
-    """A coupon of that size [mm] in the plane z = 0, centred, whose pose the capture says."""
+    """Return a centred coupon of this size [mm] in the plane z = 0, for a capture with a pose."""
     size = np.array([width, height])
     return Place(world_from_sensor, -size / 2, size, np.ones((1, 1), bool))
 
 
 def found_place(cloud: PointCloud, where: str) -> Place:
-    """The plane through most points of a cloud.
+    """Find the plane through most points of a cloud, and the outline of the points in it.
+
+    ``off_plane`` of the result is their rms distance from the plane. Messages name ``where``.
 
     Raises
     ------
@@ -91,7 +100,7 @@ def found_place(cloud: PointCloud, where: str) -> Place:
     if flat.sum() < _FEWEST:
         raise _no_plane(where, int(flat.sum()))
     points = points[flat]
-    for _ in range(_ROUNDS):  # stray points pull at the plane until the raster has thrown them out
+    for _ in range(_ROUNDS):  # outliers tilt the plane until the grid of cells has excluded them
         pose = _frame(points)
         local = pose.points(points)
         low, high = local[:, :2].min(axis=0), local[:, :2].max(axis=0)
@@ -106,7 +115,10 @@ def found_place(cloud: PointCloud, where: str) -> Place:
 
 
 def plane_points(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which of the points (N, 3) [mm], seen from the origin, lie near the plane that most of them share."""
+    """Return which points (N, 3) [mm] lie near the plane through most of them, by RANSAC (see the module).
+
+    The points are in the frame of the sensor: the limit grows with their distance from the origin.
+    """
     best = np.zeros(len(points), bool)
     if len(points) < _FEWEST:
         return best
@@ -127,7 +139,10 @@ def plane_points(points: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _frame(points: NDArray[np.float64]) -> Transform:
-    """Coupon from sensor: origin in the middle of points (N, 3), z along the normal toward the sensor, x rightward."""
+    """Return the transform from the sensor frame to that of a coupon, from its points (N, 3) [mm].
+
+    Its origin is the mean of the points. z is along the normal, toward the sensor; x points to the right.
+    """
     centre = points.mean(axis=0)
     axes = np.linalg.svd(points - centre, full_matrices=False)[2]
     normal = -axes[2] * np.sign(axes[2] @ centre)
@@ -137,7 +152,7 @@ def _frame(points: NDArray[np.float64]) -> Transform:
 
 
 def _largest_piece(row: NDArray[np.int64], column: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Cells of a raster (R, C) that are dense with points, holes filled, crumbs and all pieces but the largest gone."""
+    """Return the largest connected region of the cells (R, C) that are dense with points, with its holes filled."""
     count = np.zeros((row.max() + 1, column.max() + 1))
     np.add.at(count, (row, column), 1)
     dense = np.pad(count > _DENSE * np.percentile(count[count > 0], 95), 3)
@@ -152,5 +167,5 @@ def _no_plane(where: str, count: int) -> InputError:
         "pose",
         f"null, and {count} points of its cloud in a plane",
         f"a world_from_sensor, or {_FEWEST} points side by side in a plane",
-        "decode it alone to see what is missing: mitsim decode",
+        "decode the capture to see which points are missing: mitsim decode",
     )

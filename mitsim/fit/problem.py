@@ -1,12 +1,16 @@
-"""The least-squares problem of a coupon's finish: blocks of all views, their prediction and its derivatives.
+"""Define the least-squares problem of a coupon's finish: blocks of all views, their prediction and its derivatives.
+
+Signal chain: parameters -> electrons of every pixel -> means of the blocks -> residuals in standard deviations.
 
     mean electrons of a pixel = L (a_s S(alpha) + a_w F0)      L = unit light, S = pi f of the lobe, F0 of the metal
 
-The model is linear in the amplitudes a_s and a_w. A diffuse sheet has one amplitude, albedo times relative power; light
-of a room adds one more.
+The model is linear in the amplitudes a_s and a_w. A diffuse sheet has one amplitude, albedo times relative power. Light
+of a room adds another. Source of L and S: :mod:`mitsim.scene.differentiable`.
 
-**Grain** C is the relative standard deviation of a pixel that the imager's noise does not explain: speckle, and dots
-of an unknown pattern. It is estimated inside the blocks; the variance of a block's mean over n pixels is
+**Grain** C is the relative standard deviation of a pixel that the imager's noise does not explain. It comes from
+speckle and from dots of an unknown pattern, and is estimated from the scatter inside the blocks. The variance of a
+block's mean over n pixels is the sum of independent contributions, with v the imager's noise
+(:mod:`mitsim.fit.electrons`):
 
     V = sum(v + C^2 mu^2) / n^2 + row / rows + column / columns
 """
@@ -23,13 +27,13 @@ from mitsim.fit.finish import MetalFinish
 from mitsim.fit.observation import Floats, View
 from mitsim.scene.differentiable import Directions, SpecularLobe
 
-#: relative grain with which the first weights are made
+#: grain for the initial weights
 FIRST_GRAIN = 0.1
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Blocks of one view [e-]: ``measured``, ``predicted`` and ``sigma`` (size,); ``pixels`` as predicted."""
+    """Block means of one view [e-]: ``measured``, ``predicted`` and ``sigma`` (size,); ``pixels``: predicted pixels."""
 
     view: View
     measured: Floats = field(repr=False)
@@ -39,7 +43,7 @@ class Residual:
 
     @property
     def in_noise(self) -> Floats:
-        """Measured less predicted, in standard deviations of the block's noise."""
+        """Measured minus predicted, in standard deviations of the block's noise."""
         return np.asarray((self.measured - self.predicted) / self.sigma)
 
     @property
@@ -63,9 +67,10 @@ class Residual:
 
 
 class Problem:
-    """All views, their blocks one after the other.
+    """The blocks of all views, one view after the other, and their model.
 
-    Parameters are (log alpha, a_s, a_w) of a metal, (a_w,) of a diffuse sheet, then the light of the room if any.
+    The parameters are (log alpha, a_s, a_w) for a metal and (a_w,) for a diffuse sheet. The light of the room follows,
+    if there is any.
     """
 
     def __init__(self, views: Sequence[View], finish: MetalFinish | None) -> None:
@@ -96,11 +101,11 @@ class Problem:
         self._last: tuple[float, Floats, Floats] | None = None
 
     def means(self, values: Floats) -> Floats:
-        """Of each block."""
+        """Return the mean of pixel values in each block, (blocks,)."""
         return np.asarray(np.bincount(self.block, values, self.count) / self.counts)
 
     def specular(self, x: float) -> tuple[Floats, Floats]:
-        """L S of every pixel [e-] at log alpha x, and its derivative; the last answer is kept."""
+        """Return L S of every pixel [e-] at log alpha = x, and its derivative by x; the last result is cached."""
         assert self.finish is not None
         if self._last is None or self._last[0] != x:
             value, slope = self.lobe.reflectance_and_slope(self.finish.scatter, x, self.directions)
@@ -108,16 +113,16 @@ class Problem:
         return self._last[1], self._last[2]
 
     def pixels(self, values: Floats) -> Floats:
-        """Predicted electrons of every pixel."""
+        """Return the predicted electrons [e-] of every pixel at the parameters ``values``."""
         predicted = self.linear @ values[self.first_linear :]
         return predicted if self.finish is None else predicted + self.specular(values[0])[0] * values[1]
 
     def residual(self, values: Floats, variance: Floats) -> Floats:
-        """Predicted less measured, in standard deviations."""
+        """Return predicted minus measured block means, in standard deviations."""
         return np.asarray((self.means(self.pixels(values)) - self.measured) / np.sqrt(variance))
 
     def jacobian(self, values: Floats, variance: Floats) -> Floats:
-        """Of :meth:`residual`, (blocks, parameters)."""
+        """Return the Jacobian of :meth:`residual`, (blocks, parameters)."""
         columns = self.linear_means
         if self.finish is not None:
             light, slope = self.specular(values[0])
@@ -125,7 +130,10 @@ class Problem:
         return np.asarray(columns / np.sqrt(variance)[:, None])
 
     def results(self, values: Floats) -> tuple[Floats, Floats]:
-        """(log p, log alpha, w) of a metal, (log p,) of a sheet, then the room; and their derivatives by parameters."""
+        """Return the results, and their derivatives by the parameters (results, parameters).
+
+        They are (log p, log alpha, w) for a metal and (log p,) for a diffuse sheet, then the light of the room.
+        """
         slopes = np.eye(len(values))
         if self.finish is None:
             slopes[0, 0] = 1.0 / values[0]
@@ -140,14 +148,14 @@ class Problem:
         return np.array([np.log(power), x, wide / power, *room]), slopes
 
     def variance(self, values: Floats) -> tuple[Floats, float]:
-        """Of the blocks' means [e-^2], and the grain, as the prediction has them."""
+        """Return the variance of the block means [e-^2], and the grain [1], at the predicted electrons."""
         predicted = self.pixels(values)
         ends = np.cumsum([0, *(len(view.block) for view in self.views)])
         noise = np.concatenate(
             [view.noise.variance(predicted[a:b]) for view, a, b in zip(self.views, ends[:-1], ends[1:], strict=True)]
         )
         noise_mean, square = self.means(noise), self.means(predicted**2)
-        # spread inside a block about its own mean, less what the imager explains
+        # variance inside a block about its own mean, minus the noise of the imager
         off = self.electrons - predicted
         off -= self.means(off)[self.block]
         spread = self.means(off**2) * self.counts / np.maximum(self.counts - 1, 1) - noise_mean
@@ -161,7 +169,7 @@ class Problem:
         return (noise_mean + grain**2 * square) / self.counts + shared, grain
 
     def neighbours(self, residual: Floats) -> float:
-        """Correlation of the residuals of blocks that lie side by side in a view."""
+        """Return the correlation of the residuals of neighbouring blocks in a view, NaN without neighbours."""
         products, squares = 0.0, 0.0
         pairs = 0
         for view, at in zip(self.views, self.starts, strict=False):
@@ -175,7 +183,7 @@ class Problem:
         return float(products / squares) if pairs and squares > 0 else float("nan")
 
     def quarters(self) -> NDArray[np.int64]:
-        """Number of each block's quarter of its view, about the middle of the view's blocks."""
+        """Return the number of each block's quarter of its view, divided at the median row and column of the blocks."""
         out = np.empty(self.count, np.int64)
         for number, (view, at) in enumerate(zip(self.views, self.starts, strict=False)):
             if view.size:
@@ -184,7 +192,7 @@ class Problem:
         return out
 
     def by_view(self, values: Floats, variance: Floats) -> tuple[Residual, ...]:
-        """Residuals, view by view."""
+        """Return the residuals of each view."""
         pixels = self.pixels(values)
         means = self.means(pixels)
         out, first = [], 0

@@ -1,8 +1,8 @@
-"""Captures of a coupon to what can be said of its finish and of the projector.
+"""Fit the finish of a coupon and the power of the projector to captures of the coupon.
 
-Signal chain: capture folders, scene of the coupon -> place of the coupon in each (:mod:`mitsim.fit.place`) -> views
-(:mod:`mitsim.fit.observation`) -> fit (:mod:`mitsim.fit.estimate`) -> alpha, Ra-equivalent, power [W], residual; of a
-pattern that is not the file's also its dots (:mod:`mitsim.fit.dots`).
+Signal chain: capture folders, scene of the coupon -> place of the coupon in each (:mod:`mitsim.fit.specimen`) -> views
+(:mod:`mitsim.fit.observation`) -> fit (:mod:`mitsim.fit.estimate`) -> alpha, Ra-equivalent, power [W], residual. If the
+pattern is not that of the sensor file, its dots are compared, too (:mod:`mitsim.fit.dots`).
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, load_sensor, presets
 from mitsim.sensor.roi import Roi
 
-#: side of a block [px] where the pattern is known, and where its dots count as grain: several times as wide as the
-#: grain is long, under one pixel and about two
+#: side of a block [px] with a known pattern, and with an unknown one, whose dots count as grain. It is several times
+#: the length of the grain, which is under 1 px and about 2 px, respectively
 KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX = 8, 32
 
 DIFFUSE = "matt_white"
@@ -44,11 +44,14 @@ DIFFUSE = "matt_white"
 
 @dataclass(frozen=True)
 class CouponFit:
-    """A fit and what it was made from.
+    """A fit and its inputs.
 
-    ``sensor``; ``finish`` family in words; ``metal`` None of a diffuse sheet; ``fit``; ``dots`` by view where the
-    pattern is unknown; ``captures``; ``places`` of the coupon; ``block_px``; ``source`` of the captures;
-    ``pattern_unknown`` if that of one of them is not the sensor file's.
+    - ``sensor``; ``finish``: name of metal and process, or of the diffuse sheet; ``metal``: None for a diffuse sheet.
+    - ``fit``: result of the fit.
+    - ``dots``: comparison of the dots by view, if the pattern is unknown.
+    - ``captures``: their folders; ``places`` of the coupon in them; ``source`` of the captures.
+    - ``block_px``: side of a block [px].
+    - ``pattern_unknown``: whether the pattern of a capture is not known to be that of the sensor file.
     """
 
     sensor: Sensor = field(repr=False)
@@ -64,25 +67,25 @@ class CouponFit:
 
     @property
     def alpha(self) -> tuple[float, float]:
-        """Width of the lobe in Beckmann's sense [1], and its standard uncertainty; NaN of a diffuse sheet."""
+        """Width alpha of the lobe as defined by Beckmann [1], and its standard uncertainty; NaN for a diffuse sheet."""
         return _exponential(self.fit.log_alpha)
 
     @property
     def roughness(self) -> tuple[float, float]:
-        """Ra-equivalent [um] and its standard uncertainty; NaN where no Ra of the process has that lobe."""
+        """Ra-equivalent [um] and its standard uncertainty; NaN if no Ra of the process has this lobe."""
         if self.metal is None or self.fit.log_alpha is None:
             return math.nan, math.nan
         return self.metal.roughness(self.alpha[0], self.fit.log_alpha.uncertainty)
 
     @property
     def power(self) -> tuple[float, float]:
-        """Flux of the projector [W], of a diffuse sheet times its albedo, and its standard uncertainty."""
+        """Flux of the projector [W] and its standard uncertainty; for a diffuse sheet, both times its albedo."""
         relative, uncertainty = _exponential(self.fit.log_power)
         return relative * self.sensor.projector.flux, uncertainty * self.sensor.projector.flux
 
     @property
     def censored(self) -> float:
-        """Share of the blocks on the coupon that were left out for saturation."""
+        """Share of the blocks on the coupon that were excluded for saturation [1]."""
         return 1.0 - self.fit.blocks / sum(residual.view.whole for residual in self.fit.residuals)
 
     @property
@@ -92,12 +95,12 @@ class CouponFit:
 
     @property
     def rms_in_noise(self) -> float:
-        """The same in standard deviations of a block's noise [1]."""
+        """Root mean square residual of all blocks in standard deviations of a block's noise [1]."""
         return _pooled([(r.view.size, r.rms_in_noise) for r in self.fit.residuals])
 
     @property
     def worst(self) -> Residual:
-        """The view whose chi-square is farthest beyond its number of blocks, in standard deviations of it."""
+        """Residuals of the view with the largest (chi-square - n) / sqrt(2 n), with n its number of blocks."""
 
         def beyond(residual: Residual) -> float:
             blocks = residual.view.size
@@ -106,7 +109,7 @@ class CouponFit:
         return max((residual for residual in self.fit.residuals if residual.view.size), key=beyond)
 
     def numbers(self) -> dict[str, Any]:
-        """All of it for JSON; what is not known is null."""
+        """Return the fit as JSON values, null for unknown ones; the keys are in docs/reference/formats/fit.md."""
         fit, (ra, ra_uncertainty) = self.fit, self.roughness
         told: dict[str, Any] = json_values(
             {
@@ -152,34 +155,36 @@ def fit_captures(
 
     Parameters
     ----------
+    captures
+        Capture folders of one coupon, taken by one sensor.
     sensor
-        Its preset or file; the preset that the captures name if left out.
+        Name of a preset, or path of a sensor file; by default, the preset that the captures name.
     scene
-        Of the coupon: its size, metal and process; what its Ra is does not matter. The one that the captures name if
-        left out. ``parameters`` set its ``<default>``s.
+        Scene file with size, metal and process of the coupon; its Ra has no influence. By default, the scene that the
+        captures name.
+    parameters
+        Values for the ``<default>`` elements of the scene.
     block_px
-        Side of a block [px].
+        Side of a block [px]; by default :data:`KNOWN_BLOCK_PX`, or :data:`UNKNOWN_BLOCK_PX` for an unknown pattern.
     roi
-        Region of the first camera's image that shows the coupon and nothing else: the plane is fitted to its points,
-        whatever pose the captures say.
+        Region of the first camera's image [px] that shows only the coupon. The plane is then fitted to its points, and
+        the poses of the captures are not used.
 
     Raises
     ------
     InputError
-        If captures, sensor and scene do not go together, or too little can be compared.
+        If captures, sensor and scene do not fit each other, or too few blocks can be compared.
     """
     if not captures:
         raise InputError("CAPTURES", "", "none", "one capture folder or more")
     if len({path.resolve() for path in captures}) < len(captures):
-        raise InputError(
-            "CAPTURES", "", "a folder twice", "each capture once", "twice the same noise is no second look"
-        )
+        raise InputError("CAPTURES", "", "a folder twice", "each capture once", "the same noise twice is not a repeat")
     chosen, first = _sensor(captures[0], sensor), read_capture(captures[0])
     path = scene or _own_scene(first, captures[0])
     recipe = CouponRecipe(str(path), tuple(sorted((parameters or {}).items())), chosen.wavelength_nm)
     sample = load_sample(recipe)
     finish = sample.scene.finishes[0]
-    assert finish is not None  # load_sample's own check
+    assert finish is not None  # load_sample checks this
     metal = None if finish.name == DIFFUSE else metal_finish(finish, chosen.wavelength_nm, str(path))
     block = block_px or (KNOWN_BLOCK_PX if pattern_is_known(first, chosen) else UNKNOWN_BLOCK_PX)
 
@@ -210,8 +215,8 @@ def fit_captures(
             "captures",
             "images",
             f"no block of {block} px on the coupon: {why}",
-            "a coupon that is seen",
-            "name the part of the image that shows it: --window",
+            "a coupon in the images",
+            "give the region of the image that shows it: --window",
         )
     say(f"fitting {sum(len(view.block) for view in views)} pixels in {sum(view.size for view in views)} blocks")
     return CouponFit(
@@ -238,7 +243,7 @@ def _sensor(folder: Path, name: str | None) -> Sensor:
             "sensor",
             own,
             f"one of {', '.join(presets())}",
-            "say which sensor file describes it: --sensor",
+            "give the preset or the sensor file: --sensor",
         )
     return load_sensor(own)
 
@@ -252,13 +257,13 @@ def _own_scene(capture: Capture, folder: Path) -> Path:
         folder / "settings.json",
         "scene",
         found,
-        "a scene file that is there",
-        "say what the coupon is: --scene scenes/coupon/coupon.xml",
+        "an existing scene file",
+        "give the scene of the coupon: --scene scenes/coupon/coupon.xml",
     )
 
 
 def _same(first: Rig, second: Rig) -> bool:
-    """Whether two rigs have the same cameras at the same places."""
+    """Return whether two rigs have the same cameras at the same poses."""
     if list(first.cameras) != list(second.cameras):
         return False
     return all(
@@ -270,7 +275,7 @@ def _same(first: Rig, second: Rig) -> bool:
 
 
 def _exponential(parameter: Parameter | None) -> tuple[float, float]:
-    """Value and standard uncertainty of what the logarithm was fitted of."""
+    """Return value and standard uncertainty of a quantity whose logarithm was fitted."""
     if parameter is None:
         return math.nan, math.nan
     value = math.exp(parameter.value)

@@ -1,8 +1,8 @@
-"""Where the flat specimen of a capture lies, how it is bent, and which pixels show it.
+"""Find plane, outline and bend of the flat specimen in a capture, and the pixels that show it.
 
-Signal chain: capture -> cloud, by its own decoder -> plane of the points in the region of the image that the user
-named, else of most points (:mod:`mitsim.fit.place`) -> its extent, and the bend of its points
-(:mod:`mitsim.fit.bend`) -> which pixels and view rays meet it.
+Signal chain: capture -> cloud, from its own decoder -> plane of the points in the image region that the user gave, or
+of most points (:mod:`mitsim.fit.place`) -> its outline, and the bend of its points (:mod:`mitsim.fit.bend`) -> pixels
+and view rays that meet it.
 """
 
 from __future__ import annotations
@@ -26,36 +26,48 @@ from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
 
-#: pixels inside the specimen's outline that are not looked at: its edge is blurred, and matched with what is behind
+#: margin inside the specimen's outline that is not used [px]: its edge is blurred, and matched with the background
 MARGIN_PX = 15.0
 
-#: least points of a plane in the user's region, and most points that it is fitted to
+#: least number of points of a plane in the user's region, and largest number of points for its fit
 _FEWEST_POINTS, _PLANE_POINTS = 500, 20000
 
-#: cosine to the normal from which on a ray meets the plane
+#: least cosine between a ray and the normal with which the ray meets the plane
 GRAZING = 1e-6
 
-#: cells of the specimen's raster along its longer side
+#: number of cells along the longer side of the specimen
 _CELLS = 120
 
-#: points count for the bend that lie off the plane by up to this share of its distance
+#: largest distance from the plane of points that are used for the bend, as a share of the sensor's distance
 _NEAR_PLANE = 0.02
 
 
 def specimen_place(capture: Capture, settings: Settings, roi: Roi | None, where: str) -> Place:
     """Estimate the plane and the outline of the specimen from the capture's decoded cloud.
 
-    ``roi`` of the reference image: all of it is specimen, also where it has no points, and the plane is fitted to its
-    points (:func:`characterisation.features.fits.fit_plane`). Without a region, the plane is that of most points of the
-    cloud, and the outline is where points are dense (:func:`mitsim.fit.place.found_place`).
+    Parameters
+    ----------
+    capture, settings
+        Capture with images, and the settings of its decoder.
+    roi
+        Region of the reference image [px] that shows only the specimen, also where it has no points. The plane is
+        fitted to its points (:func:`characterisation.features.fits.fit_plane`). Without a region,
+        :func:`mitsim.fit.place.found_place` takes the plane of most points, and the outline of the dense ones.
+    where
+        Name of the capture in messages.
+
+    Returns
+    -------
+    Place
+        Its ``off_plane`` is a robust standard deviation with a region, and the rms distance without one.
 
     Raises
     ------
     InputError
-        If the region is not in the image, or too few points lie in one plane.
+        If the capture has no images, the region is not in the image, or too few points lie in one plane.
     """
     if not capture.images:
-        raise InputError(where, "images", "none", "a capture with images, not a device's map alone")
+        raise InputError(where, "images", "none", "a capture with images, not only a map of the device")
     if roi is None:
         cloud = capture_cloud(capture, settings)
         flat = found_place(cloud, where)
@@ -75,7 +87,7 @@ def specimen_place(capture: Capture, settings: Settings, roi: Roi | None, where:
     inside = shown(grid.origin + 1000.0 * grid.rays())
     cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(inside))
     found = cloud.points[inside & cloud.valid].astype(float)
-    # a decoder's stray points lie far off, along the rays: a fit that begins with them would be drawn onto the rays
+    # outliers of a decoder lie far away along the rays, and a fit that starts with them would follow the rays
     points = found[plane_points(found)]
     if len(points) < _FEWEST_POINTS:
         told = f"{len(found)} points in {asked}" + (f", {len(points)} of them in one plane" if len(found) else "")
@@ -83,7 +95,7 @@ def specimen_place(capture: Capture, settings: Settings, roi: Roi | None, where:
     try:
         plane = fit_plane(points[:: -(-len(points) // _PLANE_POINTS)], camera.centre)
     except FitError as error:
-        hint = "name a part that shows a flat specimen, seen less obliquely"
+        hint = "give a region that shows a flat specimen, from a less oblique view"
         raise InputError("--window", "", f"{asked}, where {error}", "a plane", hint) from None
     off = (points - plane.point) @ plane.normal
     across = np.array([1.0, 0.0, 0.0]) - plane.normal[0] * plane.normal
@@ -107,13 +119,15 @@ def specimen_place(capture: Capture, settings: Settings, roi: Roi | None, where:
 
 
 def place_of(capture: Capture, sensor: Sensor, size: tuple[float, float], where: str, roi: Roi | None = None) -> Place:
-    """Place of the coupon: by the region of the image that shows it, else by the pose of the capture, else by the plane
-    of its cloud.
+    """Return the place of the coupon of this ``size`` (width, height) [mm] in a capture.
+
+    It follows from ``roi``, the image region that shows the coupon; otherwise from the capture's pose; otherwise from
+    the plane of its cloud. Messages name ``where``.
 
     Raises
     ------
     InputError
-        If neither is there, or the coupon shows its back.
+        If no plane is found, or the sensor is behind the coupon.
     """
     if roi is not None:
         return specimen_place(capture, sensor.settings, roi, where)
@@ -122,12 +136,12 @@ def place_of(capture: Capture, sensor: Sensor, size: tuple[float, float], where:
         return found_place(capture_cloud(capture, sensor.settings, imager=imager), where)
     place = known_place(capture.world_from_sensor, *size)
     if place.world_from_sensor.translation[2] <= 0:
-        raise InputError(where, "world_from_sensor", "a sensor behind the coupon", "a place with z over 0")
+        raise InputError(where, "world_from_sensor", "a sensor behind the coupon", "a sensor position with z over 0")
     return place
 
 
 def _bend_of(place: Place, points: Floats) -> Bend | None:
-    """Bend of the points (n, 3) of the sensor frame that lie on a place's cells."""
+    """Return the bend of the points (n, 3) [mm], in the sensor frame, on a place's cells; None for too few."""
     local = place.world_from_sensor.points(points)
     near = np.abs(local[:, 2]) < _NEAR_PLANE * np.linalg.norm(place.world_from_sensor.translation)
     inside = np.zeros(len(local), bool)
@@ -136,9 +150,10 @@ def _bend_of(place: Place, points: Floats) -> Bend | None:
 
 
 def on_specimen(place: Place, origin: Floats, rays: Floats, pitch: float, margin_px: float) -> NDArray[np.bool_]:
-    """Which view rays (..., 3), unit and in the sensor frame, meet the specimen, a margin [px] inside its outline.
+    """Return which view rays meet the specimen, at least a margin [px] inside its outline.
 
-    ``origin`` (3,) of the rays [mm]; ``pitch`` between neighbouring ones [rad].
+    ``rays`` (..., 3) are unit vectors in the sensor frame, with their ``origin`` (3,) [mm]. ``pitch`` is the angle
+    between neighbouring rays [rad].
     """
     points, reach, cosine = feet_of(place.world_from_sensor, origin, rays)
     down = cosine > GRAZING
@@ -149,10 +164,11 @@ def on_specimen(place: Place, origin: Floats, rays: Floats, pitch: float, margin
 
 
 def feet_of(pose: Transform, origin: Floats, rays: Floats) -> tuple[Floats, Floats, Floats]:
-    """Where rays meet the plane z = 0 of a frame (..., 2) [mm], how far along them [mm], cosine to its normal.
+    """Return where rays meet the plane z = 0 of a frame.
 
-    ``pose`` takes the sensor frame, that of ``origin`` (3,) and ``rays`` (..., 3), to that of the plane. NaN for rays
-    that miss it.
+    The results are x and y (..., 2) [mm] in the frame of the plane, the distance along the ray [mm], and the cosine to
+    the normal. Points and distances are NaN for rays that miss the plane. ``pose`` takes the sensor frame, that of
+    ``origin`` (3,) [mm] and ``rays`` (..., 3), to the frame of the plane.
     """
     start, directions = pose.points(origin), pose.directions(rays)
     cosine = -directions[..., 2]
@@ -161,7 +177,7 @@ def feet_of(pose: Transform, origin: Floats, rays: Floats) -> tuple[Floats, Floa
 
 
 def image_mask(place: Place, camera: Camera, margin_px: float = 0.0) -> NDArray[np.bool_]:
-    """Which pixels (H, W) of a camera's raw image show the specimen."""
+    """Return which pixels (H, W) of a camera's raw image show the specimen, a margin [px] inside its outline."""
     mask = np.zeros((camera.height, camera.width), bool)
     roi = roi_around(camera, place.corners(), 1) or Roi.whole(camera.width, camera.height)
     columns, rows = roi.pixels()

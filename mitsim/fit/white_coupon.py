@@ -1,7 +1,10 @@
-"""A white coupon before a sensor: the light that its cameras would see of it, with one image in place of the patterns.
+"""Render a white coupon in front of a sensor, with one projected image in place of the patterns.
 
-Where the projected pattern is not known to be the sensor file's (a device's), the mean level of the patterns stands in
-for it, and the dots count as grain.
+Signal chain: patterns of the sensor -> their light, averaged -> one image -> radiance of the white coupon at the pose
+of the coupon -> electrons per second in each pixel.
+
+The projected pattern of a device may not be that of the sensor file. A uniform image of the same mean level then
+replaces it, and the dots count as grain.
 """
 
 from __future__ import annotations
@@ -26,29 +29,28 @@ from mitsim.simulation.simulate import SimulatedSensor
 
 Floats = NDArray[np.float64]
 
-#: one image instead of a sensor's patterns: the mean of all of them; their mean level, the same all over the field;
-#: the first alone
+#: image in place of a sensor's patterns: the mean of all patterns; a uniform image of their mean level; the first one
 Pattern = Literal["mean", "level", "first"]
 
-#: pixels of the region around the coupon
+#: margin around the coupon [px]
 _MARGIN_PX = 12
 
 
 class Bench:
-    """A sensor before white coupons, set up once; its projector has one image in place of its patterns."""
+    """A sensor that renders white coupons, prepared once; its projector shows one image in place of its patterns."""
 
     def __init__(self, sensor: Sensor, samples: int = 16) -> None:
         self.sensor, self.samples = sensor, samples
-        # the patterns come below, one by one: they are not laid on the device all together
+        # white() sets the image; a placeholder here keeps the patterns from being loaded on the device all at once
         self._simulated = SimulatedSensor(replace(sensor, pattern=RandomDots(kind="random_dots", run_length_px=10.0)))
         self._lit: dict[Pattern, LitPatterns] = {}
 
     def corner_loss(self, camera: str) -> NDArray[np.float32] | None:
-        """Loss of a camera's lens toward the corners (H, W) [1], None where there is none."""
+        """Return the relative illumination of a camera's lens (H, W) [1], None if it is uniform."""
         return self._simulated.corner_loss[camera]
 
     def white(self, place: Place, camera: str, roi: Roi, pattern: Pattern) -> Floats:
-        """Electrons per second (h, w) [e-/s] of a Lambertian coupon of reflectance 1, in a region."""
+        """Return electrons per second (h, w) [e-/s] in a region that shows a Lambertian coupon of reflectance 1."""
         if pattern not in self._lit:
             self._lit[pattern] = self._one(pattern)
         self._simulated.patterns = self._lit[pattern]
@@ -70,7 +72,7 @@ class Bench:
 
 
 def _mean_sent(frames: NDArray[np.float32], projector: Projector) -> NDArray[np.float32]:
-    """Mean of what frames (P, H, W) send, (1, H, W), one after the other: many fill the memory."""
+    """Return the mean light (1, H, W) of frames (P, H, W), summed one by one to save memory."""
     total = np.zeros(frames.shape[1:])
     for frame in frames:
         total += projector.emit(frame)
@@ -78,12 +80,15 @@ def _mean_sent(frames: NDArray[np.float32], projector: Projector) -> NDArray[np.
 
 
 def pattern_is_known(capture: Capture, sensor: Sensor) -> bool:
-    """Whether the images of a capture were taken with the very pattern of the sensor file."""
+    """Return whether the settings of a capture state the same pattern as the sensor file."""
     return capture.settings.get("pattern") == sensor.pattern.model_dump(mode="json")
 
 
 def with_rig(sensor: Sensor, rig: Rig) -> Sensor:
-    """The sensor with the cameras of a capture; the projector, of which recordings say nothing, stays the file's."""
+    """Return the sensor with the cameras of a capture, and the projector of its own file.
+
+    Recordings do not describe their projector.
+    """
     return replace(sensor, rig=replace(rig, projector=sensor.rig.projector))
 
 

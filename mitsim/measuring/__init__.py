@@ -1,1 +1,1 @@
-"""What is measured in clouds without a study: features in windows, plates of dots, tasks, differences of clouds."""
+"""Measure clouds without a study: features in windows, plates of dots, tasks, and differences of clouds."""

@@ -1,7 +1,7 @@
-"""The clouds that are measured: files and captures, one or many, as the command line names them.
+"""Read the clouds to measure, from cloud files, capture folders and recordings.
 
-Signal chain: path -> cloud file of ``mitsim decode``; or capture folder, decoded; or a recording that ``mitsim import``
-knows without being told more, decoded -> cloud, and its capture where there is one.
+Signal chain: path -> cloud file of ``mitsim decode``; or capture folder, decoded; or recording that ``mitsim import``
+reads without options, decoded -> cloud, and its capture if there is one.
 """
 
 from __future__ import annotations
@@ -20,18 +20,21 @@ from mitsim.reconstruction.noise import known_noise
 from mitsim.recordings.recognise import Given, read_recording
 from mitsim.sensor.matcher import MatcherSettings
 
-#: endings of the files of a folder that are measured
-_ENDINGS = (".ply", ".pcd")
+#: suffixes of cloud files that are found in a folder
+_SUFFIXES = (".ply", ".pcd")
 
-#: what a cloud file of ``mitsim decode`` has in its head
+#: text that identifies a cloud file of ``mitsim decode``, and the length of the header in which it stands [bytes]
 _MARK, _HEAD = b"\ncomment mitsim ", 4096
 
 
 @dataclass(frozen=True)
-class GivenCloud:
-    """A cloud by its ``path``; ``capture`` that it was decoded from, None of a cloud file.
+class InputCloud:
+    """A cloud to measure.
 
-    ``margin_px``: pixels beside the edge of a feature whose points may be of both sides, half a matching block.
+    - ``path`` of its file or capture folder.
+    - ``cloud`` in the sensor frame [mm].
+    - ``capture`` that it was decoded from, None for a cloud file of ``mitsim decode``.
+    - ``margin_px``: pixels beside an edge whose points may mix both sides (:func:`margin_of`).
     """
 
     path: Path
@@ -41,38 +44,37 @@ class GivenCloud:
 
 
 def cloud_paths(paths: Iterable[Path]) -> list[Path]:
-    """Paths of clouds, with folders of clouds and captures replaced by what is in them, by name.
+    """Return paths of clouds; a folder is replaced by the clouds and captures in it, sorted by name.
 
-    Raises
-    ------
-    InputError
-        If a folder holds none.
+    A folder that contains neither is kept.
     """
     out: list[Path] = []
     for path in paths:
         if not path.is_dir() or (path / "capture.json").exists():
             out.append(path)
             continue
-        inside = [
+        contained = [
             one
             for one in sorted(path.iterdir())
-            if (one / "capture.json").exists() or (one.is_file() and one.suffix.lower() in _ENDINGS)
+            if (one / "capture.json").exists() or (one.is_file() and one.suffix.lower() in _SUFFIXES)
         ]
-        # a folder without either may be a recording as its device saved it
-        out += inside or [path]
+        # a folder without them may be a recording as its device saved it
+        out += contained or [path]
     return out
 
 
-def read_cloud(path: Path, sensor: str | None = None) -> GivenCloud:
-    """Read a cloud, or decode the capture that a path leads to, with the settings of ``sensor`` if given.
+def read_cloud(path: Path, sensor: str | None = None) -> InputCloud:
+    """Read a cloud file, or decode a capture folder or recording.
+
+    ``sensor`` is the preset or sensor file whose settings decode it; by default, those of the capture.
 
     Raises
     ------
     InputError
-        If there is none, or it cannot be read or decoded.
+        If the path does not exist, or its content cannot be read or decoded.
     """
-    if path.is_file() and _is_own(path):
-        return GivenCloud(path, read_ply(path), None)
+    if path.is_file() and _is_mitsim_ply(path):
+        return InputCloud(path, read_ply(path), None)
     if (path / "capture.json").exists():
         capture = read_capture(path)
     elif path.exists():
@@ -83,15 +85,15 @@ def read_cloud(path: Path, sensor: str | None = None) -> GivenCloud:
         )
     settings, imager = decoder_settings(capture, sensor)
     cloud = capture_cloud(capture, settings, imager=known_noise(capture, imager))
-    return GivenCloud(path, cloud, capture, margin_of(settings))
+    return InputCloud(path, cloud, capture, margin_of(settings))
 
 
 def margin_of(settings: Settings) -> int:
-    """Pixels beside the edge of a feature whose points may be of both sides: half a matching block and one."""
+    """Return the margin beside an edge [px] where points may mix both sides: half a matching block plus 1."""
     return settings.block_size // 2 + 1 if isinstance(settings, MatcherSettings) else 0
 
 
-def _is_own(path: Path) -> bool:
+def _is_mitsim_ply(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(_HEAD)
     return head.startswith(b"ply\n") and _MARK in head

@@ -1,4 +1,4 @@
-"""Measurements as text and as JSON values."""
+"""Print measurements as tables of text, and as JSON values."""
 
 from __future__ import annotations
 
@@ -7,79 +7,81 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mitsim.measuring.result import LEAVES_OUT, Repeated, Result
+from mitsim.measuring.result import NOT_INCLUDED, Repeatability, Result
 from mitsim.version import __version__
 
-#: significant digits of an uncertainty; a value has as many decimals as its uncertainty
+#: significant digits of an uncertainty. A value has as many decimals as its uncertainty, at least 3 and at most 6
 _DIGITS = 2
 
 
 def result_table(results: Sequence[Result]) -> str:
-    """One cloud's measurements, a line each."""
+    """Return the table of one cloud's measurements, one line for each."""
     nominal = any(math.isfinite(one.nominal) for one in results)
-    biased = any(one.origin == "statement" for one in results)
+    corrected = any(one.origin == "statement" for one in results)
     head = ["measurement", "value", "unit", "u", *(["nominal", "error"] if nominal else []), "points"]
-    rows = [head + (["bias taken off"] if biased else [])]
+    rows = [head + (["bias subtracted"] if corrected else [])]
     for one in results:
         points = f"{one.points}/{one.points_given}" if one.points_given else ""
-        row = [one.name, _shown(one.value, one.uncertainty), one.unit, _uncertain(one.uncertainty)]
+        row = [one.name, _value_text(one.value, one.uncertainty), one.unit, _uncertainty_text(one.uncertainty)]
         if nominal:
-            row += [_plain(one.nominal), _shown(one.error, one.uncertainty)]
-        row += [points] + ([_plain(one.bias)] if biased else [])
+            row += [_number_text(one.nominal), _value_text(one.error, one.uncertainty)]
+        row += [points] + ([_number_text(one.bias)] if corrected else [])
         rows.append(row + ([f"not possible: {one.reason}"] if not one.possible else []))
-    return _laid_out(rows)
+    return _aligned(rows)
 
 
-def repeatability_table(found: Sequence[Repeated]) -> str:
-    """Measurements over several clouds, a line each."""
+def repeatability_table(found: Sequence[Repeatability]) -> str:
+    """Return the table of the repeatability over several clouds, one line for each measurement."""
     nominal = any(math.isfinite(one.nominal) for one in found)
     rows = [
-        ["measurement", "n", "mean", "standard deviation", "unit", "u (mean of fits)", *(["error"] if nominal else [])]
+        ["measurement", "n", "mean", "standard deviation", "unit", "u (rms of fits)", *(["error"] if nominal else [])]
     ]
     for one in found:
         rows.append(
             [
                 one.name,
                 f"{one.count}/{one.asked}",
-                _shown(one.mean, one.deviation),
-                _uncertain(one.deviation),
+                _value_text(one.mean, one.deviation),
+                _uncertainty_text(one.deviation),
                 one.unit,
-                _uncertain(one.uncertainty),
-                *([_shown(one.mean - one.nominal, one.deviation)] if nominal else []),
+                _uncertainty_text(one.uncertainty),
+                *([_value_text(one.mean - one.nominal, one.deviation)] if nominal else []),
             ]
         )
-    return _laid_out(rows)
+    return _aligned(rows)
 
 
-def result_tables(paths: Sequence[Path], results: Sequence[Sequence[Result]], repeated: Sequence[Repeated]) -> str:
-    """Return the table of each cloud, under its path if there are several, and that of their repeatability."""
+def result_tables(
+    paths: Sequence[Path], results: Sequence[Sequence[Result]], repeatability: Sequence[Repeatability]
+) -> str:
+    """Return the table of each cloud, under its path if there are several, then the table of their repeatability."""
     if len(paths) == 1:
         tables = [result_table(results[0])]
     else:
         tables = [f"{path}\n{result_table(found)}\n" for path, found in zip(paths, results, strict=True)]
-    return "\n".join([*tables, *([repeatability_table(repeated)] if repeated else [])])
+    return "\n".join([*tables, *([repeatability_table(repeatability)] if repeatability else [])])
 
 
 def summary(clouds: Sequence[Sequence[Result]]) -> str:
-    """One line that says the result."""
+    """Return one line: the number of measurements with a value, and the first without, with its reason."""
     every = [one for results in clouds for one in results]
-    done = sum(one.possible for one in every)
-    text = f"{done} of {len(every)} measurements" + (f" in {len(clouds)} clouds" if len(clouds) > 1 else "")
-    lost = next((one for one in every if not one.possible), None)
-    return text + (f"; {lost.name}: {lost.reason}" if lost else "")
+    count = sum(one.possible for one in every)
+    text = f"{count} of {len(every)} measurements" + (f" in {len(clouds)} clouds" if len(clouds) > 1 else "")
+    first_failed = next((one for one in every if not one.possible), None)
+    return text + (f"; {first_failed.name}: {first_failed.reason}" if first_failed else "")
 
 
 def measured_document(
-    clouds: Sequence[tuple[Path, str, str]], results: Sequence[Sequence[Result]], repeated: Sequence[Repeated]
+    clouds: Sequence[tuple[Path, str, str]], results: Sequence[Sequence[Result]], repeatability: Sequence[Repeatability]
 ) -> dict[str, Any]:
-    """All measurements as JSON values, of clouds by path, sensor and source.
+    """Return all measurements as JSON values.
 
-    See docs/reference/formats/printed-json.md.
+    ``clouds`` are path, sensor and source of each cloud. The keys are in docs/reference/formats/printed-json.md.
     """
     return {
         "schema_version": 1,
         "mitsim": __version__,
-        "uncertainty": {"of": "standard uncertainty, k = 1", "from_fit_leaves_out": list(LEAVES_OUT)},
+        "uncertainty": {"of": "standard uncertainty, k = 1", "from_fit_leaves_out": list(NOT_INCLUDED)},
         "clouds": [
             {
                 "path": str(path),
@@ -99,13 +101,13 @@ def measured_document(
                 "standard_deviation": _number(one.deviation),
                 "fit_uncertainty": _number(one.uncertainty),
             }
-            for one in repeated
+            for one in repeatability
         ],
     }
 
 
 def result_values(one: Result) -> dict[str, Any]:
-    """Return a measurement as JSON values."""
+    """Return a measurement as JSON values; NaN becomes None."""
     return {
         "name": one.name,
         "unit": one.unit,
@@ -124,12 +126,12 @@ def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _uncertain(value: float) -> str:
+def _uncertainty_text(value: float) -> str:
     return f"{value:.{_DIGITS}g}" if math.isfinite(value) else "-"
 
 
-def _shown(value: float, uncertainty: float) -> str:
-    """Value to the decimals of its uncertainty, at least three and at most six."""
+def _value_text(value: float, uncertainty: float) -> str:
+    """Return a value with the decimals of its uncertainty, at least three and at most six; three without one."""
     if not math.isfinite(value):
         return "-"
     decimals = 3
@@ -138,14 +140,15 @@ def _shown(value: float, uncertainty: float) -> str:
     return f"{value:.{decimals}f}"
 
 
-def _plain(value: float) -> str:
+def _number_text(value: float) -> str:
     return f"{value:g}" if math.isfinite(value) else "-"
 
 
-def _laid_out(rows: list[list[str]]) -> str:
-    wide = max(len(row) for row in rows)
+def _aligned(rows: list[list[str]]) -> str:
+    columns = max(len(row) for row in rows)
     widths = [
-        max((len(row[k]) for row in rows if k < len(row) - (len(row) > len(rows[0]))), default=0) for k in range(wide)
+        max((len(row[k]) for row in rows if k < len(row) - (len(row) > len(rows[0]))), default=0)
+        for k in range(columns)
     ]
     return "\n".join(
         "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=False)).rstrip() for row in rows

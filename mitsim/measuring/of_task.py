@@ -1,11 +1,11 @@
-"""The measurements of a task in a cloud, at a pose of the part, as a study makes them.
+"""Measure a task in a cloud, at a known pose of the part, as a study does.
 
-Signal chain: cloud, scene and pose -> the shape of the part that each pixel shows, away from edges -> fits and values
-with standard uncertainties (:func:`characterisation.tasks.evaluation.measure`) -> the bias of a statement subtracted,
-where asked.
+Signal chain: cloud, scene and pose -> label of each pixel, the shape of the part that it shows, away from edges -> fits
+and values with standard uncertainties (:func:`characterisation.tasks.evaluation.measure`) -> bias subtracted, if a
+statement of uncertainty is given.
 
-A statement belongs to a sensor, a part and a view. It is refused for another sensor or other measurements, and where
-the sensor stands elsewhere: its bias changes with the view.
+A statement holds for one sensor, part and view, because its bias changes with the view. It is rejected for another
+sensor, for a measurement that it lacks, and for another pose of the sensor.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from mitsim.scene.load import Scene
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import Transform
 
-#: a part is placed and a sensor stands as a statement says if they differ by no more than this [mm], [deg]
+#: largest difference between the sensor's pose and that of a statement [mm], [deg]
 SAME_PLACE_MM, SAME_ANGLE_DEG = 10.0, 2.0
 
 
 @dataclass(frozen=True)
 class Correction:
-    """Bias and standard uncertainty after its correction of one measurement, in its unit."""
+    """Bias of one measurement, and its standard uncertainty after the bias is subtracted, both in ``unit``."""
 
     unit: str
     bias: float
@@ -44,8 +44,11 @@ class Correction:
 
 
 @dataclass(frozen=True)
-class StatedView:
-    """What a ``statement.json`` says of a view: its sensor, its pose, and the correction of each measurement."""
+class ViewStatement:
+    """Statement of uncertainty for one view, from the ``statement.json`` at ``path``.
+
+    ``sensor`` is its name; ``world_from_sensor`` is the pose of the view; ``corrections`` are by measurement.
+    """
 
     path: Path
     sensor: str
@@ -53,25 +56,25 @@ class StatedView:
     corrections: Mapping[str, Correction]
 
     def check(self, sensor: str, pose: Transform) -> None:
-        """Refuse to correct what was taken by another sensor, or from elsewhere.
+        """Check that a cloud's sensor and its ``pose``, world from sensor, are those of the statement.
 
         Raises
         ------
         InputError
-            If so.
+            If the sensor differs, or the pose by more than :data:`SAME_PLACE_MM` or :data:`SAME_ANGLE_DEG`.
         """
         if sensor != self.sensor:
-            raise InputError(self.path, "sensor", self.sensor, f"{sensor}, which took the cloud")
-        between = self.world_from_sensor.inverse() @ pose
-        moved = float(np.linalg.norm(between.translation))
-        turned = math.degrees(math.acos(min(max((float(np.trace(between.rotation)) - 1) / 2, -1.0), 1.0)))
-        if moved > SAME_PLACE_MM or turned > SAME_ANGLE_DEG:
+            raise InputError(self.path, "sensor", self.sensor, f"{sensor}, the sensor of the cloud")
+        difference = self.world_from_sensor.inverse() @ pose
+        distance_mm = float(np.linalg.norm(difference.translation))
+        rotation_deg = math.degrees(math.acos(min(max((float(np.trace(difference.rotation)) - 1) / 2, -1.0), 1.0)))
+        if distance_mm > SAME_PLACE_MM or rotation_deg > SAME_ANGLE_DEG:
             raise InputError(
                 self.path,
                 "world_from_sensor",
-                f"a view {moved:.1f} mm and {turned:.1f} deg from the cloud's",
-                f"up to {SAME_PLACE_MM:g} mm and {SAME_ANGLE_DEG:g} deg: a bias belongs to its view",
-                "state this view: mitsim budget STUDY --view N",
+                f"a view {distance_mm:.1f} mm and {rotation_deg:.1f} deg from that of the cloud",
+                f"up to {SAME_PLACE_MM:g} mm and {SAME_ANGLE_DEG:g} deg: a bias holds only for its view",
+                "make a statement for this view: mitsim budget STUDY --view N",
             )
 
 
@@ -80,32 +83,51 @@ def measure_task(
     task: Task,
     scene: Scene,
     world_from_sensor: Transform,
-    stated: StatedView | None = None,
+    statement: ViewStatement | None = None,
     margin_px: int = 0,
 ) -> list[Result]:
-    """Measure a task in a cloud of a part whose pose is known to some mm.
+    """Measure a task in a cloud of a part whose pose is known within a few mm.
 
-    Points within ``margin_px`` of the edge of a shape, and at least within three pixels, belong to none.
+    Parameters
+    ----------
+    cloud
+        Organised cloud in the sensor frame [mm].
+    task, scene
+        Measurements, and the part that they refer to.
+    world_from_sensor
+        Pose of the sensor in the part frame.
+    statement
+        Its biases are subtracted; None subtracts nothing.
+    margin_px
+        Pixels closer to the edge of a shape than this, and at least 3 px, are not used.
+
+    Returns
+    -------
+    list of Result
+        One for each measurement of the task, in mm or deg.
 
     Raises
     ------
     InputError
-        If the statement is not of this sensor, view and task.
+        If the statement is for another sensor or view, or lacks a measurement.
     """
-    if stated is not None:
-        stated.check(cloud.sensor, world_from_sensor)
+    if statement is not None:
+        statement.check(cloud.sensor, world_from_sensor)
     results = measure_labelled(labelled_cloud(cloud, scene, world_from_sensor, margin_px), task, world_from_sensor)
-    return results if stated is None else [corrected(one, stated) if one.possible else one for one in results]
+    return results if statement is None else [corrected(one, statement) if one.possible else one for one in results]
 
 
 def labelled_cloud(cloud: PointCloud, scene: Scene, world_from_sensor: Transform, margin_px: int = 0) -> PointCloud:
-    """A cloud with the shape of a part that each pixel shows; -1 within ``margin_px`` of an edge, at least 3 px."""
-    labels = _grid_predictor(cloud, max(margin_px, EDGE_MARGIN_PX)).quick_labels(scene, world_from_sensor)
+    """Label each pixel of a cloud with the shape of the part that it shows.
+
+    The label is the index in ``scene.names``. It is -1 within ``margin_px`` of the edge of a shape, at least 3 px.
+    """
+    labels = _predictor_of_grid(cloud, max(margin_px, EDGE_MARGIN_PX)).quick_labels(scene, world_from_sensor)
     return replace(cloud, feature=labels, feature_names=scene.names)
 
 
 def measure_labelled(labelled: PointCloud, task: Task, world_from_sensor: Transform) -> list[Result]:
-    """Measure a task in a cloud whose pixels are told to the shapes of a part, which has all that the task names."""
+    """Measure a task in a labelled cloud (:func:`labelled_cloud`), whose labels include all shapes of the task."""
     assert labelled.feature is not None
     sensor_from_part = world_from_sensor.inverse().matrix()
     found = measure(labelled, task, sensor_from_part)
@@ -113,34 +135,45 @@ def measure_labelled(labelled: PointCloud, task: Task, world_from_sensor: Transf
     used = {name: 0 if isinstance(fit, FitError) else fit.count for name, fit in fits.items()}
     results = []
     for name, one in found.items():
-        asked = task.measurements[name]
+        definition = task.measurements[name]
         shapes = [labelled.feature_names.index(shape) for shape in task.shapes_for(name)]
-        given = int((np.isin(labelled.feature, shapes) & labelled.valid).sum())
+        count = int((np.isin(labelled.feature, shapes) & labelled.valid).sum())
         if not one.possible:
-            results.append(failed(name, asked.unit, one.reason, points_given=given))
+            results.append(failed(name, definition.unit, one.reason, points_given=count))
             continue
         points = sum(used[feature] for feature in task.fitted_for(name))
         results.append(
-            Result(name, asked.unit, one.value, one.standard_uncertainty, "fit", points, given, nominal=asked.nominal)
+            Result(
+                name,
+                definition.unit,
+                one.value,
+                one.standard_uncertainty,
+                "fit",
+                points,
+                count,
+                nominal=definition.nominal,
+            )
         )
     return results
 
 
-def corrected(result: Result, stated: StatedView) -> Result:
-    """Subtract the bias that a statement has of a measurement; the uncertainty is then the statement's.
+def corrected(result: Result, statement: ViewStatement) -> Result:
+    """Subtract the bias of a measurement; its uncertainty becomes that of the statement.
 
     Raises
     ------
     InputError
-        If the statement does not know the measurement, in its unit, or knows no bias.
+        If the statement lacks the measurement, has it in another unit, or has no bias for it.
     """
-    if result.name not in stated.corrections:
-        known = ", ".join(stated.corrections)
-        raise InputError(stated.path, "measurements", known, f"{result.name}, which the task asks for")
-    correction = stated.corrections[result.name]
+    if result.name not in statement.corrections:
+        known = ", ".join(statement.corrections)
+        raise InputError(
+            statement.path, "measurements", known, f"a statement with {result.name}, a measurement of the task"
+        )
+    correction = statement.corrections[result.name]
     if correction.unit != result.unit or not math.isfinite(correction.bias):
         found = f"bias {correction.bias:g} {correction.unit}"
-        raise InputError(stated.path, f"measurements.{result.name}", found, f"a bias in {result.unit}")
+        raise InputError(statement.path, f"measurements.{result.name}", found, f"a bias in {result.unit}")
     return replace(
         result,
         value=result.value - correction.bias,
@@ -150,13 +183,15 @@ def corrected(result: Result, stated: StatedView) -> Result:
     )
 
 
-def read_stated_view(path: Path) -> StatedView:
-    """Read what a ``statement.json`` corrects.
+def read_view_statement(path: Path) -> ViewStatement:
+    """Read sensor, pose, biases and uncertainties from a ``statement.json``.
+
+    The uncertainty after correction is sqrt(u^2 + u_bias^2), from ``standard_uncertainty`` and ``bias_uncertainty``.
 
     Raises
     ------
     InputError
-        If it cannot be read, or is none.
+        If the file cannot be read, or is not a statement.
     """
     table = _json(path, "a statement.json of mitsim run or mitsim budget")
     try:
@@ -169,18 +204,18 @@ def read_stated_view(path: Path) -> StatedView:
             for name, one in table["measurements"].items()
         }
         pose = Transform.from_matrix(np.array(table["world_from_sensor"], float).reshape(4, 4))
-        return StatedView(path, str(table["sensor"]), pose, corrections)
+        return ViewStatement(path, str(table["sensor"]), pose, corrections)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(path, "", f"a file that is no statement ({error!r})", "a statement.json") from None
+        raise InputError(path, "", f"a file that is not a statement ({error!r})", "a statement.json") from None
 
 
 def read_pose(path: Path, view: int | None = None) -> Transform:
-    """``world_from_sensor`` of a pose.json, a statement.json, or one view of a poses.json.
+    """Read ``world_from_sensor`` from a pose.json, a statement.json, or one view of a poses.json.
 
     Raises
     ------
     InputError
-        If the file cannot be read, holds no pose, or no such view.
+        If the file cannot be read, has no pose or no such view, or its matrix is not a rigid motion.
     """
     table = _json(path, "pose.json of a capture, poses.json of a run, or statement.json")
     matrix = table.get("world_from_sensor")
@@ -189,7 +224,7 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
             known = {int(one["view"]): one["part_from_sensor"] for one in table["views"]}
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
-                path, "views", f"what does not make sense ({error!r})", "as mitsim run writes it"
+                path, "views", f"entries that cannot be read ({error!r})", "a list as mitsim run writes it"
             ) from None
         if view not in known:
             raise InputError(
@@ -204,12 +239,14 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
     except (TypeError, ValueError):
         raise InputError(path, "world_from_sensor", repr(matrix)[:60], "a 4 x 4 matrix, rows first [mm]") from None
     if not np.allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(pose.rotation) < 0:
-        raise InputError(path, "world_from_sensor", "a matrix that is no rigid motion", "a rotation and a place in mm")
+        raise InputError(
+            path, "world_from_sensor", "a matrix that is not a rigid motion", "a rotation, and a translation in mm"
+        )
     return pose
 
 
-def _grid_predictor(cloud: PointCloud, margin_px: int) -> Predictor:
-    """What labels a cloud: its grid is all that it takes, so the eyes of the rig do not matter."""
+def _predictor_of_grid(cloud: PointCloud, margin_px: int) -> Predictor:
+    """Return a predictor to label a cloud with. Labels depend on the grid alone, so one camera stands for the rig."""
     grid = cloud.grid
     matrix = np.array([[grid.fx, 0, grid.cx], [0, grid.fy, grid.cy], [0, 0, 1]])
     camera = Camera(matrix, np.zeros(0), grid.width, grid.height, Transform(grid.rotation, grid.origin))
@@ -220,5 +257,5 @@ def _number(value: Any) -> float:
     return math.nan if value is None else float(value)
 
 
-def _json(path: Path, what: str) -> dict[str, Any]:
-    return read_json_object(path, what)
+def _json(path: Path, description: str) -> dict[str, Any]:
+    return read_json_object(path, description)

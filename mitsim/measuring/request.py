@@ -1,4 +1,4 @@
-"""Requests of the command line to measure without a task: windows, plates, a difference.
+"""Read the measurements that the command line requests without a task: windows, plates, a difference.
 
 Signal chain: texts of the options -> windows and plates, checked -> results and a picture of each cloud.
 """
@@ -23,47 +23,56 @@ from characterisation.acceptance.cloud_difference import (
 )
 from characterisation.documents import checked_name
 from characterisation.errors import InputError
-from mitsim.measuring.clouds import GivenCloud
+from mitsim.measuring.clouds import InputCloud
 from mitsim.measuring.plate import Plate, image_on_grid, measure_plate
 from mitsim.measuring.result import Result, failed
-from mitsim.measuring.windows import Between, Shape, WindowPlan, measure_windows, window_slices
+from mitsim.measuring.windows import PairKind, Shape, WindowPlan, measure_windows, window_slices
 from mitsim.report.measured_figures import difference_figure, distance_figure
 from mitsim.sensor.roi import Roi
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: ways to take a difference
-WAYS = ("auto", "rays", "surface")
+#: directions of a difference: along the view rays, or along the surface normal; ``auto`` depends on the grids
+DIRECTIONS = ("auto", "rays", "surface")
 
-_WINDOW, _PLATE = (
+_WINDOW_SYNTAX, _PLATE_SYNTAX = (
     "NAME=COLUMN,ROW,WIDTH,HEIGHT [px], or NAME alone",
     "NAME=COLUMN,ROW,WIDTH,HEIGHT,PITCH, or NAME=PITCH [mm]",
 )
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Features in windows, ``plates`` by name, and the difference from a reference ``by`` a way, in a ``window``."""
+class Request:
+    """Measurements that the options request.
+
+    - ``plan``: features in windows, and angles and distances between them.
+    - ``plates`` of dots by name.
+    - ``by``: direction of a difference, one of :data:`DIRECTIONS`.
+    - ``window`` of the difference [px], None for the whole grid.
+    - ``has_reference``: whether there is a reference cloud for a difference.
+    """
 
     plan: WindowPlan
     plates: Mapping[str, Plate]
     by: str
     window: Roi | None
-    differs: bool
+    has_reference: bool
 
     @property
     def empty(self) -> bool:
-        """Whether nothing is asked for."""
-        return not (self.plan.features or self.plates or self.differs)
+        """Whether no measurement is requested."""
+        return not (self.plan.features or self.plates or self.has_reference)
 
-    def measured(self, given: GivenCloud, reference: GivenCloud | None) -> tuple[list[Result], Callable[[], Figure]]:
-        """Results of a cloud, and what draws its picture.
+    def measure(self, given: InputCloud, reference: InputCloud | None) -> tuple[list[Result], Callable[[], Figure]]:
+        """Return the results of a cloud, and a function that draws its picture.
+
+        ``reference`` is the reference cloud of a difference, None without one.
 
         Raises
         ------
         InputError
-            If a window lies outside of the cloud, or dots are asked of a cloud without images.
+            If a window does not lie in the cloud's grid, or dots are requested of a cloud without images.
         """
         cloud = given.cloud
         results = measure_windows(cloud, self.plan)
@@ -74,7 +83,7 @@ class Asked:
                     "",
                     "a cloud without images",
                     "a capture folder, whose images show the dots",
-                    "mitsim measure CAPTURE --dots ... decodes it",
+                    "give the capture folder, which the command decodes: mitsim measure CAPTURE --dots ...",
                 )
             image = image_on_grid(given.capture, cloud.grid)
             for name, plate in self.plates.items():
@@ -83,10 +92,13 @@ class Asked:
         if reference is None:
             return results, lambda: distance_figure(cloud, boxes)
         values = self._difference(given, reference)
-        found = distribution(values, int(cloud.valid[window_slices(self.window, cloud, "difference")].sum()))
-        return results + _of_difference(found), lambda: difference_figure(values, found, boxes, self.window)
+        difference = distribution(values, int(cloud.valid[window_slices(self.window, cloud, "difference")].sum()))
+        return results + _difference_results(difference), lambda: difference_figure(
+            values, difference, boxes, self.window
+        )
 
-    def _difference(self, given: GivenCloud, reference: GivenCloud) -> NDArray[np.float64]:
+    def _difference(self, given: InputCloud, reference: InputCloud) -> NDArray[np.float64]:
+        """Return the difference (H, W) [mm] of a cloud from the reference, NaN outside the window."""
         cloud, other = given.cloud, reference.cloud
         rays = self.by == "rays" or (self.by == "auto" and same_grid(cloud.grid, other.grid))
         values = difference_along_rays(cloud, other) if rays else difference_to_surface(cloud, other)
@@ -101,7 +113,7 @@ class Asked:
         return {name: one for name, one in windows.items() if one is not None}
 
 
-def read_asked(
+def read_request(
     features: Mapping[str, Sequence[str]],
     between: Mapping[str, Sequence[str]],
     plates: Sequence[str],
@@ -109,69 +121,88 @@ def read_asked(
     against: Path | None,
     by: str,
     window: tuple[int, int, int, int] | None,
-) -> Asked:
-    """Read the texts of options: ``features`` by shape, ``between`` by angle or distance, ``plates``.
+) -> Request:
+    """Read the texts of options into a request.
+
+    Parameters
+    ----------
+    features
+        Texts ``NAME=COLUMN,ROW,WIDTH,HEIGHT`` [px], or ``NAME``, by shape.
+    between
+        Texts ``NAME,NAME`` by kind of measurement.
+    plates
+        Texts ``NAME=COLUMN,ROW,WIDTH,HEIGHT,PITCH`` [px, mm], or ``NAME=PITCH``.
+    bright
+        Whether the dots are brighter than the plate.
+    against
+        Path of the reference cloud of a difference, None without one.
+    by
+        Direction of the difference, one of :data:`DIRECTIONS`.
+    window
+        Window of the difference [px], None for the whole grid.
 
     Raises
     ------
     InputError
-        If one does not make sense; the option and what is allowed are named.
+        If a text cannot be read. The error names the option and the allowed form.
     """
     named: dict[str, tuple[Shape, Roi | None]] = {}
     for shape, texts in features.items():
         for text in texts:
-            name, numbers = named_numbers(f"--{shape}", text, (0, 4), _WINDOW)
-            named_once(f"--{shape}", name, named)
-            named[name] = cast(Shape, shape), window_of(f"--{shape}", text, numbers, _WINDOW)
-    pairs: list[tuple[Between, str, str]] = []
+            name, numbers = parse_numbers(f"--{shape}", text, (0, 4), _WINDOW_SYNTAX)
+            check_unique(f"--{shape}", name, named)
+            named[name] = cast(Shape, shape), parse_window(f"--{shape}", text, numbers, _WINDOW_SYNTAX)
+    pairs: list[tuple[PairKind, str, str]] = []
     for kind, texts in between.items():
         for text in texts:
             names = [one.strip() for one in text.split(",")]
             if len(names) != 2 or not all(names):
                 raise InputError(f"--{kind}", "", repr(text), "NAME,NAME of two features")
-            pairs.append((cast(Between, kind), names[0], names[1]))
+            pairs.append((cast(PairKind, kind), names[0], names[1]))
     known: dict[str, Plate] = {}
     for text in plates:
-        name, numbers = named_numbers("--dots", text, (1, 5), _PLATE)
-        named_once("--dots", name, {**named, **known})
+        name, numbers = parse_numbers("--dots", text, (1, 5), _PLATE_SYNTAX)
+        check_unique("--dots", name, {**named, **known})
         if not 0 < numbers[-1] < 1e4:
-            raise InputError("--dots", "", repr(text), f"{_PLATE}, the pitch over 0")
-        known[name] = Plate(window_of("--dots", text, numbers[:-1], _PLATE), numbers[-1], not bright)
-    if by not in WAYS:
-        raise InputError("--by", "", repr(by), ", ".join(WAYS))
+            raise InputError("--dots", "", repr(text), f"{_PLATE_SYNTAX}, the pitch over 0 and under 10000")
+        known[name] = Plate(parse_window("--dots", text, numbers[:-1], _PLATE_SYNTAX), numbers[-1], not bright)
+    if by not in DIRECTIONS:
+        raise InputError("--by", "", repr(by), ", ".join(DIRECTIONS))
     if against is None and (by != "auto" or window is not None):
         raise InputError("--by" if window is None else "--window", "", "no --against", "--against CLOUD")
     numbers = [] if window is None else list(map(float, window))
-    region = window_of("--window", str(window), numbers, "COLUMN ROW WIDTH HEIGHT")
+    region = parse_window("--window", str(window), numbers, "COLUMN ROW WIDTH HEIGHT")
     plan = WindowPlan(named, pairs)
     plan.check()
-    return Asked(plan, known, by, region, against is not None)
+    return Request(plan, known, by, region, against is not None)
 
 
-def _of_difference(found: Difference) -> list[Result]:
-    """Results of a difference; without uncertainties, for its points are not independent."""
-    result = partial(Result, unit="mm", points=found.count, points_given=found.asked)
+def _difference_results(difference: Difference) -> list[Result]:
+    """Return the results of a difference, without uncertainties, because its points are not independent."""
+    result = partial(Result, unit="mm", points=difference.count, points_given=difference.asked)
     values = {
-        "mean": found.mean,
-        "median": found.median,
-        "standard deviation": found.deviation,
-        "robust deviation": found.robust_deviation,
-        "2.5 %": found.low,
-        "97.5 %": found.high,
+        "mean": difference.mean,
+        "median": difference.median,
+        "standard deviation": difference.deviation,
+        "robust deviation": difference.robust_deviation,
+        "2.5 %": difference.low,
+        "97.5 %": difference.high,
     }
-    if found.count < 2:
-        reason = f"{found.count} of {found.asked} points have a counterpart"
-        return [failed(f"difference {what}", "mm", reason, found.count, found.asked) for what in values]
-    return [result(f"difference {what}", value=value) for what, value in values.items()]
+    if difference.count < 2:
+        reason = f"only {difference.count} of {difference.asked} points have a counterpart in the reference"
+        return [failed(f"difference {name}", "mm", reason, difference.count, difference.asked) for name in values]
+    return [result(f"difference {name}", value=value) for name, value in values.items()]
 
 
-def named_numbers(option: str, text: str, counts: tuple[int, ...], allowed: str) -> tuple[str, list[float]]:
-    """Return name and numbers of ``name=1,2,3``; ``counts`` are the allowed numbers of numbers.
+def parse_numbers(option: str, text: str, counts: tuple[int, ...], allowed: str) -> tuple[str, list[float]]:
+    """Return name and numbers of a text such as ``name=1,2,3``.
+
+    ``counts`` lists how many numbers are allowed; ``allowed`` describes the form of the text.
 
     Raises
     ------
     InputError
-        Naming the option, and what is allowed.
+        If the text has another form. The error names the option and the allowed form.
     """
     name, _, rest = text.partition("=")
     try:
@@ -186,13 +217,13 @@ def named_numbers(option: str, text: str, counts: tuple[int, ...], allowed: str)
         raise InputError(option, "", repr(name.strip()), str(error)) from None
 
 
-def window_of(option: str, text: str, numbers: Sequence[float], allowed: str) -> Roi | None:
-    """Return the window of four numbers, None of no numbers: the whole grid.
+def parse_window(option: str, text: str, numbers: Sequence[float], allowed: str) -> Roi | None:
+    """Return the window of four numbers [px]; no numbers give None, the whole grid.
 
     Raises
     ------
     InputError
-        If they are no window.
+        If the numbers are not whole, a position is negative, or a size is 0.
     """
     if not numbers:
         return None
@@ -202,13 +233,13 @@ def window_of(option: str, text: str, numbers: Sequence[float], allowed: str) ->
     return Roi(column, row, width, height)
 
 
-def named_once(option: str, name: str, known: Mapping[str, object]) -> None:
-    """Check that a name is not among those ``known``.
+def check_unique(option: str, name: str, known: Mapping[str, object]) -> None:
+    """Check that a name is not used yet.
 
     Raises
     ------
     InputError
-        If it is.
+        If it is among the ``known`` names.
     """
     if name in known:
-        raise InputError(option, "", f"{name!r} a second time", "a name of its own for each feature")
+        raise InputError(option, "", f"{name!r} a second time", "a different name for each feature")

@@ -1,7 +1,11 @@
-"""One measured number with its unit and uncertainty, and how many clouds repeat it.
+"""Describe one measured number with its unit and uncertainty, and its repeatability over several clouds.
 
-Uncertainties come from the covariance of the least-squares fit unless a statement replaced them. Such an uncertainty
-takes the noise of the points as independent from pixel to pixel, and leaves out what :data:`LEAVES_OUT` names.
+Signal chain: measurements of several clouds -> grouped by name -> mean, standard deviation, and root mean square of the
+uncertainties.
+
+Uncertainties come from the covariance of a least-squares fit, unless a statement of uncertainty replaces them. The fit
+treats the noise of the points as independent from pixel to pixel. Its uncertainty does not include
+:data:`NOT_INCLUDED`.
 """
 
 from __future__ import annotations
@@ -13,26 +17,28 @@ from typing import Literal
 
 import numpy as np
 
-#: what the standard uncertainty of a fit does not know of
-LEAVES_OUT = (
+#: effects that the standard uncertainty of a fit does not include
+NOT_INCLUDED = (
     "noise that neighbouring points share",
     "calibration and scale of the sensor",
     "systematic error of the surface (reflections, penetration, blur at edges)",
-    "form of the surface, but for flatness and cylindricity",
+    "form of the surface, except in flatness and cylindricity",
 )
 
-#: where a standard uncertainty comes from: covariance of a fit, a statement, or nowhere
+#: source of a standard uncertainty: the covariance of a fit, a statement, or none
 Origin = Literal["fit", "statement", "none"]
 
 
 @dataclass(frozen=True)
 class Result:
-    """One number of one cloud.
+    """One measured number of one cloud.
 
-    ``name`` of the measurement, ``value`` in ``unit``, NaN if it was not possible, and then ``reason`` says why;
-    ``points`` that it rests on, of ``points_given`` that were in its window (0 where no points were counted);
-    ``uncertainty`` standard uncertainty in the same unit by ``origin``, NaN if none is known; ``nominal`` value, NaN if
-    nobody said one; ``bias`` that was subtracted.
+    - ``name`` of the measurement, and ``value`` in ``unit``; NaN if the measurement was not possible.
+    - ``reason`` for a missing value, "" otherwise.
+    - ``uncertainty``: standard uncertainty in ``unit``, NaN if unknown; ``origin``: its source.
+    - ``points``: number of points used, of ``points_given`` in the window; 0 where no points were counted.
+    - ``nominal``: nominal value in ``unit``, NaN if there is none.
+    - ``bias`` that was subtracted, in ``unit``.
     """
 
     name: str
@@ -48,21 +54,23 @@ class Result:
 
     @property
     def possible(self) -> bool:
-        """Whether there is a value."""
+        """Whether the measurement has a value."""
         return math.isfinite(self.value)
 
     @property
     def error(self) -> float:
-        """Value minus nominal, NaN without either."""
+        """Value minus nominal, in ``unit``; NaN without either."""
         return self.value - self.nominal
 
 
 @dataclass(frozen=True)
-class Repeated:
-    """One measurement over several clouds.
+class Repeatability:
+    """One measurement over several clouds, in ``unit``.
 
-    ``count`` clouds that gave a value, of ``asked``; ``mean``, and ``deviation``, the standard deviation with count - 1
-    degrees of freedom (NaN for fewer than two); ``uncertainty``, root mean square of the uncertainties of the fits.
+    - ``count``: number of clouds with a value, of ``asked`` clouds.
+    - ``mean`` of the values, NaN without one; ``nominal`` value.
+    - ``deviation``: standard deviation with count - 1 degrees of freedom, NaN for fewer than two values.
+    - ``uncertainty``: root mean square of the known standard uncertainties, NaN without one.
     """
 
     name: str
@@ -76,12 +84,12 @@ class Repeated:
 
 
 def failed(name: str, unit: str, reason: str, points: int = 0, points_given: int = 0) -> Result:
-    """A measurement that was not possible."""
+    """Return the result of a measurement that was not possible, with its reason."""
     return Result(name, unit, math.nan, points=points, points_given=points_given, reason=reason)
 
 
-def repeated(clouds: Sequence[Sequence[Result]]) -> list[Repeated]:
-    """Each measurement over all clouds, in the order of the first cloud that names it."""
+def repeatability(clouds: Sequence[Sequence[Result]]) -> list[Repeatability]:
+    """Return the repeatability of each measurement over all clouds, in the order in which the names first occur."""
     by_name: dict[str, list[Result]] = {}
     for results in clouds:
         for one in results:
@@ -91,7 +99,7 @@ def repeated(clouds: Sequence[Sequence[Result]]) -> list[Repeated]:
         values = np.array([one.value for one in results if one.possible])
         known = np.array([one.uncertainty for one in results if math.isfinite(one.uncertainty)])
         out.append(
-            Repeated(
+            Repeatability(
                 name,
                 results[0].unit,
                 len(values),

@@ -1,11 +1,11 @@
-"""Features in windows of a cloud's grid, and the angles and distances between them.
+"""Fit features to windows of a cloud's grid, and measure the angles and distances between them.
 
 Signal chain: window [px] -> its points -> robust fit along the view rays, seen from the origin of the grid
 (:mod:`characterisation.features.fits`) -> value and standard uncertainty, propagated from the covariance of the fit
 (:func:`characterisation.tasks.evaluation.evaluate`).
 
-A feature's window should hold that feature and little else: fewer than :data:`LEAST_SHARE` of the points on the fitted
-surface is an answer that says so, and no value.
+A window should contain one feature and little else. If fewer than :data:`LEAST_SHARE` of its points lie on the fitted
+surface, the result has no value and states this reason.
 """
 
 from __future__ import annotations
@@ -46,23 +46,23 @@ from mitsim.measuring.result import Result, failed
 from mitsim.sensor.roi import Roi
 
 Shape = Literal["plane", "sphere", "cylinder"]
-Between = Literal["angle", "distance"]
+PairKind = Literal["angle", "distance"]
 ShapeFit = PlaneFit | SphereFit | CylinderFit
 
-#: share of a window's points that must lie on the fitted surface
+#: least share of a window's points on the fitted surface
 LEAST_SHARE = 0.5
 
-#: points that a window must have
+#: least number of points in a window
 LEAST_POINTS = 30
 
 
 def window_slices(window: Roi | None, cloud: PointCloud, name: str) -> tuple[slice, slice]:
-    """Return rows and columns of a window of a cloud's grid; of the whole grid if there is none.
+    """Return rows and columns of a window [px] of a cloud's grid; None is the whole grid.
 
     Raises
     ------
     InputError
-        If the window does not lie in the grid; ``name`` is that of its feature.
+        If the window does not lie in the grid. The error names ``name``, the feature of the window.
     """
     grid = cloud.grid
     if window is None:
@@ -75,67 +75,75 @@ def window_slices(window: Roi | None, cloud: PointCloud, name: str) -> tuple[sli
 
 
 def window_points(window: Roi | None, cloud: PointCloud, name: str) -> NDArray[np.float64]:
-    """Return the valid points (n, 3) [mm] of a window; raises as :func:`window_slices`."""
+    """Return the valid points (n, 3) [mm] of a window, in the sensor frame; raises as :func:`window_slices`."""
     inside = window_slices(window, cloud, name)
     return np.asarray(cloud.points[inside][cloud.valid[inside]], float)
 
 
 @dataclass(frozen=True)
 class WindowPlan:
-    """Features to measure in windows, and the angles and distances ``between`` them.
+    """Features to measure in windows, and the angles and distances between pairs of them.
 
-    ``features`` name -> shape and window, None for the whole grid; each of ``between`` is a kind of measurement and the
-    names of two features.
+    - ``features``: shape and window by name; a window of None is the whole grid.
+    - ``pairs``: kind of measurement, and the names of two features.
     """
 
     features: Mapping[str, tuple[Shape, Roi | None]]
-    between: Sequence[tuple[Between, str, str]] = ()
+    pairs: Sequence[tuple[PairKind, str, str]] = ()
 
     def check(self) -> None:
-        """Reject pairs of features that are not known, or that have no such measurement.
+        """Check that every pair names two features of the plan that have this measurement.
 
         Raises
         ------
         InputError
-            With the first of them.
+            For the first pair that does not.
         """
-        for kind, first, second in self.between:
+        for kind, first, second in self.pairs:
             for name in (first, second):
                 if name not in self.features:
                     known = list(self.features)
                     allowed = ", ".join(known) or "the name of a --plane, --sphere or --cylinder"
                     raise InputError(f"--{kind}", "", repr(name), allowed, nearest(name, known))
             shapes = self.features[first][0], self.features[second][0]
-            if _between(kind, *shapes) is None:
-                raise InputError(f"--{kind}", "", f"{first} ({shapes[0]}) and {second} ({shapes[1]})", _ALLOWED[kind])
+            if _pair_function(kind, *shapes) is None:
+                raise InputError(
+                    f"--{kind}", "", f"{first} ({shapes[0]}) and {second} ({shapes[1]})", _ALLOWED_SHAPES[kind]
+                )
 
 
 def measure_windows(cloud: PointCloud, plan: WindowPlan) -> list[Result]:
-    """Measure every feature of a plan in a cloud, then what lies between them.
+    """Measure every feature of a plan in a cloud, then the angles and distances between features.
 
-    Of a plane: flatness (low-order form, :mod:`characterisation.features.form`), noise (standard deviation of the
-    residuals along the view rays), distance from the sensor along the ray to its middle. Of a sphere: diameter,
-    noise, distance of the centre. Of a cylinder: diameter, cylindricity, noise. All in mm.
+    - Plane: flatness, noise, distance from the grid's origin along the ray to the middle of the points.
+    - Sphere: diameter, noise, distance of the centre from the grid's origin.
+    - Cylinder: diameter, cylindricity, noise.
+
+    Flatness and cylindricity are ranges of the low-order form (:mod:`characterisation.features.form`). Noise is the
+    standard deviation of the residuals along the view rays. Lengths are in mm, angles in deg.
+
+    Standard uncertainties follow from the covariance of the fits by the law of propagation of uncertainty (JCGM 100,
+    5.2). That of the noise is s / sqrt(2 nu), with nu degrees of freedom and normal noise (JCGM 100, E.4.3).
 
     Raises
     ------
     InputError
-        If a window does not lie in the grid.
+        If a window does not lie in the grid, or a pair of features has no such measurement.
     """
     plan.check()
     results: list[Result] = []
     fits: dict[str, ShapeFit | FitError] = {}
-    given: dict[str, int] = {}
+    counts: dict[str, int] = {}
     for name, (shape, window) in plan.features.items():
         points = window_points(window, cloud, name)
-        given[name] = len(points)
-        fits[name] = fit = _fitted(points, shape, cloud.grid.origin)
+        counts[name] = len(points)
+        fits[name] = fit = _fit_shape(points, shape, cloud.grid.origin)
         if isinstance(fit, FitError):
-            results += [failed(f"{name} {what}", "mm", str(fit), 0, len(points)) for what in _QUANTITIES[shape]]
+            results += [failed(f"{name} {quantity}", "mm", str(fit), 0, len(points)) for quantity in _QUANTITIES[shape]]
         else:
-            results += _of_shape(name, fit, points, cloud.grid.origin)
-    for kind, first, second in plan.between:
-        results.append(_of_pair(kind, (first, second), fits, given, plan))
+            results += _shape_results(name, fit, points, cloud.grid.origin)
+    for kind, first, second in plan.pairs:
+        results.append(_pair_result(kind, (first, second), fits, counts, plan))
     return results
 
 
@@ -145,16 +153,17 @@ _QUANTITIES: dict[Shape, tuple[str, ...]] = {
     "cylinder": ("diameter", "cylindricity", "noise"),
 }
 
-_ALLOWED: dict[Between, str] = {
+_ALLOWED_SHAPES: dict[PairKind, str] = {
     "angle": "planes and cylinders",
     "distance": "two planes, two cylinders, two spheres, or a sphere and a plane",
 }
 
 
-def _fitted(points: NDArray[np.float64], shape: Shape, viewpoint: NDArray[np.float64]) -> ShapeFit | FitError:
+def _fit_shape(points: NDArray[np.float64], shape: Shape, viewpoint: NDArray[np.float64]) -> ShapeFit | FitError:
+    """Return the fit of a shape to points (n, 3) [mm], or the error that says why there is none."""
     try:
         if len(points) < LEAST_POINTS:
-            raise FitError(f"{len(points)} points in the window, at least {LEAST_POINTS} are asked for")
+            raise FitError(f"{len(points)} points in the window, at least {LEAST_POINTS} are needed")
         fit: ShapeFit
         match shape:
             case "plane":
@@ -165,48 +174,52 @@ def _fitted(points: NDArray[np.float64], shape: Shape, viewpoint: NDArray[np.flo
                 fit = fit_cylinder(points, cylinder_start(points), viewpoint)
         if fit.count < LEAST_SHARE * len(points):
             share = f"{100 * fit.count / len(points):.0f} % of the {len(points)} points"
-            raise FitError(f"only {share} lie on one")
+            raise FitError(f"only {share} lie on the fitted {shape}")
         return fit
     except FitError as error:
         return FitError(f"{error}: does the window show one {shape}?")
 
 
-def _of_shape(name: str, fit: ShapeFit, points: NDArray[np.float64], viewpoint: NDArray[np.float64]) -> list[Result]:
-    """Results of one fitted feature."""
+def _shape_results(
+    name: str, fit: ShapeFit, points: NDArray[np.float64], viewpoint: NDArray[np.float64]
+) -> list[Result]:
+    """Return the results of one fitted feature."""
     result = partial(Result, unit="mm", origin="fit", points=fit.count, points_given=len(points))
-    # of a standard deviation with nu degrees of freedom, for normal noise (JCGM 100, E.4.3)
-    freedom = fit.count - fit.parameter_count
-    noise = result(f"{name} noise", value=fit.residual_std, uncertainty=fit.residual_std / math.sqrt(2 * freedom))
+    # relative standard uncertainty 1 / sqrt(2 nu) of a standard deviation, normal noise (JCGM 100, E.4.3)
+    degrees = fit.count - fit.parameter_count
+    noise = result(f"{name} noise", value=fit.residual_std, uncertainty=fit.residual_std / math.sqrt(2 * degrees))
 
-    def of(what: str, function: Callable[[Any], float]) -> Result:
+    def evaluated(quantity: str, function: Callable[[Any], float]) -> Result:
         value, uncertainty = evaluate(function, [fit])
-        return result(f"{name} {what}", value=value, uncertainty=uncertainty)
+        return result(f"{name} {quantity}", value=value, uncertainty=uncertainty)
 
     if isinstance(fit, SphereFit):
-        away = of("distance", lambda ball: float(np.linalg.norm(ball.centre - viewpoint)))
-        return [of("diameter", lambda ball: 2 * float(ball.radius)), noise, away]
+        distance = evaluated("distance", lambda sphere: float(np.linalg.norm(sphere.centre - viewpoint)))
+        return [evaluated("diameter", lambda sphere: 2 * float(sphere.radius)), noise, distance]
     form_name = f"{name} cylindricity" if isinstance(fit, CylinderFit) else f"{name} flatness"
     try:
         form = fit_form(points, fit, viewpoint)
-        width = Result(form_name, "mm", *evaluate(zone, [form]), "fit", form.count, len(points))
+        form_result = Result(form_name, "mm", *evaluate(zone, [form]), "fit", form.count, len(points))
     except FitError as error:
-        width = failed(form_name, "mm", str(error), points_given=len(points))
+        form_result = failed(form_name, "mm", str(error), points_given=len(points))
     if isinstance(fit, CylinderFit):
-        return [of("diameter", lambda pin: 2 * float(pin.radius)), width, noise]
+        return [evaluated("diameter", lambda cylinder: 2 * float(cylinder.radius)), form_result, noise]
     middle = fit.point - viewpoint
     ray = middle / np.linalg.norm(middle)
-    away = of("distance", lambda plane: float((plane.point - viewpoint) @ plane.normal / (ray @ plane.normal)))
-    return [width, noise, away]
+    distance = evaluated(
+        "distance", lambda plane: float((plane.point - viewpoint) @ plane.normal / (ray @ plane.normal))
+    )
+    return [form_result, noise, distance]
 
 
-def _of_pair(
-    kind: Between,
+def _pair_result(
+    kind: PairKind,
     names: tuple[str, str],
     fits: Mapping[str, ShapeFit | FitError],
-    given: Mapping[str, int],
+    counts: Mapping[str, int],
     plan: WindowPlan,
 ) -> Result:
-    """Angle or distance between two features; 0 to 90 deg, and mm."""
+    """Return the angle, 0 to 90 deg, or the distance [mm] between two features."""
     label, unit = f"{names[0]}-{names[1]} {kind}", "deg" if kind == "angle" else "mm"
     inputs: list[ShapeFit] = []
     for name in names:
@@ -214,25 +227,25 @@ def _of_pair(
         if isinstance(fit, FitError):
             return failed(label, unit, f"{name}: {fit}")
         inputs.append(fit)
-    asked = _between(kind, plan.features[names[0]][0], plan.features[names[1]][0])
-    assert asked is not None  # plan.check()
-    function, swapped = asked
+    selected = _pair_function(kind, plan.features[names[0]][0], plan.features[names[1]][0])
+    assert selected is not None  # plan.check()
+    function, swapped = selected
     ordered = inputs[::-1] if swapped else inputs
     if function is plane_distance:
         value, uncertainty = evaluate(lambda a, b: plane_distance(a, b, nominal=ordered), ordered)
     else:
         value, uncertainty = evaluate(function, ordered)
     if not math.isfinite(value):
-        return failed(label, unit, "the features are parallel, or lie in one another")
+        return failed(label, unit, "the features are parallel or coincide")
     scale = math.degrees(1.0) if unit == "deg" else 1.0
-    count, all_given = sum(one.count for one in inputs), sum(given[name] for name in names)
-    return Result(label, unit, value * scale, uncertainty * scale, "fit", count, all_given)
+    count, total = sum(one.count for one in inputs), sum(counts[name] for name in names)
+    return Result(label, unit, value * scale, uncertainty * scale, "fit", count, total)
 
 
-def _between(kind: Between, first: Shape, second: Shape) -> tuple[Callable[..., Any], bool] | None:
-    """Function of two features, and whether it takes them in the other order; None where there is none."""
-    both = (first, second)
-    table: dict[tuple[Between, Shape, Shape], Callable[..., Any]] = {
+def _pair_function(kind: PairKind, first: Shape, second: Shape) -> tuple[Callable[..., Any], bool] | None:
+    """Return the function that measures two shapes, and whether it takes them in reverse order; None without one."""
+    shapes_of_pair = (first, second)
+    table: dict[tuple[PairKind, Shape, Shape], Callable[..., Any]] = {
         ("angle", "plane", "plane"): plane_angle,
         ("angle", "plane", "cylinder"): plane_axis_angle,
         ("angle", "cylinder", "cylinder"): axis_angle,
@@ -241,7 +254,7 @@ def _between(kind: Between, first: Shape, second: Shape) -> tuple[Callable[..., 
         ("distance", "sphere", "sphere"): point_distance,
         ("distance", "sphere", "plane"): point_plane_distance,
     }
-    for ordered, swapped in ((both, False), (both[::-1], True)):
+    for ordered, swapped in ((shapes_of_pair, False), (shapes_of_pair[::-1], True)):
         if (kind, *ordered) in table:
             return table[(kind, *ordered)], swapped
     return None

@@ -1,11 +1,11 @@
-"""Planned exposures against the preset's own, view by view, on the two pillars.
+"""Compare planned exposures with the preset's own, view by view, on the two pillars.
 
 python tests/benchmarks/exposure_plans.py --sensor ensenso-n10 --views 7 40 63 90 --worlds 8
 
-A plan is made from the best guess of everything. It is judged in worlds that it has not seen, with all unknowns drawn
-and fresh noise, each traced once and exposed both ways: mean points of the three features, the share of measurements
-that have a value, and the root mean square error of those that have one both ways in every world, planned over own, as
-the geometric mean of the seven measurements.
+A plan is made with every unknown at its best estimate. It is tested in other worlds, with all unknowns and noise drawn.
+Each world is traced once and exposed both ways. The table has the mean number of points of the three features, and the
+share of measurements with a value. Its errors are root mean square errors, planned over own, of the worlds with a value
+both ways. They are the geometric mean over the measurements with three such worlds or more.
 """
 
 import argparse

@@ -134,7 +134,7 @@ def test_vendor_names_stay_inside(tmp_path, name):
 def test_a_capture_is_replaced_only_when_told(tmp_path):
     first, second = example(), replace(example(), serial="43")
     path = write_capture(first, tmp_path / "c")
-    with pytest.raises(InputError, match="there already"):
+    with pytest.raises(InputError, match="an existing capture"):
         write_capture(second, path)
     assert_same(first, read_capture(path))
     write_capture(second, path, overwrite=True)
@@ -146,10 +146,10 @@ def test_what_is_no_capture_is_never_replaced(tmp_path):
     precious = tmp_path / "c" / "thesis.txt"
     precious.parent.mkdir()
     precious.write_text("years")
-    with pytest.raises(InputError, match="no capture"):
+    with pytest.raises(InputError, match="not a capture"):
         write_capture(example(), tmp_path / "c", overwrite=True)
     assert precious.read_text() == "years"
-    with pytest.raises(InputError, match="no capture"):
+    with pytest.raises(InputError, match="not a capture"):
         write_capture(example(), precious, overwrite=True)
 
 
@@ -179,7 +179,7 @@ def test_a_failure_in_the_middle_leaves_things_as_they_were(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"settings": {"a": float("nan")}}, "settings"),
         ({"settings": {"a": {1, 2}}}, "settings"),
@@ -197,8 +197,8 @@ def test_a_failure_in_the_middle_leaves_things_as_they_were(tmp_path, monkeypatc
         ({"pose_covariance": np.triu(np.ones((6, 6)))}, "covariance"),
     ],
 )
-def test_what_could_not_be_read_back_is_not_written(tmp_path, change, told):
-    with pytest.raises(InputError, match=told):
+def test_what_could_not_be_read_back_is_not_written(tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
         write_capture(replace(example(), **change), tmp_path / "c")
     assert list(tmp_path.iterdir()) == []
 
@@ -231,7 +231,7 @@ def set_to(key, value):
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "told"),
+    ("name", "change", "message"),
     [
         ("capture.json", set_to("schema_version", 3), "update mitsim"),
         ("capture.json", set_to("schema_version", "1"), "schema_version"),
@@ -273,10 +273,10 @@ def set_to(key, value):
         ("pose.json", set_to("covariance", [[1, 2], [3, 4]]), "covariance"),
     ],
 )
-def test_what_another_program_got_wrong_is_named(tmp_path, name, change, told):
+def test_what_another_program_got_wrong_is_named(tmp_path, name, change, message):
     path = write_capture(example(), tmp_path / "c")
     rewrite(path, name, change)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         read_capture(path)
 
 
@@ -311,8 +311,8 @@ def test_maps_of_other_programs_are_scaled_and_their_holes_are_nan(tmp_path, dty
     stored[2, 5] = invalid
     path = write_capture(replace(example(), derived={"disparity": maps()["disparity"]}), tmp_path / "c")
     (path / "derived" / "disparity.npy").write_bytes(encode_npy(stored))
-    told = {"dtype": str(stored.dtype), "scale": scale, "invalid": invalid}
-    rewrite(path, "capture.json", lambda table: table["files"][-1].update(told))
+    stored_as = {"dtype": str(stored.dtype), "scale": scale, "invalid": invalid}
+    rewrite(path, "capture.json", lambda table: table["files"][-1].update(stored_as))
     found = read_capture(path).derived["disparity"]
     assert np.isnan(found[2, 5]) and np.isnan(found).sum() == 1
     known = ~np.isnan(found)
@@ -453,7 +453,7 @@ def test_a_damaged_array_is_refused_or_has_its_size(at, flip, cut):
 
 
 @pytest.mark.parametrize(
-    ("values", "told"),
+    ("values", "message"),
     [
         (np.zeros((2, 2)), "dtype: found <f8"),
         (np.zeros((2, 2), ">u2"), "dtype: found >u2"),
@@ -463,10 +463,10 @@ def test_a_damaged_array_is_refused_or_has_its_size(at, flip, cut):
         (np.array([[None]]), r"dtype: found \|O"),
     ],
 )
-def test_other_arrays_are_refused(values, told):
+def test_other_arrays_are_refused(values, message):
     stream = io.BytesIO()
     np.save(stream, values, allow_pickle=True)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         decode_npy(stream.getvalue(), "x.npy")
 
 

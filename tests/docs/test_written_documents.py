@@ -11,11 +11,11 @@ from characterisation.statements.budget import BudgetLine
 from characterisation.statements.decision import plus_minus
 from characterisation.statements.statement import statement
 from mitsim.exposures.exposure_plan import ExposurePlan
-from mitsim.exposures.exposure_sweep import FeatureLook, Look
+from mitsim.exposures.exposure_sweep import ExposureResult, FeatureResult
 from mitsim.exposures.planned import plan_document, write_plan_csv
 from mitsim.hardware.stage_connection import BAUD
 from mitsim.measuring.document import measured_document
-from mitsim.measuring.result import Repeated, Result
+from mitsim.measuring.result import Repeatability, Result
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import UnknownsTable
@@ -50,8 +50,8 @@ def test_keys_of_a_statement(stated):
 
 
 def test_keys_of_a_plan_of_exposures(tmp_path):
-    look = Look(PlannedExposure((1e-3,)), {"plane": FeatureLook(100.0, 0.5, 0.01, 0.0)}, {})
-    plan = ExposurePlan(3, look.exposure, ((1e-3, look),), look, look.features, True, (), 1)
+    result = ExposureResult(PlannedExposure((1e-3,)), {"plane": FeatureResult(100.0, 0.5, 0.01, 0.0)}, {})
+    plan = ExposurePlan(3, result.exposure, ((1e-3, result),), result, result.features, True, (), 1)
     study = SimpleNamespace(
         path=Path("study.toml"),
         sensor=SimpleNamespace(name="ensenso-n10", exposure=SimpleNamespace(limits_s=(1e-5, 1e-2))),
@@ -66,8 +66,8 @@ def test_keys_of_a_plan_of_exposures(tmp_path):
 
 def test_keys_of_measurements_on_stdout():
     one = Result("radius", "mm", 20.0)
-    repeated = Repeated("radius", "mm", 2, 2, 20.0, 0.1, 0.1, 20.0)
-    written = measured_document([(Path("a.ply"), "ensenso-n10", "simulated")], [[one]], [repeated])
+    repeatability = Repeatability("radius", "mm", 2, 2, 20.0, 0.1, 0.1, 20.0)
+    written = measured_document([(Path("a.ply"), "ensenso-n10", "simulated")], [[one]], [repeatability])
     assert first_column("columns: measure") == set(written)
     assert first_column("columns: measure cloud") == set(written["clouds"][0])
     assert first_column("columns: measure measurement") == set(written["clouds"][0]["measurements"][0])

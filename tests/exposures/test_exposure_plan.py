@@ -11,7 +11,7 @@ import pytest
 from characterisation.features.surfaces import Plane
 from characterisation.point_cloud import PointCloud, ViewGrid
 from mitsim.exposures.exposure_plan import PlanRules, plan_exposures, shortfall
-from mitsim.exposures.exposure_sweep import FeatureLook, Look, feature_look
+from mitsim.exposures.exposure_sweep import ExposureResult, FeatureResult, feature_result
 from mitsim.exposures.planned import plan_document, plan_in_words, plan_table
 from mitsim.sensor.exposure import PlannedExposure
 
@@ -19,28 +19,29 @@ POINTS = 4000
 
 
 def sensor_of(brightness: dict[str, tuple[float, float]], dark: float = 0.1, full: float = 1.0):
-    """Looks at features whose points have a brightness from low to high (in even ratios), per second.
+    """Return a function that gives the results of exposures.
 
-    A point comes back where some exposure brings it between ``dark`` and ``full``.
+    The points of a feature have a brightness per second from low to high, in equal ratios. A point is recovered if some
+    exposure brings it between ``dark`` and ``full``.
     """
     rates = {name: np.geomspace(low, high, POINTS) for name, (low, high) in brightness.items()}
 
-    def look(exposure: PlannedExposure, noise: int, draws: int) -> Look:
-        rows, seen = {}, {}
+    def evaluate(exposure: PlannedExposure, noise: int, draws: int) -> ExposureResult:
+        results, recovered = {}, {}
         for name, rate in rates.items():
             levels = np.multiply.outer(np.array(exposure.exposures_s) * exposure.power, rate)
-            seen[name] = ((levels >= dark) & (levels <= full)).any(axis=0)
-            count = int(seen[name].sum())
+            recovered[name] = ((levels >= dark) & (levels <= full)).any(axis=0)
+            count = int(recovered[name].sum())
             u = 1 / math.sqrt(count) if count >= 100 else math.inf
-            rows[name] = FeatureLook(float(count), count / POINTS, u, 1.0)
-        return Look(exposure, rows, seen)
+            results[name] = FeatureResult(float(count), count / POINTS, u, 1.0)
+        return ExposureResult(exposure, results, recovered)
 
-    return look
+    return evaluate
 
 
 def planned(brightness, own=0.01, limits=(1e-5, 1.0), **rules):
-    look = sensor_of(brightness)
-    return plan_exposures(look, PlannedExposure((own,)), limits, PlanRules(**rules)), look
+    evaluate = sensor_of(brightness)
+    return plan_exposures(evaluate, PlannedExposure((own,)), limits, PlanRules(**rules)), evaluate
 
 
 def test_features_alike_take_one_exposure_that_brings_all():
@@ -53,11 +54,11 @@ def test_features_alike_take_one_exposure_that_brings_all():
 
 
 def test_a_bright_and_a_dark_feature_take_two():
-    plan, look = planned({"bright": (1000, 4000), "dark": (10, 40)})
+    plan, evaluate = planned({"bright": (1000, 4000), "dark": (10, 40)})
     assert plan.reached and len(plan.exposure.exposures_s) == 2
     short, long_ = plan.exposure.exposures_s
     assert short < 1 / 1000 and long_ > 0.1 / 40
-    assert all(one.points >= POINTS / 1.1 for one in look(plan.exposure, 0, 1).features.values())
+    assert all(one.points >= POINTS / 1.1 for one in evaluate(plan.exposure, 0, 1).features.values())
     first, second = (step[1] for step in plan.added)
     assert min(one.points for one in first.features.values()) == 0
     assert min(one.points for one in second.features.values()) >= POINTS / 1.1
@@ -66,10 +67,10 @@ def test_a_bright_and_a_dark_feature_take_two():
 def test_of_sets_that_reach_the_limits_the_shortest_is_planned():
     """Whatever set of one exposure on the grid reaches them, none is shorter."""
     brightness = {"a": (20, 60)}
-    plan, look = planned(brightness)
+    plan, evaluate = planned(brightness)
     grid = [0.01 * math.sqrt(2) ** k for k in range(-12, 13)]
-    able = [t for t in grid if shortfall(look(PlannedExposure((t,)), 0, 1), plan.limits) <= 0.1]
-    assert plan.exposure.exposures_s[0] == pytest.approx(min(able), rel=0.01)
+    sufficient = [t for t in grid if shortfall(evaluate(PlannedExposure((t,)), 0, 1), plan.limits) <= 0.1]
+    assert plan.exposure.exposures_s[0] == pytest.approx(min(sufficient), rel=0.01)
 
 
 def test_one_exposure_is_planned_where_no_more_may_be_merged_and_the_limits_then_are_those_of_one():
@@ -90,8 +91,8 @@ def test_power_is_lowered_only_where_the_shortest_exposure_is_too_bright():
     assert plan.exposure.exposures_s == (1e-3,) and 0.2 <= plan.exposure.power <= 0.55 and plan.reached
     plan, _ = planned(bright, limits=(1e-5, 1.0))
     assert plan.exposure.power == 1 and plan.exposure.exposures_s[0] <= 5.5e-4
-    look = sensor_of(bright)
-    plan = plan_exposures(look, PlannedExposure((0.01,)), (1e-3, 1.0), PlanRules(), dimmable=False)
+    evaluate = sensor_of(bright)
+    plan = plan_exposures(evaluate, PlannedExposure((0.01,)), (1e-3, 1.0), PlanRules(), dimmable=False)
     assert plan.exposure.power == 1
 
 
@@ -102,24 +103,24 @@ def test_a_feature_that_no_exposure_brings_is_named_and_left_aside():
 
 
 def test_what_is_told_is_of_another_noise_than_what_was_chosen_on():
-    look, seen = sensor_of({"a": (20, 60)}), []
+    evaluate, calls = sensor_of({"a": (20, 60)}), []
 
     def kept(exposure, noise, draws):
-        seen.append((exposure, noise))
-        return look(exposure, noise, draws)
+        calls.append((exposure, noise))
+        return evaluate(exposure, noise, draws)
 
     plan = plan_exposures(kept, PlannedExposure((0.01,)), (1e-5, 1.0), PlanRules())
-    noises = {noise for exposure, noise in seen if exposure == plan.exposure}
+    noises = {noise for exposure, noise in calls if exposure == plan.exposure}
     assert len(noises) == 3
 
 
 def test_a_difference_that_noise_explains_is_no_shortfall():
-    limit = {"a": FeatureLook(1000, 0.5, 0.010, 1.0, 0.05)}
-    worse = FeatureLook(1000, 0.5, 0.0125, 1.0, 0.08)
-    look = Look(PlannedExposure((1.0,)), {"a": worse}, {})
-    open_ = 1 + 2 * math.hypot(0.05, 0.08)
-    assert shortfall(look, limit) == pytest.approx(1.25 / open_ - 1)
-    sure = Look(look.exposure, {"a": replace(worse, error=0.0)}, {})
+    limit = {"a": FeatureResult(1000, 0.5, 0.010, 1.0, 0.05)}
+    worse = FeatureResult(1000, 0.5, 0.0125, 1.0, 0.08)
+    result = ExposureResult(PlannedExposure((1.0,)), {"a": worse}, {})
+    allowance = 1 + 2 * math.hypot(0.05, 0.08)
+    assert shortfall(result, limit) == pytest.approx(1.25 / allowance - 1)
+    sure = ExposureResult(result.exposure, {"a": replace(worse, error=0.0)}, {})
     assert shortfall(sure, {"a": replace(limit["a"], error=0.0)}) == pytest.approx(0.25)
 
 
@@ -133,7 +134,7 @@ def plane_cloud(sigma: float, seed: int, keep: np.ndarray | None = None):
     measured = points + noise[:, None] * rays / np.linalg.norm(rays, axis=1, keepdims=True)
     if keep is not None:
         measured[~keep] = np.nan
-    slope = surface.linearised(np.zeros(3), points, rays / np.linalg.norm(rays, axis=1, keepdims=True))[1]
+    derivatives = surface.linearised(np.zeros(3), points, rays / np.linalg.norm(rays, axis=1, keepdims=True))[1]
     cloud = PointCloud(
         measured.reshape(40, 60, 3).astype(np.float32),
         np.where(np.isfinite(measured[:, 0]), 0, 1).reshape(40, 60).astype(np.uint8),
@@ -141,38 +142,38 @@ def plane_cloud(sigma: float, seed: int, keep: np.ndarray | None = None):
         source="simulated",
         sensor="s",
     )
-    return cloud, slope, surface
+    return cloud, derivatives, surface
 
 
 def test_u_of_a_feature_that_is_seen_whole_is_sigma_over_the_root_of_points_per_parameter():
     """Mean of g C g^T over the very points that were fitted is s^2 p / n, whatever g is: the trace of a projection."""
-    rows = []
+    uncertainties = []
     for seed in range(20):
-        cloud, slope, surface = plane_cloud(0.05, seed)
-        one, back = feature_look(cloud, np.arange(2400), slope, surface)
-        assert one.points == 2400 and one.fraction == 1.0 and back.all()
-        rows.append(one.u)
-    assert np.mean(rows) == pytest.approx(0.05 * math.sqrt(3 / 2400), rel=0.02)
+        cloud, derivatives, surface = plane_cloud(0.05, seed)
+        one, recovered = feature_result(cloud, np.arange(2400), derivatives, surface)
+        assert one.points == 2400 and one.fraction == 1.0 and recovered.all()
+        uncertainties.append(one.u)
+    assert np.mean(uncertainties) == pytest.approx(0.05 * math.sqrt(3 / 2400), rel=0.02)
 
 
 def test_a_half_that_is_lost_costs_more_than_half_of_the_points_lost_at_random():
     left = (np.arange(2400) % 60) < 30
     at_random = np.random.default_rng(0).permutation(left)
-    looks = []
+    results = []
     for keep in (left, at_random):
-        cloud, slope, surface = plane_cloud(0.05, 1, keep)
-        looks.append(feature_look(cloud, np.arange(2400), slope, surface)[0])
-    assert looks[0].points == looks[1].points == 1200
-    assert looks[1].u == pytest.approx(0.05 * math.sqrt(3 / 1200), rel=0.05)
+        cloud, derivatives, surface = plane_cloud(0.05, 1, keep)
+        results.append(feature_result(cloud, np.arange(2400), derivatives, surface)[0])
+    assert results[0].points == results[1].points == 1200
+    assert results[1].u == pytest.approx(0.05 * math.sqrt(3 / 1200), rel=0.05)
     # fitted over x in [-1, 0] the tilt's share at x is 12 (x + 1/2)^2, 7 in the mean over [-1, 1]; offset and the other
     # tilt have 1 each
-    assert looks[0].u == pytest.approx(0.05 * math.sqrt(9 / 1200), rel=0.05)
+    assert results[0].u == pytest.approx(0.05 * math.sqrt(9 / 1200), rel=0.05)
 
 
 def test_too_few_points_have_no_uncertainty():
     keep = np.arange(2400) < 60
-    cloud, slope, surface = plane_cloud(0.05, 1, keep)
-    one, _ = feature_look(cloud, np.arange(2400), slope, surface)
+    cloud, derivatives, surface = plane_cloud(0.05, 1, keep)
+    one, _ = feature_result(cloud, np.arange(2400), derivatives, surface)
     assert one.points == 60 and one.u == math.inf
 
 

@@ -99,7 +99,7 @@ def test_the_table_names_figures_and_a_figure_that_cannot_be_is_told(walls, tmp_
     [
         ((["wall=1,2,3"], [], []), r"--plane: found 'wall=1,2,3'"),
         ((["wall=-600"], [], []), r"lengths over 0 mm"),
-        ((["a=600"], ["a=30"], []), "a name of its own"),
+        ((["a=600"], ["a=30"], []), "a different name for each feature"),
         (([], ["ball"], []), r"--sphere: found 'ball'.*DIAMETER"),
         (([], ["ball=1,1,5,5"], []), "DIAMETER"),
         (([], ["a=30"], ["a,b,100"]), r"'a,b,100'; allowed: .*, a"),

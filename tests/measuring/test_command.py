@@ -94,7 +94,7 @@ def test_what_is_not_possible_ends_with_one(clouds, rng):
         (("--plane", "top=1,2,0,4"), "width and height over 0"),
         (("--plane", "top=1.5,2,5,4"), "whole pixels"),
         (("--plane", "top=150,20,100,80"), "within 200 x 160 pixels"),
-        (("--plane", "a", "--sphere", "a"), "a name of its own"),
+        (("--plane", "a", "--sphere", "a"), "a different name for each feature"),
         (("--plane", "a", "--angle", "a"), "NAME,NAME"),
         (("--plane", "a", "--angle", "a,b"), "'b'; allowed: a"),
         (("--dots", "p=-1"), "the pitch over 0"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from characterisation.errors import InputError
-from mitsim.measuring.of_task import corrected, read_pose, read_stated_view
+from mitsim.measuring.of_task import corrected, read_pose, read_view_statement
 from mitsim.measuring.result import Result
 from mitsim.sensor.transforms import Transform, look_at
 
@@ -24,29 +24,29 @@ def statement(tmp_path):
 
 
 def test_the_bias_is_taken_off_and_the_uncertainty_is_the_statements(statement):
-    stated = read_stated_view(statement)
-    stated.check("ensenso-n10", POSE)
-    one = corrected(Result("gap", "mm", 69.7, 0.01, "fit", nominal=70.0), stated)
+    loaded = read_view_statement(statement)
+    loaded.check("ensenso-n10", POSE)
+    one = corrected(Result("gap", "mm", 69.7, 0.01, "fit", nominal=70.0), loaded)
     assert (one.value, one.bias, one.origin) == (pytest.approx(70.0), -0.3, "statement")
     assert one.uncertainty == pytest.approx(0.05)
 
 
 def test_a_statement_of_another_sensor_or_view_is_refused(statement):
-    stated = read_stated_view(statement)
-    with pytest.raises(InputError, match="ensenso-n35, which took the cloud"):
-        stated.check("ensenso-n35", POSE)
-    stated.check("ensenso-n10", POSE @ Transform.from_degrees([0.5, 0, 0], [0, 3, 0]))
+    loaded = read_view_statement(statement)
+    with pytest.raises(InputError, match="ensenso-n35, the sensor of the cloud"):
+        loaded.check("ensenso-n35", POSE)
+    loaded.check("ensenso-n10", POSE @ Transform.from_degrees([0.5, 0, 0], [0, 3, 0]))
     for moved in (Transform.from_degrees([0, 0, 5], [0, 0, 0]), Transform.from_degrees([0, 0, 0], [0, 0, 30])):
-        with pytest.raises(InputError, match="a bias belongs to its view"):
-            stated.check("ensenso-n10", POSE @ moved)
+        with pytest.raises(InputError, match="a bias holds only for its view"):
+            loaded.check("ensenso-n10", POSE @ moved)
 
 
 def test_a_statement_without_the_measurement_or_in_another_unit_is_refused(statement):
-    stated = read_stated_view(statement)
-    with pytest.raises(InputError, match="width, which the task asks for"):
-        corrected(Result("width", "mm", 1.0), stated)
+    loaded = read_view_statement(statement)
+    with pytest.raises(InputError, match="a statement with width, a measurement of the task"):
+        corrected(Result("width", "mm", 1.0), loaded)
     with pytest.raises(InputError, match="a bias in deg"):
-        corrected(Result("gap", "deg", 1.0), stated)
+        corrected(Result("gap", "deg", 1.0), loaded)
 
 
 def test_poses_of_every_kind_of_file(statement, tmp_path):
@@ -64,8 +64,8 @@ def test_poses_of_every_kind_of_file(statement, tmp_path):
         ("{", "not JSON"),
         ("[]", "a JSON object"),
         ('{"world_from_sensor": null}', "4 x 4 matrix"),
-        (json.dumps({"world_from_sensor": (2 * np.eye(4)).tolist()}), "no rigid motion"),
-        ('{"views": [{"no": 1}]}', "does not make sense"),
+        (json.dumps({"world_from_sensor": (2 * np.eye(4)).tolist()}), "not a rigid motion"),
+        ('{"views": [{"no": 1}]}', "entries that cannot be read"),
     ],
 )
 def test_files_without_a_pose_are_refused(text, match, tmp_path):
@@ -78,5 +78,5 @@ def test_files_without_a_pose_are_refused(text, match, tmp_path):
 def test_a_file_that_is_no_statement_is_refused(tmp_path):
     path = tmp_path / "statement.json"
     path.write_text('{"sensor": "x"}', encoding="utf-8")
-    with pytest.raises(InputError, match="no statement"):
-        read_stated_view(path)
+    with pytest.raises(InputError, match="not a statement"):
+        read_view_statement(path)

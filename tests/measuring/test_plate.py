@@ -60,23 +60,23 @@ def test_rows_and_columns_are_those_of_the_plate():
     image, normal = drawn(Rotation.from_euler("xyz", (10, 20, 30), degrees=True).as_matrix())
     cloud = cloud_of(plane([0, 0, 500], normal, GRID), grid=GRID)
     dots = plate_dots("plate", Plate(None, PITCH), cloud, image)
-    assert np.array_equal(np.ptp(dots.places, axis=0), [6, 6])
-    assert len({tuple(place) for place in dots.places}) == 49
+    assert np.array_equal(np.ptp(dots.indices, axis=0), [6, 6])
+    assert len({tuple(index) for index in dots.indices}) == 49
     assert len(dots.distances) == 2 * 7 * 6
 
 
 def test_the_uncertainty_of_the_scale_is_its_scatter(rng):
     """Dots with errors of 0.05 mm on every axis, 200 times: s / u within 1 +- 3 / sqrt(2 * 199)."""
-    places = np.stack(np.meshgrid(np.arange(7), np.arange(5)), -1).reshape(-1, 2)
+    indices = np.stack(np.meshgrid(np.arange(7), np.arange(5)), -1).reshape(-1, 2)
     turn = Rotation.from_euler("xyz", (10, 20, 30), degrees=True).as_matrix()
     found = []
     for _ in range(200):
-        centres = np.column_stack([places * PITCH, np.zeros(35)]) @ turn.T + rng.normal(0, 0.05, (35, 3))
-        found.append(plate_scale(PlateDots(centres, places, np.empty(0), 35), PITCH)[:2])
+        centres = np.column_stack([indices * PITCH, np.zeros(35)]) @ turn.T + rng.normal(0, 0.05, (35, 3))
+        found.append(plate_scale(PlateDots(centres, indices, np.empty(0), 35), PITCH)[:2])
     scale, uncertainty = np.array(found).T
-    told = np.sqrt(np.mean(uncertainty**2))
-    assert abs(scale.std(ddof=1) / told - 1) < 3 / np.sqrt(2 * 199)
-    assert abs(scale.mean() - 1) < 4 * told / np.sqrt(200)
+    stated = np.sqrt(np.mean(uncertainty**2))
+    assert abs(scale.std(ddof=1) / stated - 1) < 3 / np.sqrt(2 * 199)
+    assert abs(scale.mean() - 1) < 4 * stated / np.sqrt(200)
 
 
 def test_another_pitch_is_told_with_the_one_that_is_there():

@@ -9,7 +9,8 @@ from seen_shapes import GRID, cloud_of, cylinder, plane, sphere
 from characterisation.errors import InputError
 from characterisation.features.fits import fit_cylinder
 from characterisation.features.starts import cylinder_start
-from mitsim.measuring.result import repeated
+from mitsim.measuring.document import repeatability_table
+from mitsim.measuring.result import Result, repeatability
 from mitsim.measuring.windows import WindowPlan, measure_windows
 from mitsim.sensor.roi import Roi
 
@@ -77,19 +78,25 @@ def test_the_uncertainty_is_the_scatter_of_independent_noise(trials, name):
     """Over 60 trials s / sigma lies within 1 +- 3 / sqrt(2 * 59), and the mean within 4 standard errors."""
     truth = {"a noise": 0.2, "a-b angle": 30.0, "ball diameter": 40.0, "ball distance": 450.0}
     values = np.array([by_name(one)[name].value for one in trials])
-    told = np.sqrt(np.mean([by_name(one)[name].uncertainty ** 2 for one in trials]))
-    assert abs(values.std(ddof=1) / told - 1) < 3 / np.sqrt(2 * 59)
+    stated = np.sqrt(np.mean([by_name(one)[name].uncertainty ** 2 for one in trials]))
+    assert abs(values.std(ddof=1) / stated - 1) < 3 / np.sqrt(2 * 59)
     if name in truth:
         # without the fit's own removal of points beyond 4 sigma: 6 in 10 000, 0.1 % of sigma
-        assert abs(values.mean() - truth[name]) < 4 * told / np.sqrt(60) + (1e-3 * 0.2 if name == "a noise" else 0)
+        assert abs(values.mean() - truth[name]) < 4 * stated / np.sqrt(60) + (1e-3 * 0.2 if name == "a noise" else 0)
 
 
 def test_repeatability_is_mean_and_standard_deviation_over_clouds(trials):
-    over = {one.name: one for one in repeated(trials)}
+    over = {one.name: one for one in repeatability(trials)}
     values = [by_name(one)["ball diameter"].value for one in trials]
     assert over["ball diameter"].count == over["ball diameter"].asked == 60
     assert over["ball diameter"].mean == pytest.approx(np.mean(values))
     assert over["ball diameter"].deviation == pytest.approx(np.std(values, ddof=1))
+
+
+def test_the_uncertainty_of_repeats_is_the_root_mean_square_of_those_of_the_fits():
+    (over,) = repeatability([[Result("a", "mm", 1.0, 0.3, "fit")], [Result("a", "mm", 2.0, 0.4, "fit")]])
+    assert over.uncertainty == pytest.approx(np.sqrt(0.125))
+    assert "u (rms of fits)" in repeatability_table([over])
 
 
 def test_a_window_that_shows_something_else_has_no_value_and_says_so(rng):
@@ -97,7 +104,7 @@ def test_a_window_that_shows_something_else_has_no_value_and_says_so(rng):
     found = measure_windows(cloud, WindowPlan({"a": ("plane", LEFT)}))
     assert not any(one.possible for one in found)
     assert "does the window show one plane?" in found[0].reason
-    assert repeated([found])[0].count == 0
+    assert repeatability([found])[0].count == 0
 
 
 def test_a_window_outside_the_grid_is_refused():

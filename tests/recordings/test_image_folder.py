@@ -244,7 +244,7 @@ def damage_float(folder):
         (damage_size, "image_4.png: size: found 63 x 48 px; allowed: 64 x 48 px"),
         (damage_depth, "image_4.png: depth: found 16 bits; allowed: 8"),
         (damage_half, "image_4.png"),
-        (damage_text, "image_4.png: found a file that is no image"),
+        (damage_text, "image_4.png: found a file that is not an image"),
         (damage_empty, "image_4.png: size: found 0 bytes"),
         (damage_float, "image_4.tif: depth: found float32"),
     ],

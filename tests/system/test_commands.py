@@ -107,7 +107,7 @@ def test_the_same_render_again_is_finished_and_another_is_refused_before_it_is_r
     assert [path.name for path in tmp_path.iterdir()] == ["c"]
     for other in (("--seed", 2), ("--truth",), ("--noise", "none"), ("--sensor", "oak-d-pro")):
         said = mitsim_here(*coupon, *other, "-o", tmp_path / "c", code=2).stderr
-        assert "another capture that is there already" in said
+        assert "an existing capture" in said
     (tmp_path / "c/pose.json").write_text("{}")
     assert "pose.json" in mitsim_here(*coupon, "-o", tmp_path / "c", code=2).stderr
 
