@@ -153,7 +153,7 @@ class Predictor:
         status = np.full(len(pixel), Status.VALID, np.uint8)
         outside = np.zeros(len(pixel), bool)
         for index, eye in enumerate(self.eyes):  # the projector comes last, so that its shadow takes precedence
-            outside |= ~_in_image(eye, self.view.eyes[index].lens.reach, point)
+            outside |= ~_in_image(eye, self.view.eyes[index].distortion.reach, point)
             hidden = ~surfaces.seen[index].ravel()[pixel]
             status[hidden] = Status.SHADOWED if eye is self.rig.projector else Status.HIDDEN
         status[outside] = Status.NO_SURFACE
