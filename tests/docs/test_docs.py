@@ -422,3 +422,17 @@ def test_architecture_names_code_that_exists():
         source = (ROOT / path).read_text(encoding="utf-8")
         last = name.rpartition(".")[2]
         assert not last or re.search(rf"^\s*(?:def|class) {last}\b|^{last}\b", source, re.MULTILINE), (path, name)
+
+
+@by_page
+def test_the_site_shows_every_list_as_a_list(page):
+    """Python-Markdown wants an empty line before a list, and four spaces before a nested one."""
+    lines = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S).splitlines()
+    item = re.compile(r"( *)(?:-|\d+\.) ")
+    inside = False
+    for before, line in zip(["", *lines], lines, strict=False):
+        found = item.match(line)
+        if found:
+            assert len(found[1]) % 4 == 0, line
+            assert inside or not before.strip(), line
+        inside = found is not None or (inside and bool(line.strip()))
