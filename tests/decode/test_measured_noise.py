@@ -55,7 +55,7 @@ def test_the_noise_is_that_of_the_images(name, noise, rng):
     found = measured_noise([taken(code, lambda level: noise, rng)], roles(code, WIDTH, HEIGHT), 255)
     true = np.sqrt(noise**2 + 1 / 12)
     np.testing.assert_allclose(np.sqrt(found.variances), true, rtol=0.08)
-    assert found.middle[1] == pytest.approx(true, rel=0.05)
+    assert found.at_median_level[1] == pytest.approx(true, rel=0.05)
 
 
 @pytest.mark.parametrize("name", CODES)
@@ -64,7 +64,7 @@ def test_the_gamma_of_a_projector_is_no_noise(name, rng):
     code = CODES[name]
     stack = taken(code, lambda level: 1.0, rng, gamma=2.2)
     found = measured_noise([stack], roles(code, WIDTH, HEIGHT), 255)
-    assert 0.95 < found.middle[1] / np.sqrt(1 + 1 / 12) < 1.3
+    assert 0.95 < found.at_median_level[1] / np.sqrt(1 + 1 / 12) < 1.3
 
 
 def test_shot_noise_grows_with_the_level(rng):
