@@ -17,7 +17,7 @@ from known_clouds import known_source, smooth
 
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
-from mitsim.campaign import answer, finish_cache, one_finish
+from mitsim.campaign import finish_cache, missing_finishes, one_finish
 from mitsim.campaign.finish_cache import cache_folder, kept_finish
 from mitsim.campaign.missing_finishes import Wanted, distances_about, map_with_finishes, with_lights
 from mitsim.campaign.one_finish import OneFinish, one_finish_campaign, plan_of
@@ -91,7 +91,7 @@ def test_it_is_characterised_once_and_kept(shipped, n10, quick, monkeypatch):
             assert found.sigma[0] == pytest.approx(sigma[0], rel=0.15)
         else:
             assert math.isnan(found.fraction[0])
-    monkeypatch.setattr(answer, "made_finish", None)
+    monkeypatch.setattr(missing_finishes, "made_finish", None)
     again = map_with_finishes(shipped, wanted_of(n10, milled))
     assert again.data.identical(joined.data)
     assert joined.data.attrs["characterised_when_asked"].count(",") == 2
