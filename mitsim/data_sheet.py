@@ -29,7 +29,7 @@ from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.features.fits import fit_plane, fit_sphere
 from characterisation.point_cloud import PointCloud
 from mitsim.campaign.acquire import coupon_cloud
-from mitsim.campaign.executor import Executor, worked_on
+from mitsim.campaign.executor import Executor, results_of
 from mitsim.campaign.plan import coupon_pose
 from mitsim.capture.capture import Capture
 from mitsim.progress import track
@@ -161,7 +161,7 @@ def measure_sensor(sensor: Sensor, seed: int = 1, workers: Executor | None = Non
     asked += [("recovery", (metal, mid, tilt)) for metal in METALS for tilt in TILTS_DEG]
     asked += [("residuals", (mid,))]
     pieces = [Piece(sensor, seed + number, *one) for number, one in enumerate(asked)]
-    done = worked_on(pieces, measure_piece, workers, sensor.name)
+    done = results_of(pieces, measure_piece, workers, sensor.name)
     _benches.clear()
     planes, noise, metal = done[:2], done[3 : 3 + DISTANCES], done[3 + DISTANCES : -1]
     return DataSheet(sensor, mid, planes, radius, done[2], noise, metal, done[-1])

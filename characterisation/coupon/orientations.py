@@ -53,7 +53,7 @@ class Refinement(Document):
 
 
 @dataclass(frozen=True)
-class Rough:
+class RefinedNormals:
     """Result of :func:`refine`: ``normals`` (m, 3) to add; number of ``unresolved`` edges that may not be halved."""
 
     normals: NDArray[np.float64]
@@ -95,7 +95,7 @@ def refine(
     sigma_error: NDArray[np.float64],
     refinement: Refinement,
     largest_angle: float,
-) -> Rough:
+) -> RefinedNormals:
     """Return the normals to add to those that were measured.
 
     Parameters
@@ -148,7 +148,7 @@ def refine(
     new = np.concatenate(added) if added else np.empty((0, 3))
     # an edge belongs to one subdivision, so its midpoint is found only once
     order = np.lexsort((np.arctan2(new[:, 1], new[:, 0]), -np.round(new[:, 2], 9)))
-    return Rough(new[order], unresolved)
+    return RefinedNormals(new[order], unresolved)
 
 
 def _differ(

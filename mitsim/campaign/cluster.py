@@ -65,7 +65,7 @@ class Cluster:
         # an unclosed client looks for its scheduler forever, in its own thread
         weakref.finalize(self, self.client.close).atexit = False  # Dask closes it at the end of the process
 
-    def spread(
+    def distribute(
         self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
     ) -> Iterator[tuple[Item, Result]]:
         """Yield items with the results of their orders, as they are finished; orders and results are plain values.

@@ -44,7 +44,7 @@ DEATHS = 5
 class Executor(Protocol):
     """Distributes work: :class:`Pool`, or :class:`mitsim.campaign.cluster.Cluster`."""
 
-    def spread(
+    def distribute(
         self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
     ) -> Iterator[tuple[Item, Result]]:
         """Yield items with the results of ``work``, a module-level function, on their orders, as they are finished.
@@ -109,7 +109,7 @@ class Pool:
         self.processes = processes
         self._pool: ProcessPoolExecutor | None = None
 
-    def spread(
+    def distribute(
         self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
     ) -> Iterator[tuple[Item, Result]]:
         """Yield items with the results of ``work`` on their orders, as they are finished.
@@ -189,12 +189,12 @@ def _end_with_parent(parent: int) -> None:
         raise SystemExit(0)
 
 
-def worked_on(
+def results_of(
     orders: Sequence[Plain], work: Callable[[Plain], Result], workers: Executor | None, label: str
 ) -> list[Result]:
     """Return the results of orders, in their sequence, from workers or this process; progress goes to stderr."""
     if workers is None:
         return [work(one) for one in track(orders, label)]
-    made = workers.spread(range(len(orders)), orders.__getitem__, work)
+    made = workers.distribute(range(len(orders)), orders.__getitem__, work)
     found = dict(track(made, label, len(orders)))
     return [found[number] for number in range(len(orders))]

@@ -50,7 +50,7 @@ def taken_by(workers: Executor, campaign: Campaign) -> Source:
     """Return a source whose shots are taken by workers."""
 
     def finish(shots: Sequence[Shot]) -> Iterator[tuple[Shot, Finished]]:
-        return workers.spread(shots, lambda shot: order_of(shot, campaign), take_order)
+        return workers.distribute(shots, lambda shot: order_of(shot, campaign), take_order)
 
     return finish
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from characterisation.documents import read_toml
-from mitsim.campaign.answer import Ask
+from mitsim.campaign.missing_finishes import Ask
 from mitsim.errors import InputError
 from mitsim.sensor.preset import presets
 from mitsim.study import CharacterisationTable, Study, StudyFile, open_study

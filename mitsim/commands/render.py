@@ -179,6 +179,6 @@ def _render_many(
     if workers is None:
         taken = in_turn(missing, SimulatedSensor(chosen))
     else:
-        taken = workers.spread(missing, lambda job: job, take_job)
+        taken = workers.distribute(missing, lambda job: job, take_job)
     render_many(taken, output, len(missing))
     say(f"captures: {output}: {len(jobs)}, {len(missing)} of them new")

@@ -64,7 +64,7 @@ def map_(
     from characterisation.maps.shipped import map_path
     from characterisation.maps.validation import holds, residual_table
     from mitsim.campaign.acquire import CaptureSource, simulated_source
-    from mitsim.campaign.executor import executor_of, worked_on
+    from mitsim.campaign.executor import executor_of, results_of
     from mitsim.campaign.hold_out import (
         compare,
         held_out_campaign,
@@ -94,7 +94,7 @@ def map_(
     check_folder(output)
     workers = executor_of(scheduler, processes)
     if workers is not None:
-        pairs = worked_on(held_out_orders(plan, shots, path, repeats), hold_out_order, workers, "hold out")
+        pairs = results_of(held_out_orders(plan, shots, path, repeats), hold_out_order, workers, "hold out")
     else:
         source: AbstractContextManager[CaptureSource]
         if live is None:

@@ -19,10 +19,10 @@ from characterisation.maps.samples import Samples
 from characterisation.maps.shipped import map_path, shipped_maps
 from characterisation.statements.decision import needed, tolerance_of
 from characterisation.tasks.evaluation import Task, check_features, read_task
-from mitsim.campaign.answer import (
+from mitsim.campaign.missing_finishes import (
     Ask,
     Wanted,
-    answering_map,
+    map_with_finishes,
     samples_of,
     seen_finishes,
     unknown_finishes,
@@ -147,7 +147,7 @@ def open_study(
         stood = [view.standoff for view in candidates.views]
         depths = (min(stood) - radius, max(stood) + radius)
         wanted = Wanted(sensor, scene.where, seen_finishes(scene), depths)
-        performance_map = answering_map(performance_map, wanted, ask)
+        performance_map = map_with_finishes(performance_map, wanted, ask)
     return Study(path, file, scene, task, sensor, candidates, campaign, performance_map)
 
 

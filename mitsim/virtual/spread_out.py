@@ -66,7 +66,7 @@ class SpreadMeasurements:
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
         """Yield the errors of every measurement, NaN without a value, job by job as they arrive."""
         orders = [replace(self._order, jobs=some) for some in self._rows(jobs)]
-        for order, results in self.workers.spread(orders, lambda one: one, make_trials):
+        for order, results in self.workers.distribute(orders, lambda one: one, make_trials):
             yield from zip(order.jobs, results, strict=True)
 
     def _rows(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, ...]]:

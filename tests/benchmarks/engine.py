@@ -39,9 +39,9 @@ def timed(order: Order) -> tuple[bytes, float]:
 
 def spread(workers: Executor, shots: Sequence[Shot], campaign, warm: Sequence[Shot]) -> tuple[dict, float, float]:
     """Patches by shot, the time of all [s], and that in which workers worked [s]."""
-    list(workers.spread(warm, lambda shot: order_of(shot, campaign), timed))
+    list(workers.distribute(warm, lambda shot: order_of(shot, campaign), timed))
     began = time.perf_counter()
-    found = list(workers.spread(shots, lambda shot: order_of(shot, campaign), timed))
+    found = list(workers.distribute(shots, lambda shot: order_of(shot, campaign), timed))
     whole = time.perf_counter() - began
     return {_key(shot): data for shot, (data, _) in found}, whole, sum(seconds for _, (_, seconds) in found)
 

@@ -98,13 +98,13 @@ def main() -> None:
 def hand_out(given: argparse.Namespace, cluster: Cluster, pid: int) -> None:
     """Hand out all captures, and tell now and then."""
     processes = {"scheduler": pid, "command": os.getpid()}
-    list(cluster.spread(range(given.workers), lambda n: Sleep(n, 0.0, given.bytes), sleep))  # builds are compared
+    list(cluster.distribute(range(given.workers), lambda n: Sleep(n, 0.0, given.bytes), sleep))  # builds are compared
     before = {name: used(one)[0] for name, one in processes.items()}
     began = told = time.perf_counter()
     done = 0
     size = f"{given.workers} workers of {given.threads} threads, captures of {given.seconds:g} s"
     print(f"{size}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}", flush=True)
-    made = cluster.spread(range(given.tasks), lambda n: Sleep(n, given.seconds, given.bytes), sleep)
+    made = cluster.distribute(range(given.tasks), lambda n: Sleep(n, given.seconds, given.bytes), sleep)
     for done, _ in enumerate(made, 1):
         if time.perf_counter() - told > 30 or done == given.tasks:
             told = time.perf_counter()

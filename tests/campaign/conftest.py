@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from known_clouds import known_source, smooth
 
-from mitsim.campaign import answer, one_finish
+from mitsim.campaign import missing_finishes, one_finish
 from mitsim.campaign.plan import CampaignFile, plan_campaign
 
 
@@ -40,7 +40,7 @@ def quick(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(one_finish, "BANDS", ((80.0, 1),))
     monkeypatch.setattr(one_finish, "REFINED", None)
-    monkeypatch.setattr(answer, "SimulatedSensor", lambda sensor: None)
+    monkeypatch.setattr(missing_finishes, "SimulatedSensor", lambda sensor: None)
     monkeypatch.setattr(one_finish, "simulated_source", lambda *_: None)
 
     def take(_, campaign):

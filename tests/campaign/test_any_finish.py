@@ -17,9 +17,9 @@ from known_clouds import known_source, smooth
 
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
-from mitsim.campaign import answer, finish_cache, one_finish
-from mitsim.campaign.answer import Wanted, answering_map, distances_about, with_lights
+from mitsim.campaign import finish_cache, missing_finishes, one_finish
 from mitsim.campaign.finish_cache import cache_folder, kept_finish
+from mitsim.campaign.missing_finishes import Wanted, distances_about, map_with_finishes, with_lights
 from mitsim.campaign.one_finish import OneFinish, one_finish_campaign, plan_of
 from mitsim.choose import read_candidates
 from mitsim.commands.options import asking
@@ -49,8 +49,8 @@ def wanted_of(n10, finish, between=(480.0, 620.0)):
 
 def test_what_is_known_is_answered_by_the_map_itself(shipped, n10, quick):
     ground = finish_of(type="machined_metal", process="ground", Ra=0.4)
-    assert answering_map(shipped, wanted_of(n10, ground)) is shipped
-    assert answering_map(shipped, wanted_of(n10, finish_of(type="matt_white"))) is shipped
+    assert map_with_finishes(shipped, wanted_of(n10, ground)) is shipped
+    assert map_with_finishes(shipped, wanted_of(n10, finish_of(type="matt_white"))) is shipped
     assert not quick
 
 
@@ -69,7 +69,7 @@ def test_what_is_known_is_answered_by_the_map_itself(shipped, n10, quick):
 def test_what_is_not_known_is_refused_where_nobody_can_be_asked(shipped, n10, quick, bsdf):
     for ask in (None, lambda _: False):
         with pytest.raises(InputError, match=r"'seat'.*aluminium/ground Ra 0.09 to 0.74 um.*--yes") as caught:
-            answering_map(shipped, wanted_of(n10, finish_of(**bsdf)), ask)
+            map_with_finishes(shipped, wanted_of(n10, finish_of(**bsdf)), ask)
         assert "about" in caught.value.hint
     assert not quick
 
@@ -77,7 +77,7 @@ def test_what_is_not_known_is_refused_where_nobody_can_be_asked(shipped, n10, qu
 def test_it_is_characterised_once_and_kept(shipped, n10, quick, monkeypatch):
     questions = []
     milled = finish_of(**MILLED)
-    joined = answering_map(shipped, wanted_of(n10, milled), lambda text: not questions.append(text))
+    joined = map_with_finishes(shipped, wanted_of(n10, milled), lambda text: not questions.append(text))
     assert len(questions) == 1
     assert "carbon_steel/milled Ra 1.6 um" in questions[0]
     assert len(quick) == 3  # at 400, 504 and 635 mm of the map's four distances
@@ -91,14 +91,14 @@ def test_it_is_characterised_once_and_kept(shipped, n10, quick, monkeypatch):
             assert found.sigma[0] == pytest.approx(sigma[0], rel=0.15)
         else:
             assert math.isnan(found.fraction[0])
-    monkeypatch.setattr(answer, "made_finish", None)
-    again = answering_map(shipped, wanted_of(n10, milled))
+    monkeypatch.setattr(missing_finishes, "made_finish", None)
+    again = map_with_finishes(shipped, wanted_of(n10, milled))
     assert again.data.identical(joined.data)
     assert joined.data.attrs["characterised_when_asked"].count(",") == 2
 
 
 def test_what_the_map_knew_before_it_answers_as_before(shipped, n10, quick):
-    joined = answering_map(shipped, wanted_of(n10, finish_of(**MILLED)), lambda _: True)
+    joined = map_with_finishes(shipped, wanted_of(n10, finish_of(**MILLED)), lambda _: True)
     ground = finish_of(type="machined_metal", process="ground", Ra=0.4)
     for light in (None, ground.light):
         one, other = (m.query(ground.name, 0.4, [560.0], AHEAD, light) for m in (shipped, joined))
@@ -109,7 +109,7 @@ def test_what_the_map_knew_before_it_answers_as_before(shipped, n10, quick):
 def test_a_broken_file_of_the_cache_is_made_again(shipped, n10, quick, fault, capsys):
     milled = finish_of(**MILLED)
     one = OneFinish(milled, n10, 80.0)
-    first = answering_map(shipped, wanted_of(n10, milled, (504.0, 504.0)), lambda _: True)
+    first = map_with_finishes(shipped, wanted_of(n10, milled, (504.0, 504.0)), lambda _: True)
     path = cache_folder() / f"{one.digest(504.0)}.nc"
     whole = path.read_bytes()
     if fault == "another":
@@ -119,8 +119,8 @@ def test_a_broken_file_of_the_cache_is_made_again(shipped, n10, quick, fault, ca
     assert kept_finish(one, 504.0) is None
     assert str(path) in capsys.readouterr().err
     with pytest.raises(InputError, match="--yes"):
-        answering_map(shipped, wanted_of(n10, milled, (504.0, 504.0)))
-    again = answering_map(shipped, wanted_of(n10, milled, (504.0, 504.0)), lambda _: True)
+        map_with_finishes(shipped, wanted_of(n10, milled, (504.0, 504.0)))
+    again = map_with_finishes(shipped, wanted_of(n10, milled, (504.0, 504.0)), lambda _: True)
     assert len(quick) == 2
     one_of, other = (m.query(milled.name, 1.6, [504.0], AHEAD, milled.light) for m in (first, again))
     assert one_of.sigma == other.sigma
@@ -130,7 +130,7 @@ def test_what_a_killed_process_left_is_swept_after_a_day(shipped, n10, quick):
     for name, age in (("work-old", 2 * 86400), ("work-new", 60)):
         (cache_folder() / name).mkdir(parents=True)
         os.utime(cache_folder() / name, (time.time() - age,) * 2)
-    answering_map(shipped, wanted_of(n10, finish_of(**MILLED), (504.0, 504.0)), lambda _: True)
+    map_with_finishes(shipped, wanted_of(n10, finish_of(**MILLED), (504.0, 504.0)), lambda _: True)
     assert [path.name for path in cache_folder().glob("work-*")] == ["work-new"]
 
 
@@ -173,7 +173,7 @@ def test_a_lay_gets_the_mean_over_its_directions_and_what_they_differ_by(shipped
         return known_source(lambda distance, normals: (0 * distance + level, 0 * distance + 0.2))
 
     monkeypatch.setattr(one_finish, "in_turn", by_direction)
-    joined = answering_map(shipped, wanted_of(n10, lay, (504.0, 504.0)), lambda _: True)
+    joined = map_with_finishes(shipped, wanted_of(n10, lay, (504.0, 504.0)), lambda _: True)
     found = joined.query(lay.name, lay.roughness, [504.0], AHEAD, lay.light)
     levels = [0.3, 0.55, 0.8, 0.55]
     assert found.fraction[0] == pytest.approx(np.mean(levels), abs=0.03)
@@ -205,7 +205,7 @@ def test_sensors_that_compete_are_asked_for_once_allowed(scenes, quick, tmp_path
 def test_a_map_of_a_device_takes_no_simulated_sample(shipped, n10, quick):
     device = PerformanceMap(shipped.data.assign_attrs(source="device"))
     with pytest.raises(InputError, match="comes from a device"):
-        answering_map(device, wanted_of(n10, finish_of(**MILLED)), lambda _: True)
+        map_with_finishes(device, wanted_of(n10, finish_of(**MILLED)), lambda _: True)
 
 
 def test_distances_about_the_views(shipped):

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mitsim.campaign import executor
-from mitsim.campaign.executor import Pool, available_memory, executor_of, fitting_processes, worked_on
+from mitsim.campaign.executor import Pool, available_memory, executor_of, fitting_processes, results_of
 from mitsim.cli import app
 from mitsim.errors import DeviceError, InputError, MissingEnvironmentError
 
@@ -47,21 +47,21 @@ def pool():
 
 
 def test_every_item_comes_once_with_its_result(pool):
-    found = dict(pool.spread(range(20), lambda n: n + 1, squared))
+    found = dict(pool.distribute(range(20), lambda n: n + 1, squared))
     assert found == {n: (n + 1) ** 2 for n in range(20)}
-    assert worked_on([3, 1, 2], squared, pool, "squares") == [9, 1, 4] == worked_on([3, 1, 2], squared, None, "")
-    assert list(pool.spread([], squared, squared)) == []
+    assert results_of([3, 1, 2], squared, pool, "squares") == [9, 1, 4] == results_of([3, 1, 2], squared, None, "")
+    assert list(pool.distribute([], squared, squared)) == []
 
 
 def test_who_stops_asking_leaves_nothing_in_work(pool):
-    asked = pool.spread(range(100), lambda n: n, squared)
+    asked = pool.distribute(range(100), lambda n: n, squared)
     next(asked)
     asked.close()
-    assert dict(pool.spread([5], lambda n: n, squared)) == {5: 25}
+    assert dict(pool.distribute([5], lambda n: n, squared)) == {5: 25}
 
 
 def test_a_process_that_dies_loses_no_work(pool, tmp_path, capsys):
-    found = [item for item, _ in pool.spread(range(8), lambda n: (n, str(tmp_path / "died")), die_once)]
+    found = [item for item, _ in pool.distribute(range(8), lambda n: (n, str(tmp_path / "died")), die_once)]
     assert sorted(found) == list(range(8)) and (tmp_path / "died").exists()
     assert "a worker process died" in capsys.readouterr().err
 
@@ -69,12 +69,12 @@ def test_a_process_that_dies_loses_no_work(pool, tmp_path, capsys):
 def test_processes_that_always_die_are_given_up(monkeypatch):
     monkeypatch.setattr(executor, "DEATHS", 1)
     with pytest.raises(MissingEnvironmentError, match="died in a row"):
-        list(Pool(2).spread([1], lambda n: n, die))
+        list(Pool(2).distribute([1], lambda n: n, die))
 
 
 def test_what_a_worker_refuses_is_told_as_it_said_it(pool):
     with pytest.raises(InputError, match=r"a\.toml: key: found 7; allowed: another\. write one") as caught:
-        list(pool.spread([7], lambda n: n, refuse))
+        list(pool.distribute([7], lambda n: n, refuse))
     assert caught.value.field == "key"
     for error in (caught.value, DeviceError("stage", "move", "nothing", "an answer", "look")):
         again = pickle.loads(pickle.dumps(error))

@@ -107,7 +107,7 @@ def seen_finishes(scene: Scene) -> dict[str, Finish]:
     return {name: one for name, one in zip(scene.names, scene.finishes, strict=True) if one is not None}
 
 
-def answering_map(performance_map: PerformanceMap, wanted: Wanted, ask: Ask | None = None) -> PerformanceMap:
+def map_with_finishes(performance_map: PerformanceMap, wanted: Wanted, ask: Ask | None = None) -> PerformanceMap:
     """Return the map with samples for all needed finishes.
 
     Parameters
