@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
+from characterisation.threads import usable_cores
 from mitsim.sensor.preset import Sensor, load_sensor
 
 # The same examples at every run, so that a run tells of a change; HYPOTHESIS_PROFILE=explore looks for new ones.
@@ -20,18 +21,40 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 
 ROOT = Path(__file__).resolve().parents[1]
 
+#: what malloc of glibc is told: keep blocks of up to a gigabyte that are freed, instead of asking for new pages for
+#: every image
+KEEP_MEMORY = {"MALLOC_MMAP_THRESHOLD_": "1000000000", "MALLOC_TRIM_THRESHOLD_": "1000000000"}
 
 #: tests that the inner loop leaves out, ``pytest -m "not slow"``: a line for each, or for a file of nothing else
 SLOW = frozenset((ROOT / "tests/slow_tests.txt").read_text(encoding="utf-8").split())
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Set up the processes of ``-n``, which inherit this environment, and the order in which they get files.
+
+    No test cuts the power, so nothing waits for the disk: ``os.fsync`` does nothing. What a killed process has written
+    is there without it.
+    """
+    os.fsync = lambda handle: None
+    workers = getattr(config.option, "numprocesses", None)
+    if not workers:
+        return
+    for name, value in KEEP_MEMORY.items():
+        os.environ.setdefault(name, value)
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, usable_cores() // workers)))
+    config.option.loadscopereorder = False  # files in the order of pytest_collection_modifyitems
+
+
 @pytest.hookimpl(tryfirst=True)  # before pytest chooses by markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that ``slow_tests.txt`` lists."""
+    """Mark the tests that ``slow_tests.txt`` lists, and run their files first: quick files fill up the end."""
+    slow_files = set()
     for item in items:
         name = item.nodeid.partition("[")[0]
         if name in SLOW or name.partition("::")[0] in SLOW:
             item.add_marker(pytest.mark.slow)
+            slow_files.add(item.path)
+    items.sort(key=lambda item: item.path not in slow_files)
 
 
 @pytest.fixture(scope="session")

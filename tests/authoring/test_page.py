@@ -14,6 +14,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+from shell import mitsim_here
 
 from mitsim.authoring.read_step import step_installed
 from mitsim.report.author_page import fair_share
@@ -226,14 +227,7 @@ def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(folder, bro
         ["part", tmp_path / "bracket.step", "-o", tmp_path / "made"],
         ["check", tmp_path / "made/made.xml", "--task", tmp_path / "made/task.toml", "--html", tmp_path / "page.html"],
     ):
-        done = subprocess.run(
-            [sys.executable, "-m", "mitsim", *map(str, arguments)],
-            capture_output=True,
-            text=True,
-            cwd=ROOT,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
+        mitsim_here(*arguments)
     browser.scheme("dark")
     page = Author(browser, (tmp_path / "page.html").as_uri())
     box = browser.box("#author-canvas")
@@ -256,10 +250,7 @@ def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(folder, bro
 def test_rules_and_features_that_the_page_does_not_show_are_kept(folder, browser, tmp_path):
     write_step([("bracket", bracket(), None)], tmp_path / "bracket.step")
     made = tmp_path / "made"
-    run = lambda *arguments: subprocess.run(  # noqa: E731
-        [sys.executable, "-m", "mitsim", *map(str, arguments)], capture_output=True, text=True, cwd=ROOT, check=True
-    )
-    run("part", tmp_path / "bracket.step", "-o", made)
+    mitsim_here("part", tmp_path / "bracket.step", "-o", made)
     own = (
         "[features.middle]\nkind = 'mid_plane'\nof = ['left', 'right']\n"
         "[decision]\nrule = 'simple_acceptance'\nuncertainty_ratio = 6\n"
@@ -267,7 +258,7 @@ def test_rules_and_features_that_the_page_does_not_show_are_kept(folder, browser
         "tolerance = [-0.1, 0]\ndecision = { guard_share = 0.1 }\n"
     )
     (made / "task.toml").write_text((made / "task.toml").read_text() + own)
-    run("check", made / "made.xml", "--task", made / "task.toml", "--html", tmp_path / "page.html")
+    mitsim_here("check", made / "made.xml", "--task", made / "task.toml", "--html", tmp_path / "page.html")
     page = Author(browser, (tmp_path / "page.html").as_uri())
     page.choose("left")
     page.type("#author-name", "side")

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from known_clouds import known_source, smooth
+from shell import mitsim_here
 
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
@@ -263,7 +262,7 @@ def test_yes_needs_no_question_and_scripts_have_nobody_to_ask():
 
 
 @pytest.mark.parametrize("command", ["score", "run", "budget", "choose", "predict"])
-def test_scripts_without_yes_end_with_a_message(command, scenes, tmp_path):
+def test_scripts_without_yes_end_with_a_message(command, scenes, tmp_path, monkeypatch):
     study = (scenes / "two_pillars/study.toml").read_text()
     scene = scenes / "two_pillars/two_pillars.xml"
     for name in ("scene", "task"):
@@ -279,18 +278,10 @@ def test_scripts_without_yes_end_with_a_message(command, scenes, tmp_path):
         "budget": [str(tmp_path / "study.toml"), "--view", "1"],
         "choose": [str(tmp_path / "study.toml"), "--sensors", "ensenso-n10"],
     }.get(command, [str(tmp_path / "study.toml")])
-    done = subprocess.run(
-        [sys.executable, "-m", "mitsim", command, *arguments, "-o", str(tmp_path / "out")],
-        capture_output=True,
-        text=True,
-        stdin=subprocess.DEVNULL,
-        check=False,
-        env={**os.environ, "XDG_CACHE_HOME": str(tmp_path)},
-    )
-    assert done.returncode == 2, done.stderr
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    done = mitsim_here(command, *arguments, "-o", tmp_path / "out", code=2)
     assert "--yes" in done.stderr
     assert "Ra 3.2" in done.stderr
-    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("name", sorted(NAMED_FINISHES))

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
-from shell import ROOT, mitsim
+from shell import ROOT, mitsim, mitsim_here
 
 from mitsim.authoring.check import findings, read_features
 from mitsim.errors import InputError
@@ -310,13 +310,13 @@ def test_the_command_prints_writes_and_judges(tmp_path):
     assert "--position 0 -424.3 454.3 --target 0 0 30" in done.stderr
     assert (tmp_path / "two.png").read_bytes()[:4] == b"\x89PNG"
     (tmp_path / "other.toml").write_text((ROOT / task).read_text().replace("pillar2", "pillar3"))
-    done = mitsim("check", scene, "--task", tmp_path / "other.toml", code=1)
+    done = mitsim_here("check", scene, "--task", tmp_path / "other.toml", code=1)
     assert "error: pillar3: a feature of the task without a shape in the scene. Did you mean" in done.stdout
 
 
 def test_bad_input_is_told_with_code_2(tmp_path):
     (tmp_path / "mine.xml").write_text('<scene version="3.0.0"><shape type="spere" id="a"/></scene>')
-    done = mitsim("check", tmp_path / "mine.xml", code=2)
+    done = mitsim_here("check", tmp_path / "mine.xml", code=2)
     assert "did you mean 'sphere'" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 

@@ -34,7 +34,7 @@ trials = 24
 RADIUS, REST = 8.0, 60.0
 
 
-mitsim = partial(shell.mitsim, code=None)
+mitsim_here = partial(shell.mitsim_here, code=None)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def chosen(tmp_path_factory):
     task = re.sub(r"(nominal = (?:0|70).0)", rf"\1\ntolerance = {REST}", task)
     (folder / "task.toml").write_text(task)
     arguments = ("choose", folder / "study.toml", "--sensors", "kinect-v2,zivid-2-m70", "-o")
-    return folder, arguments, mitsim(*arguments, folder / "out")
+    return folder, arguments, shell.mitsim(*arguments, folder / "out", code=None)
 
 
 def test_sensors_are_listed_best_first_with_what_they_fit(chosen):
@@ -78,12 +78,12 @@ def test_progress_names_the_leader_and_the_last_line_is_the_result(chosen):
 def test_a_finished_comparison_is_kept_and_overwritten_on_request_from_its_own_trials(chosen):
     folder, arguments, first = chosen
     before = (folder / "out" / "choice.json").read_bytes()
-    again = mitsim(*arguments, folder / "out")
+    again = mitsim_here(*arguments, folder / "out")
     assert again.returncode == 2 and "--overwrite" in again.stderr and "Traceback" not in again.stderr
     assert (folder / "out" / "choice.json").read_bytes() == before
     trials = {path: path.read_bytes() for path in (folder / "out").rglob("view_*.jsonl")}
     (folder / "out" / "kinect-v2" / "scores.nc").unlink()  # as if it had been killed there
-    again = mitsim(*arguments, folder / "out", "--overwrite")
+    again = mitsim_here(*arguments, folder / "out", "--overwrite")
     assert again.returncode == 0 and again.stdout == first.stdout
     assert trials and {path: path.read_bytes() for path in (folder / "out").rglob("view_*.jsonl")} == trials
     assert "choose: kinect-v2," in again.stderr and "choose: zivid-2-m70," not in again.stderr
@@ -93,7 +93,7 @@ def test_page_and_sheet(chosen):
     folder, _, _ = chosen
     page = (folder / "out" / "choice.html").read_text()
     assert page.count("<svg") == 1 and "fits 7 of 7 tolerances" in page and "screened only: out by far" in page
-    done = mitsim("report", folder / "out", "--pdf")
+    done = mitsim_here("report", folder / "out", "--pdf")
     assert done.returncode == 0, done.stderr
     sheet = (folder / "out" / "sheet.pdf").read_bytes()
     assert sheet.startswith(b"%PDF") and len(re.findall(rb"/Type /Page\b", sheet)) == 1
@@ -105,5 +105,5 @@ def test_page_and_sheet(chosen):
 )
 def test_sensors_that_are_none_are_one_message(chosen, sensors, told):
     folder, _, _ = chosen
-    done = mitsim("choose", folder / "study.toml", "--sensors", sensors, "-o", folder / "other")
+    done = mitsim_here("choose", folder / "study.toml", "--sensors", sensors, "-o", folder / "other")
     assert done.returncode == 2 and told in done.stderr and "Traceback" not in done.stderr

@@ -28,15 +28,15 @@ def test_importing_is_quick_and_light(module):
 
 
 def test_help_names_every_command_and_each_has_an_example():
-    text = mitsim("--help").stdout
+    text = mitsim_here("--help").stdout
     for command in ("doctor", "run", "render", "import", "decode", "characterise", "predict", "calibrate", "report"):
         assert command in text
-        assert f"Example: mitsim {command}" in " ".join(mitsim(command, "--help").stdout.split())
+        assert f"Example: mitsim {command}" in " ".join(mitsim_here(command, "--help").stdout.split())
 
 
 @pytest.mark.parametrize("group", [(), ("validate",), ("export",), ("fit",)])
 def test_the_list_of_commands_tells_whole_sentences(group):
-    assert "..." not in mitsim(*group, "--help").stdout.partition("Commands:")[2]
+    assert "..." not in mitsim_here(*group, "--help").stdout.partition("Commands:")[2]
 
 
 def test_version_is_that_of_the_package():
@@ -44,7 +44,7 @@ def test_version_is_that_of_the_package():
 
 
 def test_completion_for_a_shell_can_be_had():
-    assert "--install-completion" in mitsim("--help").stdout
+    assert "--install-completion" in mitsim_here("--help").stdout
 
 
 def test_quiet_leaves_out_progress_and_keeps_results(capsys):
@@ -64,7 +64,7 @@ def test_doctor_says_what_is_there():
     assert findings["renderer"]["verdict"] == "ok"
     assert "llvm_ad_mono" in findings["renderer"]["detail"] or "cuda_ad_mono" in findings["renderer"]["detail"]
     assert findings["mitsim"]["detail"]
-    assert "renderer" in mitsim("doctor").stdout
+    assert "renderer" in mitsim_here("doctor").stdout
 
 
 def test_render_decode_and_back(tmp_path):
@@ -88,7 +88,7 @@ def test_render_decode_and_back(tmp_path):
     capture = read_capture(tmp_path / "capture")
     assert capture.source == "simulated"
     assert capture.images["left"].shape == (1, 480, 752)
-    out = mitsim("decode", tmp_path / "capture", "-o", tmp_path / "cloud.ply").stdout
+    out = mitsim_here("decode", tmp_path / "capture", "-o", tmp_path / "cloud.ply").stdout
     counts = dict(line.split("\t") for line in out.splitlines())
     cloud = read_ply(tmp_path / "cloud.ply")
     assert int(counts["valid"]) == cloud.valid.sum() > 8000
@@ -99,7 +99,7 @@ def test_render_decode_and_back(tmp_path):
 
 def test_the_same_render_again_is_finished_and_another_is_refused_before_it_is_rendered(tmp_path):
     coupon = ("render", "scenes/coupon/matt_white.xml", "--position", 0, 0, 500, "--samples", 1, "--depth", 1)
-    mitsim(*coupon, "-o", tmp_path / "c")
+    mitsim_here(*coupon, "-o", tmp_path / "c")
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "c").rglob("*")}
     (tmp_path / f".c.partial-999999999-{HOST}0123456789ab").mkdir()
     assert "finished before" in mitsim_here(*coupon, "-o", tmp_path / "c").stderr
@@ -114,7 +114,7 @@ def test_the_same_render_again_is_finished_and_another_is_refused_before_it_is_r
 
 def test_a_deviation_is_told_and_kept_with_the_capture(tmp_path):
     coupon = ("render", "scenes/coupon/coupon.xml", "--position", 0, 0, 500, "--samples", 1)
-    done = mitsim(*coupon, "--deviation", "alpha=1,wide_angle=-1", "-o", tmp_path / "moved")
+    done = mitsim_here(*coupon, "--deviation", "alpha=1,wide_angle=-1", "-o", tmp_path / "moved")
     assert "aluminium/ground Ra 0.4 um: prior of ground metal" in done.stderr
     assert "alpha +1 and wide angle -1 sigma" in done.stderr
     kept = read_capture(tmp_path / "moved").settings["deviation"]
@@ -133,7 +133,7 @@ def test_characterise_says_what_is_not_known_of_a_finish(tmp_path):
         scene = "{coupon}"
         spread = true
     """)
-    done = mitsim("characterise", tmp_path / "campaign.toml", "-o", tmp_path / "out")
+    done = mitsim_here("characterise", tmp_path / "campaign.toml", "-o", tmp_path / "out")
     assert "aluminium/ground, Ra 0.4 µm: unknown properties of the finish change F by up to 0." in done.stderr
 
 
@@ -231,7 +231,7 @@ def test_bad_arguments_are_told_with_code_2(tmp_path, arguments):
 
 def test_a_broken_png_is_named(tmp_path):
     plate = "scenes/coupon/matt_white.xml"
-    mitsim("render", plate, "--position", 0, 0, 500, "-o", tmp_path / "capture", "--samples", 1)
+    mitsim_here("render", plate, "--position", 0, 0, 500, "-o", tmp_path / "capture", "--samples", 1)
     image = tmp_path / "capture/images/left_000.png"
     image.write_bytes(image.read_bytes()[:5000])
     done = mitsim_here("decode", tmp_path / "capture", "-o", tmp_path / "cloud.ply", code=2)

@@ -7,17 +7,15 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
+from shell import ROOT, mitsim_here
 
 from characterisation.atomic_io import HOST, atomic_write, atomic_write_named, write_folder
 from mitsim.commands.folder_lock import LOCK, lock_folder, sweep, sweep_beside
 from mitsim.errors import InputError
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
-
-ROOT = Path(__file__).parents[2]
 
 HOLD = "import sys, time, pathlib; from mitsim.commands.folder_lock import lock_folder; f = pathlib.Path(sys.argv[1]); "
 HOLD += "release = lock_folder(f); (f / f'.scores.csv.{__import__(\"os\").getpid()}.partial').write_text('half'); "
@@ -116,14 +114,14 @@ def test_signals_end_a_command_as_ctrl_c_does(tmp_path, number):
 
 @pytest.mark.timeout(120)
 def test_commands_hold_their_folders_and_let_them_go(tmp_path, holder):
-    score = [sys.executable, "-m", "mitsim", "score", "scenes/two_pillars/study.toml", "-o", str(tmp_path)]
-    for call in (score, [*score[:3], "run", *score[4:]], [*score[:3], "budget", score[4], "--view", "1", *score[5:]]):
-        done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, check=False)
-        assert done.returncode == 2 and f"process {holder.pid}" in done.stderr, (call, done.stderr)
+    study, into = "scenes/two_pillars/study.toml", ("-o", str(tmp_path))
+    for call in (("score", study, *into), ("run", study, *into), ("budget", study, "--view", "1", *into)):
+        assert f"process {holder.pid}" in mitsim_here(*call, code=2).stderr
     assert {path.name for path in tmp_path.iterdir()} == {LOCK, f".scores.csv.{holder.pid}.partial"}
     os.kill(holder.pid, signal.SIGKILL)
     holder.wait()
     seen = []
+    score = [sys.executable, "-m", "mitsim", "score", study, *into]
     with subprocess.Popen(score, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as running:
         while running.poll() is None:
             with contextlib.suppress(OSError, ValueError):

@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import importlib.util
 import os
-import subprocess
-import sys
 import tempfile
 import tomllib
 from pathlib import Path
@@ -16,6 +14,7 @@ import pytest
 import trimesh
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from shell import mitsim_here
 
 from characterisation.features.fits import Cylinder
 from mitsim.authoring.check import read_features
@@ -442,15 +441,12 @@ def test_a_file_name_cannot_break_the_scene():
 
 def test_the_command_makes_what_check_and_render_take(plate):
     target = plate / "made"
-    command = [sys.executable, "-m", "mitsim", "part", plate / "plate.stl", "-o", target, "--Ra", "0.4"]
-    done = subprocess.run([str(c) for c in command], capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
+    command = ("part", plate / "plate.stl", "-o", target, "--Ra", "0.4")
+    done = mitsim_here(*command)
     table = dict(line.split("\t") for line in done.stdout.splitlines())
     assert table["boss_30mm"].startswith("boss, radius 15.0")
     assert "made.xml" in done.stderr
-    again = subprocess.run([str(c) for c in command], capture_output=True, text=True, timeout=120, check=False)
-    assert again.returncode == 2
-    assert "Traceback" not in again.stderr
+    again = mitsim_here(*command, code=2)
     assert "a folder that exists" in again.stderr
 
 

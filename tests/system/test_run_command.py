@@ -125,7 +125,7 @@ def test_run_again_uses_the_map_and_gives_the_same(study_folder):
     folder, _ = study_folder
     before = (folder / "out/scores.csv").read_bytes()
     statement = (folder / "out/statement.json").read_bytes()
-    done = mitsim("run", folder / "study.toml", "-o", folder / "out", "--overwrite")
+    done = mitsim_here("run", folder / "study.toml", "-o", folder / "out", "--overwrite")
     assert "characterise: 0 done" in done.stderr and "state view" in done.stderr
     assert (folder / "out/scores.csv").read_bytes() == before
     assert (folder / "out/statement.json").read_bytes() == statement
@@ -140,20 +140,20 @@ def test_a_run_is_exported_for_other_tools(study_folder, tmp_path):
     for suffix in ("rrd", "glb", "usdc", "mcap", "e57"):
         said = mitsim_here("export", "run", folder / "out", "-o", tmp_path / f"run.{suffix}").stderr
         assert f"{clouds} clouds" in said and clouds > shown
-    said = mitsim("export", "results", folder / "out", "-o", tmp_path / "run.qif").stderr
+    said = mitsim_here("export", "results", folder / "out", "-o", tmp_path / "run.qif").stderr
     assert "7 measurements" in said and "mitsim.verdict" in (tmp_path / "run.qif").read_text()
-    mitsim("export", "targets", folder / "out", "--robot", "abb", "--views", "all", "-o", tmp_path / "views.mod")
+    mitsim_here("export", "targets", folder / "out", "--robot", "abb", "--views", "all", "-o", tmp_path / "views.mod")
     views = json.loads((folder / "out/run.json").read_text())["views"]
     assert (tmp_path / "views.mod").read_text().count("robtarget view_") == views
     cloud = next((folder / "out/clouds").glob("predicted_*.ply"))
-    said = mitsim("export", "cloud", cloud, "-o", tmp_path / "cloud.pcd").stderr
+    said = mitsim_here("export", "cloud", cloud, "-o", tmp_path / "cloud.pcd").stderr
     points = len(read_ply(cloud).points[read_ply(cloud).valid])
     assert f"{points} points, {points} of them with a covariance" in said
 
 
 def test_score_prints_the_best_views_as_the_run_ranked_them(study_folder, tmp_path):
     folder, _ = study_folder
-    done = mitsim(
+    done = mitsim_here(
         "score",
         folder / "study.toml",
         "--map",
@@ -197,13 +197,13 @@ def test_a_set_of_views_is_chosen_and_told(study_folder, tmp_path):
     text = (folder / "study.toml").read_text().replace('campaign = "campaign.toml"', 'map = "out/map.nc"')
     table = "[set]\nlimits = {{ pillar1_radius = {0}, pillar2_radius = {0} }}\n"
     (folder / "set.toml").write_text(text + table.format(100.0))
-    done = mitsim("score", folder / "set.toml", "--measurement", "pillar1_radius", "-o", tmp_path / "one")
+    done = mitsim_here("score", folder / "set.toml", "--measurement", "pillar1_radius", "-o", tmp_path / "one")
     assert "views that measure together: " in done.stderr and "(the fewest)" in done.stderr
     (folder / "wrong.toml").write_text(text + "[set]\nlimits = { pilar1_radius = 1.0 }\n")
     done = mitsim_here("score", folder / "wrong.toml", "-o", tmp_path / "no", code=2)
     assert "set.limits.pilar1_radius" in done.stderr
     (folder / "small.toml").write_text(text + table.format(1e-5))
-    done = mitsim("score", folder / "small.toml", "-o", tmp_path / "small")
+    done = mitsim_here("score", folder / "small.toml", "-o", tmp_path / "small")
     assert "is unreachable" in done.stderr
 
 
@@ -213,9 +213,9 @@ def test_report_and_predict_from_what_run_left(study_folder, tmp_path):
     for name in ("point1_point2_distance", "pillar2_radius", "simulated", "ensenso-n10"):
         assert name in page
     (folder / "out/report.html").unlink()
-    mitsim("report", folder / "out")
+    mitsim_here("report", folder / "out")
     assert (folder / "out/report.html").exists()
-    mitsim(
+    mitsim_here(
         "predict",
         "scenes/two_pillars/two_pillars.xml",
         "--map",
