@@ -119,12 +119,20 @@ class ConfirmedEntry(Document):
     standard_uncertainty: float | None
 
 
+class TriedEntry(Document):
+    """A set of views that was measured, and its largest ratio of error to limit; None without a value."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+    views: list[int]
+    excess: float | None = None
+
+
 class ViewSetEntry(Document):
     """Set of views that together keep limits, given for each measurement in its unit.
 
     ``exact`` is true if no smaller set keeps the limits. ``feasible`` is false for a limit that even all views together
     miss. ``joined`` describes how the views are combined. ``confirmed`` holds the virtual measurements of the whole
-    set.
+    set, ``tried`` all sets that were measured.
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
@@ -135,6 +143,7 @@ class ViewSetEntry(Document):
     exact: bool = False
     joined: str = "joined as if their poses were exact"
     confirmed: dict[str, ConfirmedEntry] = Field(default_factory=dict)
+    tried: list[TriedEntry] = Field(default_factory=list)
 
 
 class RunDocument(Document):
