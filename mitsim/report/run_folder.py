@@ -22,6 +22,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.report.run_files import check_own
 from mitsim.report.statement_section import StatementDocument, read_statement
+from mitsim.surface.lay import LayLeftOut
 
 _MADE_BY = "a folder made by mitsim run"
 
@@ -169,6 +170,7 @@ class RunDocument(Document):
     score_light_path_depth: int = 1
     render_residual: ResidualEntry | None = None
     features: dict[str, str]
+    lay: dict[str, LayLeftOut] = Field(default_factory=dict)
     measurements: dict[str, MeasurementEntry]
     view_sets: list[ViewSetEntry] = Field(default_factory=list)
     seconds: dict[str, float] = Field(default_factory=dict)
