@@ -49,7 +49,7 @@ def run_record(study: Study, performance_map: PerformanceMap, outcome: Outcome) 
     """Return the record of a run without the digests of its files."""
     raced, chosen, residual = outcome.raced, outcome.chosen, outcome.residual
     finishes = finishes_of_features(study)
-    lays = {name: lay_left_out(one.name, one.scatter) for name, one in finishes.items()}
+    lays = {name: lay_left_out(one.name, one.scatter) for name, one in finishes.items() if one is not None}
     return {
         "schema_version": 1,
         "mitsim": __version__,

@@ -153,15 +153,15 @@ def open_study(
     return Study(path, file, scene, task, sensor, candidates, campaign, performance_map)
 
 
-def finishes_of_features(study: Study) -> dict[str, Finish]:
-    """Return the finish of every feature of the task that has a shape of the scene."""
+def finishes_of_features(study: Study) -> dict[str, Finish | None]:
+    """Return the finish of every feature of the task, None for a shape without one."""
     return {name: study.scene.finishes[study.scene.names.index(name)] for name in study.task.shapes}
 
 
 def tell_lays(study: Study) -> None:
     """Say what the prediction leaves out of the direction of machining marks on the features of the study."""
     finishes = finishes_of_features(study)
-    for sentence in lays_in_words({name: (one.name, one.scatter) for name, one in finishes.items()}):
+    for sentence in lays_in_words({name: (one.name, one.scatter) for name, one in finishes.items() if one is not None}):
         say(sentence)
 
 

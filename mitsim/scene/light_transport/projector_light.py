@@ -212,9 +212,8 @@ class ProjectorLight(Eye):
         self.irradiance = dr.opaque(mi.Float, projector.plane_irradiance)
         self.radius = float(0.5 * projector.aperture_mm)
         self.inverse_focus = float(1.0 / projector.focus_mm)
-        low, high = np.moveaxis(
-            [_photon_rectangle(self.distortion, projector, frame, bounds) for frame in frames], 1, 0
-        )
+        rectangles = np.array([_photon_rectangle(self.distortion, projector, frame, bounds) for frame in frames])
+        low, high = rectangles[:, 0], rectangles[:, 1]
         self.extents = [(of_lane(a, lane), of_lane(b - a, lane)) for a, b in zip(low.T, high.T, strict=True)]
         self.area = of_lane(np.prod(high - low, axis=1), lane)
         self.vignetting = float(projector.corner_illumination) ** -0.5 - 1.0

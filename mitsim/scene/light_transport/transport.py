@@ -127,7 +127,8 @@ def trace(
     numpy.ndarray
         (P, height, width), or (P + 1, height, width), of the region, float32 [W / (mm^2 sr)].
     """
-    return _traced(scene, rays, light, [world_from_sensor], paths, roi or rays.whole, shift)[0]
+    (images,) = _traced(scene, rays, light, [world_from_sensor], paths, roi or rays.whole, shift)
+    return np.asarray(images)
 
 
 def trace_poses(
