@@ -153,9 +153,6 @@ def map_with_finishes(performance_map: PerformanceMap, wanted: Wanted, ask: Ask 
             )
         say(f"{wanted.sensor.name}: characterising {lacking} in about {_minutes(seconds)}; kept in {cache_folder()}")
         kept |= _characterise(ones, to_make, wanted.sensor)
-    for one in ones.values():
-        if len(one.turns) > 1:
-            say(f"{one.finish}: has a lay; the map averages over its directions, virtual measurements render it")
     found = [one for one in kept.values() if one is not None]
     joined = with_samples(performance_map, found)
     digests = sorted(str(one.data.attrs["finish_digest"]) for one in found)

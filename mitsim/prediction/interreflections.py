@@ -26,6 +26,7 @@ points.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -38,7 +39,7 @@ from mitsim.prediction.multipath_phase_bias import amplitude, finest_fringe, fri
 from mitsim.prediction.multipath_range_bias import path_amplitudes, path_bias, range_bias
 from mitsim.prediction.perturbation import Perturbation, SceneView
 from mitsim.scene.light_transport.projector_light import LitPatterns, ModulatedLight
-from mitsim.scene.light_transport.transport import LightPaths, trace
+from mitsim.scene.light_transport.transport import LightPaths, trace_poses
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
@@ -58,6 +59,9 @@ PIXELS, PIXELS_OF_FRINGE = 20_000, 6
 #: camera paths and photons per render of interreflections. A phase code has two renders, since their noise must be told
 #: from a bias. With large pixels photons are efficient: 300 000 remove two thirds of the noise of 80 000 camera paths
 PATHS, PHOTONS = 180_000, 400_000
+
+#: views that are rendered at once: to record a kernel takes as long as to render three of them
+TOGETHER = 16
 
 #: standard deviation of the window that averages rho, in pixels of the sensor
 SMOOTHED_PX = 3.0
@@ -126,10 +130,18 @@ class InterreflectionImage:
 class InterreflectionEffect:
     """Interreflections over up to ``depth`` surfaces for a sensor, prepared for any number of views of any scene.
 
-    ``paths`` of the camera and ``photons`` are numbers per render.
+    ``paths`` of the camera and ``photons`` are numbers per render. ``poses`` are views in the order in which they will
+    be asked for: :data:`TOGETHER` of them are rendered at once, with the same result, at half the cost.
     """
 
-    def __init__(self, sensor: Sensor, depth: int = 2, paths: int = PATHS, photons: int = PHOTONS) -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        depth: int = 2,
+        paths: int = PATHS,
+        photons: int = PHOTONS,
+        poses: Sequence[Transform] = (),
+    ) -> None:
         camera = sensor.rig.reference
         self.sensor, self.depth, self.photons = sensor, depth, photons
         self.fringe = finest_fringe(sensor)
@@ -142,10 +154,11 @@ class InterreflectionEffect:
         self.rays = CameraRays(self.coarse)  # a pinhole, since large pixels exceed the blur
         self.middles = PixelRays.of_camera(self.coarse)
         self.light = _light(sensor)
+        self.poses, self.ready = list(poses), dict[int, InterreflectionImage]()
 
     def __call__(self, view: SceneView) -> Perturbation:
         """Return the perturbation of the ideal points of a view."""
-        found = self.look(view.scene, view.world_from_sensor).at(view.ideal.point)
+        found = self._ahead(view.scene, view.world_from_sensor).at(view.ideal.point)
         rho = np.where(np.isfinite(found.rho), found.rho, 0.0)
         nothing = Perturbation.none(len(rho))
         if isinstance(self.sensor.settings, MatcherSettings):
@@ -162,13 +175,26 @@ class InterreflectionEffect:
             )
         return Perturbation(kept, np.sqrt(1 + rho), displaced, np.abs(scattered), nothing.shared)
 
+    def _ahead(self, scene: Scene, pose: Transform) -> InterreflectionImage:
+        """Return the image of a view; if it is one of ``poses``, render it together with those that follow."""
+        place = next((k for k, one in enumerate(self.poses) if one is pose), None)
+        if place is None:
+            return self.look(scene, pose)
+        if place not in self.ready:
+            images = self.look_from(scene, self.poses[place : place + TOGETHER])
+            self.ready = dict(enumerate(images, place))
+        return self.ready.pop(place)
+
     def look(self, scene: Scene, world_from_sensor: Transform, seed: int = 1) -> InterreflectionImage:
         """Render the interreflections in a view."""
-        given = scene, self.rays, self.light, world_from_sensor
-        shape = shapes_met(scene, self.middles, world_from_sensor)
-        direct = trace(*given, LightPaths(samples=self.samples, seed=seed))
+        return self.look_from(scene, [world_from_sensor], seed)[0]
+
+    def look_from(self, scene: Scene, poses: Sequence[Transform], seed: int = 1) -> list[InterreflectionImage]:
+        """Render the interreflections in several views at once; each as :meth:`look` returns it, in less time."""
+        given = scene, self.rays, self.light, poses
+        direct = trace_poses(*given, LightPaths(samples=self.samples, seed=seed))
         later = [
-            trace(
+            trace_poses(
                 *given,
                 LightPaths(
                     samples=self.samples,
@@ -180,6 +206,15 @@ class InterreflectionEffect:
             )
             for half in range(1 if self.fringe is None else 2)
         ]
+        return [
+            self._image(shapes_met(scene, self.middles, pose), direct[k], [one[k] for one in later])
+            for k, pose in enumerate(poses)
+        ]
+
+    def _image(
+        self, shape: NDArray[np.integer], direct: NDArray[np.float32], later: Sequence[NDArray[np.float32]]
+    ) -> InterreflectionImage:
+        """Return the interreflections of one view from its direct light and one or two renders of the other light."""
         code = self.sensor.pattern
         own = (
             1 if not isinstance(code, AmplitudeModulation) else code.steps

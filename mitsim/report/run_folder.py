@@ -22,6 +22,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.report.run_files import check_own
 from mitsim.report.statement_section import StatementDocument, read_statement
+from mitsim.surface.lay import LayLeftOut
 
 _MADE_BY = "a folder made by mitsim run"
 
@@ -119,12 +120,20 @@ class ConfirmedEntry(Document):
     standard_uncertainty: float | None
 
 
+class TriedEntry(Document):
+    """A set of views that was measured, and its largest ratio of error to limit; None without a value."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+    views: list[int]
+    excess: float | None = None
+
+
 class ViewSetEntry(Document):
     """Set of views that together keep limits, given for each measurement in its unit.
 
     ``exact`` is true if no smaller set keeps the limits. ``feasible`` is false for a limit that even all views together
     miss. ``joined`` describes how the views are combined. ``confirmed`` holds the virtual measurements of the whole
-    set.
+    set, ``tried`` all sets that were measured.
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
@@ -135,6 +144,7 @@ class ViewSetEntry(Document):
     exact: bool = False
     joined: str = "joined as if their poses were exact"
     confirmed: dict[str, ConfirmedEntry] = Field(default_factory=dict)
+    tried: list[TriedEntry] = Field(default_factory=list)
 
 
 class RunDocument(Document):
@@ -160,6 +170,7 @@ class RunDocument(Document):
     score_light_path_depth: int = 1
     render_residual: ResidualEntry | None = None
     features: dict[str, str]
+    lay: dict[str, LayLeftOut] = Field(default_factory=dict)
     measurements: dict[str, MeasurementEntry]
     view_sets: list[ViewSetEntry] = Field(default_factory=list)
     seconds: dict[str, float] = Field(default_factory=dict)

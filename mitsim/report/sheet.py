@@ -187,6 +187,8 @@ def _of_run(run: Run, geometry: SceneGeometry | None) -> Sheet:
         )
         facts.append(("Calibration", document.calibration))
         missing = [one.name for one in document.influences if not one.included]
+    if "round" in run.about.lay.values():
+        missing.append("direction of machining marks")
     planned = "" if document is None else exposed_in_words(document.exposure)
     facts.append(("Exposure", f"{planned} (in place of the sensor’s own)" if planned else run.about.exposure_rule))
     rules = sorted({one.decision.rule for one in document.measurements.values() if one.decision} if document else ())

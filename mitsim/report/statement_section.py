@@ -15,7 +15,7 @@ from pydantic import ConfigDict, Field
 
 from characterisation.checked_files import read_json_object
 from characterisation.documents import Document, validate
-from mitsim.report.numbers import NONE, percent, quantity, rounded, two_digits
+from mitsim.report.numbers import NONE, listed, percent, quantity, rounded, two_digits
 
 #: colour and name of a group of unknowns (Okabe and Ito, safe for colour-blind readers)
 GROUPS = {
@@ -153,9 +153,9 @@ def exposed_in_words(one: ExposureEntry | None) -> str:
     """Describe the exposure of the captures, unless it follows the sensor's own rule."""
     if one is None:
         return ""
-    times = " and ".join(f"{1e3 * seconds:.3g} ms" for seconds in one.exposures_s)
+    times = listed([f"{1e3 * seconds:.3g}" for seconds in one.exposures_s])
     merged = ", merged" if len(one.exposures_s) > 1 else ""
-    return f"{times}{merged}, at {percent(one.power)} of the projector's power"
+    return f"{times} ms{merged}, at {percent(one.power)} of the projector's power"
 
 
 def _row(name: str, one: StatedMeasurement) -> dict[str, str]:

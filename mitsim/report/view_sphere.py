@@ -27,7 +27,7 @@ from markupsafe import Markup
 from characterisation.tasks.covariance import LEAST_CHANCE
 from mitsim.report import findings
 from mitsim.report.numbers import NONE, count, percent, quantity, rounded, two_digits
-from mitsim.report.run_folder import Run, ViewSetEntry
+from mitsim.report.run_folder import Run, TriedEntry, ViewSetEntry
 from mitsim.report.view_data import as_json, solids, view_data
 
 #: views in the table that replaces the sphere
@@ -104,7 +104,20 @@ def _set_words(run: Run, entry: ViewSetEntry) -> dict[str, Any]:
             + _confirmed_words(entry, name)
         )
     minimal = "proven" if entry.exact else "not proven: a smaller set may exist"
-    return {"views": entry.views, "limits": lines, "exact": minimal, "joined": entry.joined}
+    return {
+        "views": entry.views,
+        "limits": lines,
+        "exact": minimal,
+        "joined": entry.joined,
+        "tried": [_tried_words(one) for one in entry.tried if set(one.views) != set(entry.views)],
+    }
+
+
+def _tried_words(one: TriedEntry) -> str:
+    """Describe a set that was measured and not chosen."""
+    how = "a measurement without a value" if one.excess is None else f"{two_digits(one.excess)} times a limit"
+    views = f"{len(one.views)} view{'s' if len(one.views) > 1 else ''} ({', '.join(map(str, one.views))})"
+    return f"also measured: {views}, {how}"
 
 
 def _confirmed_words(entry: ViewSetEntry, name: str) -> str:

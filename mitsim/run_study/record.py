@@ -10,7 +10,8 @@ from typing import Any
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.scores.view_sets import ViewSet
 from mitsim.simulation.render_residual import RenderResidual
-from mitsim.study import Study
+from mitsim.study import Study, finishes_of_features
+from mitsim.surface.lay import lay_left_out
 from mitsim.version import __version__
 from mitsim.view_sets.confirmed_set import TriedSet, confirmed_entry, joining_in_words, tried_entries
 from mitsim.virtual.race import Raced
@@ -47,7 +48,8 @@ class Outcome:
 def run_record(study: Study, performance_map: PerformanceMap, outcome: Outcome) -> dict[str, Any]:
     """Return the record of a run without the digests of its files."""
     raced, chosen, residual = outcome.raced, outcome.chosen, outcome.residual
-    features = {name: str(study.scene.finishes[study.scene.names.index(name)]) for name in study.task.shapes}
+    finishes = finishes_of_features(study)
+    lays = {name: lay_left_out(one.name, one.scatter) for name, one in finishes.items() if one is not None}
     return {
         "schema_version": 1,
         "mitsim": __version__,
@@ -69,7 +71,8 @@ def run_record(study: Study, performance_map: PerformanceMap, outcome: Outcome) 
         "light_path_depth": study.file.measure.light_path_depth,
         "score_light_path_depth": study.file.score.light_path_depth,
         "render_residual": None if residual is None else asdict(residual),
-        "features": features,
+        "features": {name: str(one) for name, one in finishes.items()},
+        "lay": {name: left_out for name, left_out in lays.items() if left_out is not None},
         "measurements": {
             name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features)}
             for name, m in study.task.measurements.items()

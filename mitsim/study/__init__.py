@@ -3,7 +3,17 @@
 :mod:`~mitsim.study.tables` defines the TOML file. :mod:`~mitsim.study.reading` reads it and all files that it names.
 """
 
-from mitsim.study.reading import MINIMUM_POINTS, Study, open_study, read_map, read_study, with_limits, with_plan
+from mitsim.study.reading import (
+    MINIMUM_POINTS,
+    Study,
+    finishes_of_features,
+    open_study,
+    read_map,
+    read_study,
+    tell_lays,
+    with_limits,
+    with_plan,
+)
 from mitsim.study.tables import (
     CharacterisationTable,
     CheckTable,
@@ -28,9 +38,11 @@ __all__ = [
     "StatementTable",
     "Study",
     "StudyFile",
+    "finishes_of_features",
     "open_study",
     "read_map",
     "read_study",
+    "tell_lays",
     "with_limits",
     "with_plan",
 ]

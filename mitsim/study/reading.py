@@ -32,10 +32,12 @@ from mitsim.campaign.plan import Campaign, check_exposure, read_campaign, sensor
 from mitsim.errors import InputError
 from mitsim.progress import say
 from mitsim.scene.load import Scene, load_scene
+from mitsim.scene.materials import Finish
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
 from mitsim.study.tables import ExposureTable, StudyFile
+from mitsim.surface.lay import lays_in_words
 from mitsim.view_scores import MATT_WHITE
 from mitsim.views import Candidates, View, candidate_views
 from mitsim.views.standoffs import characterised_range, chosen_standoffs
@@ -149,6 +151,18 @@ def open_study(
         wanted = Wanted(sensor, scene.where, seen_finishes(scene), depths)
         performance_map = map_with_finishes(performance_map, wanted, ask)
     return Study(path, file, scene, task, sensor, candidates, campaign, performance_map)
+
+
+def finishes_of_features(study: Study) -> dict[str, Finish | None]:
+    """Return the finish of every feature of the task, None for a shape without one."""
+    return {name: study.scene.finishes[study.scene.names.index(name)] for name in study.task.shapes}
+
+
+def tell_lays(study: Study) -> None:
+    """Say what the prediction leaves out of the direction of machining marks on the features of the study."""
+    finishes = finishes_of_features(study)
+    for sentence in lays_in_words({name: (one.name, one.scatter) for name, one in finishes.items() if one is not None}):
+        say(sentence)
 
 
 def with_plan(study: Study, plan: bool) -> Study:

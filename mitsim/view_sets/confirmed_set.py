@@ -2,8 +2,10 @@
 
 Signal chain: limits -> the fewest views that keep them according to the map (:mod:`characterisation.scores.task_sets`)
 -> virtual measurements of the whole set (:mod:`mitsim.view_sets.joined`) -> a stricter search limit for each
-measurement that missed its limit, by the ratio of expected to measured uncertainty -> next set. The loop ends if all
-limits are kept, if the map finds no set, or after :data:`MOST_SETS` sets.
+measurement that missed its limit, by the ratio of expected to measured uncertainty -> next set. If no set is predicted
+to keep a stricter limit, the search comes back half of the way to the limit before; if it finds a set that is already
+measured, it goes on to stricter limits. The loop ends if all limits are kept, if :data:`MOST_SEARCHES` searches find no
+further set, or after :data:`MOST_SETS` sets.
 
 The map contains neither the random finish nor the effects of curved faces and edges, so its u can be too small. The
 loop measures by how much.
@@ -33,6 +35,9 @@ from mitsim.virtual.world import SET_DAYS, Trial
 
 #: largest number of sets to measure
 MOST_SETS = 5
+
+#: searches for one more set, with limits between the last and the stricter ones
+MOST_SEARCHES = 8
 
 #: a missed limit becomes stricter for the search by at least this factor
 _TIGHTENING = 0.9
@@ -71,7 +76,7 @@ def confirmed_set(
     """Measure the first set, and sets for stricter limits until one keeps the limits.
 
     Returns all measured sets, the best last: the set that keeps all reachable limits, or the one of least excess.
-    Trials in the folder are reused.
+    Trials in the folder are reused. Says of each set which limits it misses, and why no further set is tried.
     """
     table = study.file.set
     assert table is not None
@@ -79,20 +84,55 @@ def confirmed_set(
     while True:
         stated = state_set(study, chosen, here, digest, folder)
         tried.append(TriedSet(chosen, dict(searched), tuple(stated)))
-        if tried[-1].excess(table.limits) <= 1 or len(tried) == MOST_SETS:
+        if tried[-1].excess(table.limits) <= 1:
             break
-        searched = stricter(searched, table.limits, chosen, stated)
-        chosen = search(searched)
-        lost = [
-            name
-            for name, before, now in zip(table.limits, first.feasible, chosen.feasible, strict=True)
-            if before and not now
-        ]
-        if lost or not chosen.views or any(set(one.chosen.views) == set(chosen.views) for one in tried):
+        say(f"set {len(tried)}, views {', '.join(map(str, chosen.views))}: {_missed(tried[-1], table.limits)}")
+        if len(tried) == MOST_SETS:
+            say(f"no further set is tried: {MOST_SETS} sets were measured, the most that a run measures")
             break
-        missed = ", ".join(name for name in searched if searched[name] < tried[-1].searched[name])
-        say(f"{missed} missed; the next set: views {', '.join(map(str, chosen.views))}")
+        found = _next_set(search, searched, stricter(searched, table.limits, chosen, stated), first, tried)
+        if found is None:
+            say(
+                f"no further set is tried: by the map, no set of other views is more accurate "
+                f"({MOST_SEARCHES} searches with stricter limits)"
+            )
+            break
+        chosen, searched = found
+        say(f"the next set: views {', '.join(map(str, chosen.views))}")
     return sorted(tried, key=lambda one: -one.excess(table.limits))
+
+
+def _next_set(
+    search: Search, before: dict[str, float], strict: dict[str, float], first: ViewSet, tried: Sequence[TriedSet]
+) -> tuple[ViewSet, dict[str, float]] | None:
+    """Return a set that is not measured yet, with the limits of its search: the strictest that the map can keep.
+
+    ``before`` are the limits of the last search, ``strict`` those by what it missed. A limit that no set can keep is
+    taken back half of the way, in ratio, to the limit before. If the set is an old one, limits that were missed become
+    stricter by the least step. None if :data:`MOST_SEARCHES` searches find no new set.
+    """
+    limits, missed = dict(strict), [name for name in strict if strict[name] < before[name]]
+    for _ in range(MOST_SEARCHES):
+        chosen = search(limits)
+        lost = [name for name, once, now in zip(limits, first.feasible, chosen.feasible, strict=True) if once > now]
+        for name in lost:
+            limits[name] = math.sqrt(limits[name] * before[name])
+        if lost or not chosen.views:
+            continue
+        if all(set(one.chosen.views) != set(chosen.views) for one in tried):
+            return chosen, limits
+        for name in missed:
+            limits[name] *= _TIGHTENING
+    return None
+
+
+def _missed(tried: TriedSet, limits: dict[str, float]) -> str:
+    """Return text such as ``radius missed, 1.3 times its limit``."""
+    found = {
+        one.measurement: _excess(one, limits[one.measurement]) for one in tried.stated if one.measurement in limits
+    }
+    words = [f"{name} missed, {ratio:.2g} times its limit" for name, ratio in found.items() if 1 < ratio < math.inf]
+    return "; ".join(words + [f"{name} without a value" for name, ratio in found.items() if ratio == math.inf])
 
 
 def stricter(

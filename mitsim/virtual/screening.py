@@ -51,7 +51,8 @@ def effects_of(study: Study) -> list[Effect]:
     effects: list[Effect] = [shared_errors(study, study_unknowns(study))]
     depth = study.file.score.light_path_depth
     if depth > 1 and sees_itself(study.scene):
-        effects.append(InterreflectionEffect(study.sensor, depth))
+        poses = [view.world_from_sensor for view in study.views]
+        effects.append(InterreflectionEffect(study.sensor, depth, poses=poses))
     return effects
 
 

@@ -144,3 +144,32 @@ def white_corner(sensor):
         },
         sensor.wavelength_nm,
     )
+
+
+@pytest.mark.parametrize("name", ["ensenso-n10", "david-sls-3", "kinect-v2"])
+def test_views_rendered_together_are_those_rendered_alone(name):
+    """Every pose of a launch has its own frame, streams and pixels; the images agree to the last bit."""
+    sensor = load_sensor(name)
+    near = 1.2 * sensor.working_range_mm[0]
+    scene = white_corner(sensor)
+    poses = [look_at([x, -0.7 * near, 0.7 * near], [0, 0, 0], [0, 0, 1]) for x in (-200, 0, 150)]
+    effect = InterreflectionEffect(sensor, paths=20_000, photons=100_000)
+    alone = [effect.look(scene, pose).values for pose in poses]
+    together = [image.values for image in effect.look_from(scene, poses)]
+    assert not np.array_equal(alone[0], alone[1], equal_nan=True)
+    for one, other in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_views_named_ahead_are_rendered_once_and_in_any_order(n10):
+    scene, near = white_corner(n10), 1.2 * n10.working_range_mm[0]
+    poses = [look_at([x, -0.7 * near, 0.7 * near], [0, 0, 0], [0, 0, 1]) for x in (-200, 0, 150)]
+    predictor = Predictor.of_sensor(n10, sensor_geometry(n10)).thinned(8)
+    views = []
+    for pose in poses:
+        surfaces = predictor.surfaces(scene, pose)
+        views.append(SceneView(scene, pose, surfaces, predictor.ideal(surfaces)))
+    alone, ahead = InterreflectionEffect(n10, photons=50_000), InterreflectionEffect(n10, photons=50_000, poses=poses)
+    for k in (0, 1, 2, 1):  # the last is asked for again, after its image was given away
+        np.testing.assert_array_equal(ahead(views[k]).noisier, alone(views[k]).noisier)
+    assert not np.array_equal(ahead(views[0]).noisier[:50], ahead(views[2]).noisier[:50])

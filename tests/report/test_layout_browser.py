@@ -1,5 +1,7 @@
 """Layout of both pages in a real browser: no column lost, nothing beside the page, in light, dark and print."""
 
+import json
+
 import pytest
 
 from mitsim.report.choice_page import write_choice_page
@@ -8,6 +10,7 @@ from mitsim.report.page import write_report
 from .choice_run import write_choice
 from .chromium import BROWSER, Chromium
 from .conftest import write_run
+from .view_sphere_run import write_expecting_run
 
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")]
 
@@ -48,7 +51,23 @@ OVERLAPS = """(() => {
 def pages(tmp_path_factory):
     folder = tmp_path_factory.mktemp("layout")
     run = write_report(write_run(folder / "run"))
-    return {"run": run, "choice": write_choice_page(write_choice(folder / "choice"))}
+    # a set of so many views that they fill several lines, and a bracket of planned exposures
+    sets = write_expecting_run(folder / "sets")
+    about, statement = (
+        json.loads((sets / name).read_text(encoding="utf-8")) for name in ("run.json", "statement.json")
+    )
+    about["view_sets"][0] |= {
+        "views": list(range(12)),
+        "joined": "joined by targets: each pose to 0.03 mm and 0.01 deg",
+    }
+    (sets / "run.json").write_text(json.dumps(about), encoding="utf-8")
+    statement["exposure"] = {"exposures_s": [0.000815, 0.00231, 0.0131], "power": 0.5}
+    (sets / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
+    return {
+        "run": run,
+        "choice": write_choice_page(write_choice(folder / "choice")),
+        "sets": write_report(sets),
+    }
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +83,7 @@ def set_size(browser, width: int, medium: str, scheme: str) -> None:
     )
 
 
-@pytest.mark.parametrize("page", ["run", "choice"])
+@pytest.mark.parametrize("page", ["run", "choice", "sets"])
 @pytest.mark.parametrize(
     ("width", "medium", "scheme"),
     [(1400, "screen", "light"), (1000, "screen", "dark"), (400, "screen", "light"), (703, "print", "light")],
@@ -96,6 +115,26 @@ def test_the_verdicts_fit_a_telephone_without_scrolling(browser, pages):
         browser.open(page)
         frame = "document.getElementById('verdicts').closest('.scroll')"
         assert browser.tell(f"{frame}.scrollWidth - {frame}.clientWidth") <= 1
+
+
+@pytest.mark.parametrize("width", [1400, 400])
+def test_a_set_of_many_views_is_read_from_its_top_and_without_scrolling(browser, pages, width):
+    set_size(browser, width, "screen", "light")
+    browser.open(pages["sets"])
+    frame = "document.querySelector('.vs-sets').closest('.scroll')"
+    assert browser.tell(f"{frame}.scrollWidth - {frame}.clientWidth") <= 1
+    row = "[...document.querySelector('.vs-sets tbody tr').children].map((one) => one.getBoundingClientRect())"
+    tops, bottoms = browser.tell(f"{row}.map((box) => box.top)"), browser.tell(f"{row}.map((box) => box.bottom)")
+    if width == 1400:
+        button = "document.querySelector('.vs-sets [data-set]').getBoundingClientRect()"
+        assert len(set(tops)) == 1 and browser.tell(f"{button}.height") < 40  # in one line
+    else:
+        assert all(top >= above - 1 for above, top in zip(bottoms, tops[1:], strict=False))
+
+
+def test_planned_exposures_are_told_as_one_list(pages):
+    text = pages["sets"].read_text(encoding="utf-8")
+    assert "Expose 0.815, 2.31 and 13.1 ms, merged, at 50 % of the projector" in text
 
 
 def test_pages_are_small(pages):

@@ -84,6 +84,14 @@ def test_numbers_of_the_page_are_those_of_the_scores(data, expecting):
     assert data["checked"] == CHECKED and data["sets"][0]["views"] == [2, 7]
 
 
+def test_sets_that_were_measured_and_not_chosen_are_named_with_their_excess(text):
+    told = re.findall(r"also measured: [^<]*", text)
+    assert told == [
+        "also measured: 2 views (4, 7), 1.3 times a limit",
+        "also measured: 1 view (5), a measurement without a value",
+    ]
+
+
 def test_a_view_is_able_with_an_uncertainty_and_a_chance_of_one_half(data):
     assert [i for i, able in enumerate(data["measurements"][0]["able"]) if not able] == list(IMPOSSIBLE)
     assert [i for i, able in enumerate(data["measurements"][1]["able"]) if not able] == [3]

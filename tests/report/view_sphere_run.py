@@ -28,6 +28,7 @@ SET = {
     "uncertainty": {MEASUREMENTS[1]: 0.04},
     "feasible": {MEASUREMENTS[1]: True},
     "exact": True,
+    "tried": [{"views": [4, 7], "excess": 1.3}, {"views": [5], "excess": None}, {"views": [2, 7], "excess": 0.9}],
 }
 
 

@@ -90,7 +90,7 @@ def test_camera_lamp_and_both_have_one_mean(corner, eyes, depth):
 
     def lamp_alone(seed):
         images = seen(1000 + seed, 1, 0)
-        add_photons(images, corner, rays, light, POSE, Photons(500**2, depth, seed), rays.whole)
+        add_photons(images[None], corner, rays, light, [POSE], Photons(500**2, depth, seed), rays.whole)
         return images
 
     def blocks(images):

@@ -66,9 +66,26 @@ def test_an_error_that_no_view_averages_ends_the_search_with_the_best_set(search
     assert min(one.excess(LIMITS) for one in tried) == tried[-1].excess(LIMITS) > 2
 
 
-def test_limits_that_become_unreachable_for_the_map_end_the_search(search_and_measure):
-    _, measured = search_and_measure(hope=(2.0, 2.0), most=8)
-    assert measured == [4]  # sixteen would do
+def test_where_the_map_can_keep_no_stricter_limit_the_search_comes_back_to_those_that_it_can(
+    search_and_measure, capsys
+):
+    tried, measured = search_and_measure(hope=(2.0, 2.0), most=8)
+    assert measured[:2] == [4, 8] and tried[-1].excess(LIMITS) > 1  # sixteen would do; eight come nearest
+    assert len(tried[-1].chosen.views) == 8 and tried[-1].searched["apart"] < 0.1
+    told = capsys.readouterr().err
+    assert "set 1, views 0, 1, 2, 3: apart missed, 2 times its limit; radius missed, 2 times its limit" in told
+    assert "no further set is tried: by the map, no set of other views is more accurate" in told
+
+
+def test_a_limit_out_of_reach_does_not_keep_the_search_from_another_that_is_missed(search_and_measure):
+    tried, measured = search_and_measure(hope=(3.0, 1.0), most=5)
+    assert measured[1] == 5 and tried[-1].searched["radius"] == LIMITS["radius"]
+
+
+def test_a_search_ends_after_as_many_sets_as_it_may_measure(search_and_measure, capsys):
+    _, measured = search_and_measure(floor=0.2, most=10**6)
+    assert len(measured) == MOST_SETS == len(set(measured))
+    assert f"{MOST_SETS} sets were measured, the most that a run measures" in capsys.readouterr().err
 
 
 def test_only_missed_limits_become_stricter_by_what_was_missed():

@@ -32,6 +32,7 @@ Photons write records, which are summed in their order in double precision: the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,7 +49,7 @@ from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 #: number of photons in one launch; each needs 24 bytes for every surface after its first
-LARGEST_LAUNCH = 1 << 21
+PHOTONS_AT_ONCE = 1 << 21
 
 #: number of pixels whose images are computed at once
 _PIXELS_AT_ONCE = 1 << 18
@@ -84,7 +85,7 @@ def add_photons(
     scene: Scene,
     rays: CameraRays,
     light: Light,
-    world_from_sensor: Transform,
+    poses: Sequence[Transform],
     photons: Photons,
     roi: Roi,
 ) -> None:
@@ -93,19 +94,20 @@ def add_photons(
     Parameters
     ----------
     images
-        (P, height, width) of the region [W / (mm^2 sr)], changed in place. Photons do not depend on the region: each
-        pixel receives the same light as in the whole image.
-    scene, rays, light, world_from_sensor
-        The scene, the camera's rays, the projector's light, and the pose of the sensor.
+        (poses, P, height, width) of the region [W / (mm^2 sr)], changed in place. Photons do not depend on the region:
+        each pixel receives the same light as in the whole image.
+    scene, rays, light, poses
+        The scene, the camera's rays, the projector's light, and the poses of the sensor.
     photons
-        Their number, depth and seed.
+        Their number at each pose, depth and seed.
     roi
         The region of the image.
     """
-    sums = np.zeros((light.codes, roi.height * roi.width))
-    for first in range(0, photons.count, LARGEST_LAUNCH):
-        batch = range(first, min(first + LARGEST_LAUNCH, photons.count))
-        pixel, radiance, uv, length = _launch(scene, rays, light, world_from_sensor, photons, batch, roi)
+    sums = np.zeros((light.codes, len(poses) * roi.height * roi.width))
+    at_once = max(1, PHOTONS_AT_ONCE // len(poses))
+    for first in range(0, photons.count, at_once):
+        batch = range(first, min(first + at_once, photons.count))
+        pixel, radiance, uv, length = _launch(scene, rays, light, poses, photons, batch, roi)
         if not len(pixel):
             continue
         values = light.values(uv, length, mi.Bool(True))
@@ -113,35 +115,43 @@ def add_photons(
         for total, value in zip(sums, values, strict=True):
             total += np.bincount(pixel, radiance * np.asarray(value), total.size)
     sums /= photons.count
-    flat = images.reshape(len(images), -1)
-    # all pixels at once would need twice the memory of the images
-    for first in range(0, flat.shape[1], _PIXELS_AT_ONCE):
-        part = slice(first, first + _PIXELS_AT_ONCE)
-        for image, total in zip(flat, light.images([code_sum[part] for code_sum in sums]), strict=True):
-            image[part] += total.astype(np.float32)
+    for pose_images, pose_sums in zip(
+        images, np.moveaxis(sums.reshape(light.codes, len(poses), -1), 1, 0), strict=True
+    ):
+        flat = pose_images.reshape(len(pose_images), -1)
+        # all pixels at once would need twice the memory of the images
+        for first in range(0, flat.shape[1], _PIXELS_AT_ONCE):
+            part = slice(first, first + _PIXELS_AT_ONCE)
+            for image, total in zip(flat, light.images([code_sum[part] for code_sum in pose_sums]), strict=True):
+                image[part] += total.astype(np.float32)
 
 
 def _launch(
     scene: Scene,
     rays: CameraRays,
     light: Light,
-    world_from_sensor: Transform,
+    poses: Sequence[Transform],
     photons: Photons,
     batch: range,
     roi: Roi,
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], Any, Any]:
-    """Trace a ``batch`` of the photons to a region.
+    """Trace a ``batch`` of the photons of every pose to a region.
 
     Returns one entry for each record, in the order of the photons: pixel in the region, radiance, (u, v) and L [mm].
+    The pixels of one pose follow those of the pose before.
     """
-    first, count, depth, seed = batch.start, len(batch), photons.depth, photons.seed
-    camera = Eye(world_from_sensor @ rays.camera.sensor_from_camera)
-    projector = ProjectorLight(world_from_sensor, light.projector, scene.bounds)
+    first, count, depth, seed = batch.start, len(poses) * len(batch), photons.depth, photons.seed
+    index, lane = dr.arange(mi.UInt32, count), None
+    if len(poses) > 1:
+        per_pose = dr.opaque(mi.UInt32, len(batch))
+        lane, index = index // per_pose, index % per_pose
+    camera = Eye([pose @ rays.camera.sensor_from_camera for pose in poses], lane)
+    projector = ProjectorLight(poses, light.projector, scene.bounds, lane)
     aperture, inverse_focus = 0.5 * rays.aperture_mm, 1.0 / rays.focus_mm
     # n_C / n_L; 0 if there are only photons
     samples_per_photon = dr.opaque(mi.Float, 0.0 if photons.samples is None else photons.samples / photons.count)
 
-    index = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
+    index += dr.opaque(mi.UInt32, first)
     streams = mi.UInt64(index) + _FIRST_STREAM
     random = mi.PCG32(initstate=dr.opaque(mi.UInt64, seed), initseq=streams)
     side = dr.opaque(mi.UInt32, round(np.sqrt(photons.count)))
@@ -239,7 +249,10 @@ def _launch(
     kept = dr.compress((radiances > 0) & inside)
     if not len(kept):
         return np.empty(0, np.int32), np.empty(0), uv, lengths
-    pixel = mi.Int32(dr.gather(mi.UInt32, row * width + column, kept))
+    pixel = row * width + column
+    if len(poses) > 1:
+        pixel += dr.arange(mi.UInt32, count * records) // (per_pose * records) * (width * height)
+    pixel = mi.Int32(dr.gather(mi.UInt32, pixel, kept))
     radiance, length = dr.gather(mi.Float, radiances, kept), dr.gather(mi.Float, lengths, kept)
     uv = dr.gather(mi.Point2f, uv, kept // records)
     dr.eval(pixel, radiance, length, uv)

@@ -11,7 +11,7 @@ both on the same paths. The radiometry is that of :mod:`mitsim.sensor.projector`
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import reduce
 from operator import add
 from typing import Any, Protocol
@@ -23,7 +23,7 @@ from scipy.linalg import qr
 from mitsim.errors import InputError
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.ray_casting.distortion import Distortion
-from mitsim.scene.ray_casting.eye import Eye, shadow_ray
+from mitsim.scene.ray_casting.eye import Eye, of_lane, shadow_ray
 from mitsim.sensor.modulation import LIGHT_MM_S
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.transforms import Transform
@@ -191,27 +191,31 @@ class ModulatedLight:
 
 
 class ProjectorLight(Eye):
-    """A projector at a pose, seen from a surface.
+    """A projector at a pose, seen from a surface, or at several: then ``lane`` is the number of each lane's pose.
 
     ``bounds`` (2, 3) [mm] of the scene, world frame; photons are emitted only toward them.
     """
 
     def __init__(
-        self, world_from_sensor: Transform, projector: Projector, bounds: NDArray[np.floating] | None = None
+        self,
+        world_from_sensor: Transform | Sequence[Transform],
+        projector: Projector,
+        bounds: NDArray[np.floating] | None = None,
+        lane: Any = None,
     ) -> None:
         optics = projector.optics
-        super().__init__(world_from_sensor @ optics.sensor_from_camera)
+        poses = [world_from_sensor] if isinstance(world_from_sensor, Transform) else world_from_sensor
+        frames = [pose @ optics.sensor_from_camera for pose in poses]
+        super().__init__(frames, lane)
         self.size = (optics.width, optics.height)
         self.distortion = Distortion(optics)
         self.irradiance = dr.opaque(mi.Float, projector.plane_irradiance)
         self.radius = float(0.5 * projector.aperture_mm)
         self.inverse_focus = float(1.0 / projector.focus_mm)
-        world_from_projector = world_from_sensor @ optics.sensor_from_camera
-        low, high = _photon_rectangle(self.distortion, projector, world_from_projector, bounds)
-        self.extents = [
-            (dr.opaque(mi.Float, float(a)), dr.opaque(mi.Float, float(b - a))) for a, b in zip(low, high, strict=True)
-        ]
-        self.area = dr.opaque(mi.Float, float(np.prod(high - low)))
+        rectangles = np.array([_photon_rectangle(self.distortion, projector, frame, bounds) for frame in frames])
+        low, high = rectangles[:, 0], rectangles[:, 1]
+        self.extents = [(of_lane(a, lane), of_lane(b - a, lane)) for a, b in zip(low.T, high.T, strict=True)]
+        self.area = of_lane(np.prod(high - low, axis=1), lane)
         self.vignetting = float(projector.corner_illumination) ** -0.5 - 1.0
         cx, cy = optics.matrix[0, 2], optics.matrix[1, 2]
         self.principal = (float(cx), float(cy))

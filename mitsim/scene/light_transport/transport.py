@@ -21,6 +21,7 @@ Radiometry: code value x plane irradiance E_1 [W] -> radiance [W / (mm^2 sr)], s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport.ambient import has_emitters, hit_emitter_light, sampled_emitter_light
 from mitsim.scene.light_transport.aperture_samples import aperture_samples
-from mitsim.scene.light_transport.light_tracing import Photons, add_photons
+from mitsim.scene.light_transport.light_tracing import PHOTONS_AT_ONCE, Photons, add_photons
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
 from mitsim.scene.light_transport.plain_scene import intersect_plane, single_bsdf, single_plane
 from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
@@ -126,19 +127,52 @@ def trace(
     numpy.ndarray
         (P, height, width), or (P + 1, height, width), of the region, float32 [W / (mm^2 sr)].
     """
-    roi = roi or rays.whole
+    (images,) = _traced(scene, rays, light, [world_from_sensor], paths, roi or rays.whole, shift)
+    return np.asarray(images)
+
+
+def trace_poses(
+    scene: Scene, rays: CameraRays, light: Light, poses: Sequence[Transform], paths: LightPaths
+) -> NDArray[np.float32]:
+    """Return the radiance of :func:`trace` for whole images at several poses: (poses, P, height, width).
+
+    Poses that fit into one launch share it. To record a kernel takes longer than to render some 20 000 pixels.
+    """
+    pixels = rays.camera.width * rays.camera.height
+    together = min(
+        LARGEST_LAUNCH // (pixels * (light.count + 1)), PHOTONS_AT_ONCE // max(1, paths.photon_count(pixels))
+    )
+    together = max(1, together)
+    return np.concatenate(
+        [
+            _traced(scene, rays, light, poses[first : first + together], paths, rays.whole)
+            for first in range(0, len(poses), together)
+        ]
+    )
+
+
+def _traced(
+    scene: Scene,
+    rays: CameraRays,
+    light: Light,
+    poses: Sequence[Transform],
+    paths: LightPaths,
+    roi: Roi,
+    shift: NDArray[np.floating] | None = None,
+) -> NDArray[np.float32]:
+    """Return the radiance (poses, P, height, width) of a region, at poses that share their launches."""
     photons = paths.photon_count(rays.camera.width * rays.camera.height)
-    images = np.empty((light.count + paths.with_ambient, roi.height, roi.width), np.float32)
-    rows = max(1, LARGEST_LAUNCH // (roi.width * (light.count + 1)))
+    images = np.empty((len(poses), light.count + paths.with_ambient, roi.height, roi.width), np.float32)
+    rows = max(1, LARGEST_LAUNCH // (len(poses) * roi.width * (light.count + 1)))
     for first in range(0, roi.height, rows):
         band = Roi(roi.left, roi.top + first, roi.width, min(rows, roi.height - first))
         band_shift = None if shift is None else shift[:, first : first + band.height]
-        traced = _launch(scene, rays, light, world_from_sensor, paths, band, band_shift)
-        for image, values in zip(images, traced, strict=False):  # the ambient image comes last and may be unused
-            image[first : first + band.height] = np.asarray(values).reshape(band.height, band.width)
+        traced = _launch(scene, rays, light, poses, paths, band, band_shift)
+        for number, values in zip(range(images.shape[1]), traced, strict=False):  # the ambient image may be unused
+            images[:, number, first : first + band.height] = np.asarray(values).reshape(-1, band.height, band.width)
     if photons:
         request = Photons(photons, paths.depth, paths.seed, paths.side**2)
-        add_photons(images[: light.count], scene, rays, light, world_from_sensor, request, roi)
+        add_photons(images[:, : light.count], scene, rays, light, poses, request, roi)
     return images
 
 
@@ -146,19 +180,22 @@ def _launch(
     scene: Scene,
     rays: CameraRays,
     light: Light,
-    world_from_sensor: Transform,
+    poses: Sequence[Transform],
     paths: LightPaths,
     roi: Roi,
     shift: NDArray[np.floating] | None,
 ) -> list[Any]:
-    """Return all images of a region, and the ambient one, as arrays on the device; one kernel."""
+    """Return all images of a region, and the ambient one, as arrays on the device, pose after pose; one kernel."""
     side, depth, seed, jitter = paths.side, paths.depth, paths.seed, paths.jitter
     photons = paths.photon_count(rays.camera.width * rays.camera.height)
-    camera = Eye(world_from_sensor @ rays.camera.sensor_from_camera)
-    projector = ProjectorLight(world_from_sensor, light.projector, scene.bounds)
+    count = len(poses) * roi.width * roi.height
+    index, lane = dr.arange(mi.UInt32, count), None
+    if len(poses) > 1:
+        pixels = dr.opaque(mi.UInt32, roi.width * roi.height)
+        lane, index = index // pixels, index % pixels
+    camera = Eye([pose @ rays.camera.sensor_from_camera for pose in poses], lane)
+    projector = ProjectorLight(poses, light.projector, scene.bounds, lane)
 
-    count = roi.width * roi.height
-    index = dr.arange(mi.UInt32, count)
     width = dr.opaque(mi.UInt32, roi.width)
     column = index % width + dr.opaque(mi.UInt32, roi.left)
     row = index // width + dr.opaque(mi.UInt32, roi.top)

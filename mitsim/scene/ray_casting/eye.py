@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
+
+import numpy as np
 
 from mitsim.scene.backend import dr, mi
 from mitsim.sensor.transforms import Transform
@@ -21,15 +24,28 @@ def shadow_ray(surface: Any, toward: Any, distance: Any) -> Any:
     return ray
 
 
-class Eye:
-    """Frame of a camera or projector on the device.
+def of_lane(values: Sequence[float], lane: Any = None) -> Any:
+    """Return for each lane one of ``values``: that with the number ``lane``, or the only one if ``lane`` is None.
 
-    ``position`` [mm] and ``axes``, in the world frame. They are opaque to Dr.Jit, so that all poses share one kernel.
+    The numbers are opaque to Dr.Jit, so that all poses share one kernel.
+    """
+    if lane is None:
+        return dr.opaque(mi.Float, float(values[0]))
+    return dr.gather(mi.Float, mi.Float(np.asarray(values, np.float32)), lane)
+
+
+class Eye:
+    """Frame of a camera or projector on the device, or several frames: ``lane`` then is each lane's number of a frame.
+
+    ``position`` [mm] and ``axes``, in the world frame.
     """
 
-    def __init__(self, world_from_eye: Transform) -> None:
-        self.position = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in world_from_eye.translation])
-        self.axes = [mi.Vector3f(*[dr.opaque(mi.Float, float(v)) for v in axis]) for axis in world_from_eye.rotation.T]
+    def __init__(self, world_from_eye: Transform | Sequence[Transform], lane: Any = None) -> None:
+        frames = [world_from_eye] if isinstance(world_from_eye, Transform) else world_from_eye
+        places = np.array([frame.translation for frame in frames])
+        axes = np.array([frame.rotation.T for frame in frames])
+        self.position = mi.Point3f(*[of_lane(one, lane) for one in places.T])
+        self.axes = [mi.Vector3f(*[of_lane(one, lane) for one in axis.T]) for axis in np.moveaxis(axes, 1, 0)]
 
     def to_world(self, local: Any) -> Any:
         """Rotate a direction from the eye's frame to the world frame."""
