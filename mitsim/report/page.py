@@ -93,7 +93,7 @@ def page_content(run: Run) -> dict[str, Any]:
         "rolls": _rolls(run),
         "least_chance": percent(LEAST_CHANCE),
         "minimum_points": count(int(scores.attrs.get("minimum_points", 100))),
-        "first": _first(run),
+        "first": of_run(run, read_scene_geometry(run.folder)),
         "statement": None if run.statement is None else statement_section(run.statement),
         "stated_pose": None if run.statement is None else _pose(run, run.statement.view),
         "race_confidence": percent(about.confidence.get(ALL, 0.0)),
@@ -117,21 +117,6 @@ def page_content(run: Run) -> dict[str, Any]:
         "residual": _residual(run),
         "total_seconds": rounded(sum(about.seconds.values())),
         "rounded": rounded,
-    }
-
-
-def _first(run: Run) -> dict[str, Any]:
-    """Return the first screen: the result in words, the picture, the verdicts."""
-    first = of_run(run, read_scene_geometry(run.folder))
-    tolerances = run.statement is not None and any(
-        one.tolerance is not None for one in run.statement.measurements.values()
-    )
-    return {
-        "words": first.words,
-        "good": first.good,
-        "rows": first.rows,
-        "picture": first.picture,
-        "tolerances": tolerances,
     }
 
 
@@ -182,6 +167,7 @@ def _pose(run: Run, view: int) -> dict[str, str]:
         "azimuth": f"{rounded(float(here['azimuth_deg']))}°",
         "elevation": f"{rounded(float(here['elevation_deg']))}°",
         "roll": f"{rounded(float(here['roll_deg']))}°",
+        "standoff": f"{rounded(float(here['standoff_mm']))}\N{NO-BREAK SPACE}mm",
         "position": ", ".join(rounded(float(x)) for x in position),
     }
 

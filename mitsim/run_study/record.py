@@ -71,7 +71,13 @@ def run_record(study: Study, performance_map: PerformanceMap, outcome: Outcome) 
         "render_residual": None if residual is None else asdict(residual),
         "features": features,
         "measurements": {
-            name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features)}
+            name: {
+                "kind": m.kind,
+                "nominal": m.nominal,
+                "unit": m.unit,
+                "features": list(m.features),
+                "tolerance": m.tolerance,
+            }
             for name, m in study.task.measurements.items()
         },
         "seconds": outcome.seconds,
