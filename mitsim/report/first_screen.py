@@ -139,9 +139,10 @@ def of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None) -> FirstSc
 def pose_words(standoff_mm: float, azimuth_deg: float, elevation_deg: float, roll_deg: float) -> str:
     """Describe a pose in plain words: distance, azimuth, elevation and roll, each with its reference."""
     return (
-        f"distance {rounded(standoff_mm)}\N{NO-BREAK SPACE}mm, azimuth {rounded(azimuth_deg)}° (about the part’s z axis, "
-        f"from x), elevation {rounded(elevation_deg)}° (above the plane z = 0), roll {rounded(roll_deg)}° (about the line "
-        "of sight, clockwise as the sensor sees)"
+        f"distance {rounded(standoff_mm)}\N{NO-BREAK SPACE}mm, "
+        f"azimuth {rounded(azimuth_deg)}° (about the part’s z axis, from x), "
+        f"elevation {rounded(elevation_deg)}° (above the plane z = 0), "
+        f"roll {rounded(roll_deg)}° (about the line of sight, clockwise as the sensor sees)"
     )
 
 
