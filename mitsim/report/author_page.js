@@ -72,7 +72,7 @@ function words(context, text, x, y, strong = false, own = null) {
   const shift = SHIFTS.find((one) => apart(boxAt(one)) && clear(boxAt(one))) ?? SHIFTS.find((one) => apart(boxAt(one))) ?? [0, 0];
   const placed = boxAt(shift), left = placed.left + 4;
   y = placed.top + 10;
-  state.words.push(placed);
+  state.words.push({ ...placed, own });
   context.fillStyle = style('--paper');
   context.globalAlpha = 0.88;
   context.fillRect(left - 4, y - 10, wide + 8, 19);

@@ -69,6 +69,15 @@ def served(folder):
         process.communicate(timeout=30)
 
 
+#: number of texts in the picture, and those that cover another text or a line of another dimension
+COVERED = """(() => {
+  const apart = (a, b) => a === b || a.right < b.left || b.right < a.left || a.bottom < b.top || b.bottom < a.top;
+  const bad = state.words.filter((one) => !state.words.every((each) => apart(one, each))
+    || state.lines.some((line) => line.own !== one.own && crosses(line.ends, one)));
+  return [state.words.length, bad.map(({ left, top }) => [left, top])];
+})()"""
+
+
 class Author:
     """The page, by what a person does on it."""
 
@@ -246,6 +255,17 @@ def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(folder, bro
     browser.rest()
     assert browser.tell("document.getElementById('author-name').value") != first
     assert browser.shot(box) != before
+    browser.press("Home")
+    for chosen, kind in (
+        (("bore_12mm_left", "bore_12mm_right"), "axis_distance"),
+        (("boss_20mm",), "diameter"),
+        (("bottom",), "flatness"),
+    ):
+        page.choose(*chosen)
+        page.measure(kind, "0.1")
+    browser.rest()
+    written, covered = browser.tell(COVERED)
+    assert written >= 4 and covered == []
     assert [url for url in browser.requests if not url.startswith("file:")] == []
     assert browser.problems == []
 
