@@ -133,6 +133,7 @@ function drawMarks(context) {
     context.fill();
     words(context, chosen.length > 1 ? `${i + 1} ${face.name}` : face.name, x, y - 16, true);
   });
+  view.canvas.drawn = { words: state.words, lines: state.lines }; // for tests
   if (state.hover >= 0 && !chosen.includes(state.hover)) words(context, faces[state.hover].name, state.x, state.y - 18);
 }
 

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup, escape
 
 from characterisation.atomic_io import atomic_write
 from characterisation.errors import InputError
 from mitsim.report.choice_document import CHOICE, CellEntry, ChoiceDocument, SensorEntry, read_choice
-from mitsim.report.first_rows import exact, tolerance_words
+from mitsim.report.first_rows import breakable, exact, tolerance_words
 from mitsim.report.first_screen import of_choice, sensor_rows
 from mitsim.report.numbers import NONE, listed, percent, quantity, rounded, two_digits, with_degree_signs
 from mitsim.report.placement_figure import VERDICTS
@@ -41,6 +40,7 @@ def write_choice_page(folder: Path) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["breakable"] = breakable
     text = environment.get_template("choice.html.j2").render(page_content(choice, folder))
     path = folder / "choice.html"
     with atomic_write(path) as file:
@@ -69,11 +69,6 @@ def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
         "excluded": [{"name": one.name, "why": one.why} for one in choice.sensors if one.status == "excluded"],
         "seconds": rounded(choice.seconds),
     }
-
-
-def breakable(name: str) -> Markup:
-    """Return a name as safe markup that a browser may break after underscores."""
-    return Markup(escape(name).replace("_", Markup("_<wbr>")))
 
 
 def _asked(choice: ChoiceDocument, name: str) -> dict[str, str]:

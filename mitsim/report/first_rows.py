@@ -11,6 +11,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from markupsafe import Markup, escape
+
 from mitsim.report.numbers import MINUS, NONE, count, listed, percent, quantity, unit_symbol
 from mitsim.report.stand_figure import VERDICTS
 
@@ -125,6 +127,11 @@ def measured_words(kind: str, features: Sequence[str]) -> str:
         return _KINDS[kind].format(*features)
     except (KeyError, IndexError):  # another kind, or a file of an older mitsim without kinds
         return f"{kind.replace('_', ' ')} of {listed(list(features))}" if kind else listed(list(features))
+
+
+def breakable(name: str) -> Markup:
+    """Return a name as safe markup that a browser may break after underscores."""
+    return Markup(escape(name).replace("_", Markup("_<wbr>")))
 
 
 def exact(value: float, unit: str) -> str:

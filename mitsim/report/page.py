@@ -27,6 +27,7 @@ from characterisation.tasks.covariance import LEAST_CHANCE, PERSISTENT_REACH_PX,
 from mitsim.report import findings
 from mitsim.report.agreement import Agreement, agreement, chance_level
 from mitsim.report.cloud_figures import REASONS
+from mitsim.report.first_rows import breakable
 from mitsim.report.first_screen import of_run
 from mitsim.report.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
 from mitsim.report.page_pictures import camera_view, cloud_picture, map_pictures, measurement_pictures
@@ -73,6 +74,7 @@ def write_report(folder: str | Path) -> Path:
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    environment.filters["breakable"] = breakable
     text = environment.get_template("page.html.j2").render(page_content(run))
     path = run.folder / "report.html"
     with atomic_write(path) as file:

@@ -112,7 +112,11 @@ def test_without_tolerances_there_is_no_column_of_verdicts(tmp_path):
     said = html.unescape(re.sub(r"<[^>]*>|\s+", " ", table[1]))
     assert "Verdict" not in said and "no tolerance" not in said
     assert re.search(r"Nominal .* No value of 200 virtual measurements", said)
-    assert "0\N{NO-BREAK SPACE}mm" in said and "13\N{NO-BREAK SPACE}%" in said and re.search(r"noise on \S+ [\d\u202f]+ points", said)
+    assert (
+        "0\N{NO-BREAK SPACE}mm" in said
+        and "13\N{NO-BREAK SPACE}%" in said
+        and re.search(r"noise on \S+ [\d\u202f]+ points", said)
+    )
 
 
 def test_values_that_are_missing_are_told_of_a_comparison_without_tolerances(tmp_path):
