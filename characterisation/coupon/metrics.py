@@ -71,6 +71,9 @@ class RayNoise:
 def ray_noise_std(points: NDArray[np.floating]) -> RayNoise:
     """Measure the noise along the view ray of patches of a flat surface.
 
+    P = P_eps + eps V^ and sigma^2 = sum of eps^2 / (n - 3). P is a measured point, P_eps the point of the fitted plane
+    on the same ray (talk of Kinnell and Justham, 2018, slide *Point Cloud Processing*).
+
     Parameters
     ----------
     points
@@ -197,6 +200,7 @@ def recovered_fraction(
 ) -> tuple[Floats, Floats, Floats]:
     """Return F = recovered points / possible points, with a Clopper-Pearson interval.
 
+    F is that of the talk's slide *Point Cloud Processing*: density of recovered points over maximum possible density.
     ``possible`` need not be whole.
 
     Returns
@@ -241,7 +245,7 @@ def density_fraction(
     Parameters
     ----------
     count, area, distance, cos_incidence
-        n [1], patch area A [mm^2], |V| [mm], N.V [1].
+        n [1], patch area A [mm^2], |V| [mm], and N.V [1]: the cosine of incidence, positive.
     angular_pitch
         Lambda [rad], the angle between neighbouring pixels on the axis; lambda^2 is the solid angle of a pixel.
     cos_off_axis

@@ -79,7 +79,8 @@ def sphere_directions(subdivisions: int) -> NDArray[np.float64]:
 def cap_directions(subdivisions: int, largest_angle: float) -> NDArray[np.float64]:
     """Return the directions (n, 3) of the sphere within ``largest_angle`` [rad] of +z, nearest first.
 
-    They are the normals of the coupon in the view frame, whose z axis points toward the sensor.
+    They are the normals of the coupon in the view frame, whose z axis points toward the sensor (talk of Kinnell and
+    Justham, 2018, slide *Data Collection*, step 1: sub-divided icosahedron).
     """
     directions = sphere_directions(subdivisions)
     angle = np.arccos(np.clip(directions[:, 2], -1.0, 1.0))
@@ -96,7 +97,7 @@ def refine(
     refinement: Refinement,
     largest_angle: float,
 ) -> RefinedNormals:
-    """Return the normals to add to those that were measured.
+    """Return the normals to add to those that were measured: the talk's *variable density* (slide *Data Collection*).
 
     Parameters
     ----------

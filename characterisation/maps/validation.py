@@ -4,7 +4,7 @@ Signal chain: captures of coupons, each with the predicted cloud of the same pos
 patches of a capture -> residuals by sample and distance; and the distributions of the points about the planes of their
 patches -> distance between the distributions.
 
-The talk of Kinnell and Justham (2018; slide *Validation of the Simulation*) reports a mean absolute residual below 10 %
+The talk of Kinnell and Justham (2018; slide *Simulation Validation*) reports a mean absolute residual below 10 %
 for all surfaces except the shiniest. It does not name the quantity. Here F and sigma have separate residuals. That of
 sigma is a mean over points: a pose is weighted by its F, as in a cloud. The unweighted residual is given as well.
 """

@@ -5,8 +5,8 @@ n^ and sigma^ -> feature score S_f -> S^_f; matt white with and without the rest
 S_m, R_m -> V_m -> rank.
 
 The equations are those of the slides "The View Score" (Kinnell and Justham, "Task Specific Viewpoint Optimisation",
-Hamburg 2018), without changes. docs/explanation/view-score.md lists what the slides do not define, and its
-interpretation here.
+Hamburg 2018), unchanged. What the slides do not define is filled as docs/explanation/view-score.md lists: for example,
+a view with fewer than ``minimum_points`` on a needed feature has V_m = 0.
 """
 
 from __future__ import annotations

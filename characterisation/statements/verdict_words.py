@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 #: least share of trials without a value that is mentioned
-_OFTEN = 0.05
+OFTEN = 0.05
 
 
 @dataclass(frozen=True)
@@ -30,25 +30,34 @@ class Judged:
 
 
 def result_in_words(judged: Sequence[Judged]) -> str:
-    """Return one line: how many tolerances fit, and the reasons why the others do not, worst first."""
+    """Return one line: how many tolerances fit, and the reasons why the others do not, worst first.
+
+    Without tolerances: that there are none, and the measurement that most often had no value.
+    """
     asked = [one for one in judged if one.verdict != "no tolerance"]
     if not asked:
-        worst = max(judged, key=lambda one: one.without_value)
-        text = f"{len(judged)} measurements stated; no tolerance was given; "
-        if worst.without_value == 0:
-            return text + "every trial gave a value for each"
-        return text + f"{worst.name} has no value in {100 * worst.without_value:.0f} % of the trials"
+        text = f"Uncertainty given for {len(judged)} measurement{'' if len(judged) == 1 else 's'}. "
+        text += "The task has no tolerances: nothing to accept or reject"
+        return ". ".join([text, *filter(None, [losses_in_words(judged)])])
     fitting = [one for one in asked if one.verdict == "fits"]
     rest = sorted((one for one in asked if one.verdict not in ("fits", "not decided")), key=_ratio, reverse=True)
     lines = [f"fits {len(fitting)} of {len(asked)} tolerances", *(_why(one) for one in rest)]
     if unsure := [one.name for one in asked if one.verdict == "not decided"]:
-        lines.append(f"{', '.join(unsure)}: not decided, more trials are needed")
+        lines.append(f"{', '.join(unsure)}: not decided, more virtual measurements are needed")
     lines += [
-        f"{one.name} fits, but {100 * one.without_value:.0f} % of the trials gave no value"
+        f"{one.name} fits, but has no value in {_percent(one.without_value)} of the virtual measurements"
         for one in fitting
-        if one.without_value >= _OFTEN
+        if one.without_value >= OFTEN
     ]
     return "; ".join(lines)
+
+
+def losses_in_words(judged: Sequence[Judged]) -> str:
+    """Name the measurement that most often had no value; empty if each virtual measurement gave one."""
+    worst = max(judged, key=lambda one: one.without_value)
+    if worst.without_value == 0:
+        return ""
+    return f"{worst.name} has no value in {_percent(worst.without_value)} of the virtual measurements"
 
 
 def fits_all(judged: Sequence[Judged]) -> bool:
@@ -64,11 +73,15 @@ def _ratio(one: Judged) -> float:
 def _why(one: Judged) -> str:
     words = "is undecidable" if one.verdict == "undecidable" else "does not fit"
     if not math.isfinite(one.uncertainty):
-        return f"{one.name} {words}: no trial gave a value"
+        return f"{one.name} {words}: no virtual measurement gave a value"
     if one.fits_corrected:
         return f"{one.name} {words} unless its bias is subtracted"
-    needed = f", {_two(one.needed)} needed" if math.isfinite(one.needed) else ""
-    return f"{one.name} {words}: u {_two(one.uncertainty)} {one.unit}{needed}"
+    needed = f", {_two(one.needed)} {one.unit} needed" if math.isfinite(one.needed) else ""
+    return f"{one.name} {words}: standard uncertainty {_two(one.uncertainty)} {one.unit}{needed}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= 0.005 else "less than 1 %"
 
 
 def _two(value: float) -> str:

@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-from mitsim.commands.options import Out, check_file
+from mitsim.commands.options import OutCloud, check_file
 
 
 def decode(
     capture: Annotated[Path, typer.Argument(help="Capture folder.")],
-    output: Out,
+    output: OutCloud,
     sensor: Annotated[
         str | None,
         typer.Option(

@@ -12,6 +12,7 @@ from mitsim.commands.devices import mount
 from mitsim.commands.options import (
     Defines,
     Out,
+    OutCloud,
     Position,
     Processes,
     Roll,
@@ -161,7 +162,7 @@ def compare(
 
 def predict(
     scene: Scene,
-    output: Out,
+    output: OutCloud,
     map_file: Annotated[Path, typer.Option("--map", help="A map.nc file, or a sensor whose map comes with mitsim.")],
     position: Position,
     target: Target = (0.0, 0.0, 0.0),

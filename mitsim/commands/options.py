@@ -14,7 +14,8 @@ from typer.core import TyperGroup
 from mitsim.commands.folder_lock import lock_folder, sweep_beside
 from mitsim.errors import InputError
 
-Out = Annotated[Path, typer.Option("--output", "-o", help="Folder or file to write.")]
+Out = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")]
+OutCloud = Annotated[Path, typer.Option("--output", "-o", help="Point cloud to write, a PLY file.")]
 Scene = Annotated[Path, typer.Argument(help="Scene XML file of the part, in mm.")]
 Variant = Annotated[str | None, typer.Option(help="Mitsuba variant: cuda_ad_mono (GPU) or llvm_ad_mono (CPU).")]
 SensorOption = Annotated[str, typer.Option(help="Name of a preset, or path of a sensor TOML file.")]

@@ -43,7 +43,12 @@ def run(
     study: StudyFile,
     output: Out,
     minutes: Annotated[
-        float | None, typer.Option(min=0.1, help="Time limit for comparing views by virtual measurements [min].")
+        float | None,
+        typer.Option(
+            min=0.1,
+            help="Time limit for comparing views by virtual measurements [min]; default: that of the study's [race], "
+            "otherwise none.",
+        ),
     ] = None,
     plan: PlanExposures = False,
     scheduler: Scheduler = None,
@@ -56,7 +61,7 @@ def run(
 
     Screening predicts uncertainties from the performance map of the sensor. A virtual measurement renders, decodes and
     measures the part once, with random values of all unknown effects. Exit code 1 if a measurement with a
-    tolerance does not fit it, or the set of views that the study asks for misses a limit.
+    tolerance does not fit it, or the set of views that the study asks for exceeds an uncertainty limit.
 
     Example: mitsim run scenes/two_pillars/study.toml -o runs/two_pillars
     """
@@ -195,9 +200,10 @@ def exposures(
     as_json: Annotated[bool, typer.Option("--json", help="Print exposures.json in place of the table.")] = False,
     variant: Variant = None,
 ) -> None:
-    """Find the fewest exposures of one view with which every feature of the task meets its limits.
+    """Find the fewest exposures of one view with which every feature nearly reaches its least possible uncertainty.
 
-    The limits of a feature are the most points and the smallest uncertainty that any exposures reach. The command
+    The limits of a feature are the most points and the smallest uncertainty that any exposures reach; --within says how
+    near is enough. The command
     simulates the light once and decodes sets of exposures. Exit code 1 if a feature that the task needs has too few
     points at every exposure, or if a limit is not met.
 
@@ -232,7 +238,7 @@ def exposures(
 
 
 def _tell_statement(stated: Sequence[Statement], output: Path, sets: Sequence[ViewSetEntry] = ()) -> None:
-    """Print the statements, and the result of the sets; exit with code 1 if a tolerance does not fit or a set misses
+    """Print the statements, and the result of the sets; exit with code 1 if a tolerance does not fit or a set exceeds
     a limit.
     """
     from characterisation.statements.verdict_words import fits_all, result_in_words

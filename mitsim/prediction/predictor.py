@@ -229,7 +229,12 @@ class Predictor:
         rng: np.random.Generator,
         correlated: bool = False,
     ) -> PointCloud:
-        """Return a random cloud of a view, with errors of neighbours independent or correlated as measured in the map.
+        """Return a random cloud of a view: P_eps = P + eps V^ if R_U < F, with eps = R_N sigma.
+
+        P is the ideal point, V^ the unit vector along its ray, R_N a normal deviate and R_U a uniform one. The talk of
+        Kinnell and Justham (2018; slide *Simulating the Point Cloud*) writes rho_e for F and sigma_e for sigma. The
+        deviates R_N of neighbours are independent, as in the talk, or ``correlated`` as measured in the map. The
+        equations are in :meth:`_cloud`.
 
         Raises
         ------
@@ -252,7 +257,10 @@ class Predictor:
         sigma: NDArray[np.float64],
         rng: np.random.Generator,
     ) -> PointCloud:
-        """Draw a cloud with noise and losses from F and sigma (n,), which are NaN where the map has no answer."""
+        """Draw a cloud from ideal points, F and sigma (n,), with the equations of :meth:`predict`.
+
+        F and sigma are NaN where the map has no answer; such points are lost.
+        """
         size = (self.grid.height, self.grid.width)
 
         def image(values: NDArray[Any], missing: float) -> NDArray[Any]:

@@ -44,11 +44,35 @@ function paint() {
   view.redraw();
 }
 
-function words(context, text, x, y, strong = false) {
+// Return whether a line from a to b passes through a box.
+function crosses([a, b], { left, right, top, bottom }) {
+  let [from, to] = [0, 1];
+  for (const [start, way, low, high] of [[a[0], b[0] - a[0], left, right], [a[1], b[1] - a[1], top, bottom]]) {
+    if (Math.abs(way) < 1e-9) { if (start < low || start > high) return false; continue; }
+    const ends = [(low - start) / way, (high - start) / way].sort((p, q) => p - q);
+    [from, to] = [Math.max(from, ends[0]), Math.min(to, ends[1])];
+  }
+  return from <= to;
+}
+
+// Shifts of a text in px, nearest first.
+const SHIFTS = [...Array(17 * 17).keys()].map((k) => [9 * (k % 17 - 8), 9 * (Math.floor(k / 17) - 8)])
+  .sort((p, q) => Math.hypot(...p) - Math.hypot(...q) || q[1] - p[1]);
+
+// Write a text near a place where it covers no other text and no line of another dimension.
+function words(context, text, x, y, strong = false, own = null) {
   context.font = `${strong ? 600 : 400} 13px system-ui, "DejaVu Sans", sans-serif`;
-  const wide = context.measureText(text).width, left = Math.min(Math.max(x - wide / 2, 6), view.width - wide - 6);
-  while (state.words.some((one) => Math.abs(one.y - y) < 20 && left < one.right + 8 && one.left < left + wide + 8)) y += 6;
-  state.words.push({ left, right: left + wide, y });
+  const wide = context.measureText(text).width;
+  const boxAt = ([dx, dy]) => {
+    const start = Math.min(Math.max(x + dx - wide / 2, 6), view.width - wide - 6);
+    return { left: start - 4, right: start + wide + 4, top: y + dy - 10, bottom: y + dy + 9 };
+  };
+  const apart = (one) => !state.words.some((each) => one.left < each.right + 2 && each.left < one.right + 2 && one.top < each.bottom + 2 && each.top < one.bottom + 2);
+  const clear = (one) => !state.lines.some((each) => each.own !== own && crosses(each.ends, one));
+  const shift = SHIFTS.find((one) => apart(boxAt(one)) && clear(boxAt(one))) ?? SHIFTS.find((one) => apart(boxAt(one))) ?? [0, 0];
+  const placed = boxAt(shift), left = placed.left + 4;
+  y = placed.top + 10;
+  state.words.push({ ...placed, own });
   context.fillStyle = style('--paper');
   context.globalAlpha = 0.88;
   context.fillRect(left - 4, y - 10, wide + 8, 19);
@@ -57,8 +81,9 @@ function words(context, text, x, y, strong = false) {
   context.fillText(text, left, y + 4);
 }
 
-function line(context, a, b, width, arrows) {
+function line(context, a, b, width, arrows, own = null) {
   const [p, q] = [view.project(a), view.project(b)];
+  state.lines.push({ ends: [p, q], own });
   context.lineWidth = width;
   context.beginPath();
   context.moveTo(p[0], p[1]);
@@ -76,16 +101,17 @@ function line(context, a, b, width, arrows) {
 }
 
 function drawMarks(context) {
-  state.words = []; // texts move down to avoid others
+  [state.words, state.lines] = [[], []]; // texts avoid them
+  const texts = [];
   context.strokeStyle = context.fillStyle = style('--ink');
   for (const one of measurements.values()) {
     const drawn = dimension(one);
     if (!drawn) continue;
     context.strokeStyle = context.fillStyle = style('--dimension');
     context.setLineDash([3, 3]);
-    drawn.thin.forEach(([a, b]) => line(context, a, b, 1));
+    drawn.thin.forEach(([a, b]) => line(context, a, b, 1, false, one));
     context.setLineDash([]);
-    drawn.lines.forEach(([a, b]) => line(context, a, b, 1.6, drawn.arrows));
+    drawn.lines.forEach(([a, b]) => line(context, a, b, 1.6, drawn.arrows, one));
     if (drawn.arc) {
       const [corner, a, b] = drawn.arc.map((one_) => view.project(one_)), angle = (p) => Math.atan2(p[1] - corner[1], p[0] - corner[0]);
       const from = angle(a), to = angle(b), gap = Math.atan2(Math.sin(to - from), Math.cos(to - from));
@@ -94,8 +120,9 @@ function drawMarks(context) {
       context.stroke();
     }
     const [x, y] = view.project(drawn.at);
-    words(context, dimensionText(one), x, y);
+    texts.push([dimensionText(one), x, y, false, one]);
   }
+  texts.forEach((text) => words(context, ...text));
   chosen.forEach((number, i) => {
     const face = faces[number];
     if (!face.anchor) return;
@@ -106,6 +133,7 @@ function drawMarks(context) {
     context.fill();
     words(context, chosen.length > 1 ? `${i + 1} ${face.name}` : face.name, x, y - 16, true);
   });
+  view.canvas.drawn = { words: state.words, lines: state.lines }; // for tests
   if (state.hover >= 0 && !chosen.includes(state.hover)) words(context, faces[state.hover].name, state.x, state.y - 18);
 }
 
@@ -136,7 +164,7 @@ function touched() {
 // ---- panels
 
 const option = (value, text, selected) => element('option', { value, selected }, text);
-const field = (label, input) => element('label', { class: 'au-field' }, element('span', {}, label), input);
+const field = (label, input, wide = false) => element('label', { class: wide ? 'au-field au-wide' : 'au-field' }, element('span', {}, label), input);
 const button = (text, act, attributes = {}) => {
   const made = element('button', { type: 'button', ...attributes }, text);
   made.addEventListener('click', act);
@@ -155,7 +183,7 @@ const entry = (value, change, attributes = {}) => {
 };
 
 const told = (finish) => (finish.type === 'machined_metal' ? `${finish.metal}, ${finish.process}, Ra ${finish.Ra}` : finish.type);
-const finishOptions = () => finishes.map((one) => [one.id, `${one.id}: ${told(one)}`]);
+const finishOptions = () => finishes.map((one) => [one.id, `${told(one)} (${one.id})`]);
 
 function finding(one) {
   const sign = { error: '✖ error', warning: '▲ warning', note: '● note' }[one.severity];
@@ -192,7 +220,7 @@ function facePanel() {
         input.value = face.name;
       } else touched();
     }, { id: 'author-name', disabled: !face.node })));
-    parts.push(element('p', { class: 'quiet' }, `${kind ?? 'not measurable: neither plane, cylinder, cone nor sphere'}; ${size} mm, ${short(face.area)} mm²`));
+    parts.push(element('p', { class: 'quiet' }, `${kind ?? 'not measurable: neither plane, cylinder, cone nor sphere'}; box around it ${size} mm, area ${short(face.area)} mm²`));
   } else parts.push(element('p', {}, `${those.length} faces: ${those.map((each) => each.name).join(', ')}`));
   const same = those.every((each) => each.finish === face.finish) ? face.finish : '';
   const options = [...(same ? [] : [['', '(several, or unnamed)']]), ...finishOptions(), ['+', 'a new finish']];
@@ -201,7 +229,7 @@ function facePanel() {
     const id = value === '+' ? newFinish().id : value;
     those.filter((each) => each.node).forEach((each) => giveFinish(each, id));
     touched();
-  }, { id: 'author-finish' })));
+  }, { id: 'author-finish' }), true));
   const found = those.flatMap(about);
   if (found.length) parts.push(element('ul', { class: 'au-findings' }, ...found.map(finding)));
   panel.replaceChildren(...parts);
@@ -314,7 +342,7 @@ function show() {
   finishList();
   faceList();
   const general = data.findings.filter((one) => !faces.some((face) => face.name === one.about) && !(one.about === 'task' && measurements.size));
-  place('findings').replaceChildren(...(general.length ? general.map(finding) : [element('li', { class: 'quiet' }, 'No findings about the whole scene.')]));
+  place('findings').replaceChildren(...(general.length ? general.map(finding) : [element('li', { class: 'quiet' }, 'No problems found.')]));
   if (focused !== undefined) place('faces').querySelector(`[data-face="${focused}"]`)?.focus();
   paint();
 }

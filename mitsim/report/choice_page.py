@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup, escape
 
 from characterisation.atomic_io import atomic_write
 from characterisation.errors import InputError
 from mitsim.report.choice_document import CHOICE, CellEntry, ChoiceDocument, SensorEntry, read_choice
+from mitsim.report.first_rows import breakable, exact, tolerance_words
 from mitsim.report.first_screen import of_choice, sensor_rows
-from mitsim.report.numbers import MINUS, NONE, listed, percent, quantity, rounded, two_digits
+from mitsim.report.numbers import NONE, listed, percent, quantity, rounded, two_digits, with_degree_signs
 from mitsim.report.placement_figure import VERDICTS
 from mitsim.report.scene_geometry import read_scene_geometry
 
@@ -40,6 +40,7 @@ def write_choice_page(folder: Path) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["breakable"] = breakable
     text = environment.get_template("choice.html.j2").render(page_content(choice, folder))
     path = folder / "choice.html"
     with atomic_write(path) as file:
@@ -49,22 +50,18 @@ def write_choice_page(folder: Path) -> Path:
 
 def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
     """Return everything that the template shows."""
-    first = of_choice(choice, read_scene_geometry(folder))
     tolerances = any(one.tolerance is not None for one in choice.measurements.values())
     taking_part = [one for one in choice.sensors if one.status != "excluded"]
     return {
         "choice": choice,
         "part": Path(choice.scene).stem,
-        "first": {
-            "words": first.words,
-            "good": first.good,
-            "rows": first.rows,
-            "picture": first.picture,
-            "tolerances": tolerances,
-        },
+        "first": of_choice(choice, read_scene_geometry(folder)),
         "tolerances": tolerances,
         "best": taking_part[0].name if taking_part else "no sensor",
-        "names": [breakable(name) for name in choice.measurements],
+        "names": [
+            (breakable(name), tolerance_words(one.tolerance, one.nominal, one.unit) if one.tolerance else "")
+            for name, one in choice.measurements.items()
+        ],
         "asked": [_asked(choice, name) for name in choice.measurements],
         "rows": [_row(choice, one) for one in taking_part],
         "screened": any(one.status == "screened" for one in taking_part),
@@ -74,29 +71,15 @@ def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
     }
 
 
-def breakable(name: str) -> Markup:
-    """Return a name as safe markup that a browser may break after underscores."""
-    return Markup(escape(name).replace("_", Markup("_<wbr>")))
-
-
 def _asked(choice: ChoiceDocument, name: str) -> dict[str, str]:
     one = choice.measurements[name]
-    symbol = "°" if one.unit == "deg" else f"\N{NO-BREAK SPACE}{one.unit}"
     return {
         "name": name,
-        "nominal": f"{one.nominal:g}{symbol}",
+        "nominal": exact(one.nominal, one.unit),
         "features": listed(one.features),
         "rule": one.rule,
-        "tolerance": NONE if one.tolerance is None else f"{_tolerance(one.tolerance)}{symbol}",
+        "tolerance": tolerance_words(one.tolerance, one.nominal, one.unit),
     }
-
-
-def _tolerance(tolerance: float | tuple[float, float]) -> str:
-    """Format a tolerance: ``0.1``, or the upper and the lower deviation with their signs."""
-    if isinstance(tolerance, tuple):
-        lower, upper = tolerance
-        return f"{upper:+g} {lower:+g}".replace("-", MINUS)
-    return f"{tolerance:g}"
 
 
 def _row(choice: ChoiceDocument, one: SensorEntry) -> dict[str, Any]:
@@ -149,7 +132,7 @@ def _details(choice: ChoiceDocument, one: SensorEntry, tolerances: bool) -> dict
         )
     return {
         "name": one.name,
-        "words": one.words,
+        "words": with_degree_signs(one.words),
         "rows": sensor_rows(choice, one),
         "tolerances": tolerances,
         "poses": poses,

@@ -1,8 +1,8 @@
 """Make the first screen of a page: picture of the part with its sensor, the result in one line, a short table.
 
 Signal chain: statement of a run, or the table of several sensors -> verdict of every measurement -> each face of the
-part coloured by the worst verdict of its measurements -> picture and rows as texts. The report, the comparison of
-sensors and the sheet for a quotation all use it.
+part coloured by the worst verdict of its measurements -> picture, its caption with the pose, and rows as texts
+(:mod:`mitsim.report.first_rows`). The report, the comparison of sensors and the sheet for a quotation all use it.
 """
 
 from __future__ import annotations
@@ -10,178 +10,208 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
+import xarray as xr
 from markupsafe import Markup
 from numpy.typing import ArrayLike
 
-from characterisation.statements.verdict_words import Judged, fits_all, result_in_words
-from mitsim.report.choice_document import ChoiceDocument, SensorEntry
-from mitsim.report.numbers import MINUS, NONE, percent, quantity
-from mitsim.report.placement_figure import VERDICTS, face_verdicts, placement_figure
+from characterisation.statements.verdict_words import OFTEN, Judged, fits_all, losses_in_words, result_in_words
+from mitsim.report.choice_document import ChoiceDocument, SensorEntry, judged
+from mitsim.report.first_rows import Row, RowValues, measured_words
+from mitsim.report.numbers import NONE, count, rounded, with_degree_signs
+from mitsim.report.placement_figure import face_verdicts, placement_figure
 from mitsim.report.run_folder import Run
 from mitsim.report.scene_geometry import SceneGeometry
 from mitsim.report.set_words import with_sets
+from mitsim.report.statement_section import StatedMeasurement
 from mitsim.report.style import Picture, as_svg
 
-
-@dataclass(frozen=True)
-class Row:
-    """One measurement in the short table, as texts; ``colour`` of its verdict; ``good`` is None without a tolerance."""
-
-    name: str
-    uncertainty: str
-    needed: str
-    share: str
-    tolerance: str
-    accepted: str
-    false_accept: str
-    verdict: str
-    colour: str
+#: good: every tolerance fits; plain: there are no tolerances; warn: values are missing, or a verdict is open; bad: a
+#: tolerance does not fit, or a set of views exceeds a limit
+Tone = Literal["good", "plain", "warn", "bad"]
 
 
 @dataclass(frozen=True)
 class FirstScreen:
-    """Content of the first screen: the result in ``words``, rows and picture.
+    """Content of the first screen: the result in ``words``, its ``tone``, rows and picture.
 
-    ``good`` is true unless a measurement is known not to fit its tolerance, or a set of views to miss a limit. The
-    picture shows ``poses`` (label, part_from_sensor) and ``verdicts`` by feature.
+    The picture shows ``poses`` (label, part_from_sensor) and ``verdicts`` by feature. ``trials`` is the largest number
+    of virtual measurements behind a row.
     """
 
     words: str
-    good: bool
+    tone: Tone
     rows: list[Row]
     picture: Picture | None
     poses: list[tuple[str, ArrayLike]]
     verdicts: dict[str, str]
+    trials: int = 0
+
+    @property
+    def tolerances(self) -> bool:
+        """Return whether a measurement has a tolerance."""
+        return any(row.tolerance != NONE for row in self.rows)
+
+    @property
+    def open(self) -> bool:
+        """Return whether a measurement is not decided."""
+        return any(row.verdict == "not decided" for row in self.rows)
+
+    @property
+    def limited(self) -> bool:
+        """Return whether a row says what limits the view."""
+        return any(row.limited for row in self.rows)
+
+    @property
+    def share_limit(self) -> str:
+        """Return the largest share of the tolerance that fits, if it is the same for all rows; otherwise empty."""
+        limits = {row.share_limit for row in self.rows if row.tolerance != NONE and row.share != NONE}
+        return limits.pop() if len(limits) == 1 else ""
+
+
+def tone_of(results: Sequence[Judged]) -> Tone:
+    """Return the tone of the results of one view: see :data:`Tone`."""
+    if not fits_all(results):
+        return "bad"
+    if any(one.without_value >= OFTEN or one.verdict == "not decided" for one in results):
+        return "warn"
+    return "good" if any(one.verdict == "fits" for one in results) else "plain"
 
 
 def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     """Return the first screen of the report of a run."""
     document = run.statement
     if document is None:
-        words = with_sets("no view can make the measurements", False, run.about.view_sets).words
-        return FirstScreen(words, False, [], None, [], {})
-    judged, rows = list[Judged](), list[Row]()
-    for name, one in document.measurements.items():
-        decision = one.decision
-        needed = None if decision is None else decision.needed
-        judged.append(
-            Judged(
-                name,
-                one.unit,
-                one.verdict,
-                _or_nan(one.standard_uncertainty),
-                _or_nan(needed),
-                decision is not None and decision.fits_corrected,
-                one.without_value,
-            )
-        )
-        rows.append(
-            RowValues(
-                name,
-                one.unit,
-                one.verdict,
-                one.standard_uncertainty,
-                needed,
-                one.tolerance,
-                one.share_of_tolerance,
-                None if decision is None else decision.accepted,
-                None if decision is None else decision.false_accept,
-            ).texts()
-        )
+        words = with_sets("No view can make the measurements", False, run.about.view_sets).words
+        return FirstScreen(words, "bad", [], None, [], {})
+    results = [_judged(name, one) for name, one in document.measurements.items()]
+    here = run.scores.sel(view=document.view)
     asked = {
         name: (run.about.measurements[name].features, one.verdict)
         for name, one in document.measurements.items()
         if name in run.about.measurements
     }
-    pose = run.scores["world_from_sensor"].sel(view=document.view).values
-    poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", pose)]
+    poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", here["world_from_sensor"].values)]
     verdicts = face_verdicts(asked)
-    result = with_sets(result_in_words(judged), fits_all(judged), run.about.view_sets)
-    caption = f"{run.about.sensor} at view {document.view}, to scale; on the right the part from the same side."
-    return FirstScreen(result.words, result.good, rows, _picture(geometry, poses, verdicts, caption), poses, verdicts)
+    result = with_sets(result_in_words(results), fits_all(results), run.about.view_sets)
+    best = f"the best of {count(run.scores.sizes['view'])} views for all measurements together"
+    pose = pose_words(*(float(here[name]) for name in ("standoff_mm", "azimuth_deg", "elevation_deg", "roll_deg")))
+    return FirstScreen(
+        with_degree_signs(result.words[:1].upper() + result.words[1:]),
+        tone_of(results) if result.good else "bad",
+        [_run_row(run, here, name, one) for name, one in document.measurements.items()],
+        _picture(geometry, poses, verdicts, f"{run.about.sensor} in view {document.view}, {best}: {pose}"),
+        poses,
+        verdicts,
+        max((one.trials for one in document.measurements.values()), default=0),
+    )
 
 
 def of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None) -> FirstScreen:
     """Return the first screen of the page that compares sensors, which shows the best one."""
     best = next((one for one in choice.sensors if one.status != "excluded" and one.measurements), None)
     if best is None:
-        return FirstScreen(choice.words, False, [], None, [], {})
-    rows = sensor_rows(choice, best)
+        return FirstScreen(with_degree_signs(choice.words), "bad", [], None, [], {})
     verdicts = face_verdicts(
         {name: (choice.measurements[name].features, cell.verdict) for name, cell in best.measurements.items()}
     )
     poses: list[tuple[str, ArrayLike]] = [(f"view {one.view}", one.world_from_sensor) for one in best.poses]
-    good = all(cell.verdict in ("fits", "no tolerance") for cell in best.measurements.values())
     of = sum(one.status != "excluded" for one in choice.sensors)
-    caption = f"{best.name}, the best of {of} sensors, to scale; on the right the part from the same side."
-    return FirstScreen(choice.words, good, rows, _picture(geometry, poses, verdicts, caption), poses, verdicts)
+    caption = f"{best.name}, the best of {of} sensor{'s' if of > 1 else ''}"
+    if best.poses:
+        first = best.poses[0]
+        caption += f", in view {first.view}: "
+        caption += pose_words(first.standoff_mm, first.azimuth_deg, first.elevation_deg, first.roll_deg)
+    results = judged(best)
+    lost = "" if any(one.verdict != "no tolerance" for one in results) else losses_in_words(results)
+    return FirstScreen(
+        with_degree_signs("; ".join(filter(None, [choice.words, lost]))),
+        tone_of(results),
+        sensor_rows(choice, best),
+        _picture(geometry, poses, verdicts, caption),
+        poses,
+        verdicts,
+        max((cell.trials for cell in best.measurements.values()), default=0),
+    )
+
+
+def pose_words(standoff_mm: float, azimuth_deg: float, elevation_deg: float, roll_deg: float) -> str:
+    """Describe a pose in plain words: distance, azimuth, elevation and roll, each with its reference."""
+    return (
+        f"distance {rounded(standoff_mm)}\N{NO-BREAK SPACE}mm, "
+        f"azimuth {rounded(azimuth_deg)}° (about the part’s z axis, from x), "
+        f"elevation {rounded(elevation_deg)}° (above the plane z = 0), "
+        f"roll {rounded(roll_deg)}° (about the line of sight, clockwise as the sensor sees)"
+    )
 
 
 def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[Row]:
     """Return the rows for the measurements of one sensor."""
     return [
         RowValues(
-            name,
-            choice.measurements[name].unit,
-            cell.verdict,
-            cell.uncertainty,
-            cell.needed,
-            choice.measurements[name].tolerance_size,
-            cell.share_of_tolerance,
-            cell.accepted,
-            cell.false_accept,
+            name=name,
+            about=measured_words("", asked.features),
+            unit=asked.unit,
+            verdict=cell.verdict,
+            nominal=asked.nominal,
+            tolerance=asked.tolerance,
+            uncertainty=cell.uncertainty,
+            without_value=cell.without_value,
+            needed=cell.needed,
+            share=cell.share_of_tolerance,
+            rule=asked.rule,
+            demand=cell.demand,
+            demand_interval=cell.demand_interval,
+            accepted=cell.accepted,
+            false_accept=cell.false_accept,
         ).texts()
         for name, cell in one.measurements.items()
+        for asked in (choice.measurements[name],)
     ]
 
 
-@dataclass(frozen=True)
-class RowValues:
-    """Values of one measurement, in ``unit``; None where a value is not known or there is no tolerance.
-
-    ``share`` of the tolerance that the uncertainty takes; ``accepted`` lowest and highest reading.
-    """
-
-    name: str
-    unit: str
-    verdict: str
-    uncertainty: float | None
-    needed: float | None
-    tolerance: float | None
-    share: float | None
-    accepted: tuple[float | None, float] | None
-    false_accept: float | None
-
-    def texts(self) -> Row:
-        """Return the row of the table, as texts."""
-        return Row(
-            self.name,
-            _quantity(self.uncertainty, self.unit),
-            _quantity(self.needed, self.unit),
-            NONE if self.share is None else percent(self.share),
-            _quantity(self.tolerance, self.unit),
-            accepted_words(self.accepted, self.unit, self.tolerance),
-            NONE if self.false_accept is None else percent(self.false_accept),
-            self.verdict,
-            VERDICTS.get(self.verdict, "#9a9fa8"),
-        )
+def _run_row(run: Run, here: xr.Dataset, name: str, one: StatedMeasurement) -> Row:
+    """Return the row of a measurement of a run; ``here`` are the scores of the stated view."""
+    entry, decision = run.about.measurements.get(name), one.decision
+    limit = feature = ""
+    points = None
+    if entry is not None:
+        limit, feature = (str(here[key].sel(measurement=name).values) for key in ("limit", "limiting_feature"))
+        points = float(here["n"].sel(feature=feature)) if feature in here["feature"].values else None
+    tolerance = one.tolerance if entry is None or entry.tolerance is None else entry.tolerance
+    return RowValues(
+        name=name,
+        about="" if entry is None else measured_words(entry.kind, entry.features),
+        unit=one.unit,
+        verdict=one.verdict,
+        nominal=math.nan if entry is None else entry.nominal,
+        tolerance=tolerance,
+        uncertainty=one.standard_uncertainty,
+        without_value=one.without_value,
+        needed=None if decision is None else decision.needed,
+        share=one.share_of_tolerance,
+        rule="" if decision is None else decision.rule,
+        demand=None if decision is None else decision.demand,
+        demand_interval=None if decision is None else decision.demand_interval,
+        accepted=None if decision is None else decision.accepted,
+        false_accept=None if decision is None else decision.false_accept,
+        limited=f"{limit} on {feature}" if limit and feature else limit,
+        points=points if limit else None,
+    ).texts()
 
 
-def accepted_words(accepted: tuple[float | None, float] | None, unit: str, tolerance: float | None) -> str:
-    """Format the readings that are accepted: ``19.82 to 20.18 mm``, ``up to 0.13 mm``, ``none``; a dash without
-    tolerance.
-    """
-    if tolerance is None:
-        return NONE
-    if accepted is None:
-        return "none"
-    digits = max(0, 2 - math.floor(math.log10(tolerance)))
-    low, high = accepted
-    symbol = "°" if unit == "deg" else f"\N{NO-BREAK SPACE}{unit}"
-    text = f"up to {high:.{digits}f}" if low is None else f"{low:.{digits}f} to {high:.{digits}f}"
-    return text.replace("-", MINUS) + symbol
+def _judged(name: str, one: StatedMeasurement) -> Judged:
+    decision = one.decision
+    return Judged(
+        name,
+        one.unit,
+        one.verdict,
+        _or_nan(one.standard_uncertainty),
+        _or_nan(None if decision is None else decision.needed),
+        decision is not None and decision.fits_corrected,
+        one.without_value,
+    )
 
 
 def _picture(
@@ -194,11 +224,8 @@ def _picture(
         by_verdict.setdefault(verdict, []).append(name)
     faces = (f"{verdict}: {', '.join(names)}" for verdict, names in by_verdict.items())
     alt = "The part and the sensor. " + "; ".join(faces)
-    return Picture(Markup(as_svg(placement_figure(geometry, poses, verdicts), alt)), caption)
-
-
-def _quantity(value: float | None, unit: str) -> str:
-    return NONE if value is None else quantity(value, unit)
+    drawn = f"{caption}. Drawn to scale; on the right, the part from the same side."
+    return Picture(Markup(as_svg(placement_figure(geometry, poses, verdicts), alt)), drawn)
 
 
 def _or_nan(value: float | None) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 MINUS, NONE, SPACE = "\N{MINUS SIGN}", "\N{EN DASH}", "\N{NO-BREAK SPACE}"
 
@@ -35,6 +36,11 @@ def unit_symbol(unit: str) -> str:
     return "°" if unit == "deg" else unit
 
 
+def with_degree_signs(text: str) -> str:
+    """Write ``°`` for ``deg`` after a number."""
+    return re.sub(r"(?<=\d) deg\b", "°", text)
+
+
 def quantity(value: float, unit: str) -> str:
     """Write a quantity with two significant digits and its unit; a dash without a value."""
     if not math.isfinite(value):
@@ -46,6 +52,8 @@ def percent(share: float) -> str:
     """Write a share as a percentage, with one decimal below ten."""
     if not math.isfinite(share):
         return NONE
+    if share == 0:
+        return f"0{SPACE}%"
     if 0 < share < 0.0005:
         return f"<{SPACE}0.1{SPACE}%"
     return f"{100 * share:.{1 if share < 0.0995 else 0}f}{SPACE}%"

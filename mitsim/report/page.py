@@ -27,6 +27,7 @@ from characterisation.tasks.covariance import LEAST_CHANCE, PERSISTENT_REACH_PX,
 from mitsim.report import findings
 from mitsim.report.agreement import Agreement, agreement, chance_level
 from mitsim.report.cloud_figures import REASONS
+from mitsim.report.first_rows import breakable
 from mitsim.report.first_screen import of_run
 from mitsim.report.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
 from mitsim.report.page_pictures import camera_view, cloud_picture, map_pictures, measurement_pictures
@@ -73,6 +74,7 @@ def write_report(folder: str | Path) -> Path:
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    environment.filters["breakable"] = breakable
     text = environment.get_template("page.html.j2").render(page_content(run))
     path = run.folder / "report.html"
     with atomic_write(path) as file:
@@ -93,7 +95,7 @@ def page_content(run: Run) -> dict[str, Any]:
         "rolls": _rolls(run),
         "least_chance": percent(LEAST_CHANCE),
         "minimum_points": count(int(scores.attrs.get("minimum_points", 100))),
-        "first": _first(run),
+        "first": of_run(run, read_scene_geometry(run.folder)),
         "statement": None if run.statement is None else statement_section(run.statement),
         "stated_pose": None if run.statement is None else _pose(run, run.statement.view),
         "race_confidence": percent(about.confidence.get(ALL, 0.0)),
@@ -117,21 +119,6 @@ def page_content(run: Run) -> dict[str, Any]:
         "residual": _residual(run),
         "total_seconds": rounded(sum(about.seconds.values())),
         "rounded": rounded,
-    }
-
-
-def _first(run: Run) -> dict[str, Any]:
-    """Return the first screen: the result in words, the picture, the verdicts."""
-    first = of_run(run, read_scene_geometry(run.folder))
-    tolerances = run.statement is not None and any(
-        one.tolerance is not None for one in run.statement.measurements.values()
-    )
-    return {
-        "words": first.words,
-        "good": first.good,
-        "rows": first.rows,
-        "picture": first.picture,
-        "tolerances": tolerances,
     }
 
 
@@ -182,6 +169,7 @@ def _pose(run: Run, view: int) -> dict[str, str]:
         "azimuth": f"{rounded(float(here['azimuth_deg']))}°",
         "elevation": f"{rounded(float(here['elevation_deg']))}°",
         "roll": f"{rounded(float(here['roll_deg']))}°",
+        "standoff": f"{rounded(float(here['standoff_mm']))}\N{NO-BREAK SPACE}mm",
         "position": ", ".join(rounded(float(x)) for x in position),
     }
 

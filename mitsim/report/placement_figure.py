@@ -2,7 +2,7 @@
 
 Signal chain: triangles, pose of the sensor, verdict of every feature -> a viewpoint from which neither hides the other
 -> depth buffer of the part, shaded by the normal -> frustum and eyes, in front of the part or behind -> labels in two
-columns beside the part, sorted so that their lines do not cross.
+columns beside the part, sorted so that their lines do not cross -> the axes of the part, to which the pose refers.
 
 The projection is orthographic, so lengths along one direction can be compared anywhere in the picture.
 """
@@ -38,6 +38,9 @@ VERDICTS = {
     "undecidable": "#a3447c",
 }
 _NOT_ASKED = "#b9bdc4"
+
+#: words of the legend, where they are not the verdict
+_LEGEND = {"no tolerance": "measured, without tolerance"}
 
 #: pixels along the longer side of the picture
 _PIXELS = 900
@@ -96,7 +99,8 @@ def draw_placement(
             _sensor(whole, geometry, matrices[number], middle, turn, poses[number][0], number == 0)
         whole.margins(0.04, 0.1)
         _labels(near, geometry, flat, depth, verdicts)
-        _legend(figure, verdicts)
+        _axes_of_part(near, turn)
+        _legend(figure, verdicts, geometry.camera)
 
 
 def _middle(geometry: SceneGeometry) -> Floats:
@@ -276,9 +280,24 @@ def spread(heights: Sequence[float], step: float) -> list[float]:
     return [first + k * step for first, number in groups for k in range(int(number))]
 
 
-def _legend(figure: FigureBase, verdicts: Mapping[str, str]) -> None:
+def _axes_of_part(axes: Axes, turn: Floats) -> None:
+    """Draw the directions x, y and z of the part below it, each as long as it appears from the viewpoint."""
+    (low, high), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    size = 0.07 * (high - low)
+    origin = np.array([(low + high) / 2, bottom - 1.3 * size])
+    for number, name in enumerate("xyz"):
+        tip = origin + size * turn[:2, number]
+        axes.annotate("", tuple(tip), tuple(origin), arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 1.0})
+        way = tip - origin
+        beyond = tip + 0.35 * size * way / max(float(np.linalg.norm(way)), 0.2 * size)
+        axes.text(*beyond, name, ha="center", va="center", fontsize=8, color=MUTED)
+    axes.set_ylim(bottom - 2.6 * size, top)
+
+
+def _legend(figure: FigureBase, verdicts: Mapping[str, str], camera: str) -> None:
     used = [verdict for verdict in VERDICTS if verdict in verdicts.values()]
-    handles: list[Any] = [Patch(facecolor=VERDICTS[verdict], label=verdict) for verdict in used]
+    handles: list[Any] = [Patch(facecolor=VERDICTS[verdict], label=_LEGEND.get(verdict, verdict)) for verdict in used]
     handles.append(Patch(facecolor=_NOT_ASKED, label="not measured"))
-    handles.append(Line2D([], [], color=INK, lw=0.8, ls="--", label="seen by the reference camera"))
+    seen = f"field of view of the {camera or 'first'} camera".replace("camera camera", "camera")
+    handles.append(Line2D([], [], color=INK, lw=0.8, ls="--", label=seen))
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), handlelength=1.3, columnspacing=1.4)

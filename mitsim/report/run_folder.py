@@ -92,12 +92,14 @@ _PATCHES = Schema(
 
 
 class MeasurementEntry(Document):
-    """Entry of a measurement in ``run.json``."""
+    """Entry of a measurement in ``run.json``; ``kind`` and ``tolerance`` as in the task."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     nominal: float
     unit: str
     features: list[str]
+    kind: str = ""
+    tolerance: float | tuple[float, float] | None = None
 
 
 class ResidualEntry(Document):

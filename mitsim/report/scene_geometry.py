@@ -35,6 +35,7 @@ class SceneGeometry:
     ``corners`` (n, 3, 3) of triangles [mm], part frame; ``shape`` (n,) index into ``names``. For every eye, the
     reference camera first: ``centres`` (k, 3) [mm] and ``rays`` (k, 4, 3), unit vectors through the corners of its
     image in cyclic order, both in the sensor frame. ``reach`` holds the nearest and farthest working distance [mm].
+    ``camera`` is the name of the reference camera, empty if the file is old.
     """
 
     corners: Floats
@@ -43,6 +44,7 @@ class SceneGeometry:
     centres: Floats
     rays: Floats
     reach: tuple[float, float]
+    camera: str = ""
 
 
 def write_scene_geometry(folder: Path, scene: Scene, sensor: Sensor) -> None:
@@ -64,6 +66,7 @@ def write_scene_geometry(folder: Path, scene: Scene, sensor: Sensor) -> None:
         centres=np.array([eye.centre for eye in eyes]),
         rays=np.array(rays),
         reach=np.array(sensor.working_range_mm, float),
+        camera=np.array(next(iter(sensor.rig.cameras)), "U"),
     )
     with atomic_write(folder / GEOMETRY_FILE) as file:
         file.write_bytes(out.getvalue())
@@ -95,6 +98,7 @@ def read_scene_geometry(folder: Path) -> SceneGeometry | None:
                 data["centres"].astype(float).reshape(-1, 3),
                 data["rays"].astype(float).reshape(-1, 4, 3),
                 (near, far),
+                str(data["camera"]) if "camera" in data else "",
             )
     except InputError:
         raise

@@ -46,7 +46,7 @@ def set_result(entry: ViewSetEntry) -> SetResult:
         if one is None or not reached[name] or not error <= limit:
             missed[name] = _missed(name, one, error, limit, reached[name])
         elif one.without_value >= _OFTEN:
-            often.append(f"{name}: {100 * one.without_value:.0f} % of the trials gave no value")
+            often.append(f"{name}: no value in {100 * one.without_value:.0f} % of the virtual measurements")
     kept = len(limits) - len(missed)
     words = f"{which}, measured together, keeps {kept} of {len(limits)} limits"
     return SetResult("; ".join([words, *missed.values(), *often]), not missed)
@@ -70,4 +70,4 @@ def _missed(name: str, one: ConfirmedEntry | None, error: float, limit: float, r
         return f"{name} is out of reach"
     if one is None or not math.isfinite(error):
         return f"{name} has no value"
-    return f"{name} misses its limit: error {error:.2g} {one.unit}, {limit:.2g} allowed"
+    return f"{name} exceeds its limit: error {error:.2g} {one.unit}, {limit:.2g} {one.unit} allowed"

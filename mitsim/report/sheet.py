@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from characterisation.atomic_io import atomic_write
 from mitsim.report.choice_document import CHOICE, ChoiceDocument, read_choice
-from mitsim.report.first_screen import FirstScreen, of_choice, of_run
+from mitsim.report.first_screen import FirstScreen, Tone, of_choice, of_run
 from mitsim.report.numbers import listed, rounded, two_digits
 from mitsim.report.placement_figure import draw_placement
 from mitsim.report.run_folder import Run, read_run
@@ -31,6 +31,9 @@ _WIDTH, _HEIGHT, _MARGIN = 8.27, 11.69, 0.65
 
 #: heights [in] of a line of text, a row of the table and the picture
 _LINE, _ROW, _PICTURE = 0.165, 0.2, 3.55
+
+#: colour of the result by its tone
+_COLOURS: dict[Tone, str] = {"good": "#00694e", "plain": INK, "warn": "#7a5600", "bad": "#a84a00"}
 
 #: characters in a line of small text, and largest number of rows in a table
 _ACROSS, _MOST_ROWS = 112, 16
@@ -80,7 +83,7 @@ def sheet_figure(sheet: Sheet, geometry: SceneGeometry | None) -> Figure:
             size=10.5,
             weight="bold",
             across=86,
-            colour="#00694e" if sheet.first.good else "#a84a00",
+            colour=_COLOURS[sheet.first.tone],
             line=0.19,
         )
         if geometry is not None and len(geometry.corners) and sheet.first.poses:
@@ -135,21 +138,27 @@ class _Column:
 
 
 def _table(down: _Column, first: FirstScreen) -> None:
-    tolerances = any(row.tolerance != "–" for row in first.rows)
-    head = ["Measurement", "Verdict", "Standard u"] + (
-        ["Needed", "Tolerance", "Accepted readings"] if tolerances else []
-    )
+    if first.tolerances:
+        head = ["Measurement", "Verdict", "Standard u", "Needed", "Tolerance", "Accepted readings"]
+    else:
+        head = ["Measurement", "Nominal", "Standard u", "No value"]
     lefts = [0.0, 2.05, 3.2, 4.05, 4.8, 5.6]
     down.place -= 0.05
     rows = [
-        [row.name if len(row.name) <= 28 else f"{row.name[:27]}…", row.verdict, row.uncertainty]
-        + ([row.needed, row.tolerance, row.accepted] if tolerances else [])
+        [
+            row.name if len(row.name) <= 28 else f"{row.name[:27]}…",
+            *(
+                (row.verdict, row.uncertainty, row.needed, row.tolerance, row.accepted)
+                if first.tolerances
+                else (row.nominal, row.uncertainty, row.without_value)
+            ),
+        ]
         for row in first.rows
     ]
     for number, cells in enumerate([head, *rows[:_MOST_ROWS]]):
         for left, text in zip(lefts, cells, strict=False):
             colour = MUTED if number == 0 else INK
-            weight = "bold" if number and left == lefts[1] else "normal"
+            weight = "bold" if number and first.tolerances and left == lefts[1] else "normal"
             down.figure.text(
                 (_MARGIN + left) / _WIDTH,
                 down.place / _HEIGHT,
@@ -159,7 +168,7 @@ def _table(down: _Column, first: FirstScreen) -> None:
                 color=colour,
                 fontweight=weight,
             )
-        if number:
+        if number and first.tolerances:
             colour = first.rows[number - 1].colour
             down.figure.text(
                 (_MARGIN + lefts[1] - 0.14) / _WIDTH, down.place / _HEIGHT, "●", fontsize=8, va="top", color=colour

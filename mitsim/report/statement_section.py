@@ -58,6 +58,8 @@ class DecisionEntry(_Loose):
     false_reject: float | None
     consumer_risk: float | None
     producer_risk: float | None
+    demand: float | None = None
+    demand_interval: tuple[float | None, float | None] | None = None
 
 
 class StatedMeasurement(_Loose):

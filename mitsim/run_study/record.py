@@ -74,7 +74,13 @@ def run_record(study: Study, performance_map: PerformanceMap, outcome: Outcome) 
         "features": {name: str(one) for name, one in finishes.items()},
         "lay": {name: left_out for name, left_out in lays.items() if left_out is not None},
         "measurements": {
-            name: {"nominal": m.nominal, "unit": m.unit, "features": list(m.features)}
+            name: {
+                "kind": m.kind,
+                "nominal": m.nominal,
+                "unit": m.unit,
+                "features": list(m.features),
+                "tolerance": m.tolerance,
+            }
             for name, m in study.task.measurements.items()
         },
         "seconds": outcome.seconds,

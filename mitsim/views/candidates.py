@@ -3,6 +3,9 @@
 Signal chain: vertices of a subdivided icosahedron above the horizon x rolls -> angles of the stage, if there is one ->
 pose of the sensor at each standoff -> shift outward along its axis, if its body is too near to the part -> views, and
 excluded views with the reason.
+
+The talk of Kinnell and Justham (2018; slide *Viewpoint Scoring*, step 1) generates its candidates in the same way: a
+sub-divided icosahedron, and reachability by the tilt table.
 """
 
 from __future__ import annotations
@@ -40,7 +43,7 @@ class View:
     """One candidate: a pose of the sensor that looks at the part.
 
     ``direction`` (3,) is a unit vector in the part frame, from the target back along the axis of the reference camera;
-    ``roll_deg`` is the rotation about it. ``standoff`` |V| is the distance of the target along that axis [mm].
+    ``roll_deg`` is the rotation about it. ``standoff`` is the distance of the target along that axis [mm].
     ``world_from_sensor`` is the pose; the world is the part frame.
 
     On a stage there are also ``stage_angles`` (axes,) [rad], and ``stage_distance`` [mm] of the reference camera from

@@ -32,7 +32,7 @@ def main(target: Path) -> None:
             ],
         ):
             subprocess.run([sys.executable, "-m", "mitsim", *map(str, arguments)], check=True, capture_output=True)
-        with Chromium(folder / "profile", width=1150, height=860) as browser:
+        with Chromium(folder / "profile", width=1150, height=900) as browser:
             page = Author(browser, (folder / "page.html").as_uri())
             for faces, kind, tolerance in (
                 (("bore_12mm_left", "bore_12mm_right"), "axis_distance", "0.1"),

@@ -13,6 +13,7 @@ import urllib.request
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import numpy as np
 import pytest
 from shell import mitsim_here
 
@@ -68,6 +69,30 @@ def served(folder):
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=30)
+
+
+#: boxes of the texts in the picture, and lines, each with the number of its dimension
+DRAWN = """(() => {
+  const { words, lines } = document.getElementById('author-canvas').drawn;
+  const owners = [...new Set([...words, ...lines].map((one) => one.own))], number = (one) => owners.indexOf(one.own);
+  return [words.map((one) => [number(one), one.left, one.top, one.right, one.bottom]),
+    lines.map((one) => [number(one), ...one.ends[0].slice(0, 2), ...one.ends[1].slice(0, 2)])];
+})()"""
+
+
+def covered(words, lines):
+    """Texts that cover another text, or a line of another dimension."""
+    inside = np.linspace(0, 1, 400)[:, None]
+    found = []
+    for k, (own, left, top, right, bottom) in enumerate(words):
+        beside = (one for j, one in enumerate(words) if j != k)
+        bad = any(a < right and left < c and b < bottom and top < d for _, a, b, c, d in beside)
+        for other, *ends in lines:
+            places = np.array(ends[:2]) * (1 - inside) + np.array(ends[2:]) * inside
+            within = (places > [left, top]) & (places < [right, bottom])
+            bad |= other != own and bool(within.all(axis=1).any())
+        found += [words[k]] if bad else []
+    return found
 
 
 class Author:
@@ -240,6 +265,17 @@ def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(folder, bro
     browser.rest()
     assert browser.tell("document.getElementById('author-name').value") != first
     assert browser.shot(box) != before
+    browser.press("Home")
+    for chosen, kind in (
+        (("bore_12mm_left", "bore_12mm_right"), "axis_distance"),
+        (("boss_20mm",), "diameter"),
+        (("bottom",), "flatness"),
+    ):
+        page.choose(*chosen)
+        page.measure(kind, "0.1")
+    browser.rest()
+    words, lines = browser.tell(DRAWN)
+    assert len(words) >= 4 and len(lines) >= 4 and covered(words, lines) == []
     assert [url for url in browser.requests if not url.startswith("file:")] == []
     assert browser.problems == []
 

@@ -1,6 +1,7 @@
 """The last line of a run, word by word."""
 
 import math
+from dataclasses import replace
 
 from characterisation.statements.verdict_words import Judged, fits_all, result_in_words
 
@@ -14,8 +15,9 @@ def test_what_fits_is_counted_and_the_worst_is_named_first():
         Judged("note", "mm", "no tolerance", 0.02, math.nan),
     ]
     assert result_in_words(judged) == (
-        "fits 1 of 4 tolerances; seat_radius is undecidable: u 0.12 mm, 0.030 needed; "
-        "angle does not fit: u 0.20 deg, 0.10 needed; width: not decided, more trials are needed"
+        "fits 1 of 4 tolerances; seat_radius is undecidable: standard uncertainty 0.12 mm, 0.030 mm "
+        "needed; angle does not fit: standard uncertainty 0.20 deg, 0.10 deg needed; width: not decided, more virtual "
+        "measurements are needed"
     )
     assert not fits_all(judged) and fits_all([judged[0], judged[3], judged[4]])
 
@@ -26,10 +28,16 @@ def test_a_bias_that_is_all_and_values_that_are_missing_are_told():
     seldom = Judged("c", "mm", "fits", 0.01, 0.05, without_value=0.13)
     words = result_in_words([bias, lost, seldom])
     assert "a does not fit unless its bias is subtracted" in words
-    assert "b is undecidable: no trial gave a value" in words
-    assert "c fits, but 13 % of the trials gave no value" in words
+    assert "b is undecidable: no virtual measurement gave a value" in words
+    assert "c fits, but has no value in 13 % of the virtual measurements" in words
 
 
 def test_without_tolerances_the_losses_are_told():
-    told = result_in_words([Judged("a", "mm", "no tolerance", 0.1, math.nan, without_value=0.25)])
-    assert told == "1 measurements stated; no tolerance was given; a has no value in 25 % of the trials"
+    a, b = (Judged(name, "mm", "no tolerance", 0.1, math.nan, without_value=0.25) for name in "ab")
+    none = "Uncertainty given for 1 measurement. The task has no tolerances: nothing to accept or reject"
+    assert result_in_words([a]) == f"{none}. a has no value in 25 % of the virtual measurements"
+    assert result_in_words([replace(a, without_value=0.0)]) == none
+    few = replace(b, without_value=0.001)
+    assert result_in_words([replace(a, without_value=0.0), few]).endswith(
+        "b has no value in less than 1 % of the virtual measurements"
+    )

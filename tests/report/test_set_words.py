@@ -32,7 +32,7 @@ def test_a_set_that_keeps_its_limits_is_good():
 def test_a_bias_counts_and_a_missed_limit_is_named_with_its_error():
     result = set_result(entry({"apart": (0.08, 0.08, 0.0), "radius": (0.0, 0.1, 0.0)}))  # 0.113 together
     assert not result.good
-    assert "keeps 1 of 2 limits; apart misses its limit: error 0.11 mm, 0.1 allowed" in result.words
+    assert "keeps 1 of 2 limits; apart exceeds its limit: error 0.11 mm, 0.1 mm allowed" in result.words
 
 
 def test_a_limit_out_of_reach_is_missed_though_its_error_is_small():
@@ -43,7 +43,9 @@ def test_a_limit_out_of_reach_is_missed_though_its_error_is_small():
 def test_a_measurement_without_value_is_missed_and_one_that_often_has_none_is_named():
     result = set_result(entry({"apart": (None, None, 1.0), "radius": (0.0, 0.1, 0.25)}))
     assert not result.good
-    assert "apart has no value" in result.words and "radius: 25 % of the trials gave no value" in result.words
+    assert (
+        "apart has no value" in result.words and "radius: no value in 25 % of the virtual measurements" in result.words
+    )
 
 
 def test_a_set_that_no_measurement_confirms_says_so():
@@ -65,9 +67,13 @@ def test_the_result_of_a_run_is_good_only_if_its_sets_are():
 def test_the_first_screen_of_a_run_says_what_its_set_misses(tmp_path, u):
     folder = write_run(tmp_path / "run")
     about = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    stated = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
+    known = stated["measurements"][MEASUREMENTS[0]] | {"without_value": 0.0}
+    stated["measurements"] = dict.fromkeys(MEASUREMENTS, known)
+    (folder / "statement.json").write_text(json.dumps(stated), encoding="utf-8")
     name, confirmed = MEASUREMENTS[1], {"unit": "mm", "trials": 9, "without_value": 0.0, "bias": 0.0}
     one = {"limits": {name: 0.05}, "views": [2, 7], "confirmed": {name: confirmed | {"standard_uncertainty": u}}}
     (folder / "run.json").write_text(json.dumps(about | {"view_sets": [one]}), encoding="utf-8")
     first = of_run(read_run(folder), None)
     assert f"keeps {int(u < 0.05)} of 1 limits" in first.words
-    assert not first.good or u < 0.05
+    assert first.tone == ("plain" if u < 0.05 else "bad")

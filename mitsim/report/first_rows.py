@@ -1,0 +1,188 @@
+"""Format the rows of the short table on a first screen: one measurement each, as texts.
+
+Signal chain: values of a measurement by a statement, its tolerance and rule -> texts with units. The share of the
+tolerance is given with the largest share that fits and with its own 95 % interval, so that a reader can follow the
+verdict.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from markupsafe import Markup, escape
+
+from mitsim.report.numbers import MINUS, NONE, count, listed, percent, quantity, unit_symbol
+from mitsim.report.placement_figure import VERDICTS
+
+#: beginning of the names of rules whose demand is the share of the tolerance over the largest share that fits
+_BY_SHARE = ("ISO 14253-1", "simple acceptance")
+
+#: share above which the exact figure is of no use
+_LARGEST_SHARE = 10.0
+
+#: what a kind of measurement is, of its features in their order; other kinds are their name, "of" the features
+_KINDS = {
+    "intersection_distance": "distance between the points where the axes of {1} and {2} meet {0}",
+    "axis_distance": "distance between the axes of {0} and {1}",
+    "point_distance": "distance between {0} and {1}",
+    "point_plane_distance": "distance of {0} from {1}",
+    "plane_distance": "distance between {0} and {1}",
+    "plane_axis_angle": "angle between the normal of {0} and the axis of {1}",
+    "axis_angle": "angle between the axes of {0} and {1}",
+    "plane_angle": "angle between {0} and {1}",
+    "cone_angle": "full angle of {0}",
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measurement in the short table, as texts; ``colour`` of its verdict.
+
+    ``about`` says what is measured. ``share`` of the tolerance with its ``share_interval`` and the largest
+    ``share_limit`` that fits. ``limited`` says what limits the view, ``points`` how many it expects there. Texts are
+    empty where nothing is known; values without a number are a dash.
+    """
+
+    name: str
+    about: str
+    nominal: str
+    tolerance: str
+    uncertainty: str
+    needed: str
+    share: str
+    share_interval: str
+    share_limit: str
+    accepted: str
+    false_accept: str
+    without_value: str
+    limited: str
+    points: str
+    verdict: str
+    colour: str
+
+
+@dataclass(frozen=True)
+class RowValues:
+    """Values of one measurement, in ``unit``; None where a value is not known or there is no tolerance.
+
+    ``tolerance`` as in the task, or half the interval that conforms. ``share`` of the tolerance that the uncertainty
+    takes; ``demand`` of the ``rule`` with its interval; ``accepted`` lowest and highest reading. ``limited`` is what
+    limits the view, with the expected ``points`` on that feature.
+    """
+
+    name: str
+    about: str
+    unit: str
+    verdict: str
+    nominal: float
+    tolerance: float | tuple[float, float] | None
+    uncertainty: float | None
+    without_value: float
+    needed: float | None = None
+    share: float | None = None
+    rule: str = ""
+    demand: float | None = None
+    demand_interval: tuple[float | None, float | None] | None = None
+    accepted: tuple[float | None, float] | None = None
+    false_accept: float | None = None
+    limited: str = ""
+    points: float | None = None
+
+    @property
+    def share_limit(self) -> float | None:
+        """Return the largest share of the tolerance that fits; None if the rule does not limit the share."""
+        if not self.rule.startswith(_BY_SHARE) or not self.share or not self.demand:
+            return None
+        return self.share / self.demand
+
+    def texts(self) -> Row:
+        """Return the row of the table, as texts."""
+        limit = self.share_limit
+        size = _size(self.tolerance)
+        return Row(
+            name=self.name,
+            about=self.about,
+            nominal=exact(self.nominal, self.unit),
+            tolerance=tolerance_words(self.tolerance, self.nominal, self.unit),
+            uncertainty=_quantity(self.uncertainty, self.unit),
+            needed=_quantity(self.needed, self.unit),
+            share=NONE if self.share is None else _share(self.share),
+            share_interval="" if limit is None else _interval(self.demand_interval, limit),
+            share_limit="" if limit is None else percent(limit),
+            accepted=accepted_words(self.accepted, self.unit, size),
+            false_accept=NONE if self.false_accept is None else percent(self.false_accept),
+            without_value=percent(self.without_value),
+            limited=self.limited,
+            points="" if self.points is None or not math.isfinite(self.points) else count(round(self.points)),
+            verdict=self.verdict,
+            colour=VERDICTS.get(self.verdict, "#9a9fa8"),
+        )
+
+
+def measured_words(kind: str, features: Sequence[str]) -> str:
+    """Describe a measurement by its kind and features: ``angle between the axes of a and b``, ``radius of a``."""
+    try:
+        return _KINDS[kind].format(*features)
+    except (KeyError, IndexError):  # another kind, or a file of an older mitsim without kinds
+        return f"{kind.replace('_', ' ')} of {listed(list(features))}" if kind else listed(list(features))
+
+
+def breakable(name: str) -> Markup:
+    """Return a name as safe markup that a browser may break after underscores."""
+    return Markup(escape(name).replace("_", Markup("_<wbr>")))
+
+
+def exact(value: float, unit: str) -> str:
+    """Write a given value with its unit, with all its digits: ``70 mm``, ``0.5°``."""
+    return f"{value:g}".replace("-", MINUS) + _suffix(unit)
+
+
+def tolerance_words(tolerance: float | tuple[float, float] | None, nominal: float, unit: str) -> str:
+    """Write a tolerance: ``±0.4 mm``, ``+0.1 −0.2 mm``; ``up to 0.6°`` if no value is below; a dash for None."""
+    if tolerance is None:
+        return NONE
+    if isinstance(tolerance, tuple):
+        lower, upper = tolerance
+        return f"{upper:+g} {lower:+g}".replace("-", MINUS) + _suffix(unit)
+    sign = "up to " if nominal - tolerance <= 0 else "±"
+    return f"{sign}{tolerance:g}{_suffix(unit)}"
+
+
+def accepted_words(accepted: tuple[float | None, float] | None, unit: str, tolerance: float | None) -> str:
+    """Format the readings that are accepted: ``19.82 to 20.18 mm``, ``up to 0.13 mm``, ``none``; a dash without
+    tolerance.
+    """
+    if tolerance is None:
+        return NONE
+    if accepted is None:
+        return "none"
+    digits = max(0, 2 - math.floor(math.log10(tolerance)))
+    low, high = accepted
+    text = f"up to {high:.{digits}f}" if low is None else f"{low:.{digits}f} to {high:.{digits}f}"
+    return text.replace("-", MINUS) + _suffix(unit)
+
+
+def _size(tolerance: float | tuple[float, float] | None) -> float | None:
+    return (tolerance[1] - tolerance[0]) / 2 if isinstance(tolerance, tuple) else tolerance
+
+
+def _share(share: float) -> str:
+    return percent(share) if share < _LARGEST_SHARE else f"over {percent(_LARGEST_SHARE)}"
+
+
+def _interval(ends: tuple[float | None, float | None] | None, limit: float) -> str:
+    """Return the interval of a share from that of the demand: ``22 to 130 %``."""
+    if ends is None or ends[0] is None or ends[1] is None:
+        return ""
+    low, high = (_share(end * limit) for end in ends)
+    return f"{low.removesuffix('%').rstrip()} to {high}"
+
+
+def _suffix(unit: str) -> str:
+    return unit_symbol(unit) if unit == "deg" else f"\N{NO-BREAK SPACE}{unit}"
+
+
+def _quantity(value: float | None, unit: str) -> str:
+    return NONE if value is None else quantity(value, unit)

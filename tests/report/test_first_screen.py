@@ -1,0 +1,129 @@
+"""The first screen: what its rows, its caption and the colour of its bar say."""
+
+import html
+import json
+import re
+
+import pytest
+
+from characterisation.statements.verdict_words import Judged
+from characterisation.tasks.definitions import DEFINITIONS
+from mitsim.report.choice_document import read_choice
+from mitsim.report.first_rows import RowValues, measured_words, tolerance_words
+from mitsim.report.first_screen import of_choice, of_run, pose_words, tone_of
+from mitsim.report.numbers import with_degree_signs
+from mitsim.report.page import write_report
+from mitsim.report.run_folder import read_run
+from mitsim.report.scene_geometry import read_scene_geometry
+
+from .choice_run import write_choice
+from .conftest import MEASUREMENTS, write_run
+
+
+def judged(verdict: str, without_value: float = 0.0) -> Judged:
+    return Judged("a", "mm", verdict, 0.1, 0.2, without_value=without_value)
+
+
+@pytest.mark.parametrize(
+    ("results", "tone"),
+    [
+        ([judged("no tolerance")], "plain"),
+        ([judged("no tolerance"), judged("no tolerance", 0.19)], "warn"),
+        ([judged("fits"), judged("no tolerance", 0.01)], "good"),
+        ([judged("fits", 0.17)], "warn"),
+        ([judged("fits"), judged("not decided")], "warn"),
+        ([judged("fits", 0.5), judged("does not fit")], "bad"),
+        ([judged("undecidable")], "bad"),
+    ],
+)
+def test_the_bar_is_green_only_if_something_fits_and_nothing_is_lost(results, tone):
+    assert tone_of(results) == tone
+
+
+def values(**changed) -> RowValues:
+    known = {"name": "a", "about": "", "unit": "mm", "verdict": "not decided", "nominal": 20.0, "tolerance": 0.15}
+    return RowValues(**(known | {"uncertainty": 0.018, "without_value": 0.0, "rule": "ISO 14253-1, ..."} | changed))
+
+
+def test_a_share_is_given_with_its_limit_and_its_interval():
+    row = values(share=0.33, demand=1.32, demand_interval=(0.88, 5.2)).texts()
+    assert (row.share.split()[0], row.share_limit.split()[0]) == ("33", "25")
+    assert row.share_interval.replace("\N{NO-BREAK SPACE}", " ") == "22 to 130 %"
+    far = values(share=4.0, demand=16.0, demand_interval=(8.0, 1e280)).texts()
+    assert far.share_interval.endswith("over 1000\N{NO-BREAK SPACE}%")
+
+
+def test_a_rule_that_limits_a_risk_has_no_largest_share():
+    row = values(share=0.33, demand=1.32, demand_interval=(0.9, 1.9), rule="JCGM 106, ...").texts()
+    assert row.share.startswith("33") and row.share_limit == row.share_interval == ""
+    assert values(share=None, demand=None).texts().share_limit == ""
+
+
+@pytest.mark.parametrize("kind", DEFINITIONS)
+def test_a_measurement_is_told_by_its_kind_and_all_its_features(kind):
+    features = [f"face{k}" for k in range(len(DEFINITIONS[kind].kinds))]
+    told = measured_words(kind, features)
+    assert all(name in told for name in features) and "{" not in told and "_" not in told
+
+
+def test_measurements_of_files_without_kinds_are_told_by_their_features():
+    assert measured_words("", ["plane", "pin"]) == "plane and pin"
+    assert measured_words("intersection_distance", ["plane", "a", "b"]) == (
+        "distance between the points where the axes of a and b meet plane"
+    )
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "nominal", "unit", "told"),
+    [
+        (0.4, 70.0, "mm", "±0.4 mm"),
+        (0.6, 0.0, "deg", "up to 0.6°"),
+        ((-0.2, 0.0), 35.0, "mm", "+0 −0.2 mm"),
+        (None, 35.0, "mm", "–"),
+    ],
+)
+def test_a_tolerance_says_on_which_sides_it_lies(tolerance, nominal, unit, told):
+    assert tolerance_words(tolerance, nominal, unit).replace("\N{NO-BREAK SPACE}", " ") == told
+
+
+def test_degrees_have_one_sign_on_the_page():
+    assert with_degree_signs("u 0.11 deg, 0.070 deg needed; degree 4 deg_a") == "u 0.11°, 0.070° needed; degree 4 deg_a"
+
+
+def test_the_caption_tells_the_pose_in_plain_words(run_folder):
+    run = read_run(run_folder)
+    caption = of_run(run, read_scene_geometry(run_folder)).picture.caption.replace("\N{NO-BREAK SPACE}", " ")
+    here = run.scores.sel(view=run.statement.view)
+    assert f"view {run.statement.view}, the best of 12 views for all measurements together" in caption
+    for name, key in (("distance", "standoff_mm"), ("azimuth", "azimuth_deg"), ("elevation", "elevation_deg")):
+        assert f"{name} {float(here[key]):.0f}" in caption
+    assert f"roll {float(here['roll_deg']):.0f}°" in caption
+    assert pose_words(1.0, -2.0, 3.0, 4.0).count("°") == 3
+
+
+def test_without_tolerances_there_is_no_column_of_verdicts(tmp_path):
+    folder = write_run(tmp_path / "run")
+    stated = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
+    stated["measurements"] = {MEASUREMENTS[0]: stated["measurements"][MEASUREMENTS[0]]}
+    (folder / "statement.json").write_text(json.dumps(stated), encoding="utf-8")
+    table = re.search(
+        r'<table id="verdicts">(.*?)</table>', write_report(folder).read_text(encoding="utf-8"), re.DOTALL
+    )
+    said = html.unescape(re.sub(r"<[^>]*>|\s+", " ", table[1]))
+    assert "Verdict" not in said and "no tolerance" not in said
+    assert re.search(r"Nominal .* No value of 200 virtual measurements", said)
+    assert "0 mm" in said and "13 %" in said and re.search(r"noise on \S+ +\d+ points", said)
+
+
+def test_values_that_are_missing_are_told_of_a_comparison_without_tolerances(tmp_path):
+    folder = write_choice(tmp_path / "choice")
+    document = json.loads((folder / "choice.json").read_text(encoding="utf-8"))
+    for one in document["measurements"].values():
+        one["tolerance"] = None
+    for one in document["sensors"]:
+        for cell in one["measurements"].values():
+            cell |= {"verdict": "no tolerance", "without_value": 0.29}
+    (folder / "choice.json").write_text(json.dumps(document), encoding="utf-8")
+    first = of_choice(read_choice(folder), None)
+    assert first.tone == "warn" and "no value in 29 % of the virtual measurements" in first.words
+    assert not first.tolerances
