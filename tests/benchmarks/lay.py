@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from characterisation.coupon.patches import overall
+from characterisation.coupon.patch_table import overall
 from mitsim.campaign.acquire import in_turn, simulated_source
 from mitsim.campaign.one_finish import OneFinish, one_finish_campaign, plan_of
 from mitsim.scene import backend
