@@ -169,7 +169,7 @@ def _match_disparities(
     best_back = np.full(scale_right.shape, -1.0, np.float32)
     back = np.full(scale_right.shape, np.nan, np.float32)
     for k in range(count):
-        # what the requested columns see, and what else sees the same right pixels
+        # the right pixels that the requested columns see, and all left pixels that see them
         left_columns = slice(max(begin - count + 1 + k - reach - low, 0), min(end + k + reach - low, left.shape[2]))
         right_columns = slice(left_columns.start + count - k, left_columns.stop + count - k)
         products = np.zeros((left.shape[1], left_columns.stop - left_columns.start), np.float32)

@@ -102,8 +102,8 @@ def structured_light_geometry(
     Raises
     ------
     InputError
-        If there is no such camera or no projector, or if the code's coordinate changes with depth at no pixel, or too
-        unevenly for a polynomial.
+        If the rig has no such camera or no projector, or the code's coordinate changes with depth at no pixel, or too
+        unevenly.
     """
     if camera_name not in rig.cameras:
         hint = nearest(camera_name, list(rig.cameras))

@@ -33,7 +33,7 @@ def interpolate_between_edges(
     """Interpolate coordinates along rows between the edges of stripes.
 
     A pixel whose stripe has only one edge, as beside an occlusion, is extrapolated. It uses the slope of the stripe
-    beyond that edge, and stays within its own stripe. A pixel without an edge, or without such a neighbouring stripe,
+    beyond that edge, and stays within its own stripe. A pixel without an edge, or without that neighbouring stripe,
     has no position within its stripe. Its coordinate is NaN.
 
     Parameters

@@ -93,7 +93,7 @@ def decode_structured_light_stereo(
     """
     if "columns" not in axes(code):
         raise InputError(
-            "pattern", "axis", ", ".join(axes(code)), "'columns' or 'both', for cameras that stand side by side"
+            "pattern", "axis", ", ".join(axes(code)), "'columns' or 'both', for cameras that are side by side"
         )
     geometry = rig if isinstance(rig, StereoGeometry) else stereo_geometry(rig)
     roi, read_out = context.roi, context.read_out
