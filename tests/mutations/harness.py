@@ -1,19 +1,24 @@
 """Mutations by seed, each read in a child process: what ends in a traceback, a crash or a hang is told.
 
+The children are forked from a process that has imported most of what readers need, so that each begins at once.
+
 ``python -m mutations.harness --count 20000 --seed 1`` from ``tests``. Everything is written below a folder of its own,
 which is removed; a child that is told to stop is one that was started here. No link is made, and none is followed.
 """
 
 import argparse
 import collections
+import faulthandler
+import multiprocessing
 import os
 import random
 import selectors
-import subprocess
 import sys
 import tempfile
 import time
+from multiprocessing import forkserver
 from pathlib import Path
+from unittest import mock
 
 #: seconds in which one mutation is to be read; address space of a child [bytes], of which compilers reserve much
 PATIENCE_S, MEMORY = 20.0, 12 << 30
@@ -21,89 +26,104 @@ PATIENCE_S, MEMORY = 20.0, 12 << 30
 #: how a mutation may end
 GOOD = ("refused", "accepted")
 
+#: what the children have in common; none of it starts Mitsuba, whose threads a fork would lose
+IMPORTED = [
+    "mutations.readers",
+    "report.conftest",
+    "mitsim.authoring.read_mesh",
+    "mitsim.campaign.plan",
+    "mitsim.recordings.recognise",
+    "netCDF4",
+    "scipy.io",
+]
+
 
 def run(count: int, seed: int, names: list[str], seconds: float = float("inf")) -> dict[str, collections.Counter]:
     """Outcomes by class; those that are not good are keyed by what they were, with a seed that gives them again."""
     found = {name: collections.Counter() for name in names}
     each = -(-count // len(names))
+    forks = _forks()
     end = time.monotonic() + seconds
     order = list(names)
     random.Random(seed).shuffle(order)
     for number, name in enumerate(order):
         left = end - time.monotonic()
         share = left / (len(order) - number)
-        _class(name, range(seed * 1_000_000, seed * 1_000_000 + each), found[name], time.monotonic() + share)
+        _class(forks, name, range(seed * 1_000_000, seed * 1_000_000 + each), found[name], time.monotonic() + share)
         rest = sorted(set(found[name]) - set(GOOD))
         print(f"{name}: {sum(found[name].values())} tried", *rest, sep="\n    ", file=sys.stderr, flush=True)
     return found
 
 
-def _class(name, seeds, found, end):
+def _class(forks, name, seeds, found, end):
     at = 0
     seeds = list(seeds)
     while at < len(seeds) and time.monotonic() < end:
         with tempfile.TemporaryDirectory(prefix="mitsim-mutations-") as folder:
-            command = [
-                sys.executable,
-                "-m",
-                "mutations.harness",
-                "--child",
-                name,
-                "--folder",
-                folder,
-                "--from",
-                str(seeds[at]),
-                "--count",
-                str(len(seeds) - at),
-            ]
-            tests = Path(__file__).resolve().parents[1]
-            paths = [str(tests), str(tests.parent), os.environ.get("PYTHONPATH", "")]
-            environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "PYTHONFAULTHANDLER": "0"}
-            with subprocess.Popen(
-                command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=folder, env=environment, text=True
-            ) as child:
-                at += _followed(child, seeds[at:], found, end)
+            told, telling = forks.Pipe(duplex=False)
+            given = (name, Path(folder), seeds[at], len(seeds) - at, telling)
+            reading = forks.Process(target=child, name=name, args=given)
+            reading.start()
+            telling.close()  # the child's end alone is left, and ends with it
+            with told:
+                at += _followed(reading, told, seeds[at:], found, end)
+            reading.join()
 
 
-def _followed(child, seeds, found, end):
+def _forks():
+    """The context of processes that are forked from one that has imported :data:`IMPORTED`."""
+    forks = multiprocessing.get_context("forkserver")
+    forks.set_forkserver_preload(IMPORTED)
+    tests = Path(__file__).resolve().parents[1]
+    paths = [str(tests), str(tests.parent), os.environ.get("PYTHONPATH", "")]
+    with mock.patch.dict(os.environ, {"PYTHONPATH": os.pathsep.join(paths)}):
+        forkserver.ensure_running()
+    first = forks.Process(target=time.sleep, args=(0,))
+    first.start()  # waits until all is imported
+    first.join()
+    return forks
+
+
+def _followed(reading, told, seeds, found, end):
     """Count what a child tells; returns how many seeds are done with."""
-    assert child.stdout is not None
     done = 0
     waiting = selectors.DefaultSelector()
-    waiting.register(child.stdout, selectors.EVENT_READ)
+    waiting.register(told, selectors.EVENT_READ)
     first, begun = True, False
-    since, used = time.monotonic(), _seconds_of(child.pid)
+    since, used = time.monotonic(), _seconds_of(reading.pid)
     while True:
         if time.monotonic() > end:
-            child.kill()
+            reading.kill()
             return len(seeds)
         if not waiting.select(1.0):
             patience = PATIENCE_S * (3 if first else 1)
-            waited, worked = time.monotonic() - since, _seconds_of(child.pid) - used
+            waited, worked = time.monotonic() - since, _seconds_of(reading.pid) - used
             if waited > patience and (worked > patience / 2 or waited > 10 * patience):  # others may use the machine
-                child.kill()
+                reading.kill()
                 found[f"HANG (seed {seeds[done]})"] += 1
                 return done + 1
             continue
         first = False
-        since, used = time.monotonic(), _seconds_of(child.pid)
-        line = child.stdout.readline()
-        begun = begun or line.startswith("sound")
-        if not line:
-            code = child.wait()
+        since, used = time.monotonic(), _seconds_of(reading.pid)
+        try:
+            line = told.recv()
+        except EOFError:
+            reading.join()
             if not begun:
-                raise RuntimeError(f"the sound file is refused (exit code {code}): {' '.join(map(str, child.args))}")
+                raise RuntimeError(
+                    f"{reading.name}: the sound file is refused (exit code {reading.exitcode})"
+                ) from None
             if done < len(seeds):
-                found[f"CRASH {code} (seed {seeds[done]})"] += 1
+                found[f"CRASH {reading.exitcode} (seed {seeds[done]})"] += 1
                 done += 1
             return done
-        if line.startswith("= "):
-            outcome = line[2:].strip()
-            found[outcome if outcome in GOOD else f"{outcome} (seed {seeds[done]})"] += 1
-            done += 1
-            if done == len(seeds):
-                child.wait()
-                return done
+        if line == "sound":
+            begun = True
+            continue
+        found[line if line in GOOD else f"{line} (seed {seeds[done]})"] += 1
+        done += 1
+        if done == len(seeds):
+            return done
 
 
 def _seconds_of(pid: int) -> float:
@@ -115,8 +135,8 @@ def _seconds_of(pid: int) -> float:
         return 0.0
 
 
-def child(name: str, folder: Path, start: int, count: int) -> None:
-    """Read mutation after mutation, and say of each how it ended."""
+def child(name, folder, start, count, telling) -> None:
+    """Read mutation after mutation in ``folder``, and send how each ended to the pipe's end ``telling``."""
     import resource
     import traceback
     import warnings
@@ -130,15 +150,18 @@ def child(name: str, folder: Path, start: int, count: int) -> None:
     from mutations.readers import READERS
 
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    out = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)
+    faulthandler.disable()
+    os.chdir(folder)
+    with Path(os.devnull).open("wb") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+        os.dup2(nowhere.fileno(), 2)
     warnings.simplefilter("ignore")
     reader = READERS[name]
     path = reader.sound(folder)
     sound = path.read_bytes()
     data = xr.load_dataset(path) if reader.dataset else None
     reader.read(path)  # what is sound is accepted
-    print("sound", file=out, flush=True)
+    telling.send("sound")
     for seed in range(start, start + count):
         rng = np.random.default_rng(seed)
         if data is None:
@@ -148,7 +171,7 @@ def child(name: str, folder: Path, start: int, count: int) -> None:
             try:
                 mutated_dataset(data, rng).to_netcdf(path)
             except Exception:  # a dataset that netCDF cannot hold is no mutation
-                print("= accepted", file=out, flush=True)
+                telling.send("accepted")
                 path.write_bytes(sound)
                 continue
         outcome = "accepted"
@@ -161,7 +184,7 @@ def child(name: str, folder: Path, start: int, count: int) -> None:
             ours = [f for f in frames if "/mitsim/" in f.filename or "/characterisation/" in f.filename] or frames
             place = f"{Path(ours[-1].filename).name}:{ours[-1].lineno}"
             outcome = f"{type(error).__name__} at {place}: {' '.join(str(error).split())[:120]}"
-        print(f"= {outcome}", file=out, flush=True)
+        telling.send(outcome)
 
 
 def main() -> int:
@@ -172,13 +195,7 @@ def main() -> int:
     asked.add_argument("--seed", type=int, default=1)
     asked.add_argument("--seconds", type=float, default=float("inf"))
     asked.add_argument("--only", nargs="*", help="classes, all by default")
-    asked.add_argument("--child", help=argparse.SUPPRESS)
-    asked.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
-    asked.add_argument("--from", dest="start", type=int, default=0, help=argparse.SUPPRESS)
     given = asked.parse_args()
-    if given.child:
-        child(given.child, given.folder, given.start, given.count)
-        return 0
     found = run(given.count, given.seed, given.only or list(READERS), given.seconds)
     bad = 0
     for name, outcomes in sorted(found.items()):
