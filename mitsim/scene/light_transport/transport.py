@@ -136,7 +136,7 @@ def trace_poses(
 ) -> NDArray[np.float32]:
     """Return the radiance of :func:`trace` for whole images at several poses: (poses, P, height, width).
 
-    Poses that fit into one launch share it. To record a kernel takes longer than to render some 20 000 pixels.
+    Poses that fit into one launch share it. Recording a kernel takes about as long as rendering 20 000 pixels.
     """
     pixels = rays.camera.width * rays.camera.height
     together = min(
