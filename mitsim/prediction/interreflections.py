@@ -181,7 +181,10 @@ class InterreflectionEffect:
         if place is None:
             return self.look(scene, pose)
         if place not in self.ready:
-            images = self.look_from(scene, self.poses[place : place + TOGETHER])
+            end = place + TOGETHER
+            if len(self.poses) == end + 1:  # a render of one view would be another kernel
+                end += 1
+            images = self.look_from(scene, self.poses[place:end])
             self.ready = dict(enumerate(images, place))
         return self.ready.pop(place)
 
