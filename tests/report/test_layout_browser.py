@@ -5,6 +5,7 @@ import json
 import pytest
 
 from mitsim.report.choice_page import write_choice_page
+from mitsim.report.numbers import percent
 from mitsim.report.page import write_report
 
 from .choice_run import write_choice
@@ -134,7 +135,7 @@ def test_a_set_of_many_views_is_read_from_its_top_and_without_scrolling(browser,
 
 def test_planned_exposures_are_told_as_one_list(pages):
     text = pages["sets"].read_text(encoding="utf-8")
-    assert "Expose 0.815, 2.31 and 13.1 ms, merged, at 50 % of the projector" in text
+    assert f"Expose 0.815, 2.31 and 13.1 ms, merged, at {percent(0.5)} of the projector" in text
 
 
 def test_pages_are_small(pages):

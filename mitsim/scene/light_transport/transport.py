@@ -136,18 +136,16 @@ def trace_poses(
 ) -> NDArray[np.float32]:
     """Return the radiance of :func:`trace` for whole images at several poses: (poses, P, height, width).
 
-    Poses that fit into one launch share it. To record a kernel takes longer than to render some 20 000 pixels.
+    Poses that fit into one launch share it. Recording a kernel takes about as long as rendering 20 000 pixels.
     """
     pixels = rays.camera.width * rays.camera.height
-    together = min(
-        LARGEST_LAUNCH // (pixels * (light.count + 1)), PHOTONS_AT_ONCE // max(1, paths.photon_count(pixels))
+    together = max(
+        1, min(LARGEST_LAUNCH // (pixels * (light.count + 1)), PHOTONS_AT_ONCE // max(1, paths.photon_count(pixels)))
     )
-    together = max(1, together)
+    # of about equal size: a launch of one pose would be another kernel
+    launches = np.array_split(np.arange(len(poses)), -(-len(poses) // together))
     return np.concatenate(
-        [
-            _traced(scene, rays, light, poses[first : first + together], paths, rays.whole)
-            for first in range(0, len(poses), together)
-        ]
+        [_traced(scene, rays, light, [poses[k] for k in launch], paths, rays.whole) for launch in launches]
     )
 
 
