@@ -176,7 +176,7 @@ def _interval(ends: tuple[float | None, float | None] | None, limit: float) -> s
     """Return the interval of a share from that of the demand: ``22 to 130 %``."""
     if ends is None or ends[0] is None or ends[1] is None:
         return ""
-    low, high = (_share(end * limit) for end in ends)
+    low, high = _share(ends[0] * limit), _share(ends[1] * limit)
     return f"{low.removesuffix('%').rstrip()} to {high}"
 
 

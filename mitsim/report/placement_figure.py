@@ -290,7 +290,7 @@ def _axes_of_part(axes: Axes, turn: Floats) -> None:
         axes.annotate("", tuple(tip), tuple(origin), arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 1.0})
         way = tip - origin
         beyond = tip + 0.35 * size * way / max(float(np.linalg.norm(way)), 0.2 * size)
-        axes.text(*beyond, name, ha="center", va="center", fontsize=8, color=MUTED)
+        axes.text(float(beyond[0]), float(beyond[1]), name, ha="center", va="center", fontsize=8, color=MUTED)
     axes.set_ylim(bottom - 2.6 * size, top)
 
 
