@@ -15,8 +15,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from tests.authoring.author import Author
 from tests.authoring.bracket import bracket, write_step
-from tests.authoring.test_page import Author
 from tests.report.chromium import Chromium
 
 

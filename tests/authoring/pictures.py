@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from tests.authoring.author import Author
 from tests.authoring.bracket import bracket, write_step
-from tests.authoring.test_page import Author
 from tests.report.chromium import Chromium
 
 

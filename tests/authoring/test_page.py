@@ -20,6 +20,7 @@ from shell import mitsim_here
 from mitsim.authoring.read_step import step_installed
 from mitsim.report.author_page import fair_share
 from mitsim.study import read_study
+from tests.authoring.author import Author
 from tests.authoring.bracket import bracket, write_step
 from tests.report.chromium import BROWSER, Chromium
 
@@ -93,55 +94,6 @@ def covered(words, lines):
             bad |= other != own and bool(within.all(axis=1).any())
         found += [words[k]] if bad else []
     return found
-
-
-class Author:
-    """The page, by what a person does on it."""
-
-    def __init__(self, browser, address):
-        self.browser = browser
-        browser.problems.clear()
-        browser.requests.clear()
-        browser.call("Page.navigate", url=address)
-        browser.until("document.querySelector('#author-name, #author-face p') !== null")
-        browser.rest()
-
-    def choose(self, *names):
-        """Click faces in the list, the later ones with Ctrl."""
-        for number, name in enumerate(names):
-            self.browser.tell(
-                f"[...document.querySelectorAll('[data-face]')].find((one) => one.textContent === {name!r})"
-                f".dispatchEvent(new MouseEvent('click', {{bubbles: true, ctrlKey: {str(number > 0).lower()}}}))"
-            )
-
-    def type(self, selector, text):
-        """Replace the text of a field by the keyboard, with Enter at its end."""
-        self.browser.tell(f"(() => {{ const e = document.querySelector({selector!r}); e.focus(); e.select(); }})()")
-        self.browser.call("Input.insertText", text=text)
-        self.browser.press("Enter")
-
-    def pick(self, selector, value):
-        self.browser.tell(
-            f"(() => {{ const e = document.querySelector({selector!r}); e.value = {value!r};"
-            " e.dispatchEvent(new Event('change')); })()"
-        )
-
-    def measure(self, kind, tolerance):
-        self.pick("#author-kind", kind)
-        self.type("#author-tolerance", tolerance)
-
-    def downloaded(self):
-        """Texts of the files that the page offers on saving, the scene first, then the task."""
-        self.browser.tell("window.kept = []; URL.createObjectURL = (blob) => { kept.push(blob); return 'blob:none'; }")
-        self.browser.tell("document.getElementById('author-save').click()")
-        return self.browser.tell("Promise.all(kept.map((one) => one.text()))")
-
-    @property
-    def says(self):
-        return self.browser.tell("document.getElementById('author-status').textContent")
-
-    def faces(self):
-        return self.browser.tell("[...document.querySelectorAll('[data-face]')].map((one) => one.textContent)")
 
 
 @pytest.fixture(scope="module")
