@@ -105,8 +105,9 @@ class Regret:
 
     ``risk`` of the chosen view and ``least`` risk of all views [unit of the measurement], and their ``ratio``. The
     least of many estimates is too low by chance, so ``ratio`` is too high. ``unbiased`` selects the best view in one
-    half of the worlds and compares both views in the other half. It is the geometric mean over random halves. ``low``
-    and ``high`` are the 95 % interval of ``unbiased`` over the choice of worlds.
+    half of the worlds and compares both views in the other half. It is the geometric mean over random halves, and
+    ``middle`` their median, which no single half without a value of the best view can move. ``low`` and ``high`` are
+    the 95 % interval of ``unbiased`` over the choice of worlds.
     """
 
     risk: float
@@ -114,6 +115,7 @@ class Regret:
     best: int
     ratio: float
     unbiased: float
+    middle: float
     low: float
     high: float
 
@@ -140,6 +142,7 @@ def regret(errors: ArrayLike, chosen: int, seed: int = 0, block: int = 1) -> Reg
         best,
         ratio,
         float(np.exp(drawn.mean())),
+        float(np.exp(np.median(drawn))),
         float(np.exp(low)),
         float(np.exp(high)),
     )

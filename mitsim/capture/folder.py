@@ -297,4 +297,4 @@ def check_free(folder: Path, overwrite: bool = False) -> None:
     if not (folder / "capture.json").is_file():
         raise InputError(folder, "", "a file or folder that is not a capture", "a new or empty folder")
     if not overwrite:
-        raise InputError(folder, "", "an existing capture", "a new folder", "or remove this one first")
+        raise InputError(folder, "", "an existing capture", "a new folder", "remove this one first, or name another")

@@ -94,7 +94,9 @@ _REGRET_HEAD = (
     "unbiased",
     "low",
     "high",
+    "median",
     "unbiased_pooled",
+    "median_pooled",
     "decided",
 )
 
@@ -123,6 +125,8 @@ def _regret_row(one: Choice) -> tuple[Any, ...]:
         found.unbiased,
         found.low,
         found.high,
+        found.middle,
         one.regret_pooled.unbiased,
+        one.regret_pooled.middle,
         decided,
     )

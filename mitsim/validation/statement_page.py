@@ -63,7 +63,8 @@ def write_statement_page(cases: Sequence[JudgedCase], folder: str | Path, preamb
         verdict_table(cases),
         "\n## Regret\n\nRisk of the chosen view over the least of all candidates. *plain*: as estimated; the least of "
         "many estimates is too low by chance. *unbiased*: the best view is sought in half of the worlds, and both are "
-        "judged in the other half. Every two worlds have their own finish. *pooled*: judged as before November 2026, "
+        "judged in the other half; the geometric mean over random halves. *median*: their median. "
+        "Every two worlds have their own finish. *pooled*: judged as before November 2026, "
         "in worlds that share eight finishes.\n\n",
         regret_table(choices),
     ]
@@ -169,11 +170,25 @@ def regret_table(choices: Sequence[Choice]) -> str:
                 number(one.regret.least),
                 number(one.regret.ratio),
                 f"{number(one.regret.unbiased)} ({number(one.regret.low)} to {number(one.regret.high)})",
+                number(one.regret.middle),
                 *(number(other.unbiased) for other in others),
                 number(one.regret_pooled.unbiased),
             ]
         )
-    head = ["part", "sensor", "measurement", "chosen", "best", "risk", "least", "plain", "unbiased", PREDICTED, TALK]
+    head = [
+        "part",
+        "sensor",
+        "measurement",
+        "chosen",
+        "best",
+        "risk",
+        "least",
+        "plain",
+        "unbiased",
+        "median",
+        PREDICTED,
+        TALK,
+    ]
     return markdown([*head, "pooled"], body)
 
 
@@ -206,8 +221,10 @@ def _mean_regret(choices: Sequence[Choice], key: str = "regret") -> str:
     found: list[Regret] = [getattr(one, key) for one in choices if one.judged]
     if not found:
         return "-"
-    plain, unbiased = (float(np.mean([getattr(one, name) for one in found])) for name in ("ratio", "unbiased"))
-    return f"{number(unbiased)} (plain {number(plain)})"
+    mean = {
+        key: number(float(np.mean([getattr(one, key) for one in found]))) for key in ("unbiased", "middle", "ratio")
+    }
+    return f"{mean['unbiased']} (median {mean['middle']}, plain {mean['ratio']})"
 
 
 def _share(one: Share) -> str:

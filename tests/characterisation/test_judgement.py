@@ -85,3 +85,12 @@ def test_regret_of_a_view_without_a_value_is_infinite():
     errors = np.ones((2, 10))
     errors[1] = np.nan
     assert regret(errors, 1).ratio == np.inf and regret(errors, 1).unbiased == np.inf
+
+
+def test_one_half_without_a_value_of_the_best_view_does_not_move_the_median():
+    """The best view has values in the first fifth of the worlds only; halves that lack them say nothing about it."""
+    rng = np.random.default_rng(6)
+    errors = np.array([3.0, 1.0])[:, None] * rng.normal(size=(2, 30))
+    errors[1, 3:] = np.nan
+    found = regret(errors, 0)
+    assert found.unbiased == 0 and found.middle > 0

@@ -530,7 +530,7 @@ def test_without_the_extra_other_recordings_load_and_these_say_what_to_install(r
     """In a process of its own, where none of its packages can be imported."""
     code = (
         "import sys; sys.modules.update(dict.fromkeys(('mcap', 'mcap_protobuf', 'lz4', 'zstandard', 'google')))\n"
-        "import mitsim.commands.captures, mitsim.measuring.clouds\n"
+        "import mitsim.commands.import_recording, mitsim.measuring.clouds\n"
         "from mitsim.errors import MissingEnvironmentError\n"
         "from mitsim.recordings.recognise import Given, read_recording\n"
         "try: read_recording(sys.argv[1], Given(frame=0))\n"

@@ -244,7 +244,7 @@ def test_the_same_import_again_is_finished_and_sweeps_what_a_killed_one_left(tmp
     first, second = run(*call), run(*call)
     assert not half.exists()
     assert "finished before" in second.stderr and "finished before" not in first.stderr
-    with pytest.raises(InputError, match="another capture"):
+    with pytest.raises(InputError, match="an existing capture"):
         run(*call, "--range", 690, 710)
     (tmp_path / "c" / "settings.json").write_text("{}")
     with pytest.raises(InputError, match=r"settings\.json"):
