@@ -1,6 +1,7 @@
 """A finish that a map does not know: `run`, `budget` and `choose` ask alike, and characterise it when they may.
 
-Clouds of a known F and sigma stand in for the campaign's light; the virtual measurements are real.
+Clouds of a known F and sigma stand in for the campaign's light, and virtual measurements are drawn from the map
+that it ends in.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from small_study import small_study
 
 #: milled steel of Ra 3.2 on the plane: the map of the N10 knows ground aluminium from 0.09 to 0.74, and matt white
 STUDY = small_study("{ plane_Ra = 3.2 }")
+DRAWN = STUDY.replace("[measure]\n", '[measure]\nby = "map"\n')
 COMMANDS = {"run": [], "budget": ["--view", "1"], "choose": ["--sensors", "ensenso-n10"]}
 QUESTION = r"ensenso-n10: its map lacks .*Ra 3\.2.*; characterise now \(about \d+ (s|min)\)\?"
 
@@ -39,6 +41,7 @@ invoked = partial(mitsim_here, code=(0, 1))
 @pytest.mark.parametrize("command", COMMANDS)
 def test_with_yes_the_finish_is_characterised_and_the_command_goes_on(command, study, quick, tmp_path):
     out = tmp_path / "out"
+    study.write_text(DRAWN)
     done = invoked(command, study, *COMMANDS[command], "--yes", "-o", out)
     assert len(quick) >= 1
     assert re.search(r"ensenso-n10: characterising .*Ra 3\.2.* in about \d+ (s|min); kept in ", done.stderr)

@@ -6,6 +6,7 @@ import json
 import re
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import typer.main
@@ -13,6 +14,7 @@ from shell import mitsim_here
 from small_study import small_study
 
 from mitsim.cli import app
+from mitsim.exposures import planned
 
 #: ground aluminium of Ra 0.37: from the side the N10's own exposure, 1.15 ms, is too short
 STUDY = small_study("{ plane_Ra = 0.37, pillar_Ra = 0.37 }")
@@ -24,12 +26,44 @@ SAID = r"view {view}: expose (.* ms, at full power): every (other )?feature is a
 invoked = partial(mitsim_here, code=(0, 1))
 
 
+def asked(study, _, view, rules):
+    """What a plan follows from: two that agree in it are the same to the last bit."""
+    light = {"scene", "parameters", "task", "seed", "unknowns", "measure", "exposure"}
+    file = study.file.model_dump(mode="json", include=light)
+    return file, study.sensor.name, view.number, view.world_from_sensor.matrix().tolist(), rules
+
+
+class Plans:
+    """Plans that were made, by what they follow from: a plan takes half of a command's time."""
+
+    def __init__(self, plan_view):
+        self.plan_view, self.made, self.taken_again = plan_view, [], 0
+
+    def anew(self, *given):
+        self.made.append((asked(*given), self.plan_view(*given)))
+        return self.made[-1][1]
+
+    def kept(self, *given):
+        """The plan that was made of the same; a command that asks for another has to make it."""
+        for known, plan in self.made:
+            if known == asked(*given):
+                self.taken_again += 1
+                return plan
+        return self.anew(*given)
+
+
 @pytest.fixture(scope="module")
-def chosen(tmp_path_factory):
+def plans():
+    return Plans(planned.plan_view)
+
+
+@pytest.fixture(scope="module")
+def chosen(tmp_path_factory, plans):
     """What `run --plan-exposures` left and said, and the number of the view that it stated."""
     folder = tmp_path_factory.mktemp("planned")
     (folder / "study.toml").write_text(STUDY)
-    done = invoked("run", folder / "study.toml", "--plan-exposures", "-o", folder / "run")
+    with mock.patch.object(planned, "plan_view", plans.anew):
+        done = invoked("run", folder / "study.toml", "--plan-exposures", "-o", folder / "run")
     return folder, done, json.loads((folder / "run/statement.json").read_text())["view"]
 
 
@@ -48,11 +82,16 @@ def test_run_states_its_view_with_the_planned_exposure(chosen):
 
 
 @pytest.mark.parametrize("command", ["budget", "choose"])
-def test_budget_and_choose_plan_as_run_does(chosen, command):
-    """Of the same view the plan, and what is said of it, are the same; the statement holds for it."""
+def test_budget_and_choose_plan_as_run_does(chosen, plans, command):
+    """Of the same view the plan, and what is said of it, are the same; the statement holds for it.
+
+    `budget` makes its plan anew. `choose` has to ask for the very plan that `run` made, and gets that.
+    """
     folder, done, view = chosen
     more = ["--view", view] if command == "budget" else ["--sensors", "ensenso-n10"]
-    other = invoked(command, folder / "study.toml", *more, "--plan-exposures", "-o", folder / command)
+    with mock.patch.object(planned, "plan_view", plans.anew if command == "budget" else plans.kept):
+        other = invoked(command, folder / "study.toml", *more, "--plan-exposures", "-o", folder / command)
+    assert plans.taken_again == (command == "choose")
     where = folder / command / ("ensenso-n10" if command == "choose" else "")
     stated = statement_in(where)
     assert stated["view"] == view

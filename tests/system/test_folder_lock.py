@@ -19,7 +19,7 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
 
 HOLD = "import sys, time, pathlib; from mitsim.commands.folder_lock import lock_folder; f = pathlib.Path(sys.argv[1]); "
 HOLD += "release = lock_folder(f); (f / f'.scores.csv.{__import__(\"os\").getpid()}.partial').write_text('half'); "
-HOLD += "print('held', flush=True); time.sleep(60)"
+HOLD += "print('held', flush=True); time.sleep(600)"
 
 
 @pytest.fixture

@@ -14,6 +14,14 @@ from report.conftest import write_run  # noqa: E402
 MOUNT = 'mount --bind "$0" "$0" && mount -o remount,ro,bind "$0" && exec "$@"'
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a run, which no command here can change."""
+    made = tmp_path_factory.mktemp("read_only")
+    write_run(made / "run")
+    return made
+
+
 @pytest.mark.parametrize(
     ("command", "told"),
     [
@@ -25,10 +33,9 @@ MOUNT = 'mount --bind "$0" "$0" && mount -o remount,ro,bind "$0" && exec "$@"'
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
-def test_a_read_only_folder_is_one_line(tmp_path, command, told):
-    write_run(tmp_path / "run")
+def test_a_read_only_folder_is_one_line(folder, command, told):
     for names in ("-rm", "-m"):  # as anybody, where user namespaces are allowed; as root, where they are not
-        unshared = ["unshare", names, "sh", "-c", MOUNT, str(tmp_path)]
+        unshared = ["unshare", names, "sh", "-c", MOUNT, str(folder)]
         try:
             if subprocess.run([*unshared, "true"], capture_output=True, check=False).returncode == 0:
                 break
@@ -36,7 +43,7 @@ def test_a_read_only_folder_is_one_line(tmp_path, command, told):
             pytest.skip("no unshare on this system")
     else:
         pytest.skip("no mounts here")
-    call = [sys.executable, "-m", "mitsim", *(one.format(tmp_path) for one in command)]
+    call = [sys.executable, "-m", "mitsim", *(one.format(folder) for one in command)]
     done = subprocess.run([*unshared, *call], capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 2, done.stderr
     assert told in done.stderr.splitlines()[-1]
