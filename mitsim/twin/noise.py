@@ -68,7 +68,7 @@ def fit_imager(groups: list[list[Take]], sensor: Sensor, places: dict[str, Place
     if dark:
         imager, level = _with_black_level(imager, dark)
         estimates.append(level)
-    imager, curve = _with_curve(imager, groups, sensor, places)
+    imager, curve = _with_curve(imager, groups, sensor)
     estimates += curve
     if repeated:
         line = repeated_line([_repeats(group, _there(group[0], places)) for group in repeated], imager)
@@ -149,15 +149,16 @@ def _there(take: Take, places: dict[str, Place]) -> NDArray[np.bool_]:
     return image_mask(places[take.name], camera, MARGIN_PX)
 
 
-def _with_curve(
-    imager: Imager, groups: list[list[Take]], sensor: Sensor, places: dict[str, Place]
-) -> tuple[Imager, list[Estimate]]:
-    """Return the imager with the knee of its curve, if one image shows it; only stereo sensor files may have one."""
+def _with_curve(imager: Imager, groups: list[list[Take]], sensor: Sensor) -> tuple[Imager, list[Estimate]]:
+    """Return the imager with the knee of its curve, if one image shows it; only stereo sensor files may have one.
+
+    The whole image is used: a curve belongs to the imager, whatever it sees. Black and saturated pixels are left out.
+    """
     if sensor.technology != "active_stereo" or imager.companding or imager.gamma != 1:
         return imager, []
     for take in (group[0] for group in groups if group[0].kind == "off"):
         image = next(iter(take.capture.images.values()))[0]
-        levels, there = image.astype(float), _there(take, places)
+        levels, there = image.astype(float), (image > 0) & (image < imager.full_scale)
         clean = denoised(levels, there)
         knee = first_knee(levels, clean, quiet_pixels(levels, clean, there), imager)
         if knee is not None:

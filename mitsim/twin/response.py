@@ -1,47 +1,66 @@
 """The first knee of an imager's response curve, by the noise of one image over its levels.
 
-Signal chain: image, printed or not -> the same without noise (:mod:`mitsim.validation.denoise`) -> pixels where the
-print has no finest detail of its own -> variance of the finest detail by level, in bins of 2 DN -> a straight line,
-against one that a companding curve bends at the level K. A pixel of level m has the variance
+Signal chain: image -> the same without noise (:mod:`mitsim.validation.denoise`) -> tiles of 32 px, and in them the
+pixels whose finest detail is noise -> likelihood of the squared finest detail for a straight curve, and for curves with
+a knee at K and the slope g beyond it -> K, g, and the uncertainty of K by a jackknife over the tiles.
 
-    v = a + b m + 1/12  below K,        v = g^2 (a + b (K + (m - K) / g)) + 1/12  above,        g = 1/2, 1/4 or 1/8
+In the converter's levels u, noise has the variance s^2 = a + b (u - black). The curve takes u + z to
 
-and finest detail that of its 25 pixels, each by the square of its weight: at the edge of a print they differ.
+    x - (1 - g) max(x - K, 0),      x = u + z
 
-Photon noise grows with the level, so bright pixels that are quieter than dark ones show a curve that is flatter there.
-Chips compand by steps of two ("hardware gamma": imagers of the MT9V03x family convert 12 bits to 10 so, data sheet; the
-uEye manual says it of the cameras with them). Beyond the brightest level seen the curve is assumed to go on with g.
+With z normal, t = (u - K) / s, e1 = phi(t) + t Phi(t) and e2 = (1 + t^2) Phi(t) + t phi(t), a pixel has
+
+    mean M(u) = u - (1 - g) s e1,      variance s^2 [1 - 2 (1 - g) Phi(t) + (1 - g)^2 (e2 - e1^2)] + 1/12
+
+The chip rounds down behind its curve: with a knee of 80 DN in the sensor file, level 80 is the first that holds 1 / g
+levels of the converter, from 79.5 on. So K is half a level under the file's knee. Finest detail is a sum over 25
+pixels. Its variance is the mean of theirs by the squares of its weights: at an edge they differ.
+
+Photon noise grows with the level. Bright pixels that are quieter than dark ones therefore show a curve that is flatter
+there. Chips compand by steps of two (data sheets of the MT9V03x family: 12 bits to 10). Levels beyond the brightest
+pixel are unknown; the curve is assumed to go on with g.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
-from scipy.optimize import nnls
+from scipy.stats import norm
 
 from mitsim.fit.fine_detail import FINEST, finest_detail, noise_of_levels
 from mitsim.sensor.imager import Imager
 from mitsim.twin.photon_transfer import independent_share
 
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
-#: width of a bin [DN], pixels of one at least, bins on either side of a knee at least
-_BIN_DN, _PIXELS, _BINS = 2.0, 40, 3
+#: side of a tile and its rim, which the weights reach [px]; largest number of tiles, least number with quiet pixels
+_TILE_PX, _RIM_PX, _TILES, _FEWEST = 32, 2, 120, 8
 
-#: slopes beyond a knee, steps of its level [DN]; what a bin's variance may be off beside chance [1]
-_SLOPES, _STEP_DN, _UNEVEN = (0.5, 0.25, 0.125), 0.5, 0.1
+#: slopes beyond a knee; steps of its level [DN], coarse and fine; half of the fine range [DN]
+_SLOPES, _COARSE_DN, _STEP_DN, _AROUND_DN = (0.5, 0.25), 4.0, 0.5, 4.0
 
-#: chi-square that a knee must gain: two more numbers, by chance once in 10^4
-_GAIN = 18.4
+#: how far a level's own share of the light begins under the knee of the file [DN]
+_ROUNDED_DOWN_DN = 0.5
 
-#: the print's own finest detail that a pixel may have, in standard deviations of the noise
-_QUIET = 0.5
+#: pixels nearer than this to a knee do not say whether it is there [DN]
+_NEAR_DN = 4.0
 
-#: median of chi-square with one degree of freedom, and the median's efficiency for a variance
-_MEDIAN_SQUARE, _EFFICIENCY = 0.45493642311957283, 0.37
+#: share of the quiet pixels that lie on either side of a knee at least
+_BESIDE = 0.01
+
+#: -2 log likelihood that a knee must gain: two more numbers, by chance once in 10^4; and in deviations of the tiles
+_GAIN, _SURE = 18.4, 3.0
+
+#: the print's own finest detail that a pixel may have, and the largest finest detail, in standard deviations of noise
+_QUIET, _LARGEST = 0.5, 4.0
+
+#: median of chi-square with one degree of freedom
+_MEDIAN_SQUARE = 0.45493642311957283
 
 
 @dataclass(frozen=True)
@@ -61,7 +80,7 @@ class Knee:
         return (self.level, self.level), (reached, near), (float(last), full)
 
 
-def quiet_pixels(image: Floats, clean: Floats, there: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def quiet_pixels(image: Floats, clean: Floats, there: Mask) -> Mask:
     """Pixels ``there`` of an image (H, W) whose finest detail is noise and not the edge of a print.
 
     ``clean`` is the image without its noise.
@@ -70,46 +89,144 @@ def quiet_pixels(image: Floats, clean: Floats, there: NDArray[np.bool_]) -> NDAr
     return there & (own < _QUIET**2 * np.maximum(noise_of_levels(image, there)(clean), 1e-12))
 
 
-def first_knee(image: Floats, clean: Floats, quiet: NDArray[np.bool_], imager: Imager) -> Knee | None:
+def first_knee(image: Floats, clean: Floats, quiet: Mask, imager: Imager) -> Knee | None:
     """Find the first knee in the :func:`quiet_pixels` of an image [DN]; None if a straight curve explains its noise."""
-    level, square = _of_neighbours(clean)[quiet], finest_detail(image)[quiet] ** 2
-    number = np.floor(level / _BIN_DN).astype(int)
-    counts = np.bincount(number.clip(0))
-    used = np.flatnonzero(counts >= _PIXELS)
-    if len(used) < 2 * _BINS + 1:
+    tiles = _Tiles.of(image, clean, quiet, imager.black_level)
+    if tiles is None:
         return None
-    variance = np.array([float(np.median(square[number == one])) / _MEDIAN_SQUARE for one in used])
-    spread = 2 / (counts[used] * _EFFICIENCY * independent_share()) + _UNEVEN**2
-
-    def chi_square(knee: float, slope: float) -> float:
-        light = np.where(clean > knee, knee + (clean - knee) / slope, clean) - imager.black_level
-        gain = np.where(clean > knee, slope**2, 1.0)
-        maps = [_of_neighbours(gain)[quiet], _of_neighbours(gain * np.maximum(light, 0.0))[quiet]]
-        design = np.stack([np.bincount(number.clip(0), values)[used] / counts[used] for values in maps], axis=1)
-        return _chi_square(design, variance, spread)
-
-    straight = chi_square(np.inf, 1.0)
-    levels = np.arange(_BIN_DN * (used[_BINS] + 0.5), _BIN_DN * (used[-_BINS] + 0.5), _STEP_DN)
-    tried = [(chi_square(float(level), slope), float(level), slope) for slope in _SLOPES for level in levels]
-    if not tried or straight - min(tried)[0] < _GAIN:
+    low, high = np.quantile(tiles.clean[tiles.inside], [_BESIDE, 1 - _BESIDE])
+    coarse = np.arange(low, high, _COARSE_DN)
+    if not len(coarse):
         return None
-    _, found, slope = min(tried)
-    weight = np.array([np.exp((min(tried)[0] - one) / 2) if own == slope else 0.0 for one, _, own in tried])
-    at = np.array([level for _, level, _ in tried])
-    spread_of = float(np.sqrt((weight * (at - found) ** 2).sum() / weight.sum() + _STEP_DN**2 / 12))
-    return Knee(found, spread_of, slope)
+    _, middle, slope = min((tiles.best(k, g).sum(), k, g) for g in _SLOPES for k in coarse)
+    levels = np.arange(max(low, middle - _AROUND_DN), min(high, middle + _AROUND_DN), _STEP_DN)
+    misfits = np.stack([tiles.best(level, slope) for level in levels])
+    total = misfits.sum(axis=1)
+    best = int(total.argmin())
+    away = tiles.away_from(levels[best])
+    gain = away.best(np.inf, 1.0) - away.best(levels[best], slope)
+    if gain.sum() < max(_GAIN, _SURE * float(gain.std()) * np.sqrt(len(gain))) or not 0 < best < len(levels) - 1:
+        return None
+    before, least, after = total[best - 1 : best + 2]
+    level = levels[best] + _STEP_DN / 2 * (before - after) / (before - 2 * least + after)
+    return Knee(float(level), tiles.uncertainty(level, slope), slope)
+
+
+@dataclass(frozen=True)
+class _Tiles:
+    """Tiles (n, 36, 36) of an image without noise, which of their pixels are used, and these pixels' squared detail."""
+
+    clean: Floats
+    inside: Mask
+    square: Floats
+    own: Floats
+    black: float
+
+    @classmethod
+    def of(cls, image: Floats, clean: Floats, quiet: Mask, black: float) -> _Tiles | None:
+        side = _TILE_PX + 2 * _RIM_PX
+        if min(image.shape) < side:
+            return None
+        cut = [
+            sliding_window_view(one, (side, side))[::_TILE_PX, ::_TILE_PX].reshape(-1, side, side)
+            for one in (clean, quiet, finest_detail(image) ** 2, finest_detail(clean) ** 2)
+        ]
+        rim = np.zeros((side, side), bool)
+        rim[_RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX] = True
+        some = np.flatnonzero((cut[1] & rim).any(axis=(1, 2)))
+        if len(some) < _FEWEST:
+            return None
+        some = some[:: int(np.ceil(len(some) / _TILES))]
+        inside = cut[1][some] & rim
+        return cls(cut[0][some], inside, cut[2][some][inside], cut[3][some][inside], black)
+
+    def away_from(self, level: float) -> _Tiles:
+        """The tiles without pixels near a level: a curve that is flat there only is no knee."""
+        far = np.abs(self.clean - level) > _NEAR_DN
+        kept = far[self.inside]
+        return replace(self, inside=self.inside & far, square=self.square[kept], own=self.own[kept])
+
+    def best(self, knee: float, slope: float) -> Floats:
+        """-2 log likelihood (n,) of the tiles with the best a and b of all of them."""
+        return self.misfit(knee, slope, self.fitted(knee, slope))
+
+    def fitted(self, knee: float, slope: float) -> Floats:
+        """The a and b of all tiles, by weighted least squares."""
+        middle = float(np.median(self.square)) / _MEDIAN_SQUARE
+        numbers, variance = np.array([0.0, middle / max(float(np.median(self.clean)), 1.0)]), middle + 0 * self.square
+        for _ in range(3):
+            maps = self._maps(knee, slope, numbers)
+            for _ in range(2):
+                weight = (self.square < _LARGEST**2 * variance) / variance**2
+                numbers = _two(maps, self.square - 1 / 12 - self.own, weight)
+                variance = np.maximum(maps @ numbers, 1e-3) + 1 / 12 + self.own
+        return numbers
+
+    def misfit(self, knee: float, slope: float, numbers: Floats) -> Floats:
+        """-2 log likelihood (n,) of the tiles."""
+        variance = np.maximum(self._maps(knee, slope, numbers) @ numbers, 1e-3) + 1 / 12 + self.own
+        each = np.log(variance) + np.minimum(self.square / variance, _LARGEST**2)
+        return independent_share() * np.bincount(np.nonzero(self.inside)[0], each, minlength=len(self.clean))
+
+    def uncertainty(self, knee: float, slope: float) -> float:
+        """Standard uncertainty of the knee by the jackknife: one tile after another is left out.
+
+        K, a and b without a tile follow by one Newton step, from the first and second derivatives of every tile's
+        likelihood. Tiles are independent samples, whether the model fits or not.
+        """
+        numbers = self.fitted(knee, slope)
+        steps = np.diag([_STEP_DN, 0.1 * max(numbers[0], 0.1), 0.05 * max(numbers[1], 1e-4)])
+
+        def at(step: Floats) -> Floats:
+            return self.misfit(knee + float(step[0]), slope, numbers + step[1:])
+
+        middle, sides = at(np.zeros(3)), [(at(step), at(-step)) for step in steps]
+        slopes, bend = np.stack([(up - down) / 2 for up, down in sides], axis=1), np.empty((len(middle), 3, 3))
+        for i, (up, down) in enumerate(sides):
+            bend[:, i, i] = up - 2 * middle + down
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            both = (
+                at(steps[i] + steps[j]) - at(steps[i] - steps[j]) - at(steps[j] - steps[i]) + at(-steps[i] - steps[j])
+            )
+            bend[:, i, j] = bend[:, j, i] = both / 4
+        without = bend.sum(axis=0) - bend
+        moved = np.linalg.solve(without, (slopes - slopes.mean(axis=0))[..., None])[:, 0, 0] * _STEP_DN
+        return float(np.sqrt((len(moved) - 1) * moved.var()))
+
+    def _maps(self, knee: float, slope: float, numbers: Floats) -> Floats:
+        """What a and b are multiplied with in every used pixel (N, 2)."""
+        light, ratio = self.clean, np.ones(self.clean.shape)
+        if slope < 1:
+            top = knee + (float(self.clean.max()) + 5 - knee) / slope
+            every = np.linspace(0.0, top, 1500)
+            mean, share = _through(every, knee, slope, np.sqrt(np.maximum(self._noise(every, numbers), 0.02)))
+            light, ratio = np.interp(self.clean, mean, every), np.interp(self.clean, mean, share)
+        both = ratio, ratio * np.maximum(light - self.black, 0.0)
+        return np.stack([_of_neighbours(one)[self.inside] for one in both], axis=1)
+
+    def _noise(self, level: Floats, numbers: Floats) -> Floats:
+        return np.asarray(numbers[0] + numbers[1] * np.maximum(level - self.black, 0.0))
+
+
+def _through(level: Floats, knee: float, slope: float, spread: Floats) -> tuple[Floats, Floats]:
+    """Mean (n,) behind the curve of levels with normal noise, and the share of the noise's variance there."""
+    t, flat = (level - (knee - _ROUNDED_DOWN_DN)) / spread, 1 - slope
+    above, density = norm.cdf(t), norm.pdf(t)
+    first, second = density + t * above, (1 + t**2) * above + t * density
+    return level - flat * spread * first, 1 - 2 * flat * above + flat**2 * (second - first**2)
+
+
+def _two(design: Floats, values: Floats, weight: Floats) -> Floats:
+    """Two numbers by weighted least squares, neither of them negative."""
+    normal, right = design.T @ (design * weight[:, None]), design.T @ (weight * values)
+    found = np.linalg.solve(normal + 1e-12 * np.eye(2), right)
+    if found[0] < 0:
+        found = np.array([0.0, max(right[1] / normal[1, 1], 0.0)])
+    elif found[1] < 0:
+        found = np.array([max(right[0] / normal[0, 0], 0.0), 0.0])
+    return np.asarray(found)
 
 
 def _of_neighbours(values: Floats) -> Floats:
-    """Mean (H, W) of the pixels about each by the squares of their weights in finest detail."""
-    return np.asarray(correlate1d(correlate1d(values, FINEST**2, axis=0), FINEST**2, axis=1))
-
-
-def _chi_square(design: Floats, variance: Floats, spread: Floats) -> float:
-    """Chi-square of variances (n,) about the best a and b, none of them negative; ``spread`` relative variances."""
-    expected = np.maximum(variance, 1 / 12)
-    for _ in range(4):
-        weight = 1 / (np.sqrt(spread) * expected)
-        found = nnls(design * weight[:, None], (variance - 1 / 12) * weight)[0]
-        expected = np.maximum(design @ found, 0.0) + 1 / 12
-    return float(((variance / expected - 1) ** 2 / spread).sum())
+    """Mean (n, H, W) of the pixels about each by the squares of their weights in finest detail."""
+    return np.asarray(correlate1d(correlate1d(values, FINEST**2, axis=1), FINEST**2, axis=2))

@@ -18,11 +18,9 @@ SEEDS = range(4)
 def plate(seed: int, blur: float = BLUR_PX, size: tuple[int, int] = (150, 160)) -> np.ndarray:
     """Grey levels [DN] of dark dots on paper, 53 on 92, at random places, drawn at an eighth of a pixel."""
     fine, rng = 8, np.random.default_rng(seed)
-    y, x = (axis / fine for axis in np.mgrid[: size[0] * fine, : size[1] * fine])
-    dots = np.zeros(y.shape)
-    for row in np.arange(rng.uniform(-24, 0), size[0] + 24, 24):
-        for column in np.arange(rng.uniform(-24, 0), size[1] + 24, 24):
-            dots = np.maximum(dots, np.hypot(y - row, x - column) < 5.5)
+    # distance along either axis from the nearest centre of a dot
+    y, x = (np.abs((np.arange(n * fine) / fine - rng.uniform(0, 24)) % 24 - 12) for n in size)
+    dots = (np.hypot(y[:, None], x) < 5.5).astype(float)
     dots = gaussian_filter(dots, blur * fine).reshape(size[0], fine, size[1], fine).mean(axis=(1, 3))
     return 92 * (1 - 0.42 * dots)
 
