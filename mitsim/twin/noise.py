@@ -159,8 +159,7 @@ def _with_curve(imager: Imager, groups: list[list[Take]], sensor: Sensor) -> tup
     for take in (group[0] for group in groups if group[0].kind == "off"):
         image = next(iter(take.capture.images.values()))[0]
         levels, there = image.astype(float), (image > 0) & (image < imager.full_scale)
-        clean = denoised(levels, there)
-        knee = first_knee(levels, clean, quiet_pixels(levels, clean, there), imager)
+        knee = first_knee(levels, there, imager)
         if knee is not None:
             how = f"noise by level of one image: the first knee, {knee.slope:g} times as steep beyond it"
             told = Estimate("imager.companding_dn", knee.level, knee.uncertainty, "DN", (take.name,), how)

@@ -2,7 +2,8 @@
 
 Signal chain: image -> the same without noise (:mod:`mitsim.validation.denoise`) -> tiles of 32 px, and in them the
 pixels whose finest detail is noise -> likelihood of the squared finest detail for a straight curve, and for curves with
-a knee at K and the slope g beyond it -> K, g, and the uncertainty of K by a jackknife over the tiles.
+a knee at K and the slope g beyond it -> K, g, and the uncertainty of K by a jackknife over the tiles. Its bias
+by levels that still contain some noise is simulated and subtracted.
 
 In the converter's levels u, noise has the variance s^2 = a + b (u - black). The curve takes u + z to
 
@@ -34,6 +35,7 @@ from scipy.stats import norm
 from mitsim.fit.fine_detail import FINEST, finest_detail, noise_of_levels
 from mitsim.sensor.imager import Imager
 from mitsim.twin.photon_transfer import independent_share
+from mitsim.validation.denoise import denoised
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -42,10 +44,13 @@ Mask = NDArray[np.bool_]
 _TILE_PX, _RIM_PX, _TILES, _FEWEST = 32, 2, 120, 8
 
 #: slopes beyond a knee; steps of its level [DN], coarse and fine; half of the fine range [DN]
-_SLOPES, _COARSE_DN, _STEP_DN, _AROUND_DN = (0.5, 0.25), 4.0, 0.5, 4.0
+_SLOPES, _COARSE_DN, _STEP_DN, _AROUND_DN = (0.5, 0.25), 3.0, 0.5, 2.0
 
 #: how far a level's own share of the light begins under the knee of the file [DN]
 _ROUNDED_DOWN_DN = 0.5
+
+#: draws of noise that tell the bias of a knee
+_DRAWS = 4
 
 #: pixels nearer than this to a knee do not say whether it is there [DN]
 _NEAR_DN = 4.0
@@ -89,9 +94,10 @@ def quiet_pixels(image: Floats, clean: Floats, there: Mask) -> Mask:
     return there & (own < _QUIET**2 * np.maximum(noise_of_levels(image, there)(clean), 1e-12))
 
 
-def first_knee(image: Floats, clean: Floats, quiet: Mask, imager: Imager) -> Knee | None:
-    """Find the first knee in the :func:`quiet_pixels` of an image [DN]; None if a straight curve explains its noise."""
-    tiles = _Tiles.of(image, clean, quiet, imager.black_level)
+def first_knee(image: Floats, there: Mask, imager: Imager) -> Knee | None:
+    """Find the first knee [DN] of an image (H, W) in the pixels ``there``; None if a straight curve explains the noise."""
+    clean = denoised(image, there)
+    tiles = _Tiles.of(image, clean, quiet_pixels(image, clean, there), imager.black_level)
     if tiles is None:
         return None
     low, high = np.quantile(tiles.clean[tiles.inside], [_BESIDE, 1 - _BESIDE])
@@ -99,17 +105,50 @@ def first_knee(image: Floats, clean: Floats, quiet: Mask, imager: Imager) -> Kne
     if not len(coarse):
         return None
     _, middle, slope = min((tiles.best(k, g).sum(), k, g) for g in _SLOPES for k in coarse)
-    levels = np.arange(max(low, middle - _AROUND_DN), min(high, middle + _AROUND_DN), _STEP_DN)
-    misfits = np.stack([tiles.best(level, slope) for level in levels])
-    total = misfits.sum(axis=1)
-    best = int(total.argmin())
-    away = tiles.away_from(levels[best])
-    gain = away.best(np.inf, 1.0) - away.best(levels[best], slope)
-    if gain.sum() < max(_GAIN, _SURE * float(gain.std()) * np.sqrt(len(gain))) or not 0 < best < len(levels) - 1:
+    level = _least(tiles, middle, slope)
+    away = tiles.away_from(level)
+    gain = away.best(np.inf, 1.0) - away.best(level, slope)
+    if gain.sum() < max(_GAIN, _SURE * float(gain.std()) * np.sqrt(len(gain))) or not low < level < high:
         return None
+    bias, spread = _bias(clean, there, tiles, Knee(level, 0.0, slope))
+    return Knee(level - bias, float(np.hypot(tiles.uncertainty(level, slope), spread)), slope)
+
+
+def _bias(clean: Floats, there: Mask, tiles: _Tiles, knee: Knee) -> tuple[float, float]:
+    """By how much a knee is off since levels come from an image without noise, not from the light; and its uncertainty.
+
+    The image without noise serves as light: noise is drawn, and the knee found once with the levels of that image after
+    its noise is taken off, once with the true ones.
+    """
+    numbers, found = tiles.fitted(knee.level, knee.slope), []
+    k = knee.level - _ROUNDED_DOWN_DN
+    every = np.linspace(0.0, k + (float(clean.max()) + 5 - k) / knee.slope, 1500)
+    spread = np.sqrt(np.maximum(numbers[0] + numbers[1] * np.maximum(every - tiles.black, 0.0), 0.02))
+    mean, _ = _through(every, knee.level, knee.slope, spread)
+    light = np.interp(clean, mean, every)
+    for stream in np.random.default_rng(0).spawn(_DRAWS):
+        drawn = light + np.interp(light, every, spread) * stream.normal(size=light.shape)
+        drawn = np.rint(np.minimum(drawn, k) + knee.slope * np.maximum(drawn - k, 0.0))
+        again = denoised(drawn, there)
+        found.append(
+            [
+                _least(
+                    _Tiles.of(drawn, levels, quiet_pixels(drawn, levels, there), tiles.black), knee.level, knee.slope
+                )
+                for levels in (again, clean)
+            ]
+        )
+    off = np.array(found) @ [1.0, -1.0]
+    return float(off.mean()), float(off.std(ddof=1) / np.sqrt(_DRAWS))
+
+
+def _least(tiles: _Tiles, middle: float, slope: float) -> float:
+    """The level about ``middle`` whose curve is most likely, by a parabola through three levels."""
+    levels = middle + np.arange(-_AROUND_DN, _AROUND_DN + _STEP_DN / 2, _STEP_DN)
+    total = np.array([tiles.best(level, slope).sum() for level in levels])
+    best = int(np.clip(total.argmin(), 1, len(levels) - 2))
     before, least, after = total[best - 1 : best + 2]
-    level = levels[best] + _STEP_DN / 2 * (before - after) / (before - 2 * least + after)
-    return Knee(float(level), tiles.uncertainty(level, slope), slope)
+    return float(levels[best] + _STEP_DN / 2 * (before - after) / max(before - 2 * least + after, 1e-9))
 
 
 @dataclass(frozen=True)
