@@ -95,7 +95,7 @@ def quiet_pixels(image: Floats, clean: Floats, there: Mask) -> Mask:
 
 
 def first_knee(image: Floats, there: Mask, imager: Imager) -> Knee | None:
-    """Find the first knee [DN] of an image (H, W) in the pixels ``there``; None if a straight curve explains the noise."""
+    """Find the first knee [DN] in the pixels ``there`` of an image (H, W); None if a straight curve explains it."""
     clean = denoised(image, there)
     tiles = _Tiles.of(image, clean, quiet_pixels(image, clean, there), imager.black_level)
     if tiles is None:
