@@ -2,7 +2,7 @@
 
 Signal chain: image -> the same without noise (:mod:`mitsim.validation.denoise`) -> tiles of 32 px, and in them the
 pixels whose finest detail is noise -> likelihood of the squared finest detail for a straight curve, and for curves with
-a knee at K and the slope g beyond it -> K, g, and the uncertainty of K by a jackknife over the tiles. Its bias
+a knee at K and the slope g beyond it -> K, and the uncertainty of K by a jackknife over the tiles. Its bias
 by levels that still contain some noise is simulated and subtracted.
 
 In the converter's levels u, noise has the variance s^2 = a + b (u - black). The curve takes u + z to
@@ -18,8 +18,8 @@ levels of the converter, from 79.5 on. So K is half a level under the file's kne
 pixels. Its variance is the mean of theirs by the squares of its weights: at an edge they differ.
 
 Photon noise grows with the level. Bright pixels that are quieter than dark ones therefore show a curve that is flatter
-there. Chips compand by steps of two (data sheets of the MT9V03x family: 12 bits to 10). Levels beyond the brightest
-pixel are unknown; the curve is assumed to go on with g.
+there. Chips compand by steps of two (data sheets of the MT9V03x family: 12 bits to 10), so the first knee has g = 1/2;
+others are not looked for. Levels beyond the brightest pixel are unknown; the curve is assumed to go on with g.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ Mask = NDArray[np.bool_]
 #: side of a tile and its rim, which the weights reach [px]; largest number of tiles, least number with quiet pixels
 _TILE_PX, _RIM_PX, _TILES, _FEWEST = 32, 2, 120, 8
 
-#: slopes beyond a knee; steps of its level [DN], coarse and fine; half of the fine range [DN]
-_SLOPES, _COARSE_DN, _STEP_DN, _AROUND_DN = (0.5, 0.25), 3.0, 0.5, 2.0
+#: slope beyond a knee; steps of its level [DN], coarse and fine; fine steps to either side, and as many at most
+_SLOPE, _COARSE_DN, _STEP_DN, _AROUND, _FARTHEST = 0.5, 3.0, 0.5, 4, 20
 
 #: how far a level's own share of the light begins under the knee of the file [DN]
 _ROUNDED_DOWN_DN = 0.5
@@ -104,8 +104,8 @@ def first_knee(image: Floats, there: Mask, imager: Imager) -> Knee | None:
     coarse = np.arange(low, high, _COARSE_DN)
     if not len(coarse):
         return None
-    _, middle, slope = min((tiles.best(k, g).sum(), k, g) for g in _SLOPES for k in coarse)
-    level = _least(tiles, middle, slope)
+    _, middle = min((tiles.best(k, _SLOPE).sum(), k) for k in coarse)
+    slope, level = _SLOPE, _least(tiles, middle, _SLOPE)
     away = tiles.away_from(level)
     gain = away.best(np.inf, 1.0) - away.best(level, slope)
     if gain.sum() < max(_GAIN, _SURE * float(gain.std()) * np.sqrt(len(gain))) or not low < level < high:
@@ -143,12 +143,21 @@ def _bias(clean: Floats, there: Mask, tiles: _Tiles, knee: Knee) -> tuple[float,
 
 
 def _least(tiles: _Tiles, middle: float, slope: float) -> float:
-    """The level about ``middle`` whose curve is most likely, by a parabola through three levels."""
-    levels = middle + np.arange(-_AROUND_DN, _AROUND_DN + _STEP_DN / 2, _STEP_DN)
-    total = np.array([tiles.best(level, slope).sum() for level in levels])
-    best = int(np.clip(total.argmin(), 1, len(levels) - 2))
-    before, least, after = total[best - 1 : best + 2]
-    return float(levels[best] + _STEP_DN / 2 * (before - after) / max(before - 2 * least + after, 1e-9))
+    """The level whose curve is most likely, by a parabola through three levels; from ``middle`` on, downhill."""
+    total: dict[int, float] = {}
+
+    def at(step: int) -> float:
+        if step not in total:
+            total[step] = float(tiles.best(middle + step * _STEP_DN, slope).sum())
+        return total[step]
+
+    best = min(range(-_AROUND, _AROUND + 1), key=at)
+    while abs(best) < _FARTHEST and at(beside := min(best - 1, best + 1, key=at)) < at(best):
+        best = beside
+    before, least, after = at(best - 1), at(best), at(best + 1)
+    bend = before - 2 * least + after
+    aside = (before - after) / (2 * bend) if bend > 0 else 0.0
+    return float(middle + (best + float(np.clip(aside, -1, 1))) * _STEP_DN)
 
 
 @dataclass(frozen=True)

@@ -53,14 +53,13 @@ def test_the_interval_of_a_knee_holds_it():
     assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.25
 
 
-@pytest.mark.parametrize("slope", [0.5, 0.25])
-def test_behind_a_knee_the_full_well_is_right(slope):
+def test_behind_a_knee_the_full_well_is_right():
     wells = []
     for seed in range(3):
-        image, level = capture(seed, slope)
+        image, level = capture(seed, 0.5)
         there = np.ones(image.shape, bool)
         knee = first_knee(image, there, STRAIGHT)
-        assert knee is not None and knee.slope == slope and abs(knee.level - level) < 3 * knee.uncertainty
+        assert knee is not None and knee.slope == 0.5 and abs(knee.level - level) < 3 * knee.uncertainty
         chip = replace(STRAIGHT, companding=knee.companding(8))
         quiet = quiet_pixels(image, denoised(image, there), there)
         wells.append(one_image_line(image.astype(np.uint8), quiet, chip).not_negative().full_well(chip)[0])
@@ -72,16 +71,6 @@ def test_a_straight_imager_has_no_knee():
     for seed in range(5):
         image, _ = capture(seed, None)
         assert first_knee(image, np.ones(image.shape, bool), STRAIGHT) is None
-
-
-def test_a_curve_that_is_flat_at_some_levels_only_has_no_knee():
-    image, _ = capture(0, None)
-    there, noise = np.ones(image.shape, bool), np.random.default_rng(5)
-    middle = float(np.median(image))
-    flat = image.copy()
-    near = np.abs(denoised(image, there) - middle) < 2
-    flat[near] = np.rint(middle + 0.5 * (image[near] - middle) + noise.uniform(-0.5, 0.5, near.sum()))
-    assert first_knee(flat, there, STRAIGHT) is None
 
 
 def test_the_curve_of_a_knee_is_one_that_a_sensor_file_takes():
