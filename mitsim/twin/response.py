@@ -25,6 +25,7 @@ others are not looked for. Levels beyond the brightest pixel are unknown; the cu
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -129,17 +130,14 @@ def _bias(clean: Floats, there: Mask, tiles: _Tiles, knee: Knee) -> tuple[float,
     for stream in np.random.default_rng(0).spawn(_DRAWS):
         drawn = light + np.interp(light, every, spread) * stream.normal(size=light.shape)
         drawn = np.rint(np.minimum(drawn, k) + knee.slope * np.maximum(drawn - k, 0.0))
-        again = denoised(drawn, there)
-        found.append(
-            [
-                _least(
-                    _Tiles.of(drawn, levels, quiet_pixels(drawn, levels, there), tiles.black), knee.level, knee.slope
-                )
-                for levels in (again, clean)
-            ]
-        )
+        both = [
+            _Tiles.of(drawn, levels, quiet_pixels(drawn, levels, there), tiles.black)
+            for levels in (denoised(drawn, there), clean)
+        ]
+        found.append([np.nan if one is None else _least(one, knee.level, knee.slope) for one in both])
     off = np.array(found) @ [1.0, -1.0]
-    return float(off.mean()), float(off.std(ddof=1) / np.sqrt(_DRAWS))
+    off = off[np.isfinite(off)]
+    return (float(off.mean()), float(off.std(ddof=1) / np.sqrt(len(off)))) if len(off) > 1 else (0.0, float("inf"))
 
 
 def _least(tiles: _Tiles, middle: float, slope: float) -> float:
@@ -175,18 +173,15 @@ class _Tiles:
         side = _TILE_PX + 2 * _RIM_PX
         if min(image.shape) < side:
             return None
-        cut = [
-            sliding_window_view(one, (side, side))[::_TILE_PX, ::_TILE_PX].reshape(-1, side, side)
-            for one in (clean, quiet, finest_detail(image) ** 2, finest_detail(clean) ** 2)
-        ]
         rim = np.zeros((side, side), bool)
         rim[_RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX] = True
-        some = np.flatnonzero((cut[1] & rim).any(axis=(1, 2)))
+        inside = _cut(quiet, side).astype(bool) & rim
+        some = np.flatnonzero(inside.any(axis=(1, 2)))
         if len(some) < _FEWEST:
             return None
         some = some[:: int(np.ceil(len(some) / _TILES))]
-        inside = cut[1][some] & rim
-        return cls(cut[0][some], inside, cut[2][some][inside], cut[3][some][inside], black)
+        levels, square, own = (_cut(one, side)[some] for one in (clean, finest_detail(image), finest_detail(clean)))
+        return cls(levels, inside[some], square[inside[some]] ** 2, own[inside[some]] ** 2, black)
 
     def away_from(self, level: float) -> _Tiles:
         """The tiles without pixels near a level: a curve that is flat there only is no knee."""
@@ -214,7 +209,8 @@ class _Tiles:
         """-2 log likelihood (n,) of the tiles."""
         variance = np.maximum(self._maps(knee, slope, numbers) @ numbers, 1e-3) + 1 / 12 + self.own
         each = np.log(variance) + np.minimum(self.square / variance, _LARGEST**2)
-        return independent_share() * np.bincount(np.nonzero(self.inside)[0], each, minlength=len(self.clean))
+        total = np.bincount(np.nonzero(self.inside)[0], each, minlength=len(self.clean))
+        return np.asarray(independent_share() * total, float)
 
     def uncertainty(self, knee: float, slope: float) -> float:
         """Standard uncertainty of the knee by the jackknife: one tile after another is left out.
@@ -254,6 +250,12 @@ class _Tiles:
 
     def _noise(self, level: Floats, numbers: Floats) -> Floats:
         return np.asarray(numbers[0] + numbers[1] * np.maximum(level - self.black, 0.0))
+
+
+def _cut(values: NDArray[Any], side: int) -> Floats:
+    """Tiles (n, side, side) of an image, one rim over another."""
+    tiles = sliding_window_view(values, (side, side))[::_TILE_PX, ::_TILE_PX]
+    return np.asarray(tiles.reshape(-1, side, side), float)
 
 
 def _through(level: Floats, knee: float, slope: float, spread: Floats) -> tuple[Floats, Floats]:
