@@ -1,8 +1,9 @@
 """Estimate the imager's noise from repeats, from dark captures, or from one uniform image, in this order.
 
-Signal chain: groups of repeats -> photon-transfer line -> full well, read noise; dark captures -> black level, DSNU;
-uniform light -> PRNU. Without repeats, from one image with the projector off: finest detail by level -> smoothing, full
-well, read noise, including the fixed pattern (:mod:`mitsim.twin.photon_transfer`). From dots alone the imager stays
+Signal chain: one image with the projector off -> first knee of the response curve (:mod:`mitsim.twin.response`); groups
+of repeats -> photon-transfer line -> full well, read noise; dark captures -> black level, DSNU; uniform light -> PRNU.
+Without repeats, from one image with the projector off: finest detail by level -> smoothing, full well, read noise,
+including the fixed pattern (:mod:`mitsim.twin.photon_transfer`). From dots alone the imager stays
 unknown here, and is fitted with the dots.
 """
 
@@ -31,7 +32,9 @@ from mitsim.twin.photon_transfer import (
     repeated_line,
     widths,
 )
+from mitsim.twin.response import first_knee, quiet_pixels
 from mitsim.twin.takes import Take
+from mitsim.validation.denoise import denoised
 
 Floats = NDArray[np.float64]
 
@@ -40,6 +43,9 @@ _PIXELS = 200_000
 
 #: range of the smoothing estimate [px], and its least significance in standard uncertainties
 _SMOOTHINGS, _SURE = (0.05, 3.0), 3.0
+
+#: share of the specimen's pixels away from edges of the print, above which the noise is estimated from these alone
+_LEAST_QUIET = 0.2
 
 _EVERY_SOURCE = "imager.dsnu_e", "imager.prnu"
 
@@ -62,6 +68,8 @@ def fit_imager(groups: list[list[Take]], sensor: Sensor, places: dict[str, Place
     if dark:
         imager, level = _with_black_level(imager, dark)
         estimates.append(level)
+    imager, curve = _with_curve(imager, groups, sensor)
+    estimates += curve
     if repeated:
         line = repeated_line([_repeats(group, _there(group[0], places)) for group in repeated], imager)
         if line is not None:
@@ -141,6 +149,24 @@ def _there(take: Take, places: dict[str, Place]) -> NDArray[np.bool_]:
     return image_mask(places[take.name], camera, MARGIN_PX)
 
 
+def _with_curve(imager: Imager, groups: list[list[Take]], sensor: Sensor) -> tuple[Imager, list[Estimate]]:
+    """Return the imager with the knee of its curve, if one image shows it; only stereo sensor files may have one.
+
+    The whole image is used: a curve belongs to the imager, whatever it sees. Black and saturated pixels are left out.
+    """
+    if sensor.technology != "active_stereo" or imager.companding or imager.gamma != 1:
+        return imager, []
+    for take in (group[0] for group in groups if group[0].kind == "off"):
+        image = next(iter(take.capture.images.values()))[0]
+        levels, there = image.astype(float), (image > 0) & (image < imager.full_scale)
+        knee = first_knee(levels, there, imager)
+        if knee is not None:
+            how = f"noise by level of one image: the first knee, {knee.slope:g} times as steep beyond it"
+            told = Estimate("imager.companding_dn", knee.level, knee.uncertainty, "DN", (take.name,), how)
+            return replace(imager, companding=knee.companding(imager.bits)), [told]
+    return imager, []
+
+
 def _repeats(group: list[Take], there: NDArray[np.bool_]) -> Repeats:
     """Return the first image of every repeat."""
     images = np.stack([next(iter(take.capture.images.values()))[0] for take in group])
@@ -208,6 +234,8 @@ def _one_image(take: Take, imager: Imager, places: dict[str, Place]) -> tuple[Im
     estimates = []
     bare = replace(imager, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0)
     smoothing, spread = smoothing_of(image, there)
+    quiet = quiet_pixels(image.astype(float), denoised(image.astype(float), there), there)
+    there = quiet if quiet.mean() > _LEAST_QUIET * there.mean() else there
     gain = 1.0
     if smoothing > max(_SURE * spread, 0.2):
         bare, gain = replace(bare, smoothing_px=smoothing), fine_gain(smoothing)
@@ -221,7 +249,8 @@ def _one_image(take: Take, imager: Imager, places: dict[str, Place]) -> tuple[Im
         line = TransferLine(
             line.offset / gain, line.slope / gain, line.covariance / gain**2, line.bins, line.chi_square
         )
-        if line.full_well(imager)[1] < 0.3 * line.full_well(imager)[0] and line.offset > 0:
+        line = line.not_negative()
+        if line.full_well(imager)[1] < 0.3 * line.full_well(imager)[0] and line.offset >= 0:
             found, from_line = _with_line(bare, line, names, how)
             return found, [*estimates, *from_line]
     # nearly one level: keep the file's full well and attribute the rest to read noise; without a rest, fit the well

@@ -40,6 +40,9 @@ _AROUND_PX = 3
 #: least number of bins for a line, and least ratio of their largest and smallest means
 _FEWEST, _SPAN = 3, 1.3
 
+#: standard uncertainties under 0 that an offset may lie by chance
+_BY_CHANCE = 3.0
+
 #: efficiency of the median of squares against their mean (chi-square of one degree of freedom, recalled)
 _MEDIAN_EFFICIENCY = 0.37
 
@@ -61,6 +64,18 @@ class TransferLine:
         """Return the full well [e-] and its standard uncertainty."""
         value = imager.full_well / self.slope
         return value, value * float(np.sqrt(self.covariance[1, 1])) / self.slope
+
+    def not_negative(self) -> TransferLine:
+        """The line through 0 where its offset is negative by chance: the slope that is expected given an offset of 0.
+
+        An offset further under 0 than three standard uncertainties stays: the line does not fit.
+        """
+        spread = float(np.sqrt(self.covariance[0, 0]))
+        if not -_BY_CHANCE * spread < self.offset < 0:
+            return self
+        share = self.covariance[0, 1] / self.covariance[0, 0]
+        slope, variance = self.slope - share * self.offset, self.covariance[1, 1] - share * self.covariance[0, 1]
+        return replace(self, offset=0.0, slope=float(slope), covariance=np.diag([spread**2, float(variance)]))
 
     def read_noise(self) -> tuple[float, float]:
         """Return the read noise [true e-] and its standard uncertainty; 0 for a negative intercept."""

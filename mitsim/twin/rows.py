@@ -5,8 +5,10 @@ Signal chain: capture -> cloud -> row error of each patch of the right image
 about its x axis and roll.
 
 A camera rotated by w about x sees a point f w (1 + y^2) rows lower; one that rolls by r about its axis, f r x rows
-higher, with x and y the slopes of the ray. Rotation toward the other camera (vergence) causes no row error and cannot
-be measured here. Vergence is assumed as large as these two, since the mounts are the same.
+higher, with x and y the slopes of the ray. One specimen in one part of the field hardly separates the two. Each has a
+normal prior about 0, with the standard deviation of ``[unknowns.calibration]`` of the sensor. Rotation toward the other
+camera (vergence) causes no row error and cannot be measured here. Vergence is assumed as large as these two, since the
+mounts are the same.
 """
 
 from __future__ import annotations
@@ -39,8 +41,11 @@ class Rows:
     patches: int
 
 
-def row_turns(capture: Capture, settings: Settings, place: Place) -> Rows | None:
-    """Return the rotation of a pair's second camera from its row errors; None for too few patches or no pair."""
+def row_turns(capture: Capture, settings: Settings, place: Place, prior: tuple[float, float]) -> Rows | None:
+    """Return the rotation of a pair's second camera from its row errors; None for too few patches or no pair.
+
+    ``prior`` contains the standard deviations [mrad] of rotation and roll before the measurement.
+    """
     geometry = capture_geometry(capture, settings)
     if not isinstance(geometry, StereoGeometry) or capture.technology == "structured_light":
         return None
@@ -52,7 +57,7 @@ def row_turns(capture: Capture, settings: Settings, place: Place) -> Rows | None
     for _ in range(3):
         if known.sum() < _FEWEST:
             return None
-        found, covariance, rest = _line(design[known], errors[known])
+        found, covariance, rest = _line(design[known], errors[known], np.array(prior))
         off = errors - design @ found
         known &= np.abs(off) <= _CLIP * max(_MAD_TO_SIGMA * float(np.median(np.abs(rest))), 1e-3)
     spread = np.sqrt(np.diag(covariance))
@@ -65,8 +70,13 @@ def row_turns(capture: Capture, settings: Settings, place: Place) -> Rows | None
     )
 
 
-def _line(design: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
-    found = np.asarray(np.linalg.lstsq(design, values, rcond=None)[0], float)
-    rest = values - design @ found
-    variance = float(rest @ rest) / max(len(values) - design.shape[1], 1)
-    return found, np.asarray(variance * np.linalg.inv(design.T @ design), float), rest
+def _line(design: Floats, values: Floats, prior: Floats) -> tuple[Floats, Floats, Floats]:
+    """Numbers with a normal prior about 0, their covariance, and what is left of the values.
+
+    The variance of the values is that about the least-squares line, which knows no prior.
+    """
+    free = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
+    variance = max(float(free @ free) / max(len(values) - design.shape[1], 1), 1e-12)
+    covariance = np.linalg.inv(design.T @ design / variance + np.diag(1 / np.maximum(prior, 1e-6) ** 2))
+    found = covariance @ design.T @ values / variance
+    return np.asarray(found, float), np.asarray(covariance, float), values - design @ found

@@ -126,11 +126,17 @@ def fit_sensor(
     for group in groups:
         if group[0].kind != "dark":
             settings, _ = decoder_settings(group[0].capture)
-            found = row_turns(group[0].capture, settings, places[group[0].name])
+            found = row_turns(group[0].capture, settings, places[group[0].name], _believed(chosen))
             if found is not None:
                 rows[group[0].name] = found
     estimates += _turns(rows)
     return SensorFit(base, tuple(takes), tuple(estimates), tuple(undetermined), dots, places, rows)
+
+
+def _believed(sensor: Sensor) -> tuple[float, float]:
+    """Standard deviations [mrad] of the second camera's turn about x and of its roll, by the sensor's unknowns."""
+    own = sensor.unknowns.calibration
+    return own.row_mrad, own.roll_mrad
 
 
 def sensor_path(name: str | Path) -> Path:

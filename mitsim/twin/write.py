@@ -65,7 +65,10 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
     arrays: dict[str, dict[int, Estimate]] = {}
     for one in fit.estimates:
         match = _ARRAY.match(one.key)
-        if match:
+        if one.key == "imager.companding_dn":
+            knees = ", ".join(numbers(knee, 6) for knee in fit.sensor.imager.companding)
+            entries[one.key] = Entry(f"[{knees}]", _said(one) + "; unknown beyond the brightest level seen")
+        elif match:
             arrays.setdefault(match[1], {})[int(match[2])] = one
         else:
             entries[one.key] = Entry(number(one.value), _said(one))

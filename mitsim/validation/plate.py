@@ -1,7 +1,8 @@
 """Specimen of a rebuilt capture: a matt sheet with the recorded bend, or a plate with the recorded print.
 
 Signal chain, sheet: pose and bend -> mesh -> matt white. Signal chain, print: recorded image [e-] -> removal of its
-noise by local means -> ratio to the image of a white plate -> reflectance of the plate, or of every pixel.
+noise (:mod:`mitsim.validation.denoise`) -> ratio to the image of a white plate -> reflectance of the plate, or of every
+pixel.
 """
 
 from __future__ import annotations
@@ -14,10 +15,9 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.ndimage import laplace, map_coordinates, uniform_filter
+from scipy.ndimage import laplace, map_coordinates
 
 from mitsim.fit.bend import Bend
-from mitsim.fit.fine_detail import noise_of_levels
 from mitsim.fit.place import Place
 from mitsim.fit.specimen import image_mask
 from mitsim.scene import backend
@@ -25,6 +25,7 @@ from mitsim.scene.load import Scene, scene_from_dict
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import Sensor
 from mitsim.simulation.exposing import LightOnImagers
+from mitsim.validation.denoise import denoised
 from mitsim.validation.plain_image import PlainImage
 
 Floats = NDArray[np.float64]
@@ -35,8 +36,6 @@ REFLECTANCE = 0.85
 #: number of squares of a bent sheet's mesh along each side
 _MESH = 96
 
-#: side of the windows that separate noise from print [px]
-_DENOISED_PX = 5
 #: texels per pixel footprint along an axis, and largest number of texels along a side
 _TEXELS_PER_PX, _LARGEST_TEXTURE = 2.0, 4096
 #: variance [px^2] of the aperture of a rendered texture: a pixel, which the recorded image already contains, and the
@@ -116,16 +115,3 @@ def printed(
     ratio = np.where(there & (white > 0), denoised(electrons[inside], there) / np.where(white > 0, white, 1.0), 0.0)
     ratio /= max(float(np.percentile(ratio[there], 95)), 1e-12)
     return replace(light, radiance={name: radiance * np.maximum(ratio, 0.0).astype(np.float32)})
-
-
-def denoised(image: Floats, there: NDArray[np.bool_]) -> Floats:
-    """Return an image (H, W) less its white noise: m + max(0, 1 - n / v) (x - m), with local means m and variances v.
-
-    n is the variance of the noise at that level, estimated from changes of sign between neighbouring pixels ``there``
-    (:func:`mitsim.fit.fine_detail.noise_of_levels`). The filter is Lee's (IEEE TPAMI 2 (1980) 165).
-    """
-    variance = noise_of_levels(image, there)
-    mean = uniform_filter(image, _DENOISED_PX)
-    local = np.maximum(uniform_filter(image**2, _DENOISED_PX) - mean**2, 1e-12)
-    kept = np.clip(1.0 - variance(mean) / local, 0.0, 1.0)
-    return np.asarray(mean + kept * (image - mean))

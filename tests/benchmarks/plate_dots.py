@@ -1,8 +1,9 @@
 """Noise of disparity on the dots of an N10's plate, recorded and simulated, dot by dot; and what would raise it.
 
-python tests/benchmarks/plate_dots.py CAPTURE SIMULATED
+python tests/benchmarks/plate_dots.py CAPTURE SIMULATED [left or right]
 
-CAPTURE is the imported recording, SIMULATED its twin as `mitsim validate captures` writes it. Of every dot: disparities
+CAPTURE is the imported recording, SIMULATED its twin as `mitsim validate captures` writes it. The plate is the right
+one of the two unless said. Of every dot: disparities
 of its pixels about their own plane [px]. `mitsim validate captures` takes patches of 40 px instead, of which few have
 points enough on such a plate. Then the twin's right image is changed, in one thing at a time.
 """
@@ -25,12 +26,14 @@ from mitsim.decode.matching.stereo import StereoGeometry, stereo_geometry
 from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
 
 Floats = NDArray[np.float64]
-#: rows and columns of the right plate in the rectified left image, and of both plates in the raw right one
-RIGHT_PLATE, BOTH_PLATES = np.s_[135:325, 362:548], np.s_[60:420, 150:560]
+#: rows and columns of each plate in the rectified left image, and of both plates in the raw right one
+PLATES = {"left": np.s_[121:308, 117:303], "right": np.s_[135:325, 362:548]}
+BOTH_PLATES = np.s_[60:420, 100:560]
 
 
-def main(recorded: Path, simulated: Path) -> None:
+def main(recorded: Path, simulated: Path, plate: str = "right") -> None:
     """Print one row for each."""
+    part = PLATES[plate]
     real, twin = read_capture(recorded), read_capture(simulated)
     settings = decoder_settings(real)[0]
     geometry = stereo_geometry(real.rig)
@@ -59,7 +62,7 @@ def main(recorded: Path, simulated: Path) -> None:
         ("rows of all by 0.1 px", changed(twin, lambda image: shifted(image, 0.1))),
         ("0.6 DN more noise", changed(twin, lambda image: image + rng.normal(0, 0.6, image.shape))),
     ):
-        spread = within_dots(capture, settings, geometry)
+        spread = within_dots(capture, settings, geometry, part)
         error = spread.std() / np.sqrt(len(spread))
         print(f"| {name} | {len(spread)} | {spread.mean():.4f}, u {error:.4f} |", flush=True)
 
@@ -87,7 +90,7 @@ def changed(capture: Capture, change: Callable[[Floats], Floats]) -> Capture:
     return replace(capture, images=capture.images | {name: image[None]})
 
 
-def within_dots(capture: Capture, settings: object, geometry: StereoGeometry) -> Floats:
+def within_dots(capture: Capture, settings: object, geometry: StereoGeometry, part: tuple[slice, slice]) -> Floats:
     """Standard deviation [px] of the disparities of every dot about their plane."""
     cloud = capture_cloud(capture, settings)  # type: ignore[arg-type]
     pair = geometry.rectification
@@ -96,14 +99,14 @@ def within_dots(capture: Capture, settings: object, geometry: StereoGeometry) ->
     row, column = np.mgrid[: depth.shape[0], : depth.shape[1]] / 100.0
     surface = np.stack([np.ones_like(row), column, row, column**2, column * row, row**2], axis=-1)
     kept = np.zeros(depth.shape, bool)
-    kept[RIGHT_PLATE] = np.isfinite(disparity[RIGHT_PLATE])
+    kept[part] = np.isfinite(disparity[part])
     for _ in range(6):
         off = disparity - surface @ np.linalg.lstsq(surface[kept], disparity[kept], rcond=None)[0]
         kept &= np.abs(off) < 4 * 1.4826 * np.median(np.abs(off[kept]))
     left = next(iter(capture.images.values()))[0].astype(np.float32)
     shown = cv2.remap(left, geometry.map_left[0], geometry.map_left[1], cv2.INTER_LINEAR)
     out = []
-    for dot in dots_of(shown, RIGHT_PLATE):
+    for dot in dots_of(shown, part):
         own = dot & kept
         if own.sum() >= 80:
             plane = surface[own][:, :3]
@@ -112,4 +115,4 @@ def within_dots(capture: Capture, settings: object, geometry: StereoGeometry) ->
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), *sys.argv[3:])

@@ -13,7 +13,9 @@ import pytest
 
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.recordings.recognise import Given, read_recording
+from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.roi import Roi
+from mitsim.twin.response import first_knee
 from mitsim.validation.captures_run import validate_captures
 
 pytestmark = pytest.mark.real
@@ -45,18 +47,34 @@ def test_the_recorded_n35_sheet_against_its_twin(real_data, tmp_path):
 def test_a_recorded_n10_plate_against_its_twin(real_data, tmp_path):
     """Projector off: the plate's print stands in. The preset's imager is noisier than the recorded one."""
     rows = held_against(
-        real_data, tmp_path, "ensenso/locate_multiple_patterns/camera.zip", "ensenso-n10", (140, 120, 200, 190), "off"
+        real_data, tmp_path, "ensenso/locate_multiple_patterns/camera.zip", "ensenso-n10", (141, 118, 188, 192), "off"
     )
     assert rows["contrast"].verdict == "not comparable"
     assert rows["finest detail"].verdict == "differs"
     assert 1.1 < rows["finest detail"].simulated / rows["finest detail"].real < 1.35
     # a calibration that has drifted: -0.09 px over the image (docs/how-to/real-captures.md), here with its sign turned
-    assert 0.02 < rows["vertical error"].real < 0.12
+    assert 0.0 < rows["vertical error"].real < 0.12
     assert abs(rows["vertical error"].simulated) < 0.04
     assert rows["distance"].verdict == "agrees"
-    # the print is as strong as recorded, and the noise of two views of it too small: the twin has no gloss
+    # the print is as strong as recorded; sigma within the factor that the page asks for
     assert rows["contrast"].simulated == pytest.approx(rows["contrast"].real, rel=0.015)
-    assert 0.7 < rows["sigma, median"].simulated / rows["sigma, median"].real < 0.95
+    assert 1 / 1.15 < rows["sigma, median"].simulated / rows["sigma, median"].real < 1.15
+
+
+def test_the_knee_of_a_recorded_n10_is_where_its_histograms_double(real_data):
+    """The fit uses the noise by level. The number of pixels of a level, which it does not use, doubles at the knee."""
+    path = real_data / "ensenso/locate_multiple_patterns/camera.zip"
+    if not path.exists():
+        pytest.skip("no recording ensenso/locate_multiple_patterns/camera.zip")
+    capture = read_recording(str(path), Given(sensor=None)).capture
+    imager = load_sensor("ensenso-n10").imager
+    for stack in capture.images.values():
+        image = stack[0]
+        counts = np.bincount(image.ravel(), minlength=256).astype(float)
+        step = 60 + int(np.argmax(counts[60:100] / counts[59:99]))
+        assert step == 80 and counts[80] / counts[79] == pytest.approx(2.0, rel=0.2)
+        knee = first_knee(image.astype(float), np.ones(image.shape, bool), imager)
+        assert knee is not None and knee.slope == 0.5 and abs(knee.level - step) < 0.75
 
 
 def test_a_makers_virtual_camera_against_ours(real_data, tmp_path):
