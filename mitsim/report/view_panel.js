@@ -25,6 +25,7 @@ function quantity(value, unit) {
 
 function percent(share) {
   if (!known(share)) return NONE;
+  if (share === 0) return `0${SPACE}%`;
   if (share > 0 && share < 0.0005) return `<${SPACE}0.1${SPACE}%`;
   if (share < 1 && share > 0.995) return `>${SPACE}99${SPACE}%`;
   return `${(100 * share).toFixed(share < 0.0995 ? 1 : 0)}${SPACE}%`;

@@ -46,7 +46,10 @@ def test_a_statement_on_stdout_and_in_a_file(stated):
     lines = done.stdout.splitlines()
     assert lines[0].startswith("measurement") and len(lines) == 8
     last = done.stderr.splitlines()[-1]
-    assert last.startswith("fits 0 of 1 tolerances; pillar1_radius is undecidable: u 0.") and "needed" in last
+    assert (
+        last.startswith("fits 0 of 1 tolerances; pillar1_radius is undecidable: standard uncertainty 0.")
+        and "needed" in last
+    )
     document = json.loads((folder / "out" / "statement.json").read_text())
     assert document["view"] == 1 and document["measured_by"] == "render"
     assert set(document["measurements"]) == {line.split()[0] for line in lines[1:]}
