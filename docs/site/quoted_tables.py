@@ -1,8 +1,8 @@
 """Compare a quoted table with the tables that a command prints, cell by cell.
 
 A quoted cell is compared with the printed cell of the same row label and the same column header. Its numbers have to be
-the first numbers of the printed cell, in this order and with the digits stated (:func:`quoted.same`). Cells of words
-have to begin with the same word.
+the first numbers of the printed cell, in this order and with the digits stated (:func:`quoted_numbers.same`). Cells of
+words have to begin with the same word.
 
 **Rows.** The label of a row is its first cell. If labels repeat, the following columns belong to the label, as many as
 make it unique. An empty cell of a label repeats the one above.

@@ -99,7 +99,7 @@ class Interreflections:
     """Interreflections at n points: ``rho`` (n,) relative to direct light, NaN without direct light.
 
     ``displaced`` (n,) is the bias of a phase code [rad] or of a path [mm], ``scattered`` (n,) the standard deviation
-    about it. ``refused`` (n,) is the share that a time-of-flight decoder rejects. All three are 0 for other sensors.
+    about it. ``rejected`` (n,) is the share that a time-of-flight decoder rejects. All three are 0 for other sensors.
     """
 
     rho: Floats

@@ -13,10 +13,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from characterisation.statements.verdict_words import OFTEN
 from mitsim.report.run_folder import ConfirmedEntry, ViewSetEntry
-
-#: share of trials without a value from which the sentence mentions it
-_OFTEN = 0.05
 
 
 @dataclass(frozen=True)
@@ -45,7 +43,7 @@ def set_result(entry: ViewSetEntry) -> SetResult:
         error = _error(one)
         if one is None or not reached[name] or not error <= limit:
             missed[name] = _missed(name, one, error, limit, reached[name])
-        elif one.without_value >= _OFTEN:
+        elif one.without_value >= OFTEN:
             often.append(f"{name}: no value in {100 * one.without_value:.0f} % of the virtual measurements")
     kept = len(limits) - len(missed)
     words = f"{which}, measured together, keeps {kept} of {len(limits)} limits"

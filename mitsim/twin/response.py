@@ -124,7 +124,7 @@ def _bias(clean: Floats, there: Mask, tiles: _Tiles, knee: Knee) -> tuple[float,
     numbers, found = tiles.fitted(knee.level, knee.slope), []
     k = knee.level - _ROUNDED_DOWN_DN
     every = np.linspace(0.0, k + (float(clean.max()) + 5 - k) / knee.slope, 1500)
-    spread = np.sqrt(np.maximum(numbers[0] + numbers[1] * np.maximum(every - tiles.black, 0.0), 0.02))
+    spread = tiles.spread(every, numbers)
     mean, _ = _through(every, knee.level, knee.slope, spread)
     light = np.interp(clean, mean, every)
     for stream in np.random.default_rng(0).spawn(_DRAWS):
@@ -243,13 +243,14 @@ class _Tiles:
         if slope < 1:
             top = knee + (float(self.clean.max()) + 5 - knee) / slope
             every = np.linspace(0.0, top, 1500)
-            mean, share = _through(every, knee, slope, np.sqrt(np.maximum(self._noise(every, numbers), 0.02)))
+            mean, share = _through(every, knee, slope, self.spread(every, numbers))
             light, ratio = np.interp(self.clean, mean, every), np.interp(self.clean, mean, share)
         both = ratio, ratio * np.maximum(light - self.black, 0.0)
         return np.stack([_of_neighbours(one)[self.inside] for one in both], axis=1)
 
-    def _noise(self, level: Floats, numbers: Floats) -> Floats:
-        return np.asarray(numbers[0] + numbers[1] * np.maximum(level - self.black, 0.0))
+    def spread(self, level: Floats, numbers: Floats) -> Floats:
+        """Return the standard deviation [DN] of the noise at levels (n,) of the converter, from a and b."""
+        return np.asarray(np.sqrt(np.maximum(numbers[0] + numbers[1] * np.maximum(level - self.black, 0.0), 0.02)))
 
 
 def _cut(values: NDArray[Any], side: int) -> Floats:
