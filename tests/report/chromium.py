@@ -67,18 +67,23 @@ class Chromium:
         os.close(self._out)
 
     def call(self, method: str, **parameters: object) -> dict:
+        number = self._send(method, parameters)
+        while True:
+            answer = self._next(60)
+            if answer is None:
+                raise TimeoutError(f"no answer to {method}")
+            if answer.get("id") == number:
+                assert "error" not in answer, (method, answer["error"])
+                return answer["result"]
+
+    def _send(self, method: str, parameters: dict) -> int:
+        """Number under which the answer will come."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
         if self._session is not None:
             message["sessionId"] = self._session
         os.write(self._out, json.dumps(message).encode() + b"\0")
-        while True:
-            answer = self._next(60)
-            if answer is None:
-                raise TimeoutError(f"no answer to {method}")
-            if answer.get("id") == self._number:
-                assert "error" not in answer, (method, answer["error"])
-                return answer["result"]
+        return self._number
 
     def _next(self, seconds: float) -> dict | None:
         """The next message; events are noted, answers are given back as well."""
@@ -94,7 +99,10 @@ class Chromium:
         one, _, self._rest = self._rest.partition(b"\0")
         message = json.loads(one)
         told = message.get("params", {})
-        if message.get("method") == "Runtime.exceptionThrown":
+        if message.get("method") == "Page.javascriptDialogOpening":
+            # a page with unsaved work asks before it is left, and nothing goes on until it is answered: leave
+            self._send("Page.handleJavaScriptDialog", {"accept": True})
+        elif message.get("method") == "Runtime.exceptionThrown":
             details = told["exceptionDetails"]
             self.problems.append(details.get("exception", {}).get("description", details["text"]))
         elif message.get("method") == "Runtime.consoleAPICalled" and told["type"] in ("error", "warning", "assert"):
