@@ -172,11 +172,11 @@ def score_candidates(
         possible,
         {"long_name": "whether the measurement is possible, by uncertainty and chance", "units": "1"},
     )
-    worth = np.where(possible, -np.log(np.where(uncertainty > 0, uncertainty, 1.0)), -np.inf)
+    risk = screening_risk(scores)
     scores["uncertainty_rank"] = (
         by,
-        rank_views(worth, possible),
-        {"long_name": "rank by predicted uncertainty, 1 is best", "units": "1"},
+        rank_views(-risk, np.isfinite(risk)),
+        {"long_name": "rank by predicted risk, uncertainty over the square root of chance; 1 is best", "units": "1"},
     )
     limit, feature = _limits(task, seen, scores, possible)
     scores["limit"] = (by, limit, {"long_name": "limiting factor of the view, against the best view", "units": "1"})
@@ -187,6 +187,17 @@ def score_candidates(
     scores["tolerance"] = ("measurement", tolerances, {"units": "mm or deg"})
     scores["unit"] = ("measurement", [m.unit for m in measurements])
     return with_poses(scores, views), [one.inputs for one in seen]
+
+
+def screening_risk(scores: xr.Dataset) -> Floats:
+    """Return the logarithm of the predicted risk u / sqrt(chance) (measurement, view).
+
+    It is infinite where the map excludes the view. It orders the views for the race and in every table.
+    """
+    u = scores["predicted_uncertainty"].transpose("measurement", "view").values
+    chance = scores["chance"].transpose("measurement", "view").values
+    able = np.isfinite(u) & (u > 0) & (chance > 0)
+    return np.where(able, np.log(np.where(able, u, 1.0)) - 0.5 * np.log(np.where(able, chance, 1.0)), np.inf)
 
 
 def _look(scoring: _Scoring, cast: _Cast, view: View) -> _Seen:
@@ -256,13 +267,14 @@ def _limits(
         if not able.any():
             limit[m] = "few points"
             continue
+        among = np.broadcast_to(able[:, None], noise.shape)
         with np.errstate(invalid="ignore", divide="ignore"):
             geometry = parts * np.sqrt(count) / noise
             excess = np.stack(
                 [
-                    noise / np.nanmin(np.where(able[:, None], noise, np.nan), axis=0),
-                    np.sqrt(np.nanmax(np.where(able[:, None], count, np.nan), axis=0) / count),
-                    geometry / np.nanmin(np.where(able[:, None] & (geometry > 0), geometry, np.nan), axis=0),
+                    noise / np.min(noise, axis=0, where=among & np.isfinite(noise), initial=np.inf),
+                    np.sqrt(np.max(count, axis=0, where=among & np.isfinite(count), initial=0.0) / count),
+                    geometry / np.min(geometry, axis=0, where=among & (geometry > 0), initial=np.inf),
                 ]
             )
         for v in range(len(seen)):

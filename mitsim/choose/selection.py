@@ -40,6 +40,7 @@ from mitsim.exposures.planned import exposed_for
 from mitsim.progress import say
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable
+from mitsim.view_scores import screening_risk
 from mitsim.virtual.mapped import MappedMeasurements
 from mitsim.virtual.plan import map_digest, measurements_of, trial_digest
 from mitsim.virtual.race import ALL, Maker, Raced, RaceRules, run_race
@@ -199,9 +200,8 @@ def _screened(candidate: CandidateSensor, folder: Path) -> Found:
         gc.collect()
     u = scores["predicted_uncertainty"].transpose("measurement", "view").values
     able = scores["uncertainty_possible"].transpose("measurement", "view").values.astype(bool) & (u > 0)
-    worth = np.where(able, u, np.inf)
-    best = worth.argmin(axis=1)
-    least = np.take_along_axis(worth, best[:, None], axis=1)[:, 0]
+    best = np.where(able, screening_risk(scores), np.inf).argmin(axis=1)
+    least = np.take_along_axis(np.where(able, u, np.inf), best[:, None], axis=1)[:, 0]
     asked = [
         _screened_demand(study.task, name, float(size))
         for name, size in zip(study.task.measurements, least, strict=True)

@@ -25,7 +25,7 @@ _HEAD = (
 
 
 def best_views(scores: xr.Dataset, measurement: str, count: int) -> str:
-    """Return the ``count`` best views by predicted uncertainty as text; angles in deg, lengths in mm.
+    """Return the ``count`` best views by predicted risk as text; angles in deg, lengths in mm.
 
     The text ends with an empty line.
     """

@@ -21,14 +21,17 @@ Floats = NDArray[np.float64]
 
 
 def ranked_views(scores: xr.Dataset, measurement: str) -> NDArray[np.int64]:
-    """Return the indices (not numbers) of the views that can make a measurement, least predicted uncertainty first."""
+    """Return the indices (not numbers) of the views that can make a measurement, least predicted risk first.
+
+    The risk is u / sqrt(chance), by which the race chooses its views too.
+    """
     here = scores.sel(measurement=measurement)
     order = np.argsort(here["uncertainty_rank"].values, kind="stable")
     return np.asarray(order[here["uncertainty_possible"].values.astype(bool)[order]])
 
 
 def best_view(scores: xr.Dataset, measurement: str) -> int | None:
-    """Return the number of the view with the least predicted uncertainty; None if no view can make the measurement."""
+    """Return the number of the view with the least predicted risk; None if no view can make the measurement."""
     ranked = ranked_views(scores, measurement)
     return int(scores["view"].values[ranked[0]]) if len(ranked) else None
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from characterisation.scores.screening import LEAST_MEASURABLE
 from characterisation.statements.judgement import Regret, Share, falsely_accepted, pooled_share, regret, share, within
 from mitsim.validation.statement_run import JudgedCase, StatedView
-from mitsim.virtual.race import screening_risk
+from mitsim.view_scores import screening_risk
 from mitsim.virtual.world import FINISH_DAYS
 
 Floats = NDArray[np.float64]

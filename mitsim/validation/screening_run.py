@@ -41,8 +41,8 @@ from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.study import Study
 from mitsim.validation.case_trials import benches, days, keep_trials, measured_truth
 from mitsim.validation.part_cases import PartCase
-from mitsim.view_scores import RAYS
-from mitsim.virtual.race import FIRST, first_of_each, prior_risk, screening_risk
+from mitsim.view_scores import RAYS, screening_risk
+from mitsim.virtual.race import FIRST, first_of_each, prior_risk
 from mitsim.virtual.screening import screen
 
 Floats = NDArray[np.float64]
@@ -130,7 +130,8 @@ def judged(
         for name, cost in costs.items()
     }
     costs[ALONE] = np.where(able, 0.0, np.inf)
-    flat = np.ones_like(u) * np.nanmedian(np.where(able, u, np.nan), axis=1, keepdims=True)
+    medians = [np.median(one[ok]) if ok.any() else np.nan for one, ok in zip(u, able, strict=True)]
+    flat = np.ones_like(u) * np.array(medians)[:, None]
     measured[ALONE] = measured_cost(costs[ALONE], flat, np.full_like(chance, 0.5), once, len(study.views))
     worth = {PREDICTED: chance} | worth | {ALONE: able.astype(float)}
     likelier = chance_after(chance, once)

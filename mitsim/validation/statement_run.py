@@ -25,9 +25,10 @@ from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.study import StatementTable, Study
 from mitsim.validation.case_trials import Bench, benches, days, keep_trials, measured_choice, measured_truth
 from mitsim.validation.part_cases import PartCase
+from mitsim.view_scores import screening_risk
 from mitsim.views import View
 from mitsim.virtual.plan import race_rules
-from mitsim.virtual.race import ALL, Raced, run_race, screening_risk
+from mitsim.virtual.race import ALL, Raced, run_race
 from mitsim.virtual.screening import screen
 from mitsim.virtual.stated import state_view
 

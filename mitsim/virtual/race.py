@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from characterisation.statements.selection import Standing, judge, posterior, sampled
 from mitsim.progress import say, say_progress
+from mitsim.view_scores import screening_risk
 from mitsim.views import View
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Trial
@@ -139,14 +140,6 @@ def prior_risk(u: Floats) -> Floats:
     known = np.where(np.isfinite(u) & (u > 0), u, np.nan)
     worst = np.nanmax(known) if np.isfinite(known).any() else 1.0
     return np.where(np.isfinite(known), known, 3 * worst)
-
-
-def screening_risk(scores: xr.Dataset) -> Floats:
-    """Return the logarithm of the predicted risk (measurement, view), infinite where the map excludes the view."""
-    u = scores["predicted_uncertainty"].transpose("measurement", "view").values
-    chance = scores["chance"].transpose("measurement", "view").values
-    able = np.isfinite(u) & (u > 0) & (chance > 0)
-    return np.where(able, np.log(np.where(able, u, 1.0)) - 0.5 * np.log(np.where(able, chance, 1.0)), np.inf)
 
 
 def run_race(views: Sequence[View], scores: xr.Dataset, maker: Maker, trials: TrialFolder, rules: RaceRules) -> Raced:
