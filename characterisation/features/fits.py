@@ -18,7 +18,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.robust_fit import FitError, covariance_of, rays_from, robust_fit, usable
-from characterisation.features.surfaces import GRAZING_COSINE, Cone, Cylinder, Plane, Sphere, Surface, tangents, unit
+from characterisation.features.surfaces import (
+    GRAZING_COSINE,
+    Cone,
+    Cylinder,
+    Plane,
+    Sphere,
+    Surface,
+    lengths,
+    tangents,
+    unit,
+)
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 
 __all__ = [
@@ -360,7 +370,7 @@ def belonging(points: ArrayLike, nominal: Surface, viewpoint: ArrayLike | None =
 def _not_false(points: Array, nominal: Surface, viewpoint: Array) -> NDArray[np.bool_]:
     """Return which points (n, 3) are near enough to a surface along their rays."""
     away = points - viewpoint
-    distance = np.linalg.norm(away, axis=1)
+    distance = lengths(away)
     rays = np.divide(away, distance[:, None], out=np.zeros_like(away), where=distance[:, None] > 0)
     residual = nominal.meet(points, rays).residual
     return np.asarray(np.abs(residual) <= FALSE_SHARE_OF_DISTANCE * (distance - residual))

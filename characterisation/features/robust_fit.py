@@ -11,13 +11,14 @@ it is a lower bound.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
-from characterisation.features.surfaces import GRAZING_COSINE
+from characterisation.features.surfaces import GRAZING_COSINE, lengths
 
 Array = NDArray[np.float64]
 
@@ -144,13 +145,18 @@ def _solve(
     shape: Shape, linearised: Linearised[Shape], chosen: NDArray[Any], along_rays: bool, loss: str, scale: float
 ) -> Shape:
     zero = np.zeros(shape.parameter_count)
-    check_rank(linearised(shape, zero, chosen, along_rays)[1], shape.kind)
+
+    @lru_cache(maxsize=1)  # the solver asks for residuals and derivatives one after the other
+    def at(parameters: tuple[float, ...]) -> tuple[Array, Array, Array]:
+        return linearised(shape, np.array(parameters), chosen, along_rays)
+
+    check_rank(at(tuple(zero))[1], shape.kind)
     tolerance = 1e-12 if loss == "linear" else 1e-6  # the robust shape is only a starting value
     with np.errstate(divide="ignore", invalid="ignore"):  # a degenerate surface shows in the status
         solution = least_squares(
-            lambda parameters: linearised(shape, parameters, chosen, along_rays)[0],
+            lambda parameters: at(tuple(parameters))[0],
             zero,
-            jac=lambda parameters: linearised(shape, parameters, chosen, along_rays)[1],
+            jac=lambda parameters: at(tuple(parameters))[1],
             loss=loss,
             f_scale=scale,
             x_scale="jac",
@@ -207,7 +213,7 @@ def rays_from(viewpoint: ArrayLike | None, points: Array) -> Array | None:
     if viewpoint is None:
         return None
     rays: Array = points - np.asarray(viewpoint, float)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays /= lengths(rays)[:, None]
     return rays
 
 

@@ -53,11 +53,18 @@ def result_in_words(judged: Sequence[Judged]) -> str:
 
 
 def losses_in_words(judged: Sequence[Judged]) -> str:
-    """Name the measurement that most often had no value; empty if each virtual measurement gave one."""
+    """Name the measurement that most often had no value, and count the others that often had none.
+
+    Empty if each virtual measurement gave one.
+    """
     worst = max(judged, key=lambda one: one.without_value)
     if worst.without_value == 0:
         return ""
-    return f"{worst.name} has no value in {_percent(worst.without_value)} of the virtual measurements"
+    share = f"{_percent(worst.without_value)} of the virtual measurements"
+    others = sum(one.without_value >= OFTEN for one in judged if one is not worst)
+    if not others:
+        return f"{worst.name} has no value in {share}"
+    return f"{worst.name} and {others} other{'s' if others > 1 else ''} have no value in up to {share}"
 
 
 def fits_all(judged: Sequence[Judged]) -> bool:

@@ -49,6 +49,7 @@ class Row:
     about: str
     nominal: str
     tolerance: str
+    bias: str
     uncertainty: str
     needed: str
     share: str
@@ -78,6 +79,7 @@ class RowValues:
     verdict: str
     nominal: float
     tolerance: float | tuple[float, float] | None
+    bias: float | None
     uncertainty: float | None
     without_value: float
     needed: float | None = None
@@ -106,6 +108,7 @@ class RowValues:
             about=self.about,
             nominal=exact(self.nominal, self.unit),
             tolerance=tolerance_words(self.tolerance, self.nominal, self.unit),
+            bias=_signed(self.bias, self.unit),
             uncertainty=_quantity(self.uncertainty, self.unit),
             needed=_quantity(self.needed, self.unit),
             share=NONE if self.share is None else _share(self.share),
@@ -182,6 +185,13 @@ def _interval(ends: tuple[float | None, float | None] | None, limit: float) -> s
 
 def _suffix(unit: str) -> str:
     return unit_symbol(unit) if unit == "deg" else f"\N{NO-BREAK SPACE}{unit}"
+
+
+def _signed(value: float | None, unit: str) -> str:
+    """Write a value with its sign: ``+0.31 mm``, ``−0.02°``; a dash for None."""
+    if value is None:
+        return NONE
+    return ("+" if value > 0 else MINUS if value < 0 else "") + quantity(abs(value), unit)
 
 
 def _quantity(value: float | None, unit: str) -> str:

@@ -156,6 +156,7 @@ def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[Row]:
             verdict=cell.verdict,
             nominal=asked.nominal,
             tolerance=asked.tolerance,
+            bias=cell.bias,
             uncertainty=cell.uncertainty,
             without_value=cell.without_value,
             needed=cell.needed,
@@ -187,6 +188,7 @@ def _run_row(run: Run, here: xr.Dataset, name: str, one: StatedMeasurement) -> R
         verdict=one.verdict,
         nominal=math.nan if entry is None else entry.nominal,
         tolerance=tolerance,
+        bias=one.bias,
         uncertainty=one.standard_uncertainty,
         without_value=one.without_value,
         needed=None if decision is None else decision.needed,
@@ -224,7 +226,7 @@ def _picture(
         by_verdict.setdefault(verdict, []).append(name)
     faces = (f"{verdict}: {', '.join(names)}" for verdict, names in by_verdict.items())
     alt = "The part and the sensor. " + "; ".join(faces)
-    drawn = f"{caption}. Drawn to scale; on the right, the part from the same side."
+    drawn = f"{caption}. Drawn to scale; on the right, the part enlarged, from the same viewpoint."
     return Picture(Markup(as_svg(placement_figure(geometry, poses, verdicts), alt)), drawn)
 
 

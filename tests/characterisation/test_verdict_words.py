@@ -37,6 +37,7 @@ def test_without_tolerances_the_losses_are_told():
     none = "Uncertainty given for 1 measurement. The task has no tolerances: nothing to accept or reject"
     assert result_in_words([a]) == f"{none}. a has no value in 25 % of the virtual measurements"
     assert result_in_words([replace(a, without_value=0.0)]) == none
+    assert result_in_words([a, b]).endswith("a and 1 other have no value in up to 25 % of the virtual measurements")
     few = replace(b, without_value=0.001)
     assert result_in_words([replace(a, without_value=0.0), few]).endswith(
         "b has no value in less than 1 % of the virtual measurements"

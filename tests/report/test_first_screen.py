@@ -41,7 +41,7 @@ def test_the_bar_is_green_only_if_something_fits_and_nothing_is_lost(results, to
 
 
 def values(**changed) -> RowValues:
-    known = {"name": "a", "about": "", "unit": "mm", "verdict": "not decided", "nominal": 20.0, "tolerance": 0.15}
+    known = {"name": "a", "about": "", "unit": "mm", "verdict": "not decided", "nominal": 20.0, "tolerance": 0.15, "bias": None}
     return RowValues(**(known | {"uncertainty": 0.018, "without_value": 0.0, "rule": "ISO 14253-1, ..."} | changed))
 
 
@@ -51,6 +51,13 @@ def test_a_share_is_given_with_its_limit_and_its_interval():
     assert row.share_interval.replace("\N{NO-BREAK SPACE}", " ") == "22 to 130 %"
     far = values(share=4.0, demand=16.0, demand_interval=(8.0, 1e280)).texts()
     assert far.share_interval.endswith("over 1000\N{NO-BREAK SPACE}%")
+
+
+@pytest.mark.parametrize(
+    ("bias", "written"), [(0.0312, "+0.031 mm"), (-0.5, "\N{MINUS SIGN}0.50 mm"), (0.0, "0 mm"), (None, "–")]
+)
+def test_the_bias_has_a_sign(bias, written):
+    assert values(bias=bias).texts().bias.replace("\N{NO-BREAK SPACE}", " ") == written
 
 
 def test_a_rule_that_limits_a_risk_has_no_largest_share():
@@ -125,5 +132,5 @@ def test_values_that_are_missing_are_told_of_a_comparison_without_tolerances(tmp
             cell |= {"verdict": "no tolerance", "without_value": 0.29}
     (folder / "choice.json").write_text(json.dumps(document), encoding="utf-8")
     first = of_choice(read_choice(folder), None)
-    assert first.tone == "warn" and "no value in 29 % of the virtual measurements" in first.words
+    assert first.tone == "warn" and "no value in up to 29 % of the virtual measurements" in first.words
     assert not first.tolerances
