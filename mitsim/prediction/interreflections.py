@@ -155,6 +155,7 @@ class InterreflectionEffect:
         self.middles = PixelRays.of_camera(self.coarse)
         self.light = _light(sensor)
         self.poses, self.ready = list(poses), dict[int, InterreflectionImage]()
+        self.places = {_key(pose): place for place, pose in enumerate(self.poses)}
 
     def __call__(self, view: SceneView) -> Perturbation:
         """Return the perturbation of the ideal points of a view."""
@@ -177,7 +178,7 @@ class InterreflectionEffect:
 
     def _ahead(self, scene: Scene, pose: Transform) -> InterreflectionImage:
         """Return the image of a view; if it is one of ``poses``, render it together with those that follow."""
-        place = next((k for k, one in enumerate(self.poses) if one is pose), None)
+        place = self.places.get(_key(pose))
         if place is None:
             return self.look(scene, pose)
         if place not in self.ready:
@@ -251,6 +252,10 @@ class InterreflectionEffect:
         levels = sensor.electrons() * seconds * sensor.imager.gain
         loss = camera_illumination(sensor.imager.corner_illumination, self.coarse)
         return levels if loss is None else np.asarray(levels * loss, float)
+
+
+def _key(pose: Transform) -> bytes:
+    return pose.matrix().tobytes()
 
 
 def _light(sensor: Sensor) -> LitPatterns | ModulatedLight:
