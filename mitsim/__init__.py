@@ -14,6 +14,7 @@ from mitsim.version import __version__ as __version__
 
 #: name -> module that defines it
 _NAMES = {
+    "BudgetLine": "characterisation.statements.budget",
     "Capture": "mitsim.capture.capture",
     "InputError": "characterisation.errors",
     "MissingEnvironmentError": "characterisation.errors",
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from characterisation.errors import InputError, MissingEnvironmentError
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.point_cloud import PointCloud
+    from characterisation.statements.budget import BudgetLine
     from characterisation.statements.statement import Statement
     from characterisation.tasks.task_file import Task
     from mitsim.capture.capture import Capture
@@ -71,6 +73,7 @@ if TYPE_CHECKING:
     from mitsim.study import Study
 
 __all__ = [
+    "BudgetLine",
     "Capture",
     "InputError",
     "MissingEnvironmentError",

@@ -124,8 +124,8 @@ def score_candidates(
     Dataset
         That of :func:`characterisation.scores.view_score.score_views`, with ``predicted_uncertainty`` [mm or deg],
         ``chance``, ``uncertainty_possible``, ``uncertainty_rank``, ``limit`` and ``limiting_feature`` (measurement,
-        view); ``mean_sigma``, ``n_white``, ``mean_sigma_white`` and ``n_only_white`` (view, feature); the poses; and
-        ``nominal``, ``tolerance`` and ``unit`` of the measurements.
+        view); ``overall_rank`` (view); ``mean_sigma``, ``n_white``, ``mean_sigma_white`` and ``n_only_white`` (view,
+        feature); the poses; and ``nominal``, ``tolerance`` and ``unit`` of the measurements.
     list of dict
         For every view, the input quantities of its measurements, from which sets of views are chosen.
     """
@@ -177,6 +177,14 @@ def score_candidates(
         by,
         rank_views(-risk, np.isfinite(risk)),
         {"long_name": "rank by predicted risk, uncertainty over the square root of chance; 1 is best", "units": "1"},
+    )
+    scores["overall_rank"] = (
+        "view",
+        rank_views(-risk.mean(axis=0), np.isfinite(risk).all(axis=0)),
+        {
+            "long_name": "rank by the mean logarithm of the predicted risk over all measurements, 1 is best",
+            "units": "1",
+        },
     )
     limit, feature = _limits(task, seen, scores, possible)
     scores["limit"] = (by, limit, {"long_name": "limiting factor of the view, against the best view", "units": "1"})

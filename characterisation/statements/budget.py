@@ -22,10 +22,22 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """Contribution of one group of unknowns.
+    """Contribution of one group of unknowns to the variance of an error.
 
-    Its ``variance`` [unit^2] with a 95 % interval ``low`` to ``high``, and its ``share`` of the whole variance, from
-    ``pairs`` of trials.
+    Interactions of groups count in each group that takes part, so the shares may add up to more than 1.
+
+    Parameters
+    ----------
+    group
+        Name of the group, such as ``calibration``, ``finish``, ``light``, ``unit``, ``pose`` or ``noise``.
+    variance
+        Variance of the error by this group [unit^2].
+    low, high
+        95 % interval of ``variance``, for normal errors. Heavy tails make it wider.
+    share
+        ``variance`` over the variance of the error by all groups.
+    pairs
+        Number of pairs of trials with a value that it rests on.
     """
 
     group: str
