@@ -91,7 +91,8 @@ def agreement(scores: xr.Dataset, checks: xr.Dataset, measurement: str) -> Agree
     some = known.any(axis=1)
     error = np.full(len(errors), np.nan)
     error[some] = np.nanmean(errors[some], axis=1)
-    least, most = np.where(known, errors, np.inf).min(axis=1), np.where(known, errors, -np.inf).max(axis=1)
+    least = np.min(errors, axis=1, where=known, initial=np.inf)
+    most = np.max(errors, axis=1, where=known, initial=0.0)
 
     possible = here["uncertainty_possible"].values.astype(bool)
     uncertainty, score = here["predicted_uncertainty"].values, here["V_m"].values
@@ -106,7 +107,7 @@ def agreement(scores: xr.Dataset, checks: xr.Dataset, measurement: str) -> Agree
         error,
         np.where(some, least, np.nan),
         np.where(some, most, np.nan),
-        1 - known.mean(axis=1),
+        1 - known.sum(axis=1) / max(known.shape[1], 1),  # no view was measured: (0, 0)
         int(some.sum()),
         spearman(predicted[some], error[some]),
         spearman(score[some], -error[some]),

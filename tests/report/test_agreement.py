@@ -52,6 +52,16 @@ def test_agreement_of_checked_views():
     assert found.trials == 5 and found.coverage == pytest.approx(0.8) and found.ratio == pytest.approx(1.0)
 
 
+def test_nothing_is_known_where_no_view_was_measured():
+    """The race measures none if the map predicts that no view can make the measurement."""
+    checks = xr.Dataset(
+        {"error": (("measurement", "view", "repeat"), np.empty((1, 0, 0)))},
+        {"measurement": ["m"], "view": np.empty(0, int)},
+    )
+    found = agreement(scores_of([math.nan, math.nan], [0, 0]), checks, "m")
+    assert found.count == found.trials == len(found.error) == 0 and found.order == TOO_FEW
+
+
 def test_a_view_that_u_says_to_be_impossible_ranks_last_though_it_has_a_u():
     errors = [[1], [2], [3], [4]]
     assert found_of([0.4, 0.1, 0.2, 0.3], [1] * 4, errors).spearman == pytest.approx(-0.2)
