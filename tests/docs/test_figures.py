@@ -37,6 +37,14 @@ def test_names_of_columns_and_rows_are_those_of_the_table(page):
         assert set(one.rows) <= {plain(cell) for row in one.text[2:] for cell in row_of(row)}, one.where
 
 
+def test_files_that_pages_quote_and_the_repository_has_are_equal():
+    quoted = {one.source: "\n".join(one.text) + "\n" for page in PAGES for one in figures(page) if one.kind == "file"}
+    stored = {name: text for name, text in quoted.items() if (ROOT / name).is_file()}
+    assert "scenes/two_pillars/set.toml" in stored
+    for name, text in stored.items():
+        assert (ROOT / name).read_text(encoding="utf-8") == text, name
+
+
 @by_page
 def test_every_fence_has_a_language(page):
     fences = re.findall(r"^```([^\n]*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
