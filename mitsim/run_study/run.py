@@ -188,7 +188,7 @@ def _state(
 
 
 def _best(scores: xr.Dataset) -> list[int]:
-    """Return the numbers of the best views of every measurement, by predicted uncertainty and by V_m."""
+    """Return the numbers of the best views of every measurement, by predicted risk and by V_m."""
     ranks = np.concatenate([scores["uncertainty_rank"].values, scores["rank"].values])
     able = np.concatenate([np.isfinite(scores["predicted_uncertainty"].values), scores["possible"].values])
     return sorted({int(view) for view in np.flatnonzero(((ranks <= SHOWN) & able).any(axis=0))})
