@@ -28,7 +28,7 @@ def calibrate(
         list[str] | None,
         typer.Option(
             "--drift",
-            help="Drift since the calibration: NAME=VALUE, one sigma. Repeatable. "
+            help="Drift since the calibration, for the printed accuracy only: NAME=VALUE, one sigma. Repeatable. "
             "Other terms are as in the sensor file.",
         ),
     ] = None,

@@ -27,7 +27,7 @@ app = typer.Typer(
     cls=_FinishByDefault,
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="Fit the simulation to captures: the finish of a coupon (mitsim fit CAPTURES), or your own sensor.",
+    help="Fit a finish (mitsim fit finish) or a sensor file (mitsim fit sensor) to captures.",
 )
 
 
@@ -102,8 +102,8 @@ def sensor_(
     ] = None,
     sensor: Annotated[str, typer.Option(help="Sensor to start from: a preset or a TOML file.")] = "",
     output: Annotated[Path, typer.Option("--output", "-o", help="Sensor TOML file to write.")] = Path("my-camera.toml"),
-    off: Annotated[list[Path] | None, typer.Option(help="Capture with the projector off. Repeatable.")] = None,
-    dark: Annotated[list[Path] | None, typer.Option(help="Capture with all light off. Repeatable.")] = None,
+    off: Annotated[list[Path] | None, typer.Option(help="Capture with the projector off; once for each.")] = None,
+    dark: Annotated[list[Path] | None, typer.Option(help="Capture with all light off; once for each.")] = None,
     window: Annotated[
         tuple[int, int, int, int] | None,
         typer.Option(

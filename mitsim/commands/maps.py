@@ -163,7 +163,9 @@ def compare(
 def predict(
     scene: Scene,
     output: OutCloud,
-    map_file: Annotated[Path, typer.Option("--map", help="A map.nc file, or a sensor whose map comes with mitsim.")],
+    map_file: Annotated[
+        Path, typer.Option("--map", metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")
+    ],
     position: Position,
     target: Target = (0.0, 0.0, 0.0),
     roll: Roll = 0.0,

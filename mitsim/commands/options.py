@@ -20,9 +20,11 @@ Scene = Annotated[Path, typer.Argument(help="Scene XML file of the part, in mm."
 Variant = Annotated[str | None, typer.Option(help="Mitsuba variant: cuda_ad_mono (GPU) or llvm_ad_mono (CPU).")]
 SensorOption = Annotated[str, typer.Option(help="Name of a preset, or path of a sensor TOML file.")]
 Defines = Annotated[list[str] | None, typer.Option("-D", help="Set a <default> of the scene: name=value. Repeatable.")]
-Position = Annotated[tuple[float, float, float], typer.Option(help="Position of the sensor in the world frame [mm].")]
+Position = Annotated[
+    tuple[float, float, float], typer.Option(help="Position of the sensor in the frame of the scene [mm].")
+]
 Target = Annotated[
-    tuple[float, float, float], typer.Option(help="Point that the sensor looks at, in the world frame [mm].")
+    tuple[float, float, float], typer.Option(help="Point that the sensor looks at, in the frame of the scene [mm].")
 ]
 Roll = Annotated[float, typer.Option(help="Rotation about the view axis [deg].")]
 Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Random seed; the same seed gives the same result.")]

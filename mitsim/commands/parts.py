@@ -27,7 +27,7 @@ def check(
     scene: Scene,
     position: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Position of the sensor in the world frame [mm]; default: 45 deg above the part."),
+        typer.Option(help="Position of the sensor in the frame of the scene [mm]; default: 45 deg above the part."),
     ] = None,
     target: Target = (0.0, 0.0, 0.0),
     roll: Roll = 0.0,

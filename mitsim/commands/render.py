@@ -35,7 +35,7 @@ def render(
     output: Out,
     position: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Position of the sensor in the world frame [mm]; or use --many."),
+        typer.Option(help="Position of the sensor in the frame of the scene [mm]; or use --many."),
     ] = None,
     target: Target = (0.0, 0.0, 0.0),
     roll: Roll = 0.0,

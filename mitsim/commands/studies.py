@@ -33,7 +33,7 @@ PlanExposures = Annotated[
     typer.Option(
         "--plan-exposures",
         help="Plan the exposures of the stated view (see `mitsim exposures`), with the limits in [exposure] of the "
-        "study. Views are compared with the sensor's own exposure.",
+        "study. Views are screened and compared with the sensor's own exposure.",
     ),
 ]
 ViewNumber = Annotated[int, typer.Option(min=0, help="Number of the view in scores.csv and poses/.")]
@@ -105,7 +105,7 @@ def choose(
 
     Finished work is kept: run the same command again to continue. Exit code 1 if no sensor fits every tolerance.
 
-    Example: mitsim choose scenes/two_pillars/study.toml --sensors all -o runs/choice
+    Example: mitsim choose scenes/two_pillars/tolerances.toml --sensors all -o runs/choice
     """
     start(variant)
     import json
@@ -265,6 +265,7 @@ def score(
         str,
         typer.Option(
             "--map",
+            metavar="MAP",
             help="A map.nc file, or the name of a sensor whose map comes with mitsim; default: the map of the study.",
         ),
     ] = "",

@@ -242,7 +242,7 @@ def maps(
     ] = None,
     variant: Variant = None,
 ) -> None:
-    """Compare measurements drawn from maps with rendered ones, and write the size of the effects that maps miss.
+    """Compare measurements drawn from maps with rendered ones, and write the size of effects outside the map.
 
     Uses the rendered measurements that the cases file names, and skips cases without any. The sizes come from the open
     parts only. The printed table tests each open case with sizes from the other open cases, and each sealed case with
