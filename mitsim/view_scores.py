@@ -180,7 +180,7 @@ def score_candidates(
     )
     scores["overall_rank"] = (
         "view",
-        rank_views(-risk.mean(axis=0), np.isfinite(risk).all(axis=0)),
+        rank_views(-risk.mean(axis=0), np.asarray(np.isfinite(risk).all(axis=0))),
         {
             "long_name": "rank by the mean logarithm of the predicted risk over all measurements, 1 is best",
             "units": "1",

@@ -41,8 +41,9 @@ def test_the_bar_is_green_only_if_something_fits_and_nothing_is_lost(results, to
 
 
 def values(**changed) -> RowValues:
-    known = {"name": "a", "about": "", "unit": "mm", "verdict": "not decided", "nominal": 20.0, "tolerance": 0.15, "bias": None}
-    return RowValues(**(known | {"uncertainty": 0.018, "without_value": 0.0, "rule": "ISO 14253-1, ..."} | changed))
+    known = {"name": "a", "about": "", "unit": "mm", "verdict": "not decided", "nominal": 20.0, "tolerance": 0.15}
+    rest = {"bias": None, "uncertainty": 0.018, "without_value": 0.0, "rule": "ISO 14253-1, ..."}
+    return RowValues(**(known | rest | changed))
 
 
 def test_a_share_is_given_with_its_limit_and_its_interval():
