@@ -175,12 +175,12 @@ def score_candidates(
     risk = screening_risk(scores)
     scores["uncertainty_rank"] = (
         by,
-        rank_views(-risk, np.isfinite(risk)),
+        rank_views(-risk, possible),
         {"long_name": "rank by predicted risk, uncertainty over the square root of chance; 1 is best", "units": "1"},
     )
     scores["overall_rank"] = (
         "view",
-        rank_views(-risk.mean(axis=0), np.asarray(np.isfinite(risk).all(axis=0))),
+        rank_views(-risk.mean(axis=0), np.asarray(possible.all(axis=0))),
         {
             "long_name": "rank by the mean logarithm of the predicted risk over all measurements, 1 is best",
             "units": "1",
@@ -200,7 +200,8 @@ def score_candidates(
 def screening_risk(scores: xr.Dataset) -> Floats:
     """Return the logarithm of the predicted risk u / sqrt(chance) (measurement, view).
 
-    It is infinite where the map excludes the view. It orders the views for the race and in every table.
+    It is infinite where the map excludes the view. It orders the views for the race. Tables have the same order, but
+    for views with a chance under one half, which come last.
     """
     u = scores["predicted_uncertainty"].transpose("measurement", "view").values
     chance = scores["chance"].transpose("measurement", "view").values

@@ -90,7 +90,8 @@ def score(study: Study) -> xr.Dataset:
 
         Over ``measurement`` and ``view``: ``predicted_uncertainty``, standard, in the ``unit`` (mm or deg) of the
         measurement, infinite or NaN if a view cannot measure; ``chance`` that it can, 0 to 1; ``uncertainty_rank`` by
-        u / sqrt(chance), 1 for the best; ``V_m``, the score of Kinnell and Justham (2018), and ``rank`` by it.
+        u / sqrt(chance), 1 for the best, chances under 1/2 last; ``V_m``, the score of Kinnell and Justham (2018), and
+        ``rank`` by it.
 
         Over ``view``: ``overall_rank``, by the mean of log(u / sqrt(chance)) over the measurements; ``azimuth_deg``
         about the z axis of the world, from x; ``elevation_deg`` above the plane z = 0, 90 from above; ``roll_deg``
