@@ -138,7 +138,8 @@ def _plane_name(face: Face, surface: Plane, low: Floats, high: Floats) -> str:
     off = float(np.rad2deg(np.arccos(np.abs(surface.normal).max())))
     extent = np.sort(_extents(face, surface))
     narrow = extent[0] < _CHAMFER_SHARE * float(np.linalg.norm(high - low))
-    return f"{'chamfer' if narrow else 'slope'}_{off:.0f}deg"
+    upright = abs(surface.normal[2]) < np.sqrt(1 - _ALONG**2)  # like the sides of a hexagonal nut
+    return f"{'chamfer' if narrow else 'side' if upright else 'slope'}_{off:.0f}deg"
 
 
 def _extents(face: Face, surface: Plane) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from dataclasses import replace
 
@@ -75,6 +76,22 @@ def test_names_do_not_hang_on_the_order_of_the_file(faces):
     mixed = [replace(face, name="") for face in faces]
     random.Random(5).shuffle(mixed)
     assert {face.name: face.entities for face in with_names(mixed)} == {face.name: face.entities for face in faces}
+
+
+def test_upright_faces_between_the_axes_are_sides_and_inclined_ones_are_slopes(tmp_path):
+    from OCP.BRepBuilderAPI import BRepBuilderAPI_Transform
+    from OCP.BRepPrimAPI import BRepPrimAPI_MakeBox
+    from OCP.gp import gp_Ax1, gp_Dir, gp_Pnt, gp_Trsf
+
+    def turned(axis):
+        motion = gp_Trsf()
+        motion.SetRotation(gp_Ax1(gp_Pnt(0, 0, 0), gp_Dir(*axis)), math.radians(30))
+        return BRepBuilderAPI_Transform(BRepPrimAPI_MakeBox(30, 40, 50).Shape(), motion).Shape()
+
+    for axis, kinds in (((0, 0, 1), {"side_30deg": 4}), ((1, 0, 0), {"slope_30deg": 4})):
+        path = write_step([("box", turned(axis), None)], tmp_path / "box.step")
+        names = [face.name for face in with_names(read_step(path).faces)]
+        assert {kind: sum(name.startswith(kind) for name in names) for kind in kinds} == kinds, names
 
 
 def test_a_bore_in_two_halves_is_one_face(tmp_path):
