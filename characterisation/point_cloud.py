@@ -165,8 +165,10 @@ class PointCloud:
         (H, W) uint8 of :class:`Status`; ``VALID`` exactly where the point is finite.
     grid
         The grid of the pixels.
-    sensor, source
-        Name of the sensor; ``simulated | predicted | device | replay | emulator``.
+    sensor
+        Name of the sensor.
+    source
+        ``simulated``, ``predicted``, ``device``, ``replay`` or ``emulator``.
     baseline
         (3,) unit vector in the sensor frame from the reference camera to the second camera or projector. A sensor is
         not symmetric about its axis, so normals are expressed relative to the baseline.

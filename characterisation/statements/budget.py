@@ -32,8 +32,10 @@ class BudgetLine:
         Name of the group, such as ``calibration``, ``finish``, ``light``, ``unit``, ``pose`` or ``noise``.
     variance
         Variance of the error by this group [unit^2].
-    low, high
-        95 % interval of ``variance``, for normal errors. Heavy tails make it wider.
+    low
+        Low end of the 95 % interval of ``variance``, for normal errors. Heavy tails make it wider.
+    high
+        Its high end.
     share
         ``variance`` over the variance of the error by all groups.
     pairs

@@ -32,29 +32,45 @@ class Statement:
 
     Parameters
     ----------
-    trials, without_value
-        Number of trials, and the share of them without a value.
-    bias, bias_uncertainty
-        Mean error, and its standard uncertainty from the finite number of trials.
+    measurement
+        Its name.
+    unit
+        Unit of all values, mm or deg.
+    trials
+        Number of trials.
+    without_value
+        Share of the trials without a value.
+    bias
+        Mean error.
+    bias_uncertainty
+        Its standard uncertainty from the finite number of trials.
     standard_uncertainty
         Standard deviation of the error about the bias. It remains, together with ``bias_uncertainty``, if the user
         subtracts the bias.
-    interval, interval_corrected
-        95 % coverage interval of the error, (low, high); the same after subtraction of the bias.
+    interval
+        95 % coverage interval of the error, (low, high).
+    interval_corrected
+        The same after subtraction of the bias.
     moved
         Standard errors of bias, standard uncertainty, low and high end from the finite number of trials.
-    numerical_tolerance, settled
-        delta of JCGM 101, 7.9.2 for one significant digit of the standard uncertainty, and whether twice every one of
-        ``moved`` is below it.
+    numerical_tolerance
+        delta of JCGM 101, 7.9.2 for one significant digit of the standard uncertainty.
+    settled
+        Whether twice every one of ``moved`` is below ``numerical_tolerance``.
     repeatability
         Standard deviation between captures of one day, from ``repeats``; NaN without any.
     budget
         Variance by group of unknowns, largest first; empty if it was not computed.
-    tolerance, share_of_tolerance, share_interval
-        Size of the tolerance; the end of the 95 % interval that is larger in absolute value, over the size; 95 %
-        interval of this share.
-    decided, verdict
-        Decision by the rule of the tolerance; None and ``no tolerance`` without one.
+    tolerance
+        Size of the tolerance; None without one.
+    share_of_tolerance
+        End of the 95 % interval that is larger in absolute value, over the size of the tolerance.
+    share_interval
+        95 % interval of this share.
+    decided
+        Decision by the rule of the tolerance; None without one.
+    verdict
+        ``fits``, ``does not fit``, ``undecidable``, ``not decided``, or ``no tolerance``.
     """
 
     measurement: str

@@ -23,8 +23,10 @@ def look_at(
 
     Parameters
     ----------
-    position, target
-        (3,) [mm] in the world frame, which is the frame of the scene.
+    position
+        Place of the sensor (3,) [mm] in the world frame, which is the frame of the scene.
+    target
+        Place at which it looks (3,) [mm], in the same frame.
     up
         (3,) direction to which the top of the image is turned, as closely as possible.
     roll_deg
