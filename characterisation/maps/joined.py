@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from characterisation.errors import InputError
+from characterisation.maps.lay import LAY_FIELDS, LAY_NODES
 from characterisation.maps.light import light_variables
 from characterisation.maps.performance_map import PerformanceMap
 
@@ -34,10 +35,17 @@ def with_samples(performance_map: PerformanceMap, others: Sequence[PerformanceMa
     """
     data = performance_map.data
     distances, axis = data["distance"].values.astype(float), data["a"].values.astype(float)
-    names = [str(name) for name, values in data.data_vars.items() if values.dims == _NODES]
+    kinds = {str(name): values for name, values in data.data_vars.items() if values.dims == _NODES}
+    with_lay = next((one.data for one in (performance_map, *others) if "lay" in one.data.dims), None)
+    if with_lay is not None:
+        kinds |= {name: with_lay[name] for name in LAY_FIELDS.values()}
     samples, lights = list(performance_map.samples), list(performance_map.lights)
     place: dict[str, int] = {}
-    fields = {name: [*data[name].values] for name in names}
+    missing = {
+        name: np.full((*kind.shape[1:-3], len(distances), len(axis), len(axis)), np.nan, kind.dtype)
+        for name, kind in kinds.items()
+    }
+    fields = {name: [*data[name].values] if name in data else [empty] * len(samples) for name, empty in missing.items()}
     for other in others:
         on_nodes = _on_axis(other.data, axis)
         at = [_number_of(distances, float(one)) for one in other.data["distance"].values]
@@ -47,17 +55,18 @@ def with_samples(performance_map: PerformanceMap, others: Sequence[PerformanceMa
                 place[key] = len(samples)
                 samples.append(sample)
                 lights.append(other.lights[number])
-                for name in names:
-                    fields[name].append(np.full(data[name].shape[1:], np.nan, np.float32))
-            for name in names:
+                for name, empty in missing.items():
+                    fields[name].append(empty.copy())
+            for name in kinds:
                 if name in on_nodes:
-                    fields[name][place[key]][at] = on_nodes[name].values[number]
+                    fields[name][place[key]][..., at, :, :] = on_nodes[name].values[number]
     joined = xr.Dataset(
-        {name: (_NODES, np.stack(fields[name]).astype(data[name].dtype), data[name].attrs) for name in names},
+        {name: (kind.dims, np.stack(fields[name]).astype(kind.dtype), kind.attrs) for name, kind in kinds.items()},
         coords={
             "finish": ("sample", np.array([name for name, _ in samples], dtype=str)),
             "roughness": ("sample", np.array([ra for _, ra in samples], float), data["roughness"].attrs),
             **{name: data[name] for name in ("distance", "a", "b")},
+            **({} if with_lay is None else {name: with_lay[name] for name in ("lay", "lay_mirror_x", "lay_mirror_y")}),
         },
         attrs=data.attrs,
     )
@@ -105,6 +114,30 @@ def mean_over(maps: Sequence[PerformanceMap]) -> PerformanceMap:
     return PerformanceMap(data)
 
 
+def with_directions(
+    mean: PerformanceMap, maps: Sequence[PerformanceMap], mirror_mm: tuple[float, float]
+) -> PerformanceMap:
+    """Return the mean over maps of one sample with its lay in several directions, with the fields of each direction.
+
+    The directions of the ``maps`` are equally spaced from 0 to 180 deg. ``mirror_mm`` is m of
+    :mod:`characterisation.maps.lay`.
+    """
+    angles = np.arange(len(maps)) * 180.0 / len(maps)
+    fields = {
+        stored: (LAY_NODES, np.stack([one.data[name].values for one in maps], axis=1), maps[0].data[name].attrs)
+        for name, stored in LAY_FIELDS.items()
+    }
+    described = {"units": "deg", "long_name": "direction of u of a surface with a lay, about the mirror direction"}
+    middle = {"units": "mm", "long_name": "place half-way between camera and light"}
+    return PerformanceMap(
+        mean.data.assign(fields).assign_coords(
+            lay=("lay", angles, described),
+            lay_mirror_x=((), mirror_mm[0], middle),
+            lay_mirror_y=((), mirror_mm[1], middle),
+        )
+    )
+
+
 def _number_of(distances: np.ndarray, distance: float) -> int:
     number = int(np.abs(np.log(distances / distance)).argmin())
     if abs(distances[number] / distance - 1) > _SAME_DISTANCE:
@@ -120,4 +153,6 @@ def _on_axis(data: xr.Dataset, axis: np.ndarray) -> xr.Dataset:
     own = data["a"].values.astype(float)
     if len(own) == len(axis) and np.allclose(own, axis, atol=1e-9):
         return data
-    return data[[name for name, values in data.data_vars.items() if values.dims == _NODES]].interp(a=axis, b=axis)
+    return data[[name for name, values in data.data_vars.items() if values.dims in (_NODES, LAY_NODES)]].interp(
+        a=axis, b=axis
+    )

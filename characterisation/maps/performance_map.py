@@ -40,6 +40,8 @@ from characterisation.atomic_io import write_netcdf
 from characterisation.datasets import Schema, Variable, read_dataset
 from characterisation.errors import InputError
 from characterisation.lambert_projection import inverse_lambert_projection, lambert_projection
+from characterisation.maps.lay import LAY_FIELDS, LAY_NODES, between_directions, directions_of
+from characterisation.maps.lay import SCHEMA as LAY_SCHEMA
 from characterisation.maps.light import SCHEMA as LIGHT_SCHEMA
 from characterisation.maps.light import Light, light_variables, lights_of
 from characterisation.maps.pooled_offsets import pool_offsets
@@ -87,6 +89,8 @@ _DESCRIBED = {
 
 _NODES = ("sample", "distance", "b", "a")
 
+_ROUNDED_FINELY = (*FIELDS[:2], *(LAY_FIELDS[name] for name in FIELDS[:2]))
+
 _SCHEMA = Schema(
     "a performance map (map.nc) made by mitsim characterise",
     {
@@ -102,8 +106,9 @@ _SCHEMA = Schema(
         "a": Variable(("a",), low=-2.0, high=2.0),
         "b": Variable(("b",), low=-2.0, high=2.0),
         **LIGHT_SCHEMA,
+        **LAY_SCHEMA,
     },
-    {"sample": (1, 10_000), "distance": (1, 10_000), "a": (2, 10_000), "b": (2, 10_000)},
+    {"sample": (1, 10_000), "distance": (1, 10_000), "a": (2, 10_000), "b": (2, 10_000), "lay": (2, 180)},
 )
 
 
@@ -164,6 +169,7 @@ class PerformanceMap:
         distance: ArrayLike,
         normals: NDArray[np.floating],
         light: Light | None = None,
+        tangents: NDArray[np.floating] | None = None,
     ) -> Performance:
         """Look up F and sigma.
 
@@ -175,6 +181,9 @@ class PerformanceMap:
             |V| [mm] (n,), and unit N in the view frame (n, 3).
         light
             Optical properties of the surface, see :meth:`~characterisation.maps.samples.Samples.answering`.
+        tangents
+            Direction of the surface's parameter u in the view frame (n, 3), for a surface with a lay. Without it, or
+            where it is NaN, the answer is the mean over directions. A surface without a lay ignores it.
 
         Raises
         ------
@@ -183,7 +192,12 @@ class PerformanceMap:
         """
         normals = np.asarray(normals)
         distance = np.broadcast_to(np.asarray(distance, float), normals.shape[:-1])
-        answer = self.surface(finish, roughness, light).look_up(distance.ravel(), normals.reshape(-1, 3))
+        surface, flat = self.surface(finish, roughness, light), normals.reshape(-1, 3)
+        if tangents is None or not surface.directions:
+            answer = surface.look_up(distance.ravel(), flat)
+        else:
+            along = np.broadcast_to(np.asarray(tangents, float), normals.shape).reshape(-1, 3)
+            answer = between_directions(surface, distance.ravel(), flat, along)
         return Performance(*(values.reshape(distance.shape) for values in answer))
 
     def surface(self, finish: str, roughness: float, light: Light | None = None) -> Surface:
@@ -212,7 +226,16 @@ class PerformanceMap:
             for field in FIELDS
         }
         fields = between_samples(stacks, known, float(roughness) if roughness != "" else math.nan)
-        return Surface(fields, self._distances, self._axis)
+        directions = [
+            Surface(
+                between_samples({field: one.get(field, unknown)[None] for field in FIELDS}, known, math.nan),
+                self._distances,
+                self._axis,
+            )
+            for one in (directions_of(self.data, members[0]) if len(members) == 1 else ())
+        ]
+        x, y = (float(self.data[name]) if directions else 0.0 for name in ("lay_mirror_x", "lay_mirror_y"))
+        return Surface(fields, self._distances, self._axis, directions, (x, y))
 
     def save(self, path: str | Path, compact: bool = False) -> None:
         """Write netCDF, atomically.
@@ -223,14 +246,18 @@ class PerformanceMap:
             Compress the file, after rounding values to ``VALUE_BITS`` and errors to ``ERROR_BITS`` of the mantissa
             (Zender, Geosci. Model Dev. 9 (2016) 3199-3211; rounded to nearest). Such a file is read like any other.
         """
-        data, encoding = self.data, {}
+        data = self.data
+        # most samples of a map have no lay, and NaN there
+        encoding: dict[str, dict[str, Any]] = {
+            name: {"zlib": True, "complevel": 1} for name in LAY_FIELDS.values() if name in data
+        }
         if compact:
             data = data.copy()
             for name, values in self.data.data_vars.items():
-                if values.dims == ("sample", "distance", "b", "a"):
-                    bits = VALUE_BITS if name in ("recovered_fraction", "ray_noise_std") else ERROR_BITS
+                if values.dims in (_NODES, LAY_NODES):
+                    bits = VALUE_BITS if name in _ROUNDED_FINELY else ERROR_BITS
                     data[name] = (values.dims, _rounded(values.values, bits), values.attrs)
-                    encoding[name] = {"zlib": True, "complevel": 9, "shuffle": True}
+                    encoding[str(name)] = {"zlib": True, "complevel": 9, "shuffle": True}
         write_netcdf(data, path, encoding)
 
     @staticmethod
@@ -265,6 +292,10 @@ def _check_axes(path: Path, data: xr.Dataset) -> None:
             "nodes that are unequally spaced or differ from those of b",
             "equally spaced nodes, the same for a and b",
         )
+    if "lay" in data.dims:
+        lays = data["lay"].values.astype(float) if "lay" in data.variables else np.full(1, np.nan)
+        if not np.allclose(lays, np.arange(len(lays)) * 180.0 / len(lays), atol=1e-6):
+            raise InputError(path, "lay", f"directions of {lays} deg", "equally spaced directions, 0 to 180 deg")
     roughness, finish, lights = data["roughness"].values, data["finish"].values, lights_of(data)
     if len({(name, str(ra), str(light)) for name, ra, light in zip(finish, roughness, lights, strict=True)}) < len(
         finish

@@ -26,7 +26,7 @@ must be known at both knots, and at corners with half of the weight.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,9 +145,22 @@ class Surface:
         Probit of F, ln sigma, errors and spreads from :func:`between_samples`, each (distance, b, a).
     distances, axis
         |V| [mm] (d,), ascending, and the positions of the nodes along ``a`` and ``b`` (n,), equally spaced.
+    directions
+        The same surface with its lay in each of several directions, equally spaced from 0 to 180 deg
+        (:mod:`characterisation.maps.lay`); empty without a lay. ``fields`` are then the mean over directions.
+    mirror_mm
+        The place m half-way between camera and light [mm], for directions.
     """
 
-    def __init__(self, fields: list[Floats], distances: Floats, axis: Floats) -> None:
+    def __init__(
+        self,
+        fields: list[Floats],
+        distances: Floats,
+        axis: Floats,
+        directions: Sequence[Surface] = (),
+        mirror_mm: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        self.directions, self.mirror_mm = tuple(directions), mirror_mm
         self.knots, self.first, self.step = np.log(distances), axis[0], axis[1] - axis[0]
         self.count = len(axis)
         self.fields = [field.reshape(len(distances), -1) for field in fields]

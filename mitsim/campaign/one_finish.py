@@ -3,8 +3,8 @@
 Signal chain: finish from a loaded scene, and |V| -> a flat coupon of it -> the same plan of orientations for every
 finish, refined where F or sigma changes fast -> a map of one sample at one distance.
 
-A finish with a lay is shown with its marks along, across and at 45 deg on either side of the baseline. A map has no
-axis for this direction. It contains the mean over the four directions, and their differences as its spread.
+A finish with a lay is shown in four directions (:mod:`characterisation.maps.lay`). Its map contains the fields of each,
+their mean for queries without a direction, and their differences as the spread of that mean.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from characterisation.coupon.orientations import Refinement
-from characterisation.maps.joined import mean_over
+from characterisation.maps.joined import mean_over, with_directions
+from characterisation.maps.lay import mirror_direction, tangent_at
 from characterisation.maps.performance_map import PerformanceMap
 from mitsim.campaign.acquire import in_turn, simulated_source
 from mitsim.campaign.coupons import CouponRecipe, Sample
@@ -34,6 +34,7 @@ from mitsim.campaign.plan import (
     Shot,
     half_size,
     sensor_checksum,
+    view_axes,
 )
 from mitsim.campaign.run import run_campaign
 from mitsim.scene.load import flat_coupon
@@ -44,9 +45,9 @@ from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.version import __version__
 
 #: increased if the plan below changes, so that cached maps are made again
-DESIGN_VERSION = 1
+DESIGN_VERSION = 2
 
-#: directions of a lay to show [deg]
+#: directions of u of a finish with a lay [deg], equally spaced from 0 to 180
 TURNS_DEG = (0.0, 45.0, 90.0, 135.0)
 
 #: mirror-like and glossy lobes are 5 to 20 deg wide; a matt finish varies only with cos
@@ -100,15 +101,37 @@ class OneFinish:
 
 @dataclass(frozen=True)
 class _RotatedCampaign(Campaign):
-    """A campaign whose coupons are rotated about their normals."""
+    """A campaign whose coupons have their u, the x axis, at one lay angle [deg]; None for any."""
 
-    turn_deg: float = 0.0
+    lay_deg: float | None = None
 
     def shot(self, series: Series, normal: NDArray[np.float64]) -> Shot:
         """Return a shot of the coupon of a series with a given normal."""
         shot = super().shot(series, normal)
-        turn = Transform(Rotation.from_euler("z", self.turn_deg, degrees=True).as_matrix(), np.zeros(3))
-        return replace(shot, sensor_from_coupon=shot.sensor_from_coupon @ turn)
+        if self.lay_deg is None:
+            return shot
+        mirror = mirror_direction(np.array(series.distance), mirror_mm(self.sensor))
+        u = _sensor_from_view(self.sensor) @ tangent_at(normal, self.lay_deg, mirror)
+        z = shot.sensor_from_coupon.rotation[:, 2]
+        axes = np.stack([u, np.cross(z, u), z], axis=1)
+        return replace(shot, sensor_from_coupon=Transform(axes, shot.sensor_from_coupon.translation))
+
+
+def mirror_mm(sensor: Sensor) -> tuple[float, float]:
+    """Return the place half-way between camera and light in the view frame, as a mean over the cameras [mm].
+
+    The light of a sensor without a projector is taken to be at its reference camera.
+    """
+    rig = sensor.measuring_rig
+    cameras = [camera.centre for camera in rig.cameras.values()]
+    light = cameras[0] if rig.projector is None else rig.projector.centre
+    middle = (np.mean(cameras, axis=0) + light) / 2 - cameras[0]
+    x, y, _ = middle @ _sensor_from_view(sensor)
+    return float(x), float(y)
+
+
+def _sensor_from_view(sensor: Sensor) -> NDArray[np.float64]:
+    return view_axes(sensor.rig.reference.sensor_from_camera.rotation[:, 2])
 
 
 def plan_of(largest_deg: float, seed: int = 1) -> CampaignFile:
@@ -126,15 +149,16 @@ def plan_of(largest_deg: float, seed: int = 1) -> CampaignFile:
     )
 
 
-def one_finish_campaign(one: OneFinish, distance: float, file: CampaignFile, turn_deg: float = 0.0) -> Campaign:
-    """Return the campaign of a finish at a distance [mm], with its coupon rotated about its normal."""
+def one_finish_campaign(one: OneFinish, distance: float, file: CampaignFile, lay_deg: float = 0.0) -> Campaign:
+    """Return the campaign of a finish at a distance [mm], with its u at a lay angle if it has a lay."""
     half = half_size(one.sensor, distance, COUPON_PX if file.coupon_px is None else file.coupon_px)
     recipe = CouponRecipe(one.finish.name, (), one.sensor.wavelength_nm)
     scene = flat_coupon(one.finish, half)
     sample = Sample(recipe, scene, 2 * half, 2 * half, one.label, one.finish.roughness, "", one.finish.light)
     digest = one.digest(distance)
-    series = Series(sample, distance, None, f"{turn_deg:g}deg_{digest}", int(digest[:8], 16) ^ file.seed)
-    return _RotatedCampaign(file, one.sensor, (distance,), (series,), (), turn_deg)
+    series = Series(sample, distance, None, f"{lay_deg:g}deg_{digest}", int(digest[:8], 16) ^ file.seed)
+    shown = lay_deg if len(one.turns) > 1 else None
+    return _RotatedCampaign(file, one.sensor, (distance,), (series,), (), shown)
 
 
 def characterise_finish(one: OneFinish, simulated: SimulatedSensor, distance: float, folder: Path) -> PerformanceMap:
@@ -150,7 +174,7 @@ def characterise_finish(one: OneFinish, simulated: SimulatedSensor, distance: fl
         campaign = one_finish_campaign(one, distance, file, turn)
         source = in_turn(simulated_source(simulated, file.samples_per_pixel), campaign)
         made.append(run_campaign(campaign, source, folder / f"{turn:g}"))
-    return made[0] if len(made) == 1 else mean_over(made)
+    return made[0] if len(made) == 1 else with_directions(mean_over(made), made, mirror_mm(one.sensor))
 
 
 def largest_incidence_deg(performance_map: PerformanceMap) -> float:

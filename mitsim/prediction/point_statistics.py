@@ -37,7 +37,8 @@ def performance(
         if used is None or not mask.any():
             continue
         distance, normal = ideal.distance[mask], ideal.normal[mask]
-        answer = performance_map.query(used.name, used.roughness, distance, normal, used.light)
+        along = None if ideal.along is None else ideal.along[mask]
+        answer = performance_map.query(used.name, used.roughness, distance, normal, used.light, along)
         fraction[mask], sigma[mask] = answer.fraction, answer.sigma
     fraction[ideal.status != Status.VALID] = 0.0
     return fraction, sigma
@@ -80,7 +81,8 @@ def expected_points(
     fraction, fraction_error, sigma, area, persistent = unknown, unknown, unknown, unknown, unknown
     displaced = np.zeros(len(distance))
     if finish is not None and mask.any():
-        answer = performance_map.query(finish.name, finish.roughness, distance, normal, finish.light)
+        along = None if ideal.along is None else ideal.along[mask]
+        answer = performance_map.query(finish.name, finish.roughness, distance, normal, finish.light, along)
         structure = noise_structure(performance_map, finish.name, finish.roughness, distance, normal, finish.light)
         fraction, fraction_error, sigma = answer.fraction, answer.fraction_error, answer.sigma
         area, persistent = structure.area, structure.persistent_share * sigma

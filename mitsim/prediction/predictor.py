@@ -47,7 +47,8 @@ class Ideal:
 
     ``pixel`` (n,) flat index into the grid; ``point`` (n, 3) and ``ray`` (n, 3) in the sensor frame [mm]; ``distance``
     (n,) |V| [mm]; ``normal`` (n, 3) in the view frame; ``shape`` (n,) index into the scene's names; ``status`` (n,)
-    VALID where every eye sees the point.
+    VALID where every eye sees the point; ``along`` (n, 3) the direction of the surface's parameter u in the view frame,
+    None in a scene without a lay.
     """
 
     pixel: NDArray[np.int64]
@@ -57,6 +58,7 @@ class Ideal:
     normal: NDArray[np.float64]
     shape: NDArray[np.int16]
     status: NDArray[np.uint8]
+    along: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,10 @@ class Predictor:
             status[hidden] = Status.SHADOWED if eye is self.rig.projector else Status.HIDDEN
         status[outside] = Status.NO_SURFACE
         view = in_view_frame(normal, ray, self.rig.baseline_direction)
-        return Ideal(pixel, point, ray, distance, view, surfaces.shape.ravel()[pixel], status)
+        along = None
+        if surfaces.along is not None:
+            along = in_view_frame(surfaces.along.reshape(-1, 3)[pixel].astype(float), ray, self.rig.baseline_direction)
+        return Ideal(pixel, point, ray, distance, view, surfaces.shape.ravel()[pixel], status, along)
 
     def labelled(self, cloud: PointCloud, scene: Scene, world_from_sensor: Transform) -> PointCloud:
         """Return a decoded cloud, labelled with the shape that each pixel shows according to the part's geometry."""

@@ -56,6 +56,12 @@ class Scene:
         return list(self.mitsuba.shapes())
 
     @property
+    def has_lay(self) -> bool:
+        """Return whether the lobe of some shape is wider along one direction of its surface than along the other."""
+        lights = [None if finish is None else finish.light for finish in self.finishes]
+        return any(light is not None and light.has_lay for light in lights)
+
+    @property
     def centre(self) -> NDArray[np.float64]:
         """Centre of the bounding box, (3,) [mm]."""
         return np.asarray(self.bounds.mean(axis=0))

@@ -14,6 +14,7 @@ import pytest
 from known_clouds import known_source, smooth
 from shell import mitsim_here
 
+from characterisation.maps.lay import mirror_direction, tangent_at
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 from mitsim.campaign import finish_cache, missing_finishes, one_finish
@@ -162,14 +163,15 @@ def test_a_lay_is_shown_in_four_directions(n10):
     ]
     for turn, turned in zip(one.turns, axes, strict=True):
         assert turned[:, 2] @ axes[0][:, 2] == pytest.approx(1.0)
+        assert np.linalg.det(turned) == pytest.approx(1.0)
         assert math.degrees(math.acos(np.clip(turned[:, 0] @ axes[0][:, 0], -1, 1))) == pytest.approx(turn)
 
 
-def test_a_lay_gets_the_mean_over_its_directions_and_what_they_differ_by(shipped, n10, quick, monkeypatch):
+def test_a_lay_keeps_its_directions_their_mean_and_what_they_differ_by(shipped, n10, quick, monkeypatch):
     lay = finish_of(**MILLED, lay="u")
 
     def by_direction(_, campaign):
-        level = 0.3 + 0.5 * math.sin(math.radians(campaign.turn_deg)) ** 2
+        level = 0.3 + 0.5 * math.sin(math.radians(campaign.lay_deg)) ** 2
         return known_source(lambda distance, normals: (0 * distance + level, 0 * distance + 0.2))
 
     monkeypatch.setattr(one_finish, "in_turn", by_direction)
@@ -178,7 +180,11 @@ def test_a_lay_gets_the_mean_over_its_directions_and_what_they_differ_by(shipped
     levels = [0.3, 0.55, 0.8, 0.55]
     assert found.fraction[0] == pytest.approx(np.mean(levels), abs=0.03)
     assert found.fraction_spread[0] == pytest.approx(np.std(levels), abs=0.03)
-    assert lay_left_out(lay.name, lay.scatter) == "averaged"
+    for turn, level in zip(one_finish.TURNS_DEG, levels, strict=True):
+        along = tangent_at(AHEAD, turn, mirror_direction(np.array([504.0]), one_finish.mirror_mm(n10)))
+        in_direction = joined.query(lay.name, lay.roughness, [504.0], AHEAD, lay.light, along)
+        assert in_direction.fraction[0] == pytest.approx(level, abs=0.03)
+    assert lay_left_out(lay.name, lay.scatter) is None
     with pytest.raises(InputError):  # the round lobe of the same name is another finish
         joined.query(lay.name, lay.roughness, [504.0], AHEAD, finish_of(**MILLED).light)
 

@@ -19,7 +19,8 @@ from characterisation.cloud_files import write_ply
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.documents import Document, validate
 from characterisation.errors import InputError
-from characterisation.maps.performance_map import SampleTable, build_map
+from characterisation.maps.joined import with_directions
+from characterisation.maps.performance_map import PerformanceMap, SampleTable, build_map
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.scores.joining import POSE_KNOWN
 from characterisation.scores.view_score import score_table, score_views, view_statistics
@@ -369,7 +370,8 @@ def test_documented_variables_of_samples_and_map(patches):
     written = {*map(str, _all_patches([table]).variables), "orientation"}  # added where a campaign counts its captures
     assert first_column("columns: samples.nc") == written
     data = build_map([table], {}, 0.3, nodes=5).data
-    assert first_column("columns: map.nc") == set(map(str, data.variables))
+    with_a_lay = with_directions(PerformanceMap(data), [PerformanceMap(data)] * 4, (50.0, 0.0)).data
+    assert first_column("columns: map.nc") == set(map(str, with_a_lay.variables))
 
 
 def test_documented_properties_of_a_cloud_file(tmp_path):

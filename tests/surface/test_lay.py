@@ -12,13 +12,13 @@ from mitsim.surface.paint import matt_white
     [
         ("turned", None, "round"),
         ("milled", None, "round"),
-        ("turned", "u", "averaged"),
-        ("milled", "v", "averaged"),
+        ("turned", "u", None),
+        ("milled", "v", None),
         ("polished", None, None),
         ("grit_blasted", None, None),
     ],
 )
-def test_marks_are_averaged_over_where_their_direction_is_given_and_else_round(process, lay, left_out):
+def test_marks_are_left_out_only_where_their_direction_is_not_given(process, lay, left_out):
     assert lay_left_out(f"aluminium/{process}", machined(Face("aluminium", process, 0.8, lay=lay), 850.0)) == left_out
 
 
@@ -27,10 +27,13 @@ def test_a_face_without_marks_leaves_nothing_out():
     assert lay_left_out("aluminium/turned", None) is None
 
 
-def test_each_omission_is_one_sentence_that_names_its_faces():
+def test_an_omission_is_one_sentence_that_names_its_faces():
     turned, marked = (machined(Face("brass", "turned", 0.8, lay=lay), 850.0) for lay in (None, "u"))
     finishes = {"top": ("brass/turned", turned), "bore": ("brass/turned", turned), "rim": ("brass/turned", marked)}
-    averaged, left_round = lays_in_words(finishes | {"plate": ("matt_white", matt_white())})
-    assert averaged.startswith("rim (brass/turned): the marks have a direction")
+    (left_round,) = lays_in_words(finishes | {"plate": ("matt_white", matt_white())})
     assert left_round.startswith("top (brass/turned), bore (brass/turned): no direction of the marks is given")
-    assert "plate" not in averaged + left_round and lays_in_words({"plate": ("matt_white", matt_white())}) == []
+    assert (
+        "plate" not in left_round
+        and "rim" not in left_round
+        and lays_in_words({"plate": ("matt_white", matt_white())}) == []
+    )

@@ -31,7 +31,8 @@ _BEYOND = 1e-4
 class MapTables:
     """Tables of F and sigma of the surfaces of one map.
 
-    ``surfaces``, at least one, share their distances and nodes. A query gives their index as ``number``.
+    ``surfaces``, at least one, share their distances and nodes. A query gives the number of a surface, from
+    ``numbers``, which has one for each. The numbers after that of a surface with a lay are those of its directions.
     """
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
@@ -45,9 +46,15 @@ class MapTables:
         width = np.diff(knots) if len(knots) > 1 else np.ones(1)
         low, high = (np.exp(knots[i : i + self.intervals]) for i in (0, min(1, len(knots) - 1)))
         self.knots = mi.Float(np.stack([low, high, 1 / width], axis=-1).astype(np.float32).ravel())
-        rows = np.concatenate([_rows(surface, self.intervals) for surface in surfaces])
+        every = [one for surface in surfaces for one in (surface, *surface.directions)]
+        self.numbers = np.cumsum([0] + [1 + len(surface.directions) for surface in surfaces])[:-1].tolist()
+        self.directions = max(len(surface.directions) for surface in surfaces)
+        directed = next((surface for surface in surfaces if surface.directions), first)
+        self.mirror = [dr.opaque(mi.Float, float(place)) for place in directed.mirror_mm]
+        self.has_lay = mi.Bool([bool(one.directions) for one in every])
+        rows = np.concatenate([_rows(one, self.intervals) for one in every])
         self.table = mi.Float(rows.ravel())
-        dr.eval(self.knots, self.table)
+        dr.eval(self.knots, self.table, self.has_lay)
 
     def look_up(self, number: Any, distance: Any, normal: Any, active: Any) -> tuple[Any, Any]:
         """Return F [1] and sigma [mm] of surfaces by number; NaN if unknown.
@@ -81,6 +88,33 @@ class MapTables:
         sigma = dr.select(known & (sigma_weight > 0), dr.exp(log_sigma / sigma_weight), dr.nan)
         return fraction, sigma
 
+    def look_up_lay(self, number: Any, distance: Any, normal: Any, along: Any, active: Any) -> tuple[Any, Any]:
+        """Return F [1] and sigma [mm], for surfaces with a lay in its direction (:mod:`characterisation.maps.lay`).
+
+        ``along`` is the derivative of the point by u, in the view frame; its length does not matter.
+        """
+        mean = self.look_up(number, distance, normal, active)
+        directed = active & dr.gather(mi.Bool, self.has_lay, number, active)
+        mirror = dr.normalize(mi.Vector3f(self.mirror[0] / distance, self.mirror[1] / distance, 1))
+        z = mi.Vector3f(0, 0, 1)
+        flat = _carried(_carried(along, mirror, z), _carried(normal, mirror, z), z)
+        place = dr.atan2(flat.y, flat.x) * (self.directions / math.pi)
+        place -= self.directions * dr.floor(place / self.directions)
+        before = dr.minimum(mi.UInt32(place), self.directions - 1)
+        t = place - mi.Float(before)
+        after = dr.select(before + 1 == self.directions, 0, before + 1)
+        step = math.pi / self.directions
+        near = self.look_up(number + 1 + before, distance, _turned(normal, -t * step, mirror), directed)
+        far = self.look_up(number + 1 + after, distance, _turned(normal, (1 - t) * step, mirror), directed)
+        at_near, at_far = t < AT_KNOT, t > 1 - AT_KNOT
+        fraction = (1 - t) * near[0] + t * far[0]
+        fraction = dr.select(at_near, near[0], dr.select(at_far, far[0], fraction))
+        one, other = (dr.select(dr.isnan(a), b, a) for a, b in ((near[1], far[1]), (far[1], near[1])))
+        sigma = dr.exp((1 - t) * dr.log(one) + t * dr.log(other))
+        sigma = dr.select(at_near, near[1], dr.select(at_far, far[1], sigma))
+        known = directed & dr.isfinite(fraction)
+        return dr.select(known, fraction, mean[0]), dr.select(known, sigma, mean[1])
+
     def _distance_interval(self, distance: Any, within: Any) -> tuple[Any, Any]:
         """Return the interval of distances, and the position between its knots, 0 to 1 in ln |V|."""
         interval = mi.UInt32(0)
@@ -107,6 +141,19 @@ def _rows(surface: Surface, intervals: int) -> NDArray[np.float32]:
     probit, log_sigma = surface.fields[:2]
     ends = [field[i : i + intervals] for field in (probit, log_sigma) for i in (0, far)]
     return np.stack(ends, axis=-1).astype(np.float32).reshape(-1, 4)
+
+
+def _turned(vector: Any, angle: Any, axis: Any) -> Any:
+    """Return a vector, turned about a unit vector by an angle [rad]."""
+    sine, cosine = dr.sincos(angle)
+    along = axis * dr.dot(axis, vector)
+    return cosine * (vector - along) + sine * dr.cross(axis, vector) + along
+
+
+def _carried(vector: Any, start: Any, end: Any) -> Any:
+    """Return a vector, rotated by the smallest rotation that takes one unit vector to another."""
+    both = start + end
+    return vector - both * (dr.dot(both, vector) / (1 + dr.dot(start, end))) + end * (2 * dr.dot(start, vector))
 
 
 def _single_precision_range(knots: NDArray[np.float64]) -> tuple[float, float]:

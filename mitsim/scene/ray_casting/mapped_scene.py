@@ -131,7 +131,7 @@ class ViewRays:
         return (index // width + top) * self.grid.width + index % width + left
 
     def in_view_frame(self, normal: Any, ray: Any) -> Any:
-        """Rotate a normal from the sensor frame to the view frame of a ray.
+        """Rotate a normal, or another vector, from the sensor frame to the view frame of a ray.
 
         The view frame is that of :func:`characterisation.coupon.view_frame.view_frame`.
         """
@@ -155,6 +155,9 @@ class MappedScene:
                 known.append(surface)
             numbers.append(-1 if surface is None else next(i for i, one in enumerate(known) if one is surface))
         self.tables = MapTables(known) if known else None
+        if self.tables is not None:
+            numbers = [-1 if one < 0 else self.tables.numbers[one] for one in numbers]
+        self.with_lay = self.tables is not None and self.tables.directions > 0
         # a row for each of Mitsuba's shape numbers: index of the shape, index of its surface, whether its back is seen
         ids = [shape_number(shape) for shape in scene.shapes]
         rows = np.full((max(ids) + 1, 3), -1, np.int32)
@@ -185,7 +188,9 @@ class MappedScene:
         ray = dr.gather(mi.Vector3f, view.rays.directions, pixel)
         direction = frame.to_world(ray)
         surface = self.scene.mitsuba.ray_intersect(
-            mi.Ray3f(frame.position, direction), ray_flags=mi.RayFlags.Minimal, coherent=True
+            mi.Ray3f(frame.position, direction),
+            ray_flags=mi.RayFlags.dPdUV if self.with_lay else mi.RayFlags.Minimal,
+            coherent=True,
         )
         number = dr.reinterpret_array(mi.UInt32, surface.shape)
         met = surface.is_valid() & (number < self.count)  # shapes inside an instance have larger numbers
@@ -199,7 +204,11 @@ class MappedScene:
         fraction = sigma = dr.full(mi.Float, dr.nan, dr.width(pixel))
         if self.tables is not None:
             queried = (status == _code(Status.VALID)) & (known >= 0)
-            fraction, sigma = self.tables.look_up(mi.UInt32(known), surface.t, in_view, queried)
+            if self.with_lay:
+                along = view.in_view_frame(frame.to_local(surface.dp_du), ray)
+                fraction, sigma = self.tables.look_up_lay(mi.UInt32(known), surface.t, in_view, along, queried)
+            else:
+                fraction, sigma = self.tables.look_up(mi.UInt32(known), surface.t, in_view, queried)
         return {
             "status": dr.uint8_array_t(mi.Float)(status),
             "shape": dr.select(hit, index, -1),

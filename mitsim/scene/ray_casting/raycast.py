@@ -36,12 +36,15 @@ class Surfaces:
         (H, W) index into the names of the scene; -1 where the distance is NaN.
     seen
         (E, H, W) whether each of the given eyes is on the front side and has a free line of sight to the point.
+    along
+        (H, W, 3) derivative of the point by the surface parameter u; None in a scene without a lay.
     """
 
     distance: NDArray[np.float32]
     normal: NDArray[np.float32]
     shape: NDArray[np.int16]
     seen: NDArray[np.bool_]
+    along: NDArray[np.float32] | None = None
 
 
 class PixelRays:
@@ -98,7 +101,8 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
         ray = shadow_ray(surface, to_eye / length, length)
         front = hit & (dr.dot(surface.n * facing, to_eye) > 0)
         seen.append(front & ~scene.mitsuba.ray_test(ray, front))
-    dr.eval(distance, normal, shape, seen)
+    along = frame.to_local(surface.dp_du) if scene.has_lay else None
+    dr.eval(distance, normal, shape, seen, along)
 
     size = rays.size
     return Surfaces(
@@ -106,6 +110,7 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
         normal=np.ascontiguousarray(np.array(normal, np.float32).T).reshape(*size, 3),
         shape=_indices(scene, shape).reshape(size),
         seen=_stack(seen, size),
+        along=None if along is None else np.array(along, np.float32).T.reshape(*size, 3),
     )
 
 
