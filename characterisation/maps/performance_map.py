@@ -175,10 +175,14 @@ class PerformanceMap:
 
         Parameters
         ----------
-        finish, roughness
-            The surface: name of its finish, and Ra [um] (ignored for a finish without Ra).
-        distance, normals
-            |V| [mm] (n,), and unit N in the view frame (n, 3).
+        finish
+            Name of the finish of the surface.
+        roughness
+            Its Ra [um]; ignored for a finish without Ra.
+        distance
+            |V| (n,) [mm], from the reference camera to the point.
+        normals
+            Unit N (n, 3) in the view frame: z from the point to the camera, x along the baseline.
         light
             Optical properties of the surface, see :meth:`~characterisation.maps.samples.Samples.answering`.
         tangents
