@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.lines import Line2D
@@ -50,6 +51,9 @@ _ASIDE_DEG, _LOWEST_DEG = 62.0, 18.0
 
 #: largest number of labels on each side of the part, and of characters in one
 _MOST_LABELS, _LONGEST = 9, 16
+
+#: largest number of times that a picture is widened for its texts: it shrinks, and they do not
+_WIDENINGS = 12
 
 _SIZE_IN = (7.4, 3.9)
 
@@ -100,6 +104,8 @@ def draw_placement(
         whole.margins(0.04, 0.1)
         _labels(near, geometry, flat, depth, verdicts)
         _axes_of_part(near, turn)
+        for axes in (whole, near):
+            _make_room_for_texts(axes)
         _legend(figure, verdicts, geometry.camera)
 
 
@@ -292,6 +298,24 @@ def _axes_of_part(axes: Axes, turn: Floats) -> None:
         beyond = tip + 0.35 * size * way / max(float(np.linalg.norm(way)), 0.2 * size)
         axes.text(float(beyond[0]), float(beyond[1]), name, ha="center", va="center", fontsize=8, color=MUTED)
     axes.set_ylim(bottom - 2.6 * size, top)
+
+
+def _make_room_for_texts(axes: Axes) -> None:
+    """Widen the limits along x until all texts lie in the axes' part of the figure."""
+    root = axes.figure.figure
+    assert root is not None
+    renderer = FigureCanvasAgg(root).get_renderer()
+    for _ in range(_WIDENINGS):
+        axes.apply_aspect()
+        cell = axes.get_position(original=True).transformed(axes.figure.transSubfigure)
+        boxes = [text.get_window_extent(renderer) for text in axes.texts if text.get_text()]
+        left = max([cell.x0 - box.x0 for box in boxes], default=0.0)
+        right = max([box.x1 - cell.x1 for box in boxes], default=0.0)
+        if max(left, right) <= 0:
+            return
+        low, high = axes.get_xlim()
+        per_pixel = (high - low) / axes.get_window_extent(renderer).width
+        axes.set_xlim(low - max(left + 2, 0) * per_pixel, high + max(right + 2, 0) * per_pixel)
 
 
 def _legend(figure: FigureBase, verdicts: Mapping[str, str], camera: str) -> None:

@@ -1,5 +1,7 @@
 """The picture of the part with its sensor: what hides what, colours of verdicts, labels that do not touch."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -30,15 +32,22 @@ def test_labels_stand_apart_and_are_moved_least():
     assert spread([1.0, 3.0], 1.0) == [1.0, 3.0]
 
 
-def test_no_writing_of_the_picture_overlaps_other_writing(tmp_path):
+@pytest.mark.parametrize(("height", "name"), [(1.0, "{}"), (4.0, "bore_24mm_front_right_{}")])
+def test_no_writing_of_the_picture_overlaps_other_writing_or_leaves_it(tmp_path, height, name):
     write_scene_geometry(tmp_path)
     geometry = read_scene_geometry(tmp_path)
+    names = tuple(name.format(one) for one in geometry.names)
+    geometry = replace(geometry, corners=geometry.corners * [1, 1, height], names=names)
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = 500.0
-    figure = placement_figure(geometry, [("view 3", pose)], dict.fromkeys(geometry.names, "fits"))
+    aside = pose @ np.array([[1, 0, 0, -300.0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    poses = [("view 3", pose), ("view 1234", aside)]
+    figure = placement_figure(geometry, poses, dict.fromkeys(geometry.names, "fits"))
     drawn = FigureCanvasAgg(figure).get_renderer()
     FigureCanvasAgg(figure).draw()
     texts = [one for axes in figure.axes for one in axes.texts] + list(figure.legends[0].get_texts())
     boxes = [one.get_window_extent(drawn) for one in texts if one.get_text()]
     assert len(boxes) >= 6
+    inside = figure.bbox.padded(0.5)
+    assert all(inside.x0 <= one.x0 and one.x1 <= inside.x1 for one in boxes), boxes
     assert not [(a, b) for k, a in enumerate(boxes) for b in boxes[:k] if a.overlaps(b)]
