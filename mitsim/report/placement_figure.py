@@ -304,7 +304,8 @@ def _make_room_for_texts(axes: Axes) -> None:
     """Widen the limits along x until all texts lie in the axes' part of the figure."""
     root = axes.figure.figure
     assert root is not None
-    renderer = FigureCanvasAgg(root).get_renderer()
+    canvas: Any = FigureCanvasAgg(root)
+    renderer = canvas.get_renderer()
     for _ in range(_WIDENINGS):
         axes.apply_aspect()
         cell = axes.get_position(original=True).transformed(axes.figure.transSubfigure)
