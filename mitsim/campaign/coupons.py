@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from characterisation.coupon.patches import Coupon
+from characterisation.maps.building import Variant
 from characterisation.maps.light import Light
-from characterisation.maps.performance_map import Variant
 from mitsim.errors import InputError
 from mitsim.scene.load import Scene, load_scene
 from mitsim.sensor.transforms import Transform

@@ -26,7 +26,7 @@ from pydantic import Field, field_validator
 from characterisation.coupon.orientations import Refinement, cap_directions
 from characterisation.coupon.view_frame import view_frame
 from characterisation.documents import Document, read_toml
-from characterisation.maps.performance_map import Variant
+from characterisation.maps.building import Variant
 from characterisation.stage.angles import Stage
 from mitsim.campaign.coupons import VARIANTS, CouponRecipe, Sample, load_sample
 from mitsim.campaign.devices import DeviceTable

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from characterisation import atomic_io
 from characterisation.coupon.orientations import refine
 from characterisation.coupon.patch_table import overall, patch_table
-from characterisation.maps.performance_map import PerformanceMap, SampleTable, build_map
+from characterisation.maps.building import SampleTable, build_map
+from characterisation.maps.performance_map import PerformanceMap
 from mitsim.campaign.acquire import Source
 from mitsim.campaign.plan import Campaign, Series, Shot, sensor_checksum
 from mitsim.campaign.store import Finished, keep, kept, sweep

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from characterisation.coupon.orientations import cap_directions, sphere_directions
 from characterisation.coupon.patch_table import patch_table
 from characterisation.errors import InputError
+from characterisation.maps.building import SampleTable, build_map
 from characterisation.maps.performance_map import (
     PerformanceMap,
-    SampleTable,
-    build_map,
     inverse_lambert_projection,
     lambert_projection,
 )

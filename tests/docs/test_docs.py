@@ -19,8 +19,9 @@ from characterisation.cloud_files import write_ply
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.documents import Document, validate
 from characterisation.errors import InputError
+from characterisation.maps.building import SampleTable, build_map
 from characterisation.maps.joined import with_directions
-from characterisation.maps.performance_map import PerformanceMap, SampleTable, build_map
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.scores.joining import POSE_KNOWN
 from characterisation.scores.view_score import score_table, score_views, view_statistics

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from characterisation.coupon.offsets import noise_area, own_area
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.coupon.residual_field import autocorrelation
-from characterisation.maps.performance_map import NODES, SCHEMA_VERSION, PerformanceMap
+from characterisation.maps.building import NODES
+from characterisation.maps.performance_map import SCHEMA_VERSION, PerformanceMap
 from characterisation.maps.tables import FIELDS
 from mitsim.prediction import CharacterisedScene, Predictor
 from mitsim.prediction.noise_field import averaging_field, own_field, persistent_field

@@ -1,0 +1,157 @@
+"""Build a performance map from the patches of coupons.
+
+Signal chain: tables of patches (:mod:`characterisation.coupon.patches`) -> pooled at the nodes of a grid
+(:mod:`characterisation.maps.pooling`) -> map with standard errors (:mod:`characterisation.maps.performance_map`).
+
+A sample may have *variants*, in which one unknown quantity q was changed by one standard deviation, down or up. Half
+the difference between the two in F or sigma, as root sum of squares over all unknown quantities, is the *spread*:
+
+    u^2(F) = sum over q of [(F(q high) - F(q low)) / 2]^2
+
+(GUM 5.1.3, note 2: sensitivities by finite differences; the q are assumed independent).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import xarray as xr
+
+from characterisation.maps.light import Light, light_variables
+from characterisation.maps.performance_map import SCHEMA_VERSION, PerformanceMap
+from characterisation.maps.pooled_offsets import pool_offsets
+from characterisation.maps.pooling import pool
+from characterisation.maps.tables import Floats
+
+#: unknown quantity, and whether it was changed by one standard deviation down (low) or up (high)
+Variant = tuple[str, Literal["low", "high"]]
+
+#: nodes of the grid along each axis: 1.2 deg apart for 60 deg of incidence, about as wide as a patch
+NODES = 97
+
+_SPREADS = {"recovered_fraction": "recovered_fraction_spread", "ray_noise_std": "ray_noise_std_spread"}
+
+_DESCRIBED = {
+    "recovered_fraction": ("1", "fraction of points recovered, F"),
+    "ray_noise_std": ("mm", "standard deviation along the view ray, sigma, without outliers"),
+    "recovered_fraction_error": ("1", "standard error of F in the map"),
+    "ray_noise_std_error": ("mm", "standard error of sigma in the map"),
+    "recovered_fraction_spread": ("1", "standard uncertainty of F due to unknown properties of the sample"),
+    "ray_noise_std_spread": ("mm", "standard uncertainty of sigma due to unknown properties of the sample"),
+    "false_fraction": ("1", "false points, over possible ones"),
+    "patches": ("1", "effective number of patches in the mean"),
+    "noise_area": ("px2", "noise area A: the mean of n neighbouring points has the variance sigma^2 A / n"),
+    "persistent_share": ("1", "persistent standard deviation, which does not average out, without bias, over sigma"),
+    "bias_share": ("1", "bias away from the sensor that faces of equal orientation have in common, over sigma"),
+}
+
+
+@dataclass(frozen=True)
+class SampleTable:
+    """Patches of one sample (finish, Ra [um] or NaN), or of a variant of it, at one nominal distance [mm].
+
+    ``light`` holds the optical properties of the sample; None if they are unknown.
+    """
+
+    finish: str
+    roughness: float
+    distance: float
+    patches: xr.Dataset
+    variant: Variant | None = None
+    light: Light | None = None
+
+
+def build_map(
+    tables: Sequence[SampleTable], attributes: dict[str, Any], largest_incidence: float, nodes: int = NODES
+) -> PerformanceMap:
+    """Pool tables of patches into a map.
+
+    Parameters
+    ----------
+    attributes
+        Written into the map: ``sensor``, ``source``, ``exposure_rule`` and everything else that makes it reproducible.
+        The exposure policy is part of a map's identity.
+    largest_incidence
+        Largest incidence [rad] of the campaign. Nodes beyond it are NaN, and so are those outside the hull of the
+        patches.
+    nodes
+        Number of nodes along each axis of the equal-area grid.
+    """
+    samples = sorted({(t.finish, t.roughness if not math.isnan(t.roughness) else -1.0) for t in tables})
+    distances = sorted({t.distance for t in tables})
+    reach = 2 * math.sin(largest_incidence / 2)
+    axis = np.linspace(-reach, reach, nodes)
+    shape = (len(samples), len(distances), nodes, nodes)
+    fields = {name: np.full(shape, np.nan) for name in _DESCRIBED}
+    lights: list[Light | None] = [None] * len(samples)
+    ends: dict[tuple[int, int], dict[Variant, dict[str, Floats]]] = {}
+    for table in tables:
+        key = (table.finish, table.roughness if not math.isnan(table.roughness) else -1.0)
+        i, j = samples.index(key), distances.index(table.distance)
+        pooled = _at_nodes(table, axis, reach)
+        if table.variant is not None:
+            ends.setdefault((i, j), {})[table.variant] = pooled
+            continue
+        lights[i] = table.light
+        for name, values in pooled.items():
+            fields[name][i, j] = values
+    for place, variants in ends.items():
+        for name, spread in _SPREADS.items():
+            fields[spread][place] = _spread({variant: pooled[name] for variant, pooled in variants.items()})
+    dims = ("sample", "distance", "b", "a")
+    data = xr.Dataset(
+        {
+            n: (dims, v.astype(np.float32), dict(zip(("units", "long_name"), _DESCRIBED[n], strict=True)))
+            for n, v in fields.items()
+        },
+        coords={
+            "finish": ("sample", np.array([s[0] for s in samples], dtype=str)),
+            "roughness": (
+                "sample",
+                [s[1] if s[1] >= 0 else np.nan for s in samples],
+                {"units": "um", "long_name": "roughness average Ra"},
+            ),
+            "distance": ("distance", distances, {"units": "mm", "long_name": "|V|"}),
+            "a": ("a", axis, {"units": "1", "long_name": "equal-area place along the baseline"}),
+            "b": ("b", axis, {"units": "1", "long_name": "equal-area place across the baseline"}),
+        },
+        attrs={"title": "performance map", "schema_version": SCHEMA_VERSION, **attributes},
+    )
+    if any(lights):
+        data = data.assign(light_variables(lights))
+    return PerformanceMap(data)
+
+
+def _spread(ends: dict[Variant, Floats]) -> Floats:
+    """Return half the difference between the high and the low end of each quantity, root sum of squares."""
+    moved = sorted({quantity for quantity, _ in ends})
+    return np.asarray(np.sqrt(sum(((ends[q, "high"] - ends[q, "low"]) / 2) ** 2 for q in moved)))
+
+
+def _at_nodes(table: SampleTable, axis: Floats, reach: float) -> dict[str, Floats]:
+    """Return the fields (b, a) of one sample at one distance."""
+    b, a = np.meshgrid(axis, axis, indexing="ij")
+    within = np.hypot(a, b) <= reach * (1 + 1e-9)
+    places = np.column_stack([a[within], b[within]])
+    pooled = pool(table.patches, table.distance, places)
+    offsets = pool_offsets(table.patches, places)
+    known = np.isfinite(pooled.sigma)
+    found = {
+        "recovered_fraction": pooled.fraction,
+        "ray_noise_std": pooled.sigma,
+        "recovered_fraction_error": pooled.fraction_error,
+        "ray_noise_std_error": pooled.sigma_error,
+        "false_fraction": pooled.false_fraction,
+        "patches": pooled.patches,
+        "noise_area": np.where(known, offsets.area, np.nan),
+        "persistent_share": np.where(known, offsets.persistent, np.nan),
+        "bias_share": np.where(known, offsets.bias, np.nan),
+    }
+    out = {name: np.full(a.shape, np.nan) for name in found}
+    for name, values in found.items():
+        out[name][within] = values
+    return out
