@@ -31,8 +31,7 @@ from mitsim.report.run_files import claim_folder, digests_of
 from mitsim.run_study.record import Outcome, own_files, run_record
 from mitsim.run_study.scoring import pose_columns, score_study
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.simulation.render_residual import RenderResidual, largest_residual, render_residual, warn_above_limit
-from mitsim.simulation.rendering import Rendering
+from mitsim.simulation.render_residual import LIMIT, RenderResidual, largest_residual, render_residual
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import Study
 from mitsim.view_sets.confirmed_set import (
@@ -43,7 +42,7 @@ from mitsim.view_sets.confirmed_set import (
     set_table,
     write_set_csv,
 )
-from mitsim.virtual.plan import measurements_of, race_rules, trial_digest
+from mitsim.virtual.plan import measurements_of, race_rules, rendering_of, trial_digest
 from mitsim.virtual.race import Maker, run_race
 from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.rendered import RenderedMeasurements
@@ -218,14 +217,14 @@ def _map(study: Study, twin: RenderedMeasurements | None, folder: Path) -> Perfo
 
 
 def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderResidual:
-    """Return the render noise of a view, with interreflections as in its trials; takes as long as three trials."""
-    table, pose = study.file.measure, study.views[number].world_from_sensor
-    camera = next(iter(study.sensor.rig.cameras))
-    rendering = Rendering(table.samples_per_pixel, table.light_path_depth)
-    return warn_above_limit(
-        f"view {number}",
-        render_residual(simulated, study.scene, pose, camera, rendering, seed=study.file.seed),
-    )
+    """Return the render noise of a view, rendered as in its trials; takes as long as three trials."""
+    pose, camera = study.views[number].world_from_sensor, next(iter(study.sensor.rig.cameras))
+    found = render_residual(simulated, study.scene, pose, camera, rendering_of(study), seed=study.file.seed)
+    if found.noise > LIMIT:
+        say(f"view {number}: {found}; all trials of a finish share this noise, so it counts as an effect of the finish")
+    if found.quadrature > LIMIT:
+        say(f"view {number}: {found}; above {LIMIT}: use more samples_per_pixel")
+    return found
 
 
 def _show(

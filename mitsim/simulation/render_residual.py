@@ -26,6 +26,7 @@ from mitsim.scene.load import Scene
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
+from mitsim.simulation.indirect_light import IndirectLight
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
@@ -95,16 +96,17 @@ def render_residual(
     # the first pattern is often the coarsest and the last the finest
     chosen = np.unique(np.linspace(0, simulated.patterns.count - 1, IMAGES).astype(int))
 
-    def electrons_per_s(offset: int, count: int) -> NDArray[np.float32]:
-        settings = replace(rendering, samples=count)
+    def electrons_per_s(offset: int, finer: int) -> NDArray[np.float32]:
+        settings = replace(rendering, samples=finer * rendering.samples)
+        if isinstance(settings.indirect, IndirectLight):
+            settings = replace(settings, indirect=replace(settings.indirect, samples=finer * settings.indirect.samples))
         images = simulated.radiance(scene, world_from_sensor, camera, settings, seed=seed + offset, roi=roi)
         selected: NDArray[np.float32] = images[chosen]
         del images  # frees up to 164 MB, for a sensor of 3 megapixels
         selected *= np.float32(scale)
         return selected
 
-    samples = rendering.samples
-    one, other, finer = electrons_per_s(0, samples), electrons_per_s(1, samples), electrons_per_s(2, 4 * samples)
+    one, other, finer = electrons_per_s(0, 1), electrons_per_s(1, 1), electrons_per_s(2, 4)
     exposure = sensor.exposure.exposures(finer[np.argmax(finer.mean(axis=(1, 2)))], sensor.imager.full_well)[0]
     lit = (finer > 0) & (finer * np.float32(exposure) < sensor.imager.full_well)
     if not lit.any():

@@ -26,7 +26,14 @@ from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import mean_run_length
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.render_residual import LIMIT, RenderResidual, largest_residual, warn_above_limit
+from mitsim.simulation.indirect_light import IndirectLight
+from mitsim.simulation.render_residual import (
+    LIMIT,
+    RenderResidual,
+    largest_residual,
+    render_residual,
+    warn_above_limit,
+)
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import read_study
@@ -228,6 +235,20 @@ def test_variants_of_a_sample_have_folders_of_their_own(tmp_path, scenes, n10):
     assert {series.variant for series in metal} == {None, *VARIANTS}
     without = spread_campaign(tmp_path, scenes, "false", n10)
     assert metal[0].name == without.series[0].name
+
+
+def test_the_noise_of_interreflections_that_are_rendered_apart_falls_with_their_own_samples(scenes, simulated):
+    """Four times the paths halve it; with the samples of direct light it does not change."""
+    scene = load_scene(scenes / "two_pillars/two_pillars.xml", simulated.sensor.wavelength_nm)
+    pose = look_at([0, -400, 300], [0, 0, 30], [0, 0, 1])
+
+    def noise(samples, paths):
+        rendering = Rendering(samples, 2, IndirectLight(paths, 1.5))
+        return render_residual(simulated, scene, pose, "left", rendering, seed=1).noise
+
+    few = noise(4, 4)
+    assert noise(4, 16) == pytest.approx(few / 2, rel=0.15)
+    assert noise(8, 4) == pytest.approx(few, rel=0.15)
 
 
 @pytest.fixture(scope="module")
