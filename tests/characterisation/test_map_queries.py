@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
 from characterisation.errors import InputError
+from characterisation.maps.building import NODES
 from characterisation.maps.performance_map import (
-    NODES,
     SCHEMA_VERSION,
     PerformanceMap,
     inverse_lambert_projection,
