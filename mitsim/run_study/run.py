@@ -31,7 +31,7 @@ from mitsim.report.run_files import claim_folder, digests_of
 from mitsim.run_study.record import Outcome, own_files, run_record
 from mitsim.run_study.scoring import pose_columns, score_study
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.simulation.render_residual import LIMIT, RenderResidual, largest_residual, render_residual
+from mitsim.simulation.render_residual import LIMIT, RenderResidual, largest_residual, render_residual, warn_above_limit
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import Study
 from mitsim.view_sets.confirmed_set import (
@@ -222,9 +222,7 @@ def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderRe
     found = render_residual(simulated, study.scene, pose, camera, rendering_of(study), seed=study.file.seed)
     if found.noise > LIMIT:
         say(f"view {number}: {found}; all trials of a finish share this noise, so it counts as an effect of the finish")
-    if found.quadrature > LIMIT:
-        say(f"view {number}: {found}; above {LIMIT}: use more samples_per_pixel")
-    return found
+    return warn_above_limit(f"view {number}", found) if found.quadrature > LIMIT else found
 
 
 def _show(

@@ -2,7 +2,7 @@
 
 Signal chain: one finish, round and with marks -> coupons of both at the same distance, tilts and axes of tilt, the
 marks along the baseline and across it -> F and sigma of each capture -> differences from the round finish and from the
-mean over directions, which a map answers.
+mean over directions, which a map answers if the direction is not given.
 
     python tests/benchmarks/lay.py --sensor ensenso-n10 --distance 500
 """
