@@ -120,6 +120,15 @@ def fields_of(marker: str) -> dict[str, FieldInfo]:
     return {name: field for name, field in model_of(path).model_fields.items() if name not in without}
 
 
+def test_each_shell_block_of_the_readme_works_in_an_empty_clone():
+    """CI and strangers run either block alone, so each makes the environment that its later lines use."""
+    blocks = re.findall(r"^```sh\n(.*?)^```", (ROOT / "README.md").read_text(encoding="utf-8"), re.M | re.S)
+    using = [block for block in blocks if ".venv/bin/" in block]
+    assert len(using) >= 2
+    for block in using:
+        assert block.splitlines()[0] == "python3 -m venv .venv", block
+
+
 @by_page
 def test_relative_links_lead_to_files_and_headings(page):
     text = page.read_text(encoding="utf-8")
