@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any
 _NAMES = {
     "Coupon": "characterisation.coupon.patches",
     "Cylinder": "characterisation.features.surfaces",
-    "CylinderFit": "characterisation.features.fits",
+    "CylinderFit": "characterisation.features.fitted",
     "FitError": "characterisation.features.robust_fit",
     "InputError": "characterisation.errors",
     "MissingEnvironmentError": "characterisation.errors",
     "Overall": "characterisation.coupon.patch_table",
     "PerformanceMap": "characterisation.maps.performance_map",
-    "PlaneFit": "characterisation.features.fits",
+    "PlaneFit": "characterisation.features.fitted",
     "PointCloud": "characterisation.point_cloud",
-    "SphereFit": "characterisation.features.fits",
+    "SphereFit": "characterisation.features.fitted",
     "Status": "characterisation.point_cloud",
     "ViewGrid": "characterisation.point_cloud",
     "fit_cylinder": "characterisation.features.fits",
@@ -42,14 +42,8 @@ if TYPE_CHECKING:
     from characterisation.coupon.patches import Coupon
     from characterisation.coupon_cloud import measure_coupon, patch_metrics
     from characterisation.errors import InputError, MissingEnvironmentError
-    from characterisation.features.fits import (
-        CylinderFit,
-        PlaneFit,
-        SphereFit,
-        fit_cylinder,
-        fit_plane,
-        fit_sphere,
-    )
+    from characterisation.features.fits import fit_cylinder, fit_plane, fit_sphere
+    from characterisation.features.fitted import CylinderFit, PlaneFit, SphereFit
     from characterisation.features.robust_fit import FitError
     from characterisation.features.surfaces import Cylinder
     from characterisation.interface import read_cloud, write_cloud

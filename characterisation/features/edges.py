@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.features.figures import ACROSS_THE_EDGE, Circle, EdgePoint
-from characterisation.features.fits import CircleFit, EdgePointFit, PlaneFit
+from characterisation.features.fitted import CircleFit, EdgePointFit, PlaneFit
 from characterisation.features.robust_fit import FitError, covariance_of, robust_fit
 from characterisation.features.surfaces import tangents
 from characterisation.point_cloud import PointCloud

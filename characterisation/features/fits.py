@@ -10,50 +10,23 @@ With a viewpoint, the residual is the distance from the point to the surface *al
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from characterisation.features.figures import Circle, EdgePoint
+from characterisation.features.fitted import ConeFit, CylinderFit, PlaneFit, SphereFit
 from characterisation.features.robust_fit import FitError, covariance_of, rays_from, robust_fit, usable
 from characterisation.features.surfaces import (
-    GRAZING_COSINE,
     Cone,
     Cylinder,
     Plane,
     Sphere,
     Surface,
     lengths,
-    tangents,
     unit,
 )
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
-
-__all__ = [
-    "GRAZING_COSINE",
-    "CircleFit",
-    "Cone",
-    "ConeFit",
-    "Cylinder",
-    "CylinderFit",
-    "EdgePointFit",
-    "Fit",
-    "FitError",
-    "Plane",
-    "PlaneFit",
-    "Sphere",
-    "SphereFit",
-    "belonging",
-    "fit_cone",
-    "fit_cylinder",
-    "fit_plane",
-    "fit_sphere",
-    "fit_surface",
-    "tangents",
-    "with_covariance",
-]
 
 Array = NDArray[np.float64]
 
@@ -66,97 +39,6 @@ LEAST_BELONGING = 0.25
 
 #: a quarter of normal residuals lie within this many standard deviations
 QUARTER_TO_STD = 0.3186
-
-# All fits have the same three fields. `covariance` (p, p) is that of the parameters of a small change of their shape.
-# `residual_std` [mm] has `count - p` degrees of freedom, and is along the rays if a viewpoint was given. `count` is the
-# number of points used.
-
-
-@dataclass(frozen=True)
-class PlaneFit(Plane):
-    """Fitted plane; ``point`` is the foot of the used points' centroid, ``normal`` faces the viewpoint."""
-
-    covariance: Array
-    residual_std: float
-    count: int
-
-
-@dataclass(frozen=True)
-class CylinderFit(Cylinder):
-    """Fitted cylinder.
-
-    ``point`` is the axis' point nearest the used points' centroid; ``axis`` has the sense of the initial axis.
-    """
-
-    covariance: Array
-    residual_std: float
-    count: int
-
-
-@dataclass(frozen=True)
-class SphereFit(Sphere):
-    """Fitted sphere."""
-
-    covariance: Array
-    residual_std: float
-    count: int
-
-
-@dataclass(frozen=True)
-class ConeFit(Cone):
-    """Fitted cone; ``point`` is the axis' point nearest the used points' centroid."""
-
-    covariance: Array
-    residual_std: float
-    count: int
-
-
-@dataclass(frozen=True)
-class CircleFit(Circle):
-    """Fitted circle; its covariance is that of the edge alone, since its plane has its own."""
-
-    covariance: Array
-    residual_std: float
-    count: int
-
-
-@dataclass(frozen=True)
-class EdgePointFit(EdgePoint):
-    """Fitted point of an edge; its covariance is that of the edge alone, since its plane has its own."""
-
-    covariance: Array
-    residual_std: float
-    count: int
-
-
-Fit = PlaneFit | CylinderFit | SphereFit | ConeFit | CircleFit | EdgePointFit
-
-_FITS: dict[type[Any], type[Fit]] = {
-    Plane: PlaneFit,
-    Cylinder: CylinderFit,
-    Sphere: SphereFit,
-    Cone: ConeFit,
-    Circle: CircleFit,
-    EdgePoint: EdgePointFit,
-}
-
-
-def with_covariance(
-    shape: Surface | Circle | EdgePoint, covariance: ArrayLike, residual_std: float = np.nan, count: int = 0
-) -> Fit:
-    """Return a shape, fitted or nominal, with the covariance (p, p) of its parameters, for predicted uncertainties.
-
-    Raises
-    ------
-    ValueError
-        If the covariance does not have the shape (p, p).
-    """
-    matrix = np.asarray(covariance, float)
-    if matrix.shape != (shape.parameter_count,) * 2:
-        raise ValueError(f"covariance is {matrix.shape}, a {shape.kind} has {shape.parameter_count} parameters")
-    plain = next(one for one in _FITS if isinstance(shape, one))
-    geometry = {field.name: getattr(shape, field.name) for field in fields(plain)}
-    return _FITS[plain](**geometry, covariance=matrix, residual_std=residual_std, count=count)
 
 
 def fit_plane(points: ArrayLike, viewpoint: ArrayLike | None = None) -> PlaneFit:

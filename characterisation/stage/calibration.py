@@ -24,7 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from characterisation.errors import InputError
-from characterisation.features.fits import Plane, PlaneFit, tangents
+from characterisation.features.fitted import PlaneFit
+from characterisation.features.surfaces import Plane, tangents
 from characterisation.stage.adjustment import adjusted, whitened
 from characterisation.stage.axes_from_sweeps import axes_from_normals, axes_from_rotations
 from characterisation.stage.turning_axes import LINE_PARAMETERS, TurningAxes, axial_vector, cross_matrix
@@ -76,7 +77,7 @@ class CouponCalibration:
     """A stage calibrated with the plane of a coupon.
 
     The fields are those of :class:`BoardCalibration`, with two differences. ``zero_plane`` is the coupon's plane at
-    zero, with the parameters of :class:`~characterisation.features.fits.Plane`. ``residuals`` (n, 3) are the shift [mm]
+    zero, with the parameters of :class:`~characterisation.features.surfaces.Plane`. ``residuals`` (n, 3) are the shift [mm]
     and the two tilts [rad] of the measured planes from the fitted ones. The position of the coupon's edges on its plane
     is unknown.
     """

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from characterisation.features.fits import tangents
+from characterisation.features.surfaces import tangents
 
 Floats = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ class TurningAxes:
     """Lines with unit ``directions`` (k, 3) through ``points`` (k, 3) [mm].
 
     Parameters of a small change, four for each line: tilts [rad] of the direction toward e1 and e2 of
-    :func:`~characterisation.features.fits.tangents`, shifts [mm] of the point along them.
+    :func:`~characterisation.features.surfaces.tangents`, shifts [mm] of the point along them.
     """
 
     directions: Floats

@@ -25,17 +25,11 @@ from scipy.linalg import block_diag
 from characterisation.errors import InputError, nearest
 from characterisation.features.edges import fit_circle, fit_edge_point
 from characterisation.features.figures import Circle, EdgePoint
-from characterisation.features.fits import (
-    LEAST_BELONGING,
-    CylinderFit,
-    Fit,
-    FitError,
-    PlaneFit,
-    belonging,
-    fit_surface,
-)
+from characterisation.features.fits import LEAST_BELONGING, belonging, fit_surface
+from characterisation.features.fitted import CylinderFit, Fit, PlaneFit
 from characterisation.features.form import Form, fit_form
 from characterisation.features.pose_fit import PoseFit, fit_pose
+from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Surface
 from characterisation.point_cloud import PointCloud
 from characterisation.tasks.definitions import (
@@ -99,7 +93,7 @@ class MeasurementModel:
     """A measurement as a function of its input quantities.
 
     ``value`` takes a fit for each of ``inputs``, in their order, and returns mm or rad. The fit is a
-    :data:`~characterisation.features.fits.Fit` for a feature, a :class:`~characterisation.features.form.Form`, or a
+    :data:`~characterisation.features.fitted.Fit` for a feature, a :class:`~characterisation.features.form.Form`, or a
     :class:`~characterisation.features.pose_fit.Pose`.
     """
 

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from characterisation.features.figures import Circle, EdgePoint, crossings, edge_covariance
-from characterisation.features.fits import FitError, with_covariance
+from characterisation.features.fitted import with_covariance
 from characterisation.features.form import Form, form_modes
 from characterisation.features.pose_fit import PoseFit, pose_jacobian
+from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Cone, Cylinder, Plane
 from characterisation.tasks.covariance import ExpectedFit, ExpectedPoints, expected_fit, expected_sums, solved, usable
 from characterisation.tasks.evaluation import InputQuantity, evaluate, measurement_model

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from characterisation.features.fits import Cone, Cylinder, Plane, Sphere
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.tasks.definitions import (
     axis_distance,
     plane_angle,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from characterisation.features.fits import Cone, Cylinder, Plane, Sphere
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.tasks.places import mid_plane
 from characterisation.tasks.zones import Datum, frame_fault
 from mitsim.authoring.face import Face

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.features.fits import Cone, Cylinder, Plane, Sphere, tangents
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, tangents
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -102,7 +102,7 @@ class Face:
     def corner_places(self) -> Floats | None:
         """Return places (m, 3, 2) [mm] on the developed surface, u and v; None for other surfaces.
 
-        On a plane they are along the two :func:`~characterisation.features.fits.tangents` of the normal. On a cylinder
+        On a plane they are along the two :func:`~characterisation.features.surfaces.tangents` of the normal. On a cylinder
         u is circumferential and v axial. Each triangle is developed separately, so none crosses a seam.
         """
         corners = self.vertices[self.triangles]

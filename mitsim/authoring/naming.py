@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from characterisation.features.fits import Cone, Cylinder, Plane, Sphere
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from mitsim.authoring.face import Face, Floats, Torus
 
 #: names of directions along x, y, z: (minus, plus)

@@ -20,7 +20,7 @@ import numpy as np
 import trimesh
 
 from characterisation.atomic_io import FULL, write_folder
-from characterisation.features.fits import Cone, Cylinder, Plane, Sphere
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from mitsim.authoring.drawing_task import DrawnTask, drawn_task
 from mitsim.authoring.face import Face, Torus
 from mitsim.authoring.naming import with_names

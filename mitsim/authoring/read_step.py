@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from characterisation.features.fits import Cone, Cylinder, Plane, Sphere
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from mitsim.authoring import step_worker
 from mitsim.authoring.face import Face, Floats, Ints, Surface, Torus, outward_normals, same_surface, surface_distance
 from mitsim.authoring.part21 import read_step_text

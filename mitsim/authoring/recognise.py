@@ -14,7 +14,9 @@ from collections.abc import Iterable
 import numpy as np
 import trimesh
 
-from characterisation.features.fits import Cylinder, FitError, Plane, Sphere, fit_cylinder, fit_sphere, tangents
+from characterisation.features.fits import fit_cylinder, fit_sphere
+from characterisation.features.robust_fit import FitError
+from characterisation.features.surfaces import Cylinder, Plane, Sphere, tangents
 from mitsim.authoring.face import TOLERANCE_MM, Face, Floats, Ints, Surface, outward_normals, surface_distance
 
 #: a normal is perpendicular to an axis within this sine: 0.6 deg

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.features.fits import Cone, Cylinder, Plane, Sphere, tangents
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, tangents
 from mitsim.authoring.drawing_task import DrawnTask
 from mitsim.authoring.drawn_zones import middle_outline
 from mitsim.authoring.face import Face, Floats

@@ -28,8 +28,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from characterisation.features.fits import FitError, fit_plane
-from characterisation.features.robust_fit import SMALLEST_SCALE
+from characterisation.features.fits import fit_plane
+from characterisation.features.robust_fit import SMALLEST_SCALE, FitError
 from characterisation.features.surfaces import tangents
 from characterisation.point_cloud import PointCloud, ViewGrid
 from mitsim.capture.capture import Capture

@@ -20,16 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.errors import InputError, nearest
-from characterisation.features.fits import (
-    CylinderFit,
-    FitError,
-    PlaneFit,
-    SphereFit,
-    fit_cylinder,
-    fit_plane,
-    fit_sphere,
-)
+from characterisation.features.fits import fit_cylinder, fit_plane, fit_sphere
+from characterisation.features.fitted import CylinderFit, PlaneFit, SphereFit
 from characterisation.features.form import fit_form, zone
+from characterisation.features.robust_fit import FitError
 from characterisation.features.starts import cylinder_start
 from characterisation.point_cloud import PointCloud
 from characterisation.tasks.definitions import (

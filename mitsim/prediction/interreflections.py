@@ -38,8 +38,9 @@ from characterisation.documents import Document, read_toml
 from mitsim.prediction.multipath_phase_bias import amplitude, finest_fringe, fringes, phase_bias
 from mitsim.prediction.multipath_range_bias import path_amplitudes, path_bias, range_bias
 from mitsim.prediction.perturbation import Perturbation, SceneView
+from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.projector_light import LitPatterns, ModulatedLight
-from mitsim.scene.light_transport.transport import LightPaths, trace_poses
+from mitsim.scene.light_transport.transport import trace_poses
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met

@@ -26,9 +26,10 @@ from characterisation.threads import in_threads
 from mitsim.capture.capture import Capture
 from mitsim.errors import InputError
 from mitsim.scene.light_transport.ambient import has_emitters
+from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.projector_light import Light, LitPatterns, ModulatedLight
 from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
-from mitsim.scene.light_transport.transport import LightPaths, trace
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met

@@ -17,8 +17,9 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
+from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.projector_light import LitPatterns
-from mitsim.scene.light_transport.transport import LightPaths, trace
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.transforms import Transform

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from characterisation.documents import validate
-from characterisation.features.fits import Plane
+from characterisation.features.surfaces import Plane
 from characterisation.stage.calibration import BoardCalibration, CouponCalibration
 from characterisation.stage.turning_axes import TurningAxes
 from mitsim.campaign.stage_pose import StageTable, read_stage_calibration, write_stage_calibration

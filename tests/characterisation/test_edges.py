@@ -8,7 +8,10 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from characterisation.features.edges import fit_circle, fit_edge_point
 from characterisation.features.figures import Circle, EdgePoint, crossings, edge_covariance
-from characterisation.features.fits import Cylinder, FitError, Plane, fit_plane, tangents, with_covariance
+from characterisation.features.fits import fit_plane
+from characterisation.features.fitted import with_covariance
+from characterisation.features.robust_fit import FitError
+from characterisation.features.surfaces import Cylinder, Plane, tangents
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
 FOCAL, DISTANCE = 600.0, 400.0

@@ -6,9 +6,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from characterisation.features.figures import Circle
-from characterisation.features.fits import Cone, Cylinder, Plane, fit_cone, fit_cylinder, fit_plane, fit_sphere
+from characterisation.features.fits import fit_cone, fit_cylinder, fit_plane, fit_sphere
 from characterisation.features.pose_fit import fit_pose
 from characterisation.features.robust_fit import robust_fit
+from characterisation.features.surfaces import Cone, Cylinder, Plane
 
 geom3 = pytest.importorskip("engeom.geom3", reason="pip install engeom to compare with its fits")
 align3 = pytest.importorskip("engeom.align3", reason="pip install engeom to compare with its fits")

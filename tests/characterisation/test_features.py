@@ -5,17 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from characterisation.features.fits import (
-    Cylinder,
-    FitError,
-    Plane,
-    Sphere,
-    belonging,
-    fit_cylinder,
-    fit_plane,
-    fit_sphere,
-    tangents,
-)
+from characterisation.features.fits import belonging, fit_cylinder, fit_plane, fit_sphere
+from characterisation.features.robust_fit import FitError
+from characterisation.features.surfaces import Cylinder, Plane, Sphere, tangents
 
 EYE = np.zeros(3)
 

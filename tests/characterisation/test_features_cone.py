@@ -6,17 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from characterisation.features.fits import (
-    Cone,
-    Cylinder,
-    FitError,
-    Plane,
-    Sphere,
-    fit_cone,
-    fit_surface,
-    tangents,
-    with_covariance,
-)
+from characterisation.features.fits import fit_cone, fit_surface
+from characterisation.features.fitted import with_covariance
+from characterisation.features.robust_fit import FitError
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, tangents
 
 EYE = np.zeros(3)
 AXIS = np.array([0.1, -0.9, -0.4]) / np.linalg.norm([0.1, -0.9, -0.4])

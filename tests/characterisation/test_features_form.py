@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from characterisation.features.fits import Cylinder, FitError, Plane, fit_cylinder, fit_plane, tangents
+from characterisation.features.fits import fit_cylinder, fit_plane
 from characterisation.features.form import Form, fit_form, form_modes, zone
+from characterisation.features.robust_fit import FitError
+from characterisation.features.surfaces import Cylinder, Plane, tangents
 from characterisation.tasks.evaluation import evaluate
 
 EYE = np.zeros(3)

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 from two_balls import TASK
 
 from characterisation.errors import InputError
-from characterisation.features.fits import FitError, with_covariance
+from characterisation.features.fitted import with_covariance
+from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.scores.joining import (
     POSE_KNOWN,

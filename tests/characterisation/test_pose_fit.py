@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from characterisation.features.fits import FitError
 from characterisation.features.pose_fit import Pose, fit_pose, pose_jacobian
+from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 
 EYE = np.zeros(3)

@@ -7,8 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from characterisation.features.fits import FitError, fit_surface
+from characterisation.features.fits import fit_surface
 from characterisation.features.pose_fit import fit_pose
+from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Surface
 from characterisation.tasks.covariance import ExpectedPoints
 from characterisation.tasks.evaluation import evaluate, measurement_model

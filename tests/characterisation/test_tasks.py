@@ -8,7 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from characterisation.errors import InputError
-from characterisation.features.fits import Cylinder, CylinderFit, FitError, Plane, PlaneFit
+from characterisation.features.fitted import CylinderFit, PlaneFit
+from characterisation.features.robust_fit import FitError
+from characterisation.features.surfaces import Cylinder, Plane
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.tasks.evaluation import (
     Feature,

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.documents import validate
 from characterisation.errors import InputError
-from characterisation.features.fits import with_covariance
+from characterisation.features.fitted import with_covariance
 from characterisation.features.surfaces import Cylinder, Plane
 from characterisation.statements.decision import decide, tolerance_of
 from characterisation.tasks.evaluation import Task, evaluate, measurement_model

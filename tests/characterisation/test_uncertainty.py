@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from scipy.stats import norm
 
 from characterisation.coupon.offsets import own_area
-from characterisation.features.fits import FitError
+from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Cylinder, Plane, tangents
 from characterisation.tasks.covariance import ExpectedPoints, expected_fit
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from characterisation.features.fits import tangents
+from characterisation.features.surfaces import tangents
 
 
 def unit(vector):

@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from characterisation.errors import InputError
-from characterisation.features.fits import Plane, PlaneFit, fit_plane, tangents
+from characterisation.features.fits import fit_plane
+from characterisation.features.fitted import PlaneFit
+from characterisation.features.surfaces import Plane, tangents
 from characterisation.stage.calibration import (
     axis_deviations,
     calibrate_with_board,

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 from characterisation.stage.calibration import axis_deviations, calibrate_with_board, calibration_angles
 from characterisation.stage.turning_axes import TurningAxes
 from mitsim.scene.backend import mi
+from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.projector_light import LitPatterns
-from mitsim.scene.light_transport.transport import LightPaths, trace
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.transforms import Transform

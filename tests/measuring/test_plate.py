@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from seen_shapes import cloud_of, plane
 
-from characterisation.features.fits import FitError
+from characterisation.features.robust_fit import FitError
 from characterisation.point_cloud import ViewGrid
 from mitsim.decode.dot_centres import dot_centres
 from mitsim.measuring.plate import Plate, PlateDots, measure_plate, plate_dots, plate_scale

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from mitsim.scene.backend import mi
+from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.light_tracing import Photons, add_photons
 from mitsim.scene.light_transport.projector_light import LitPatterns, ModulatedLight
-from mitsim.scene.light_transport.transport import LightPaths, trace
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mitsim.scene.backend import mi
-from mitsim.scene.light_transport import transport
+from mitsim.scene.light_transport import path_loop
+from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.plain_scene import single_bsdf, single_plane
 from mitsim.scene.light_transport.projector_light import LitPatterns, independent
-from mitsim.scene.light_transport.transport import LightPaths, trace
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
@@ -72,8 +73,8 @@ def test_the_short_way_finds_the_light_of_the_long_way(kind, depth, light, monke
     assert single_bsdf(scene) is not None
     rays = CameraRays(pinhole(96, 64, 240.0), 4.0, 430.0)
     short = trace(scene, rays, light, POSE, LightPaths(samples=16, seed=1, depth=depth))
-    monkeypatch.setattr(transport, "single_plane", lambda scene: None)
-    monkeypatch.setattr(transport, "single_bsdf", lambda scene: None)
+    monkeypatch.setattr(path_loop, "single_plane", lambda scene: None)
+    monkeypatch.setattr(path_loop, "single_bsdf", lambda scene: None)
     long = trace(scene, rays, light, POSE, LightPaths(samples=16, seed=1, depth=depth))
     assert (long > 0).mean() > 0.2
     # roundings in single precision; of interreflections now and then a ray takes the other side of an edge

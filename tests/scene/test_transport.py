@@ -8,8 +8,9 @@ import pytest
 from characterisation.features.fits import fit_sphere
 from mitsim.decode.triangulate import triangulate
 from mitsim.scene.backend import mi
+from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.projector_light import LitPatterns
-from mitsim.scene.light_transport.transport import LightPaths, trace
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera

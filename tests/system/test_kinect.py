@@ -17,8 +17,9 @@ from mitsim.capture.folder import read_capture, write_capture
 from mitsim.errors import InputError
 from mitsim.reconstruction.cloud import capture_cloud, decoder_settings, sensor_geometry
 from mitsim.scene.backend import mi
+from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.projector_light import ModulatedLight
-from mitsim.scene.light_transport.transport import LightPaths, trace
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera

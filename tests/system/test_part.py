@@ -16,7 +16,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from shell import mitsim_here
 
-from characterisation.features.fits import Cylinder
+from characterisation.features.surfaces import Cylinder
 from mitsim.authoring.check import read_features
 from mitsim.authoring.face import surface_distance
 from mitsim.authoring.part_folder import Finishing, scene_xml, write_part

@@ -18,8 +18,9 @@ from mitsim.calibration.bundle import BoardView, linearise
 from mitsim.calibration.corner_noise import corner_noise
 from mitsim.calibration.simulated import SimulatedCorners, estimate
 from mitsim.scene.backend import mi
+from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.projector_light import LitPatterns
-from mitsim.scene.light_transport.transport import LightPaths, trace
+from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.rig_parameters import parameter_differences

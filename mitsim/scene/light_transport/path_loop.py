@@ -1,0 +1,269 @@
+"""Trace the light paths of all pixels of a region, in one kernel.
+
+Signal chain, for each pixel and sample: position in the pixel and in the lens -> camera ray -> surface -> position in
+the projector's aperture, and coordinate (u, v) whose light arrives from there, if nothing blocks it -> BSDF -> radiance
+per unit of code value, optical length L -> one sum per code.
+
+The kernel has one lane per pixel and contains the loop over samples. It needs no film and no atomic additions. Later
+bounces use the same loop: a lane whose path has ended starts its next sample.
+
+Direct light from the projector is free of noise, which could be mistaken for the sensor's. The positions inside a pixel
+form a raster, and those in the two apertures are a fixed set. The remaining error is that of a quadrature rule, the
+same in every capture of a pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.scene.backend import dr, mi
+from mitsim.scene.light_transport.ambient import has_emitters, hit_emitter_light, sampled_emitter_light
+from mitsim.scene.light_transport.aperture_samples import aperture_samples
+from mitsim.scene.light_transport.light_paths import LightPaths
+from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
+from mitsim.scene.light_transport.plain_scene import intersect_plane, single_bsdf, single_plane
+from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
+from mitsim.scene.load import Scene
+from mitsim.scene.ray_casting.camera_rays import CameraRays, bilinear, pixel_area
+from mitsim.scene.ray_casting.eye import Eye
+from mitsim.sensor.roi import Roi
+from mitsim.sensor.transforms import Transform
+
+#: largest ratio of densities, so that it stays finite
+_LARGEST_RATIO = 1e30
+
+
+def launch(
+    scene: Scene,
+    rays: CameraRays,
+    light: Light,
+    poses: Sequence[Transform],
+    paths: LightPaths,
+    roi: Roi,
+    shift: NDArray[np.floating] | None,
+) -> list[Any]:
+    """Return all images of a region, and the ambient one, as arrays on the device, pose after pose; one kernel."""
+    side, depth, seed, jitter = paths.side, paths.depth, paths.seed, paths.jitter
+    photons = paths.photon_count(rays.camera.width * rays.camera.height)
+    count = len(poses) * roi.width * roi.height
+    index, lane = dr.arange(mi.UInt32, count), None
+    if len(poses) > 1:
+        pixels = dr.opaque(mi.UInt32, roi.width * roi.height)
+        lane, index = index // pixels, index % pixels
+    camera = Eye([pose @ rays.camera.sensor_from_camera for pose in poses], lane)
+    projector = ProjectorLight(poses, light.projector, scene.bounds, lane)
+
+    width = dr.opaque(mi.UInt32, roi.width)
+    column = index % width + dr.opaque(mi.UInt32, roi.left)
+    row = index // width + dr.opaque(mi.UInt32, roi.top)
+    pixel = row * rays.camera.width + column
+    x, y = rays.corners(column, row)
+    displacement = None if shift is None else _displacement(shift, camera, index)
+
+    random = mi.PCG32(initstate=dr.opaque(mi.UInt64, seed), initseq=mi.UInt64(pixel))
+    sequence_seed, z_index = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), z_order(column, row)
+    total = dr.opaque(mi.UInt32, side * side)
+    # the second moment of n midpoints in a row is too small by the factor 1 - 1/n^2. Stretched to the right moment they
+    # integrate cubics exactly, and two of them are Gauss's rule
+    stretch = 1.0 if jitter or side == 1 else float(1.0 / np.sqrt(1.0 - side**-2))
+    has_aperture = rays.aperture_mm > 0
+    pupils = _Pupils(side * side, jitter)
+    has_ambient = has_emitters(scene)
+    plane, shared_bsdf = single_plane(scene), single_bsdf(scene)
+    occluders = scene.mitsuba if plane is None else None
+    photons_per_sample = dr.opaque(mi.Float, photons / side**2)
+    area = pixel_area(x, y)
+    sums = [dr.zeros(mi.Float, count) for _ in range(light.codes + 1)]  # the last is ambient light
+    initial = _PathState(
+        sample=mi.UInt32(dr.zeros(mi.UInt32, count)),
+        bounce=mi.UInt32(dr.zeros(mi.UInt32, count)),
+        origin=dr.zeros(mi.Point3f, count),
+        direction=dr.zeros(mi.Vector3f, count),
+        weight=dr.ones(mi.Float, count),
+        pdf=dr.ones(mi.Float, count),
+        length=dr.zeros(mi.Float, count),
+        ratio=dr.zeros(mi.Float, count),
+        random=random,
+        sums=sums,
+    )
+
+    def running(path: _PathState) -> Any:
+        return path.sample < total
+
+    def step(path: _PathState) -> tuple[_PathState]:
+        sample, bounce, origin, direction = path.sample, path.bounce, path.origin, path.direction
+        weight, pdf, length, ratio = path.weight, path.pdf, path.length, path.ratio
+        random, sums = path.random, path.sums
+        # a lane at bounce 0 starts a path in the next cell of its pixel's raster of side x side
+        at_first = bounce == 0
+        a = 0.5 + stretch * ((mi.Float(sample % side) + (random.next_float32() if jitter else 0.5)) / side - 0.5)
+        b = 0.5 + stretch * ((mi.Float(sample // side) + (random.next_float32() if jitter else 0.5)) / side - 0.5)
+        local = mi.Vector3f(bilinear(x, a, b), bilinear(y, a, b), 1.0)
+        start = camera.position
+        if has_aperture:
+            in_lens = pupils.camera(sample, random) * (0.5 * rays.aperture_mm)
+            start = start + camera.axes[0] * in_lens.x + camera.axes[1] * in_lens.y
+            local -= mi.Vector3f(in_lens.x, in_lens.y, 0.0) * (1.0 / rays.focus_mm)
+        origin = dr.select(at_first, start, origin)
+        direction = dr.select(at_first, camera.to_world(dr.normalize(local)), direction)
+        weight = dr.select(at_first, 1.0, weight)
+
+        ray = mi.Ray3f(origin, direction)
+        surface = scene.mitsuba.ray_intersect(ray) if plane is None else intersect_plane(plane, ray)
+        if has_ambient:
+            ambient = weight * hit_emitter_light(scene, surface, origin, pdf, at_first)
+            if paths.indirect_only:  # an emitter behind the first surface is its direct light
+                ambient = dr.select(bounce > 1, ambient, 0.0)
+        hit = surface.is_valid() & (bounce < depth)
+        length = dr.select(at_first, 0.0, length) + dr.select(hit, surface.t, 0.0)
+        context = mi.BSDFContext()
+        bsdf = surface.bsdf() if shared_bsdf is None else shared_bsdf
+        contributes = hit & ~at_first if paths.indirect_only else hit
+
+        lens = pupils.projector(sample, random) if projector.radius > 0 else None
+        shift_mm = None if displacement is None else displacement * dr.select(at_first, surface.t, 0.0)
+        toward, irradiance, uv, distance = projector.light(occluders, surface, direction, lens, shift_mm, contributes)
+        reflected = bsdf.eval(context, surface, surface.to_local(toward), contributes & (irradiance > 0))[0]
+        radiance = weight * reflected * irradiance
+        if photons:  # ratio: n_L p_L / (n_C p_C) of the surfaces so far
+            cosine_in = dr.abs(dr.dot(surface.n, direction))
+            cosine = dr.dot(direction, camera.axes[2])
+            footprint = photons_per_sample * area * dr.square(cosine) * cosine * dr.square(surface.t)
+            ratio = dr.select(at_first, footprint, ratio) / dr.maximum(cosine_in, 1e-9)
+            reverse_density = _density_to_camera(
+                bsdf, surface, surface.to_local(toward), hit & ~at_first & (irradiance > 0)
+            )
+            reverse_density *= projector.density(toward, distance) * dr.abs(dr.dot(surface.n, toward))
+            radiance *= dr.select(at_first, 1.0, 1.0 / (1.0 + ratio * reverse_density))
+        values = light.values(uv, length + distance, contributes & (radiance > 0))
+        added = [dr.select(radiance > 0, radiance * value, 0.0) for value in values]
+        if has_ambient:
+            ambient += dr.select(
+                contributes, weight * sampled_emitter_light(scene, surface, bsdf, random, contributes), 0.0
+            )
+        sums = [s + a for s, a in zip(sums, [*added, ambient if has_ambient else 0.0], strict=True)]
+
+        if depth == 1 and not has_ambient:
+            return (_PathState(sample + 1, bounce, origin, direction, weight, pdf, length, ratio, random, sums),)
+        sample1, sample2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
+        if not jitter:  # most of the remaining error is that of the first bounce
+            even1, even2 = r3_point(z_index * total + sample, sequence_seed, 0)
+            sample1, sample2 = dr.select(at_first, even1, sample1), dr.select(at_first, even2, sample2)
+        # the ray from the last surface may meet an emitter of the scene
+        continues = hit & (bounce + 1 < (depth + 1 if has_ambient else depth))
+        sampled, bsdf_weight = bsdf.sample(context, surface, sample1, sample2, continues)
+        continues &= bsdf_weight[0] > 0
+        next_ray = surface.spawn_ray(surface.to_world(sampled.wo))
+        if photons:  # photons end at a delta lobe
+            reverse_density = dr.select(
+                at_first, 1.0, _density_to_camera(bsdf, surface, sampled.wo, continues & ~at_first)
+            )
+            is_delta = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
+            ratio *= dr.select(is_delta, 0.0, reverse_density * dr.abs(dr.dot(surface.n, next_ray.d)) / sampled.pdf)
+            ratio = dr.select(continues, dr.minimum(ratio, _LARGEST_RATIO), 0.0)
+        next_path = _PathState(
+            sample=dr.select(continues, sample, sample + 1),
+            bounce=dr.select(continues, bounce + 1, 0),
+            origin=dr.select(continues, next_ray.o, origin),
+            direction=dr.select(continues, next_ray.d, direction),
+            weight=dr.select(continues, weight * bsdf_weight[0], 1.0),
+            pdf=sampled.pdf,
+            length=length,
+            ratio=ratio,
+            random=random,
+            sums=sums,
+        )
+        return (next_path,)
+
+    (final,) = dr.while_loop((initial,), running, step, labels=("path",), label="transport")
+    sums = final.sums
+    scale = dr.opaque(mi.Float, 1.0 / (side * side))
+    *code_sums, ambient_sum = sums
+    images = [(s + ambient_sum) * scale for s in light.images(code_sums)] + [ambient_sum * scale]
+    dr.eval(images)  # all at once: one kernel for any number of images
+    return images
+
+
+@dataclass
+class _PathState:
+    """State of the light paths of one launch, one lane per pixel, in Dr.Jit's loop.
+
+    Attributes
+    ----------
+    sample
+        Index of the sample in its pixel.
+    bounce
+        Number of surfaces met before.
+    origin, direction
+        The next ray.
+    weight
+        Weight of its light.
+    pdf
+        Density of its direction [1/sr].
+    length
+        Optical length so far [mm].
+    ratio
+        n_L p_L / (n_C p_C) so far, of photons over camera paths.
+    random
+        Generator of random numbers.
+    sums
+        Light of each code, and of the emitters as the last.
+    """
+
+    sample: Any
+    bounce: Any
+    origin: Any
+    direction: Any
+    weight: Any
+    pdf: Any
+    length: Any
+    ratio: Any
+    random: Any
+    sums: Any
+
+
+def _density_to_camera(bsdf: Any, surface: Any, toward_projector: Any, active: Any) -> Any:
+    """Return the density with which a photon continues to the camera [1/sr].
+
+    It arrives from ``toward_projector``, in the local frame.
+    """
+    view = mi.SurfaceInteraction3f(surface)
+    view.wi = toward_projector
+    return bsdf.pdf(mi.BSDFContext(), view, surface.wi, active)
+
+
+class _Pupils:
+    """Positions in the unit discs of the lenses of camera and projector for each sample."""
+
+    def __init__(self, count: int, jitter: bool) -> None:
+        self.jitter = jitter
+        self.tables = [mi.Point2f(positions) for positions in aperture_samples(count)]
+
+    def camera(self, sample: Any, random: Any) -> Any:
+        """Return the position in the camera's lens."""
+        return self._position(0, sample, random)
+
+    def projector(self, sample: Any, random: Any) -> Any:
+        """Return the position in the projector's lens."""
+        return self._position(1, sample, random)
+
+    def _position(self, lens: int, sample: Any, random: Any) -> Any:
+        if self.jitter:
+            return mi.warp.square_to_uniform_disk_concentric(mi.Point2f(random.next_float32(), random.next_float32()))
+        return dr.gather(mi.Point2f, self.tables[lens], sample)
+
+
+def _displacement(shift: NDArray[np.floating], camera: Eye, index: Any) -> Any:
+    """Return the displacement of the code for each pixel of a region, world frame.
+
+    It is per unit of distance from the camera [rad].
+    """
+    # a gather, because a kernel that loads is compiled for each possible alignment of a NumPy array
+    along = mi.Float(np.ravel(shift).astype(np.float32))
+    below = index + dr.opaque(mi.UInt32, shift[0].size)
+    return camera.axes[0] * dr.gather(mi.Float, along, index) + camera.axes[1] * dr.gather(mi.Float, along, below)
