@@ -77,9 +77,9 @@ class CouponCalibration:
     """A stage calibrated with the plane of a coupon.
 
     The fields are those of :class:`BoardCalibration`, with two differences. ``zero_plane`` is the coupon's plane at
-    zero, with the parameters of :class:`~characterisation.features.surfaces.Plane`. ``residuals`` (n, 3) are the shift [mm]
-    and the two tilts [rad] of the measured planes from the fitted ones. The position of the coupon's edges on its plane
-    is unknown.
+    zero, with the parameters of :class:`~characterisation.features.surfaces.Plane`. ``residuals`` (n, 3) are the shift
+    [mm] and the two tilts [rad] of the measured planes from the fitted ones. The position of the coupon's edges on its
+    plane is unknown.
     """
 
     axes: TurningAxes

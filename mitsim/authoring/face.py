@@ -102,8 +102,8 @@ class Face:
     def corner_places(self) -> Floats | None:
         """Return places (m, 3, 2) [mm] on the developed surface, u and v; None for other surfaces.
 
-        On a plane they are along the two :func:`~characterisation.features.surfaces.tangents` of the normal. On a cylinder
-        u is circumferential and v axial. Each triangle is developed separately, so none crosses a seam.
+        On a plane they are along the two :func:`~characterisation.features.surfaces.tangents` of the normal. On a
+        cylinder u is circumferential and v axial. Each triangle is developed separately, so none crosses a seam.
         """
         corners = self.vertices[self.triangles]
         if isinstance(self.surface, Plane):

@@ -25,6 +25,7 @@ others are not looked for. Levels beyond the brightest pixel are unknown; the cu
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -160,9 +161,13 @@ def _least(tiles: _Tiles, middle: float, slope: float) -> float:
 
 @dataclass(frozen=True)
 class _Tiles:
-    """Tiles (n, 36, 36) of an image without noise, which of their pixels are used, and these pixels' squared detail."""
+    """Tiles (n, 36, 36) of an image without noise, which of their pixels are used, and these pixels' squared detail.
+
+    ``rising`` (n * 36 * 36,) are the indices of the pixels by rising level.
+    """
 
     clean: Floats
+    rising: NDArray[np.intp]
     inside: Mask
     square: Floats
     own: Floats
@@ -181,7 +186,24 @@ class _Tiles:
             return None
         some = some[:: int(np.ceil(len(some) / _TILES))]
         levels, square, own = (_cut(one, side)[some] for one in (clean, finest_detail(image), finest_detail(clean)))
-        return cls(levels, inside[some], square[inside[some]] ** 2, own[inside[some]] ** 2, black)
+        return cls(
+            levels,
+            np.argsort(levels, axis=None),
+            inside[some],
+            square[inside[some]] ** 2,
+            own[inside[some]] ** 2,
+            black,
+        )
+
+    @cached_property
+    def median_square(self) -> float:
+        """Median squared detail."""
+        return float(np.median(self.square))
+
+    @cached_property
+    def median_level(self) -> float:
+        """Median level [DN]."""
+        return float(np.median(self.clean))
 
     def away_from(self, level: float) -> _Tiles:
         """The tiles without pixels near a level: a curve that is flat there only is no knee."""
@@ -195,19 +217,19 @@ class _Tiles:
 
     def fitted(self, knee: float, slope: float) -> Floats:
         """The a and b of all tiles, by weighted least squares."""
-        middle = float(np.median(self.square)) / _MEDIAN_SQUARE
-        numbers, variance = np.array([0.0, middle / max(float(np.median(self.clean)), 1.0)]), middle + 0 * self.square
+        middle = self.median_square / _MEDIAN_SQUARE
+        numbers, variance = np.array([0.0, middle / max(self.median_level, 1.0)]), np.full_like(self.square, middle)
         for _ in range(3):
             maps = self._maps(knee, slope, numbers)
             for _ in range(2):
                 weight = (self.square < _LARGEST**2 * variance) / variance**2
                 numbers = _two(maps, self.square - 1 / 12 - self.own, weight)
-                variance = np.maximum(maps @ numbers, 1e-3) + 1 / 12 + self.own
+                variance = np.maximum(numbers @ maps, 1e-3) + 1 / 12 + self.own
         return numbers
 
     def misfit(self, knee: float, slope: float, numbers: Floats) -> Floats:
         """-2 log likelihood (n,) of the tiles."""
-        variance = np.maximum(self._maps(knee, slope, numbers) @ numbers, 1e-3) + 1 / 12 + self.own
+        variance = np.maximum(numbers @ self._maps(knee, slope, numbers), 1e-3) + 1 / 12 + self.own
         each = np.log(variance) + np.minimum(self.square / variance, _LARGEST**2)
         total = np.bincount(np.nonzero(self.inside)[0], each, minlength=len(self.clean))
         return np.asarray(independent_share() * total, float)
@@ -238,15 +260,22 @@ class _Tiles:
         return float(np.sqrt((len(moved) - 1) * moved.var()))
 
     def _maps(self, knee: float, slope: float, numbers: Floats) -> Floats:
-        """What a and b are multiplied with in every used pixel (N, 2)."""
+        """What a and b are multiplied with in every used pixel (2, N)."""
         light, ratio = self.clean, np.ones(self.clean.shape)
         if slope < 1:
             top = knee + (float(self.clean.max()) + 5 - knee) / slope
             every = np.linspace(0.0, top, 1500)
             mean, share = _through(every, knee, slope, self.spread(every, numbers))
-            light, ratio = np.interp(self.clean, mean, every), np.interp(self.clean, mean, share)
+            light, ratio = self._interpolated(mean, every), self._interpolated(mean, share)
         both = ratio, ratio * np.maximum(light - self.black, 0.0)
-        return np.stack([_of_neighbours(one)[self.inside] for one in both], axis=1)
+        return np.stack([_of_neighbours(one)[self.inside] for one in both])
+
+    def _interpolated(self, levels: Floats, values: Floats) -> Floats:
+        """Return values known at rising ``levels`` in every pixel (n, 36, 36)."""
+        # in the order of the pixels' levels, which finds the neighbours five times as fast
+        found = np.empty(self.clean.size)
+        found[self.rising] = np.interp(self.clean.reshape(-1)[self.rising], levels, values)
+        return found.reshape(self.clean.shape)
 
     def spread(self, level: Floats, numbers: Floats) -> Floats:
         """Return the standard deviation [DN] of the noise at levels (n,) of the converter, from a and b."""
@@ -268,8 +297,9 @@ def _through(level: Floats, knee: float, slope: float, spread: Floats) -> tuple[
 
 
 def _two(design: Floats, values: Floats, weight: Floats) -> Floats:
-    """Two numbers by weighted least squares, neither of them negative."""
-    normal, right = design.T @ (design * weight[:, None]), design.T @ (weight * values)
+    """Two numbers by weighted least squares, neither of them negative; the design is (2, N)."""
+    weighted = design * weight
+    normal, right = weighted @ design.T, weighted @ values
     found = np.linalg.solve(normal + 1e-12 * np.eye(2), right)
     if found[0] < 0:
         found = np.array([0.0, max(right[1] / normal[1, 1], 0.0)])

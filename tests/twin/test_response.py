@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "validation"))
 from test_denoise import plate
 
 STRAIGHT = Imager(6.0, 0.3, 6000.0, 10.0, 0.0, 0.0, 8, 4.0, 1.8)
-WELL, SEEDS = 12000.0, 64
+WELL, SEEDS = 12000.0, 32
 
 
 def capture(seed: int, slope: float | None, size: tuple[int, int] = (200, 232)) -> tuple[np.ndarray, float]:
@@ -38,7 +38,6 @@ def capture(seed: int, slope: float | None, size: tuple[int, int] = (200, 232)) 
     return expose(electrons, chip, None, Noise(), np.random.default_rng(100 + seed)).astype(float), level
 
 
-@pytest.mark.timeout(3600)
 def test_the_interval_of_a_knee_holds_it():
     errors = []
     for seed in range(SEEDS):
@@ -47,9 +46,10 @@ def test_the_interval_of_a_knee_holds_it():
         if knee is not None:  # in few of them, little is brighter than the knee
             assert knee.slope == 0.5, seed
             errors.append((knee.level - level) / knee.uncertainty)
-    assert len(errors) >= 60
-    assert 0.93 <= np.mean(np.abs(errors) < 1.96) <= 0.97
-    # the standard deviation of 60 is known to 9 %
+    assert len(errors) >= 30
+    # more than 4 of 31 outside 95 % intervals are chance once in 50; uncertainties too small by 1.5 leave 6 outside
+    assert np.sum(np.abs(errors) > 1.96) <= 4
+    # the standard deviation of 31 is known to 13 %
     assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.25
 
 
