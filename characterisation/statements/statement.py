@@ -22,6 +22,7 @@ from scipy.stats import t
 from characterisation.statements.budget import BudgetLine
 from characterisation.statements.coverage import BLOCKS, coverage_interval, standard_errors
 from characterisation.statements.decision import Decided, Tolerance, Verdict, decide
+from characterisation.statements.losses import Loss
 
 Floats = NDArray[np.float64]
 
@@ -71,6 +72,8 @@ class Statement:
         Decision by the rule of the tolerance; None without one.
     verdict
         ``fits``, ``does not fit``, ``undecidable``, ``not decided``, or ``no tolerance``.
+    losses
+        Reasons of the trials without a value, most frequent first; empty if none are known.
     """
 
     measurement: str
@@ -92,6 +95,7 @@ class Statement:
     share_interval: tuple[float, float] | None
     decided: Decided | None
     verdict: Verdict
+    losses: tuple[Loss, ...] = ()
 
     @property
     def root_mean_square(self) -> float:

@@ -62,6 +62,13 @@ class DecisionEntry(_Loose):
     demand_interval: tuple[float | None, float | None] | None = None
 
 
+class LossEntry(_Loose):
+    """A kind of reason why trials had no value, and their number."""
+
+    reason: str
+    count: int = Field(ge=0)
+
+
 class StatedMeasurement(_Loose):
     """One measurement of ``statement.json``."""
 
@@ -82,6 +89,7 @@ class StatedMeasurement(_Loose):
     share_of_tolerance: float | None
     decision: DecisionEntry | None = None
     verdict: str
+    losses: list[LossEntry] = Field(default_factory=list)
 
 
 class InfluenceEntry(_Loose):
@@ -147,6 +155,11 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
         "budget_rows": [_budget_row(name, one, shown) for name, one in document.measurements.items() if one.budget],
         "included": [one.model_dump() for one in document.influences if one.included],
         "missing": [one.model_dump() for one in document.influences if not one.included],
+        "losses": [
+            {"name": name, "count": loss.count, "trials": one.trials, "reason": loss.reason}
+            for name, one in document.measurements.items()
+            for loss in one.losses
+        ],
         "unsettled": [name for name, one in document.measurements.items() if not one.settled],
     }
 

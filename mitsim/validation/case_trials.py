@@ -69,8 +69,10 @@ class Bench:
             if trial not in self.trials.known(view.number)
         ]
         if jobs:
-            for job, errors in track(self.maker.run(self.maker.in_order(jobs)), f"{self.name}: {self.kind}", len(jobs)):
-                self.trials.add(job.view.number, job.trial, errors)
+            for job, outcome in track(
+                self.maker.run(self.maker.in_order(jobs)), f"{self.name}: {self.kind}", len(jobs)
+            ):
+                self.trials.add(job.view.number, job.trial, outcome)
 
 
 def benches(case: PartCase, study: Study, folder: Path, workers: Executor | None = None) -> dict[str, Bench]:

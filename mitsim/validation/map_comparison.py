@@ -86,8 +86,8 @@ def compare_case(case: PartCase, folder: Path, views: int, worlds: int) -> Compa
     names = tuple(study.task.measurements)
     drawn = np.full((len(names), len(some), worlds), np.nan)
     jobs = [Job(view, trial) for view in some for trial in trials]
-    for job, errors in track(maker.run(maker.in_order(jobs)), case.name, len(jobs)):
-        drawn[:, some.index(job.view), job.trial.day] = [errors[name] for name in names]
+    for job, outcome in track(maker.run(maker.in_order(jobs)), case.name, len(jobs)):
+        drawn[:, some.index(job.view), job.trial.day] = [outcome.errors[name] for name in names]
     rendered = np.stack([bench.trials.errors(view.number, trials) for view in some], axis=1)
     predicted = scores["predicted_uncertainty"].sel(measurement=list(names)).transpose("measurement", "view").values
     return ComparedCase(case, study.sensor.name, kind_of(study.sensor), names, drawn, rendered, predicted)

@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from characterisation.atomic_io import atomic_write, json_values
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.decision import tolerance_of
+from characterisation.statements.losses import losses
 from characterisation.statements.statement import Statement, statement
 from mitsim.exposures.planned import with_exposure
 from mitsim.progress import say, track
@@ -165,11 +166,15 @@ def state_set(study: Study, chosen: ViewSet, here: RenderedMeasurements, digest:
     maker = JoinedMeasurements(here, [by_number[number] for number in chosen.views], table)
     days = [SET_DAYS + k for k in range(table.trials)]
     missing = [day for day in days if Trial(day) not in trials.known(0)]
-    for day, errors in track(maker.run(missing), "confirm the set", len(missing)):
-        trials.add(0, Trial(day), errors)
-    found = trials.errors(0, [Trial(day) for day in days])
+    for day, outcome in track(maker.run(missing), "confirm the set", len(missing)):
+        trials.add(0, Trial(day), outcome)
+    wanted = [Trial(day) for day in days]
+    found = trials.errors(0, wanted)
     return [
-        statement(name, asked.unit, found[m], tolerance_of(study.task, name))
+        replace(
+            statement(name, asked.unit, found[m], tolerance_of(study.task, name)),
+            losses=losses(trials.reasons(0, wanted, name)),
+        )
         for m, (name, asked) in enumerate(study.task.measurements.items())
     ]
 

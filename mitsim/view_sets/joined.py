@@ -28,6 +28,7 @@ from characterisation.tasks.evaluation import measure, measure_points
 from mitsim.study import MINIMUM_POINTS, SetTable
 from mitsim.views import View
 from mitsim.virtual.rendered import RenderedMeasurements
+from mitsim.virtual.trials import Outcome
 from mitsim.virtual.world import Trial
 
 Floats = NDArray[np.float64]
@@ -53,8 +54,8 @@ class JoinedMeasurements:
         self.centre = np.asarray(here.study.scene.centre, float)
         self.known = pose_covariance(*table.pose_known)
 
-    def run(self, days: Iterable[int]) -> Iterable[tuple[int, dict[str, float]]]:
-        """Yield the errors of every measurement, NaN without a value, day by day.
+    def run(self, days: Iterable[int]) -> Iterable[tuple[int, Outcome]]:
+        """Yield the outcome of every virtual measurement, day by day.
 
         Days with the same finish are consecutive.
         """
@@ -85,7 +86,7 @@ class JoinedMeasurements:
         rng = np.random.default_rng(np.random.SeedSequence([self.here.unknowns.seed, _POSE_STREAM, day, place]))
         return np.asarray(np.sqrt(np.diag(self.known)) * rng.standard_normal(6))
 
-    def _measured(self, seen: Sequence[_Seen], day: int) -> dict[str, float]:
+    def _measured(self, seen: Sequence[_Seen], day: int) -> Outcome:
         task = self.here.study.task
         if len(seen) == 1:
             motion = np.linalg.inv(seen[0].told)
@@ -93,10 +94,11 @@ class JoinedMeasurements:
         else:
             try:
                 points = self._join(seen, day)
-            except FitError:
-                return dict.fromkeys(task.measurements, math.nan)
+            except FitError as error:
+                names = task.measurements
+                return Outcome(dict.fromkeys(names, math.nan), dict.fromkeys(names, f"the views do not join: {error}"))
             found = measure_points(points, task, MINIMUM_POINTS, False)
-        return {name: float(one.error) for name, one in found.items()}
+        return Outcome.of(found)
 
     def _join(self, seen: Sequence[_Seen], day: int) -> dict[str, Floats]:
         """Return the points of every feature from all views together."""

@@ -36,6 +36,7 @@ from mitsim.virtual.form import form_deviation
 from mitsim.virtual.race import Job
 from mitsim.virtual.rendered import displaced
 from mitsim.virtual.screening import screen
+from mitsim.virtual.trials import Outcome
 from mitsim.virtual.world import BEYOND, Unknowns, World
 
 Floats = NDArray[np.float64]
@@ -43,6 +44,9 @@ Floats = NDArray[np.float64]
 #: number of points of a cloud whose displacement by the calibration is computed; a polynomial of direction and inverse
 #: distance interpolates between them
 _POINTS = 600
+
+#: reason of a measurement without a value that screening rates as impossible
+_NOT_PREDICTED = "by the map, too few points are recovered in this view"
 
 
 class MappedMeasurements:
@@ -64,8 +68,8 @@ class MappedMeasurements:
         """Return the jobs sorted by view."""
         return sorted(jobs, key=lambda job: job.view.number)
 
-    def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
-        """Yield the errors of every measurement, NaN without a value, job by job.
+    def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
+        """Yield the outcome of every virtual measurement, job by job.
 
         A cloud is fitted while the next is drawn.
         """
@@ -83,9 +87,7 @@ class MappedMeasurements:
         surfaces = self.predictor.surfaces(self.study.scene, told) if self._has_form and world.form else None
         return cloud, world, labels, surfaces
 
-    def _finish(
-        self, taken: tuple[PointCloud, World, NDArray[np.int16], Surfaces | None], job: Job
-    ) -> dict[str, float]:
+    def _finish(self, taken: tuple[PointCloud, World, NDArray[np.int16], Surfaces | None], job: Job) -> Outcome:
         cloud, world, labels, surfaces = taken
         scene, told = self.study.scene, world.told.inverse() @ job.view.world_from_sensor
         cloud = replace(cloud, points=moved_by_calibration(cloud, self.study.sensor, world))
@@ -95,7 +97,7 @@ class MappedMeasurements:
             points = form_deviation(points, surfaces, scene, form, told, cloud.grid, world.form)
         labelled = replace(cloud, points=points, feature=labels, feature_names=scene.names)
         found = measure(labelled, self.study.task, told.inverse().matrix(), MINIMUM_POINTS, False)
-        return self._with_beyond({name: float(one.error) for name, one in found.items()}, job.view, world)
+        return self._with_beyond(Outcome.of(found), job.view, world)
 
     def _predict(self, views: dict[int, View]) -> None:
         """Compute and keep the predicted uncertainties of views."""
@@ -108,13 +110,18 @@ class MappedMeasurements:
         for view, row in zip(new, predicted.tolist(), strict=True):
             self._predicted[view.number] = dict(zip(scores["measurement"].values.tolist(), row, strict=True))
 
-    def _with_beyond(self, errors: dict[str, float], view: View, world: World) -> dict[str, float]:
+    def _with_beyond(self, found: Outcome, view: View, world: World) -> Outcome:
         """Add effects outside the map; NaN if screening rates a measurement as impossible."""
         if self._beyond_sizes is None:
-            return errors
-        sizes = self._beyond_sizes.draw(np.random.default_rng(world.beyond), len(errors))
+            return found
+        sizes = self._beyond_sizes.draw(np.random.default_rng(world.beyond), len(found.errors))
         predicted = self._predicted[view.number]
-        return {name: error + predicted[name] * size for (name, error), size in zip(errors.items(), sizes, strict=True)}
+        errors = {
+            name: error + predicted[name] * size
+            for (name, error), size in zip(found.errors.items(), sizes, strict=True)
+        }
+        impossible = {name: _NOT_PREDICTED for name in errors if not np.isfinite(predicted[name])}
+        return Outcome(errors, impossible | dict(found.reasons))
 
     def _scene(self, finish: int) -> CharacterisedScene:
         if finish not in self._characterised:

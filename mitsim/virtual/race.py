@@ -24,7 +24,7 @@ from characterisation.statements.selection import Standing, judge, posterior, sa
 from mitsim.progress import say, say_progress
 from mitsim.view_scores import screening_risk
 from mitsim.views import View
-from mitsim.virtual.trials import TrialFolder
+from mitsim.virtual.trials import Outcome, TrialFolder
 from mitsim.virtual.world import Trial
 
 Floats = NDArray[np.float64]
@@ -62,8 +62,8 @@ class Maker(Protocol):
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
         """Return the jobs in the order that takes the least work."""
 
-    def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
-        """Yield the errors of every measurement, NaN without a value, job by job."""
+    def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
+        """Yield the outcome of every virtual measurement, job by job."""
 
 
 @dataclass(frozen=True)
@@ -164,8 +164,8 @@ def run_race(views: Sequence[View], scores: xr.Dataset, maker: Maker, trials: Tr
             for trial in _first_trials(count)
             if trial not in trials.known(number)
         ]
-        for done, (job, errors) in enumerate(maker.run(maker.in_order(jobs)), 1):
-            trials.add(job.view.number, job.trial, errors)
+        for done, (job, outcome) in enumerate(maker.run(maker.in_order(jobs)), 1):
+            trials.add(job.view.number, job.trial, outcome)
             if time.monotonic() - last > _SAY_EVERY_S:
                 last = time.monotonic()
                 say_progress(f"race: {done} of {len(jobs)} trials of this round")

@@ -43,6 +43,7 @@ from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.views import View
 from mitsim.virtual.form import form_deviation
 from mitsim.virtual.race import Job
+from mitsim.virtual.trials import Outcome
 from mitsim.virtual.world import Trial, Unknowns, World, finish_deviation
 
 Floats = NDArray[np.float64]
@@ -116,8 +117,8 @@ class RenderedMeasurements:
         """Return the jobs sorted by finish and view: a finish is loaded once, and shared light is rendered once."""
         return sorted(jobs, key=lambda job: (self.unknowns.draw(job.trial).finish, job.view.number))
 
-    def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
-        """Yield the errors of every measurement, NaN without a value, job by job.
+    def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
+        """Yield the outcome of every virtual measurement, job by job.
 
         A capture is decoded while the next is rendered.
         """
@@ -136,21 +137,20 @@ class RenderedMeasurements:
         taken = self._taken(view, world)
         return self._cloud(taken), taken.told
 
-    def measured(self, lit: Lit, planned: PlannedExposure | None) -> tuple[PointCloud, dict[str, float]]:
-        """Return the labelled cloud of a world's light with planned exposures, and the errors of every measurement.
+    def measured(self, lit: Lit, planned: PlannedExposure | None) -> tuple[PointCloud, Outcome]:
+        """Return the labelled cloud of a world's light with planned exposures, and the outcome of its measurement.
 
         The light is kept for other exposures.
         """
         taken = self._exposed(lit, planned, True)
         cloud = self._cloud(taken)
-        return cloud, self._errors(cloud, taken)
+        return cloud, self._outcome(cloud, taken)
 
-    def _finish(self, taken: _Taken, job: Job) -> dict[str, float]:
-        return self._errors(self._cloud(taken), taken)
+    def _finish(self, taken: _Taken, job: Job) -> Outcome:
+        return self._outcome(self._cloud(taken), taken)
 
-    def _errors(self, cloud: PointCloud, taken: _Taken) -> dict[str, float]:
-        found = measure(cloud, self.study.task, taken.told.inverse().matrix(), MINIMUM_POINTS, False)
-        return {name: float(one.error) for name, one in found.items()}
+    def _outcome(self, cloud: PointCloud, taken: _Taken) -> Outcome:
+        return Outcome.of(measure(cloud, self.study.task, taken.told.inverse().matrix(), MINIMUM_POINTS, False))
 
     def _taken(self, view: View, world: World) -> _Taken:
         return self._exposed(self.lit(view, world), self.planned, False)

@@ -15,7 +15,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 from mitsim.campaign.executor import Executor
 from mitsim.progress import say
@@ -24,6 +23,7 @@ from mitsim.study import Study, StudyFile, open_study
 from mitsim.virtual.plan import rendering_of, trial_digest
 from mitsim.virtual.race import Job, Maker
 from mitsim.virtual.rendered import RenderedMeasurements
+from mitsim.virtual.trials import Outcome
 from mitsim.virtual.world import Unknowns
 
 #: largest number of jobs in one order; a worker that dies loses at most these
@@ -63,8 +63,8 @@ class SpreadMeasurements:
         """Return the jobs sorted by view and finish."""
         return self.here.in_order(jobs)
 
-    def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, dict[str, float]]]:
-        """Yield the errors of every measurement, NaN without a value, job by job as they arrive."""
+    def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
+        """Yield the outcome of every virtual measurement, job by job as they arrive."""
         orders = [replace(self._order, jobs=some) for some in self._rows(jobs)]
         for order, results in self.workers.distribute(orders, lambda one: one, make_trials):
             yield from zip(order.jobs, results, strict=True)
@@ -91,7 +91,7 @@ def spread_over(workers: Executor | None, study: Study, unknowns: Unknowns, here
 _laid_out: dict[str, RenderedMeasurements] = {}
 
 
-def make_trials(order: TrialOrder) -> list[dict[str, Any]]:
+def make_trials(order: TrialOrder) -> list[Outcome]:
     """Make the trials of an order; workers call this function."""
     if order.digest not in _laid_out:
         from mitsim.scene import backend
@@ -101,4 +101,4 @@ def make_trials(order: TrialOrder) -> list[dict[str, Any]]:
         study = open_study(order.path, order.file, mapped=False)  # trials are rendered
         _laid_out[order.digest] = RenderedMeasurements(study, order.unknowns, rendering_of(study), order.apart)
     maker = _laid_out[order.digest].exposed_as(order.planned)
-    return [errors for _, errors in maker.run(order.jobs)]
+    return [outcome for _, outcome in maker.run(order.jobs)]

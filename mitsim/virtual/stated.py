@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from characterisation.atomic_io import json_values, write_json
 from characterisation.statements.budget import budget
 from characterisation.statements.decision import tolerance_of
+from characterisation.statements.losses import losses
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
 from mitsim.progress import track
@@ -43,8 +44,8 @@ def state_view(
     repeats = [Trial(one.day, one.capture + 1) for one in pairs]
     wanted = [*base, *repeats, *(trial for some in swapped.values() for trial in some)]
     missing = [Job(view, trial) for trial in wanted if trial not in trials.known(view.number)]
-    for job, errors in track(maker.run(maker.in_order(missing)), f"state view {view.number}", len(missing)):
-        trials.add(view.number, job.trial, errors)
+    for job, outcome in track(maker.run(maker.in_order(missing)), f"state view {view.number}", len(missing)):
+        trials.add(view.number, job.trial, outcome)
     found = trials.errors(view.number, base)
     second = trials.errors(view.number, repeats)
     again = {group: trials.errors(view.number, some) for group, some in swapped.items()}
@@ -60,7 +61,8 @@ def state_view(
             if pairs and len(known) > 1
             else ()
         )
-        out.append(statement(name, asked.unit, found[m], tolerance_of(study.task, name), lines, second[m]))
+        stated = statement(name, asked.unit, found[m], tolerance_of(study.task, name), lines, second[m])
+        out.append(replace(stated, losses=losses(trials.reasons(view.number, base, name))))
     return out
 
 
@@ -147,7 +149,12 @@ def statement_table(stated: Sequence[Statement]) -> str:
                 one.verdict,
             )
         )
-    return "\n".join(aligned(rows))
+    return "\n".join([*aligned(rows), *(f"  {line}" for one in stated for line in losses_in_lines(one))])
+
+
+def losses_in_lines(one: Statement) -> list[str]:
+    """Return a line for each kind of reason why a measurement had no value, most frequent first."""
+    return [f"{one.measurement}: no value in {loss.count} of {one.trials}: {loss.reason}" for loss in one.losses]
 
 
 def judged(stated: Sequence[Statement]) -> list[Judged]:

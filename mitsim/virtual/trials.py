@@ -11,6 +11,7 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.errors import InputError
+from characterisation.tasks.evaluation import Measured
 from mitsim.virtual.world import GROUPS, Trial
 
-Errors = Mapping[str, float]
+
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of a virtual measurement: ``errors`` in mm or deg, NaN without a value, by measurement.
+
+    ``reasons`` says why a measurement has no value.
+    """
+
+    errors: Mapping[str, float]
+    reasons: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, measured: Mapping[str, Measured]) -> Outcome:
+        """Return the errors of a cloud's measurements, and the reasons of those without a value."""
+        return cls(
+            {name: float(one.error) for name, one in measured.items()},
+            {name: one.reason for name, one in measured.items() if not one.possible},
+        )
+
 
 #: upper bound of days and captures, so that they fit into 64 bits
 _MOST_DAYS = 2**62
@@ -32,29 +52,34 @@ class TrialFolder:
     def __init__(self, folder: str | Path, digest: str, measurements: Sequence[str]) -> None:
         self.folder, self.digest, self.measurements = Path(folder), digest, tuple(measurements)
         self._known: dict[int, dict[Trial, dict[str, float]]] = {}
+        self._reasons: dict[int, dict[Trial, dict[str, str]]] = {}
 
     def known(self, view: int) -> dict[Trial, dict[str, float]]:
         """Return the finished trials of a view and their errors, NaN without a value; the file is read once."""
         if view not in self._known:
-            self._known[view] = self._read(view)
+            outcomes = self._read(view)
+            self._known[view] = {trial: dict(one.errors) for trial, one in outcomes.items()}
+            self._reasons[view] = {trial: dict(one.reasons) for trial, one in outcomes.items() if one.reasons}
         return self._known[view]
 
-    def take_up(self, view: int, trials: Mapping[Trial, Errors]) -> None:
+    def take_up(self, view: int, trials: Mapping[Trial, Mapping[str, float]]) -> None:
         """Add trials that are kept elsewhere; they are not written again."""
         known = self.known(view)
         for trial, errors in trials.items():
             known.setdefault(trial, dict(errors))
 
-    def add(self, view: int, trial: Trial, errors: Errors) -> None:
+    def add(self, view: int, trial: Trial, outcome: Outcome) -> None:
         """Keep a finished trial; it is on the disk when this function returns."""
         known, path = self.known(view), self._path(view)
-        values = {name: float(errors[name]) for name in self.measurements}
+        values = {name: float(outcome.errors[name]) for name in self.measurements}
         line = {
             "day": trial.day,
             "capture": trial.capture,
             "swapped": trial.swapped,
             "errors": [value if math.isfinite(value) else None for value in values.values()],
         }
+        if outcome.reasons:
+            line["reasons"] = dict(outcome.reasons)
         try:
             fresh = not path.exists()
             if fresh:
@@ -68,11 +93,18 @@ class TrialFolder:
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(path)) from None
         known[trial] = values
+        if outcome.reasons:
+            self._reasons[view][trial] = dict(outcome.reasons)
 
     def errors(self, view: int, trials: Sequence[Trial]) -> NDArray[np.float64]:
         """Return the errors (measurements, trials) of finished trials of a view."""
         known = self.known(view)
         return np.array([[known[trial][name] for trial in trials] for name in self.measurements], float)
+
+    def reasons(self, view: int, trials: Sequence[Trial], measurement: str) -> list[str]:
+        """Return the known reasons why a measurement has no value in finished trials of a view."""
+        self.known(view)
+        return [one[measurement] for trial in trials if measurement in (one := self._reasons[view].get(trial, {}))]
 
     def _head(self) -> dict[str, Any]:
         return {"schema_version": 1, "digest": self.digest, "measurements": list(self.measurements)}
@@ -80,7 +112,7 @@ class TrialFolder:
     def _path(self, view: int) -> Path:
         return self.folder / f"view_{view:04d}.jsonl"
 
-    def _read(self, view: int) -> dict[Trial, dict[str, float]]:
+    def _read(self, view: int) -> dict[Trial, Outcome]:
         path = self._path(view)
         try:
             text = path.read_bytes().decode("utf-8", errors="replace")
@@ -107,12 +139,19 @@ class TrialFolder:
             partial.replace(path)
         return found
 
-    def _entry(self, line: str) -> tuple[Trial, dict[str, float]] | None:
+    def _entry(self, line: str) -> tuple[Trial, Outcome] | None:
         table = _parsed(line)
         try:
             trial = Trial(int(table["day"]), int(table["capture"]), str(table["swapped"]))
             values = [math.nan if value is None else float(value) for value in table["errors"]]
-        except (TypeError, KeyError, ValueError, OverflowError):  # OverflowError: an integer of 400 digits
+            reasons = {str(name): str(reason) for name, reason in table.get("reasons", {}).items()}
+        except (
+            AttributeError,
+            TypeError,
+            KeyError,
+            ValueError,
+            OverflowError,
+        ):  # OverflowError: an integer of 400 digits
             return None
         known = all(
             math.isfinite(value) for value, told in zip(values, table["errors"], strict=True) if told is not None
@@ -121,7 +160,7 @@ class TrialFolder:
             return None
         if not (0 <= trial.day < _MOST_DAYS and 0 <= trial.capture < _MOST_DAYS):
             return None
-        return trial, dict(zip(self.measurements, values, strict=True))
+        return trial, Outcome(dict(zip(self.measurements, values, strict=True)), reasons)
 
 
 def _parsed(line: str) -> Any:

@@ -65,7 +65,7 @@ def main() -> None:
                 for planned in (False, True):
                     cloud, found = maker.measured(lit, plan.exposure if planned else None)
                     points[planned].append([len(cloud.of_feature(name)) for name in shapes])
-                    errors[planned].append([found[name] for name in names])
+                    errors[planned].append([found.errors[name] for name in names])
             before, after = (np.array(errors[planned]) for planned in (False, True))
             both = np.isfinite(before) & np.isfinite(after)
             ratios = [

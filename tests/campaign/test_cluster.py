@@ -201,13 +201,13 @@ def test_virtual_measurements_are_the_same_on_a_cluster_though_a_worker_is_kille
     there = SpreadMeasurements(dask_workers, study, unknowns, here)
     workers = dask_workers.client.run(os.getpid)
     killed, found = [], []
-    for job, errors in there.run(jobs):
+    for job, outcome in there.run(jobs):
         if not killed:
             killed.append(next(iter(workers.values())))
             os.kill(killed[0], signal.SIGKILL)
-        found.append((job, errors))
+        found.append((job, outcome.errors))
     dask_workers.client.close()
-    known = {(job.view.number, job.trial): errors for job, errors in here.run(jobs)}
+    known = {(job.view.number, job.trial): outcome.errors for job, outcome in here.run(jobs)}
     assert len(found) == len(jobs) == len(known)
     for job, errors in found:
         expected = known[job.view.number, job.trial]

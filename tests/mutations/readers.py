@@ -337,12 +337,12 @@ def _read_choice(path):
 
 
 def _trials(folder):
-    from mitsim.virtual.trials import TrialFolder
+    from mitsim.virtual.trials import Outcome, TrialFolder
     from mitsim.virtual.world import Trial
 
     trials = TrialFolder(folder / "trials", "0123", ["a", "b"])
     for day in range(5):
-        trials.add(3, Trial(day), {"a": 0.1 * day, "b": float("nan")})
+        trials.add(3, Trial(day), Outcome({"a": 0.1 * day, "b": float("nan")}))
     return folder / "trials" / "view_0003.jsonl"
 
 

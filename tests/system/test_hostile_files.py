@@ -25,7 +25,7 @@ from mitsim.report.scene_geometry import read_scene_geometry
 from mitsim.scene.xml_check import checked_xml
 from mitsim.sensor.calibration_tree import read_tree
 from mitsim.surface.measured import read_height_map, read_profile
-from mitsim.virtual.trials import TrialFolder
+from mitsim.virtual.trials import Outcome, TrialFolder
 from mitsim.virtual.world import Trial
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -203,7 +203,7 @@ def test_a_superscript_is_no_digit_of_an_image():
 def test_a_trial_that_is_none_is_made_again(tmp_path, day):
     trials = TrialFolder(tmp_path, "0123", ["a"])
     for number in range(3):
-        trials.add(7, Trial(number), {"a": 0.5})
+        trials.add(7, Trial(number), Outcome({"a": 0.5}))
     path = tmp_path / "view_0007.jsonl"
     lines = path.read_text().splitlines()
     for field in ('"day": 1', '"errors": [0.5]'):

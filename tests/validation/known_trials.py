@@ -4,6 +4,8 @@ import csv
 
 import numpy as np
 
+from mitsim.virtual.trials import Outcome
+
 NAMES = ["large_radius", "small_radius", "large_height", "balls_distance"]
 
 CASES = """
@@ -42,7 +44,7 @@ class KnownMaker:
             KnownMaker.made += 1
             rng = np.random.default_rng([self.seed, job.view.number, job.trial.day])
             errors = 1 + self.wider * (1 + job.view.number) * rng.standard_normal(len(NAMES))
-            yield job, dict(zip(NAMES, errors.tolist(), strict=True))
+            yield job, Outcome(dict(zip(NAMES, errors.tolist(), strict=True)))
 
 
 def rows(path):

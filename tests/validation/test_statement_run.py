@@ -16,7 +16,7 @@ from mitsim.validation.kept_trials import take_up_trials, write_trials
 from mitsim.validation.part_cases import described, read_part_cases
 from mitsim.validation.statement_page import write_statement_page
 from mitsim.validation.statement_run import run_cases
-from mitsim.virtual.trials import TrialFolder
+from mitsim.virtual.trials import Outcome, TrialFolder
 from mitsim.virtual.world import Trial
 
 
@@ -95,8 +95,8 @@ def test_only_picks_cases_and_says_which_there_are(cases):
 
 def test_a_file_of_other_trials_is_not_taken_up(tmp_path):
     mine = TrialFolder(tmp_path / "mine", "a" * 16, ["one"])
-    mine.add(3, Trial(5, 1, "pose"), {"one": 0.25})
-    mine.add(3, Trial(1 << 20), {"one": float("nan")})
+    mine.add(3, Trial(5, 1, "pose"), Outcome({"one": 0.25}))
+    mine.add(3, Trial(1 << 20), Outcome({"one": float("nan")}))
     write_trials(tmp_path / "case.nc", {"tool": mine}, [3])
     same, other = (TrialFolder(tmp_path / digest, digest * 16, ["one"]) for digest in ("a", "b"))
     assert take_up_trials(tmp_path / "case.nc", {"tool": same, "apart": other}) == {"tool": 2, "apart": 0}
@@ -126,8 +126,9 @@ def test_a_measurement_that_hardly_any_world_makes_is_in_no_mean_of_regrets(case
         """The first measurement has a value on one day in four."""
 
         def run(self, jobs):
-            for job, errors in super().run(jobs):
-                yield job, errors if job.trial.day % 4 == 0 else errors | {NAMES[0]: np.nan}
+            for job, outcome in super().run(jobs):
+                lost = {} if job.trial.day % 4 == 0 else {NAMES[0]: np.nan}
+                yield job, Outcome(dict(outcome.errors) | lost)
 
     monkeypatch.setattr(case_trials, "measurements_of", Rarely)
     chosen = read_part_cases(cases)

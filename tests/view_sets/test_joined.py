@@ -74,7 +74,7 @@ def errors(seen, table, days=300, sigma=0.0):
     views = [SimpleNamespace(number=k) for k in range(len(seen))]
     found = dict(JoinedMeasurements(maker, views, table).run(range(days)))
     assert set(found) == set(range(days))
-    return {name: np.array([found[day][name] for day in range(days)]) for name in TASK.measurements}, maker
+    return {name: np.array([found[day].errors[name] for day in range(days)]) for name in TASK.measurements}, maker
 
 
 def table(**keys) -> SetTable:
@@ -126,7 +126,7 @@ def test_the_same_days_come_out_the_same_in_any_order():
     maker = Maker([("left",), ("right",)], 0.01)
     views = [SimpleNamespace(number=k) for k in range(2)]
     again = dict(JoinedMeasurements(maker, views, table()).run([5, 2]))
-    assert [again[day]["apart"] for day in (2, 5)] == [one["apart"][2], one["apart"][5]]
+    assert [again[day].errors["apart"] for day in (2, 5)] == [one["apart"][2], one["apart"][5]]
 
 
 def test_what_is_written_of_a_set_says_limit_expected_and_confirmed(tmp_path):

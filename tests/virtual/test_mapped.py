@@ -121,7 +121,7 @@ def test_the_linear_uncertainty_is_that_of_the_trials_where_nothing_but_noise_is
     study = replace(study, performance_map=plain_map(study.performance_map, 1.0))
     maker = MappedMeasurements(study, study_unknowns(study, ("noise",)))
     view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
-    trials = [errors for _, errors in maker.run([Job(view, Trial(k)) for k in range(100)])]
+    trials = [outcome.errors for _, outcome in maker.run([Job(view, Trial(k)) for k in range(100)])]
     scores, _ = score_candidates(
         study.scene, study.task, [view], maker.predictor, study.performance_map, MINIMUM_POINTS, []
     )
@@ -135,7 +135,7 @@ def test_what_is_beyond_the_map_is_added_in_predicted_uncertainties(drawn):
     study, plain, view = drawn
     maker = MappedMeasurements(study, study_unknowns(study, ("noise", BEYOND)))
     jobs = [Job(view, Trial(day)) for day in range(3)] + [Job(view, Trial(1, capture=1))]
-    without, with_it = ([errors[DISTANCE] for _, errors in one.run(jobs)] for one in (plain, maker))
+    without, with_it = ([outcome.errors[DISTANCE] for _, outcome in one.run(jobs)] for one in (plain, maker))
     added = np.subtract(with_it, without)
     sizes = beyond_map().of(study.sensor)
     assert (np.abs(added) <= maker._predicted[view.number][DISTANCE] * sizes.size[-1] * (1 + 1e-9)).all()
@@ -157,10 +157,10 @@ def test_trials_repeat_and_differ(drawn):
     jobs = [Job(view, Trial(day)) for day in (3, 4)]
     first, again = (list(maker.run(jobs)) for _ in range(2))
     assert first == again or all(
-        np.array_equal(list(a[1].values()), list(b[1].values()), equal_nan=True)
+        np.array_equal(list(a[1].errors.values()), list(b[1].errors.values()), equal_nan=True)
         for a, b in zip(first, again, strict=True)
     )
-    assert first[0][1][DISTANCE] != first[1][1][DISTANCE]
+    assert first[0][1].errors[DISTANCE] != first[1][1].errors[DISTANCE]
 
 
 def test_what_measures_follows_the_source_of_the_map():

@@ -9,7 +9,7 @@ import xarray as xr
 
 from mitsim.virtual.race import ALL, FIRST, Job, RaceRules, run_race, shortlist
 from mitsim.virtual.race_table import raced_errors, with_race
-from mitsim.virtual.trials import TrialFolder
+from mitsim.virtual.trials import Outcome, TrialFolder
 from mitsim.virtual.world import Trial
 
 NAMES = ["radius", "angle"]
@@ -41,7 +41,7 @@ class KnownMaker:
             values = self.spreads[:, job.view.number] * (0.5 * common + np.sqrt(0.75) * own)
             if job.view.number in self.failing and job.trial.day % 2:
                 values[0] = np.nan
-            yield job, dict(zip(NAMES, values.tolist(), strict=True))
+            yield job, Outcome(dict(zip(NAMES, values.tolist(), strict=True)))
 
 
 def scores_of(u, chance=None, tolerance=(np.nan, np.nan)):
@@ -157,7 +157,7 @@ def test_scores_follow_the_race(tmp_path):
 def filled(folder, digest="d", count=6):
     trials = TrialFolder(folder, digest, NAMES)
     for day in range(count):
-        trials.add(3, Trial(day), {"radius": day / 7, "angle": float("nan") if day == 2 else -0.1 * day})
+        trials.add(3, Trial(day), Outcome({"radius": day / 7, "angle": float("nan") if day == 2 else -0.1 * day}))
     return trials
 
 
@@ -177,15 +177,24 @@ def test_a_line_that_was_cut_off_is_dropped_and_written_again(tmp_path, cut):
     path.write_bytes(text[:-cut])
     trials = TrialFolder(tmp_path, "d", NAMES)
     assert list(trials.known(3)) == [Trial(day) for day in range(5)]
-    trials.add(3, Trial(5), {"radius": 5 / 7, "angle": -0.5})
+    trials.add(3, Trial(5), Outcome({"radius": 5 / 7, "angle": -0.5}))
     assert path.read_bytes() == text
+
+
+def test_reasons_are_kept_with_their_trials_and_old_lines_have_none(tmp_path):
+    trials = TrialFolder(tmp_path, "d", NAMES)
+    trials.add(3, Trial(0), Outcome({"radius": 0.1, "angle": -0.1}))
+    trials.add(3, Trial(1), Outcome({"radius": 0.1, "angle": np.nan}, {"angle": "plane: 3 points"}))
+    again = TrialFolder(tmp_path, "d", NAMES)
+    assert again.reasons(3, [Trial(0), Trial(1), Trial(2)], "angle") == ["plane: 3 points"]
+    assert again.reasons(3, [Trial(0), Trial(1)], "radius") == []
 
 
 def test_trials_of_another_study_are_moved_aside_and_not_used(tmp_path):
     filled(tmp_path)
     other = TrialFolder(tmp_path, "another", NAMES)
     assert other.known(3) == {}
-    other.add(3, Trial(0), {"radius": 1.0, "angle": 2.0})
+    other.add(3, Trial(0), Outcome({"radius": 1.0, "angle": 2.0}))
     assert len(list(tmp_path.glob("*.other"))) == 1
     assert list(TrialFolder(tmp_path, "another", NAMES).known(3)) == [Trial(0)]
 
@@ -216,7 +225,7 @@ def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
     trials = filled(tmp_path, count=1)
     monkeypatch.setattr("mitsim.virtual.trials.os.fsync", lambda handle: (_ for _ in ()).throw(OSError(28, "full")))
     with pytest.raises(OSError, match="full") as caught:
-        trials.add(3, Trial(1), {"radius": 1.0, "angle": 2.0})
+        trials.add(3, Trial(1), Outcome({"radius": 1.0, "angle": 2.0}))
     assert caught.value.filename.endswith("view_0003.jsonl")
     assert Trial(1) not in trials.known(3)
 
