@@ -96,7 +96,7 @@ def unknown_finishes(known: Samples, finishes: dict[str, Finish]) -> dict[str, F
             continue
         seen.add(key)
         try:
-            known.answering(finish.name, finish.roughness, finish.light)
+            known.representing(finish.name, finish.roughness, finish.light)
         except InputError:
             out[name] = finish
     return out

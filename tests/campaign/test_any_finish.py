@@ -229,7 +229,7 @@ def test_shipped_maps_answer_for_the_coupons_that_they_were_made_of(sensor, scen
         parameters = {} if math.isnan(roughness) else {"Ra": str(roughness)}
         coupon = "matt_white.xml" if math.isnan(roughness) else "coupon.xml"
         shown = load_scene(scenes / "coupon" / coupon, wavelength, parameters).finishes[0]
-        members, _ = known.known.answering(name, roughness, shown.light)
+        members, _ = known.known.representing(name, roughness, shown.light)
         assert str(known.samples[members[0]]) == str((name, roughness))
 
 
