@@ -71,12 +71,12 @@ def run(
     from mitsim.report.page import write_report
     from mitsim.report.run_folder import read_run
     from mitsim.run_study import run_study
-    from mitsim.study import read_study, tell_lays, with_plan
+    from mitsim.study import read_study, report_lays, with_plan
 
     check_folder(output)
     chosen = with_plan(read_study(study, ask=asking(yes)), plan)
     keep_finished(output, overwrite, "run.json")
-    tell_lays(chosen)
+    report_lays(chosen)
     stated = run_study(chosen, output, minutes, executor_of(scheduler, processes))
     write_report(output)
     say(f"scores: {output / 'scores.csv'}\nreport: {output / 'report.html'}")
@@ -122,7 +122,7 @@ def choose(
     from mitsim.report.choice_document import CHOICE, judged, read_choice
     from mitsim.report.choice_page import write_choice_page
     from mitsim.report.scene_geometry import write_scene_geometry
-    from mitsim.study import tell_lays, with_plan
+    from mitsim.study import report_lays, with_plan
 
     check_folder(output)
     candidates, excluded = read_candidates(study, [sensors], asking(yes, " (and likewise for every other sensor)"))
@@ -130,7 +130,7 @@ def choose(
     done = read_choice(output)
     if done is not None and done.finished:
         keep_finished(output, overwrite, CHOICE)
-    tell_lays(candidates[0].study)
+    report_lays(candidates[0].study)
     for one in excluded:
         say(f"{one.name} is excluded: {one.why}")
     if candidates[0].study.file.set is not None:
@@ -283,12 +283,12 @@ def score(
     from mitsim.reconstruction.cloud import sensor_geometry
     from mitsim.report.best_views import best_views
     from mitsim.run_study import claim, score_study
-    from mitsim.study import read_study, tell_lays
+    from mitsim.study import read_study, report_lays
     from mitsim.virtual.study_digest import study_digest, with_scene_files
 
     check_folder(output)
     chosen = read_study(study, map_file, asking(yes))
-    tell_lays(chosen)
+    report_lays(chosen)
     for name in measurement or ():
         if name not in chosen.task.measurements:
             raise InputError("--measurement", "", name, ", ".join(chosen.task.measurements))

@@ -21,7 +21,7 @@ from characterisation.statements.decision import needed, tolerance_of
 from characterisation.tasks.evaluation import Task, check_features, read_task
 from mitsim.campaign.missing_finishes import (
     Ask,
-    Wanted,
+    NeededFinishes,
     map_with_finishes,
     samples_of,
     seen_finishes,
@@ -148,7 +148,7 @@ def open_study(
     if performance_map is not None and mapped:
         stood = [view.standoff for view in candidates.views]
         depths = (min(stood) - radius, max(stood) + radius)
-        wanted = Wanted(sensor, scene.where, seen_finishes(scene), depths)
+        wanted = NeededFinishes(sensor, scene.where, seen_finishes(scene), depths)
         performance_map = map_with_finishes(performance_map, wanted, ask)
     return Study(path, file, scene, task, sensor, candidates, campaign, performance_map)
 
@@ -158,7 +158,7 @@ def finishes_of_features(study: Study) -> dict[str, Finish | None]:
     return {name: study.scene.finishes[study.scene.names.index(name)] for name in study.task.shapes}
 
 
-def tell_lays(study: Study) -> None:
+def report_lays(study: Study) -> None:
     """Say what the prediction leaves out of the direction of machining marks on the features of the study."""
     finishes = finishes_of_features(study)
     for sentence in lays_in_words({name: (one.name, one.scatter) for name, one in finishes.items() if one is not None}):

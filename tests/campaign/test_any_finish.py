@@ -19,7 +19,7 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 from mitsim.campaign import finish_cache, missing_finishes, one_finish
 from mitsim.campaign.finish_cache import cache_folder, kept_finish
-from mitsim.campaign.missing_finishes import Wanted, distances_about, map_with_finishes, with_lights
+from mitsim.campaign.missing_finishes import NeededFinishes, distances_about, map_with_finishes, with_lights
 from mitsim.campaign.one_finish import OneFinish, one_finish_campaign, plan_of
 from mitsim.choose import read_candidates
 from mitsim.commands.options import asking
@@ -45,7 +45,7 @@ def shipped(n10):
 
 
 def wanted_of(n10, finish, between=(480.0, 620.0)):
-    return Wanted(n10, "part.xml", {"seat": finish}, between)
+    return NeededFinishes(n10, "part.xml", {"seat": finish}, between)
 
 
 def test_what_is_known_is_answered_by_the_map_itself(shipped, n10, quick):
