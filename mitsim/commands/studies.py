@@ -116,7 +116,7 @@ def choose(
     from characterisation.statements.verdict_words import fits_all
     from mitsim.campaign.executor import executor_of
     from mitsim.choose import choose_sensor, read_candidates
-    from mitsim.choose.selection import Found
+    from mitsim.choose.selection import SensorResult
     from mitsim.choose.table import as_text, document
     from mitsim.progress import say
     from mitsim.report.choice_document import CHOICE, judged, read_choice
@@ -132,16 +132,16 @@ def choose(
         keep_finished(output, overwrite, CHOICE)
     report_lays(candidates[0].study)
     for one in excluded:
-        say(f"{one.name} is excluded: {one.why}")
+        say(f"{one.name} is excluded: {one.reason}")
     if candidates[0].study.file.set is not None:
         say("[set] of the study is not used: sensors are compared by single views; `mitsim run` chooses the set")
     began = time.monotonic()
 
-    def tell(found: list[Found], finished: bool) -> None:
+    def report_results(found: list[SensorResult], finished: bool) -> None:
         known = document(candidates[0].study, found, excluded, time.monotonic() - began, finished)
         write_json(output / CHOICE, known.model_dump(mode="json"))
 
-    found = choose_sensor(candidates, output, minutes, tell, executor_of(scheduler, processes))
+    found = choose_sensor(candidates, output, minutes, report_results, executor_of(scheduler, processes))
     best = found[0].candidate.study
     write_scene_geometry(output, best.scene, best.sensor)
     write_choice_page(output)
