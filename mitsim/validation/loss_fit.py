@@ -91,7 +91,7 @@ def seen_points(
     surfaces = predictor.surfaces(scene, pose)
     ideal, labels = predictor.ideal(surfaces), predictor.labels(scene, pose, surfaces)
     fraction = performance(ideal, scene, study.performance_map)[0]
-    rho = light.look(scene, pose).at(ideal.point).rho
+    rho = light.render(scene, pose).at(ideal.point).rho
     decoded = cloud.points[step // 2 :: step, step // 2 :: step].reshape(-1, 3)[ideal.pixel]
     off = np.abs(np.linalg.norm(decoded - predictor.grid.origin, axis=1) - ideal.distance)
     found = off <= FALSE_SHARE_OF_DISTANCE * ideal.distance  # false where nothing was decoded
