@@ -265,7 +265,7 @@ class _Workspace:
         if exposed.planned is not None:
             self.planned[view] = exposed.planned
         trials = exposed.trials(study, self.folder, self.trials)
-        return state_view(study, chosen, exposed.maker, trials, self.unknowns, StatementTable(trials=count, pairs=0))
+        return state_view(study, chosen, exposed.runner, trials, self.unknowns, StatementTable(trials=count, pairs=0))
 
 
 def _prepared(candidate: CandidateSensor, folder: Path, workers: Executor | None) -> _Workspace:

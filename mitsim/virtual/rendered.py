@@ -123,7 +123,7 @@ class RenderedMeasurements:
         """
         return one_ahead(jobs, self._take, self._finish)
 
-    def best_guess(self, view: View) -> tuple[Capture, PointCloud]:
+    def at_best_estimates(self, view: View) -> tuple[Capture, PointCloud]:
         """Return capture and labelled cloud of a view with every unknown at its best estimate."""
         taken = self._taken(view, replace(self.unknowns, varied=()).draw(Trial(0)))
         return taken.capture, self._cloud(taken)

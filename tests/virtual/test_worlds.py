@@ -73,7 +73,7 @@ def test_a_swapped_group_changes_alone(unknowns, group):
         assert same(one[name], other[name]) == (name != group), name
 
 
-def test_a_group_that_is_not_varied_stays_at_its_best_guess(unknowns):
+def test_a_group_that_is_not_varied_stays_at_its_best_estimate(unknowns):
     nominal = replace(unknowns, varied=())
     worlds = [nominal.draw(Trial(day)) for day in range(3)]
     for world in worlds:
