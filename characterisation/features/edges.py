@@ -93,7 +93,7 @@ def fit_circle(cloud: PointCloud, plane: PlaneFit, nominal: Circle, near: float 
     FitError
         If too little of the edge is visible.
     """
-    nominal = nominal.seen_from(cloud.grid.origin).carried(plane)
+    nominal = nominal.seen_from(cloud.grid.origin).on_moved_plane(plane)
     found = _crossings(cloud, plane, nominal, near)
     circle, kept = _fit(nominal, found)
     if not 0.5 < circle.radius / nominal.radius < 1.5:
@@ -117,7 +117,7 @@ def fit_edge_point(
     d^2 / (12 k^2), regardless of their number. Here d is the spacing of the pixels along the line, and k the number of
     rows or columns that the edge crosses.
     """
-    nominal = nominal.seen_from(cloud.grid.origin).carried(plane)
+    nominal = nominal.seen_from(cloud.grid.origin).on_moved_plane(plane)
     found = _crossings(cloud, plane, nominal, near, reach)
     edge, kept = _fit(nominal, found)
     edge = edge.seen_from(cloud.grid.origin)

@@ -26,7 +26,7 @@ from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.sensor.preset import Sensor
 from mitsim.simulation.simulate import SimulatedSensor
-from mitsim.surface.seen import as_made
+from mitsim.surface.surface_light import nominal_light
 
 #: answers a question with yes or no
 Ask = Callable[[str], bool]
@@ -58,7 +58,7 @@ def with_lights(performance_map: PerformanceMap) -> PerformanceMap:
     if wavelength is None:
         return performance_map
     lights: list[Light | None] = [
-        None if said_more else as_made(finish, roughness, float(wavelength))
+        None if said_more else nominal_light(finish, roughness, float(wavelength))
         for (finish, roughness), said_more in zip(
             performance_map.samples, _has_other_parameters(performance_map), strict=True
         )

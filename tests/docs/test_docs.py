@@ -41,7 +41,7 @@ from mitsim.sensor.rig_covariance import CovarianceFile
 from mitsim.sensor.sensor_file import SensorFile
 from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.study import StudyFile
-from mitsim.surface.seen import as_made
+from mitsim.surface.surface_light import as_made
 from mitsim.validation.part_cases import PartCasesFile
 
 ROOT = Path(__file__).resolve().parents[2]
