@@ -43,7 +43,7 @@ from mitsim.study import StatementTable
 from mitsim.view_scores import screening_risk
 from mitsim.virtual.mapped import MappedMeasurements
 from mitsim.virtual.plan import map_digest, measurements_of, trial_digest
-from mitsim.virtual.race import ALL, Maker, Raced, RaceRules, run_race
+from mitsim.virtual.race import ALL, Raced, RaceRules, TrialRunner, run_race
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.screening import screen
 from mitsim.virtual.spread_out import spread_over
@@ -252,7 +252,7 @@ class _Workspace:
     candidate: CandidateSensor
     unknowns: Unknowns
     virtual_measurements: RenderedMeasurements | MappedMeasurements
-    runner: Maker
+    runner: TrialRunner
     trials: TrialFolder
     digest: str
     folder: Path

@@ -26,7 +26,7 @@ from mitsim.study import ExposureTable, Study
 from mitsim.text_table import aligned
 from mitsim.views import View
 from mitsim.virtual.mapped import MappedMeasurements
-from mitsim.virtual.race import Maker
+from mitsim.virtual.race import TrialRunner
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.trials import TrialFolder
 
@@ -41,7 +41,7 @@ PLAN_VERSION = 1
 class Exposable(Protocol):
     """Virtual measurements whose exposure can be set."""
 
-    def exposed_as(self, planned: PlannedExposure | None) -> Maker:
+    def exposed_as(self, planned: PlannedExposure | None) -> TrialRunner:
         """Return the same measurements with other exposures; None is the sensor's own rule."""
 
 
@@ -54,7 +54,7 @@ class Exposed:
     - ``planned``: exposures, None for the sensor's own rule.
     """
 
-    runner: Maker
+    runner: TrialRunner
     digest: str
     planned: PlannedExposure | None
 
@@ -69,7 +69,7 @@ def exposed_for(
     study: Study,
     view: View,
     measurements: RenderedMeasurements | MappedMeasurements,
-    runner: Maker,
+    runner: TrialRunner,
     digest: str,
     folder: Path,
 ) -> Exposed:

@@ -43,7 +43,7 @@ from mitsim.view_sets.confirmed_set import (
     write_set_csv,
 )
 from mitsim.virtual.plan import measurements_of, race_rules, rendering_of, trial_digest
-from mitsim.virtual.race import Maker, run_race
+from mitsim.virtual.race import TrialRunner, run_race
 from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.spread_out import spread_over
@@ -142,7 +142,7 @@ def claim(folder: Path, command: str, digest: str) -> None:
 
 
 def _confirm(
-    study: Study, chosen: ViewSet | None, search: Search, virtual_measurements: Maker, digest: str, folder: Path
+    study: Study, chosen: ViewSet | None, search: Search, virtual_measurements: TrialRunner, digest: str, folder: Path
 ) -> list[TriedSet]:
     """Measure sets of views virtually until one keeps its limits; the best set comes last.
 
@@ -170,7 +170,7 @@ def _confirm(
 def _state(
     study: Study,
     leaders: list[int],
-    runner: Maker,
+    runner: TrialRunner,
     trials: TrialFolder,
     unknowns: Unknowns,
     folder: Path,
