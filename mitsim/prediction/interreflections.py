@@ -57,8 +57,9 @@ Floats = NDArray[np.float64]
 #: number of pixels of the coarse camera, and number of its pixels that a fringe covers at least
 PIXELS, PIXELS_OF_FRINGE = 20_000, 6
 
-#: camera paths and photons per render of interreflections. A phase code has two renders, since their noise must be told
-#: from a bias. With large pixels photons are efficient: 300 000 remove two thirds of the noise of 80 000 camera paths
+#: camera paths and photons per render of interreflections. A phase code has two renders, which
+#: distinguish their noise from a bias. With large pixels photons are efficient: 300 000 remove two thirds of the noise
+#: of 80 000 camera paths
 PATHS, PHOTONS = 180_000, 400_000
 
 #: number of views that are rendered at once: recording a kernel takes about as long as rendering one of them
