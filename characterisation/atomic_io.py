@@ -47,7 +47,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             yield partial
             partial.replace(path)
     finally:
-        with suppress(OSError):  # a read-only file system refuses that too, and has told why
+        with suppress(OSError):  # a read-only file system refuses that too; its reason is already reported
             partial.unlink(missing_ok=True)
 
 

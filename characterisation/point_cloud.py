@@ -34,7 +34,7 @@ class Status(IntEnum):
     NO_SURFACE = 1  #: nothing there to be seen, or outside the images
     OUT_OF_RANGE = 2  #: nearer or farther than the sensor searches
     SATURATED = 3  #: too bright for at least one camera: self-blinding
-    LOW_MODULATION = 4  #: the projected light cannot be told from the noise
+    LOW_MODULATION = 4  #: the projected light cannot be distinguished from the noise
     SHADOWED = 5  #: the projector does not reach it
     HIDDEN = 6  #: the second camera does not see it, or disagrees
     AMBIGUOUS = 7  #: several places fit equally well

@@ -162,28 +162,28 @@ def measure_sensor(sensor: Sensor, seed: int = 1, workers: Executor | None = Non
     asked += [("residuals", (mid,))]
     pieces = [Piece(sensor, seed + number, *one) for number, one in enumerate(asked)]
     done = results_of(pieces, measure_piece, workers, sensor.name)
-    _benches.clear()
+    _prepared.clear()
     planes, noise, metal = done[:2], done[3 : 3 + DISTANCES], done[3 + DISTANCES : -1]
     return DataSheet(sensor, mid, planes, radius, done[2], noise, metal, done[-1])
 
 
-_benches: dict[str, _Bench] = {}
+_prepared: dict[str, _SimulatedTargets] = {}
 
 
 def measure_piece(piece: Piece) -> Any:
     """Take and measure one capture of a data sheet; workers call this function."""
     key = repr(piece.sensor)
-    if key not in _benches:
-        _benches.clear()
-        _benches[key] = _Bench(piece.sensor, piece.seed)
-    bench = _benches[key]
-    bench.seed = piece.seed
-    return getattr(bench, piece.what)(*piece.given)
+    if key not in _prepared:
+        _prepared.clear()
+        _prepared[key] = _SimulatedTargets(piece.sensor, piece.seed)
+    targets = _prepared[key]
+    targets.seed = piece.seed
+    return getattr(targets, piece.what)(*piece.given)
 
 
 def gallery(sensor: Sensor, seed: int = 1) -> list[tuple[str, Capture, PointCloud]]:
     """Return capture and cloud of a ball on a plate, at mid range and 35 deg from above, in every finish."""
-    bench = _Bench(sensor, seed)
+    targets = _SimulatedTargets(sensor, seed)
     mid = math.sqrt(math.prod(sensor.working_range_mm))
     radius, angle = 0.1 * mid, math.radians(35.0)
     target = np.array([0.0, 0.0, radius])
@@ -192,12 +192,12 @@ def gallery(sensor: Sensor, seed: int = 1) -> list[tuple[str, Capture, PointClou
     seen = []
     for finish in track(list(FINISHES), f"{sensor.name}: gallery"):
         scene = ball_on_plate(radius, 0.6 * mid, finish, sensor.wavelength_nm)
-        capture = bench.simulated.capture(scene, pose, seed=seed, rendering=Rendering(SAMPLES_PER_PIXEL))
-        seen.append((finish, capture, bench.decoded(capture)))
+        capture = targets.simulated.capture(scene, pose, seed=seed, rendering=Rendering(SAMPLES_PER_PIXEL))
+        seen.append((finish, capture, targets.decoded(capture)))
     return seen
 
 
-class _Bench:
+class _SimulatedTargets:
     """A simulated sensor, and the test targets in front of it."""
 
     def __init__(self, sensor: Sensor, seed: int) -> None:

@@ -89,7 +89,7 @@ class _Scoring:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _ViewScore:
     """Results of one view: a row of each statistic of V_m by feature, and the expected inputs and measurements."""
 
     n: Floats
@@ -142,13 +142,14 @@ def score_candidates(
         view_of = SceneView(scene, pose, whole, ideal)
         return _Cast(ideal, labels, n_only, together((effect(view_of) for effect in effects), len(ideal.pixel)))
 
-    def look(cast: _Cast, view: View) -> _Seen:
-        return _look(scoring, cast, view)
+    def score(cast: _Cast, view: View) -> _ViewScore:
+        return _score_view(scoring, cast, view)
 
     # the rays of the next view are cast while this view is evaluated
-    seen = [one for _, one in track(one_ahead(views, cast, look), "score views", len(views))]
+    scored = [one for _, one in track(one_ahead(views, cast, score), "score views", len(views))]
     columns = {
-        key: np.array([getattr(one, key) for one in seen]) for key in ("n", "sigma", "n_white", "sigma_white", "n_only")
+        key: np.array([getattr(one, key) for one in scored])
+        for key in ("n", "sigma", "n_white", "sigma_white", "n_only")
     }
     statistics = view_statistics(
         names, columns["n"], columns["sigma"], columns["n_white"], columns["sigma_white"], columns["n_only"]
@@ -157,8 +158,8 @@ def score_candidates(
     scores["mean_sigma"] = statistics["mean_sigma"]
     for name in ("n_white", "mean_sigma_white", "n_only_white"):
         scores[name] = statistics[name]
-    uncertainty = np.array([[one.measurements[m].uncertainty for one in seen] for m in range(len(task.measurements))])
-    chance = np.array([[one.measurements[m].chance for one in seen] for m in range(len(task.measurements))])
+    uncertainty = np.array([[one.measurements[m].uncertainty for one in scored] for m in range(len(task.measurements))])
+    chance = np.array([[one.measurements[m].chance for one in scored] for m in range(len(task.measurements))])
     possible = np.isfinite(uncertainty) & (chance >= LEAST_CHANCE)
     by = ("measurement", "view")
     scores["predicted_uncertainty"] = (
@@ -186,7 +187,7 @@ def score_candidates(
             "units": "1",
         },
     )
-    limit, feature = _limits(task, seen, scores, possible)
+    limit, feature = _limits(task, scored, scores, possible)
     scores["limit"] = (by, limit, {"long_name": "limiting factor of the view, against the best view", "units": "1"})
     scores["limiting_feature"] = (by, feature, {"long_name": "the feature that contributes most", "units": "1"})
     measurements = task.measurements.values()
@@ -194,7 +195,7 @@ def score_candidates(
     tolerances = [math.nan if m.tolerance_size is None else m.tolerance_size for m in measurements]
     scores["tolerance"] = ("measurement", tolerances, {"units": "mm or deg"})
     scores["unit"] = ("measurement", [m.unit for m in measurements])
-    return with_poses(scores, views), [one.inputs for one in seen]
+    return with_poses(scores, views), [one.inputs for one in scored]
 
 
 def screening_risk(scores: xr.Dataset) -> Floats:
@@ -209,7 +210,7 @@ def screening_risk(scores: xr.Dataset) -> Floats:
     return np.where(able, np.log(np.where(able, u, 1.0)) - 0.5 * np.log(np.where(able, chance, 1.0)), np.inf)
 
 
-def _look(scoring: _Scoring, cast: _Cast, view: View) -> _Seen:
+def _score_view(scoring: _Scoring, cast: _Cast, view: View) -> _ViewScore:
     """Return the results of a view from its rays: every ``step``-th ray of every ``step``-th row."""
     scene, task, performance_map = scoring.scene, scoring.task, scoring.performance_map
     names, ideal, labels = list(task.shapes), cast.ideal, cast.labels
@@ -228,7 +229,7 @@ def _look(scoring: _Scoring, cast: _Cast, view: View) -> _Seen:
     as_mapped, points = expected(None), expected(cast.perturbation)
     inputs = expected_inputs(task, points, scoring.minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
-    return _Seen(
+    return _ViewScore(
         np.array([one.count for one in as_mapped.values()]),
         np.array([one.mean_sigma for one in as_mapped.values()]),
         n_white * thinning,
@@ -247,7 +248,7 @@ def _white_points(predictor: Predictor, alone: CharacterisedScene, world_from_se
 
 
 def _limits(
-    task: Task, seen: Sequence[_Seen], scores: xr.Dataset, possible: NDArray[np.bool_]
+    task: Task, scored: Sequence[_ViewScore], scores: xr.Dataset, possible: NDArray[np.bool_]
 ) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
     """Return the limiting factor of each measurement in each view, and its feature, (measurement, view) each.
 
@@ -255,20 +256,20 @@ def _limits(
     Each of the three is compared with its best value over all views; the one with the largest ratio is the limiting
     factor.
     """
-    shape = (len(task.measurements), len(seen))
+    shape = (len(task.measurements), len(scored))
     limit, feature = np.full(shape, "", object), np.full(shape, "", object)
     kinds = {name: one.kind for name, one in task.features.items()}
     share = scores["R_f"]
     for m in range(shape[0]):
-        for v, one in enumerate(seen):
+        for v, one in enumerate(scored):
             predicted = one.measurements[m]
             if not predicted.uncertainty > 0:
                 short = [name for name in predicted.reason.split(":")[0].split(", ") if name in kinds]
                 feature[m, v] = short[0] if short else ""
-        inputs = next((one.measurements[m].inputs for one in seen), ())
-        parts = np.array([one.measurements[m].contributions for one in seen])
-        noise, count = np.full((2, len(seen), len(inputs)), np.nan)
-        for v, one in enumerate(seen):
+        inputs = next((one.measurements[m].inputs for one in scored), ())
+        parts = np.array([one.measurements[m].contributions for one in scored])
+        noise, count = np.full((2, len(scored), len(inputs)), np.nan)
+        for v, one in enumerate(scored):
             for i, quantity in enumerate(inputs):
                 if isinstance(known := one.inputs[quantity], ExpectedInput):
                     noise[v, i], count[v, i] = known.fit.noise, known.fit.count
@@ -286,7 +287,7 @@ def _limits(
                     geometry / np.min(geometry, axis=0, where=among & (geometry > 0), initial=np.inf),
                 ]
             )
-        for v in range(len(seen)):
+        for v in range(len(scored)):
             if not np.isfinite(parts[v]).all() or not parts[v].any():
                 limit[m, v] = "few points"
                 continue

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from mitsim.study import finishes_of_features, read_study, tell_lays
+from mitsim.study import finishes_of_features, read_study, report_lays
 
 
 def test_a_study_names_the_features_whose_marks_have_no_direction(scenes, capsys):
@@ -11,7 +11,7 @@ def test_a_study_names_the_features_whose_marks_have_no_direction(scenes, capsys
         "aluminium/ground Ra 0.74 um",
         "aluminium/ground Ra 0.37 um",
     }
-    tell_lays(study)
+    report_lays(study)
     told = capsys.readouterr().err
     ground = ", ".join(f"{name} (aluminium/ground)" for name in ("plane", "pillar1", "pillar2"))
     assert told.startswith(f"{ground}: no direction of the marks is given") and told.count("\n") == 1
@@ -20,5 +20,5 @@ def test_a_study_names_the_features_whose_marks_have_no_direction(scenes, capsys
 def test_a_study_of_matt_faces_says_nothing(scenes, capsys):
     study = read_study(scenes / "two_pillars" / "study.toml", mapped=False)
     white = replace(study.scene, finishes=[None] * len(study.scene.finishes))
-    tell_lays(replace(study, scene=white))
+    report_lays(replace(study, scene=white))
     assert capsys.readouterr().err == ""

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mitsim.sensor.transforms import Transform
-from mitsim.views.collision import Box, box_distance, comes_near, is_inside, obstacle, sensor_box
+from mitsim.views.collision import Box, box_distance, is_inside, is_near, obstacle, sensor_box
 from mitsim.views.table import MARGIN_MM, SensorBody
 
 HALF = np.array([40.0, 15.0, 20.0])
@@ -71,14 +71,14 @@ def test_the_trees_miss_no_triangle_whatever_its_size(rng):
         distance = box_distance(pose.inverse().points(triangles) - box.centre, HALF).min()
         for clearance in (0.0, 7.5, 40.0):
             expected = distance < clearance or distance == 0
-            assert comes_near(part, box, pose, clearance) == expected
+            assert is_near(part, box, pose, clearance) == expected
             near += expected
     assert 20 < near < 160
 
 
 def test_nothing_is_in_the_way_of_a_part_without_triangles():
     part = obstacle(np.empty((0, 3, 3)))
-    assert not comes_near(part, Box(np.zeros(3), HALF), Transform.identity(), 100.0)
+    assert not is_near(part, Box(np.zeros(3), HALF), Transform.identity(), 100.0)
     assert not is_inside(part, np.zeros(3))
 
 

@@ -34,14 +34,14 @@ _BLOCK = 65536
 
 @dataclass(frozen=True)
 class Difference:
-    """Distribution of a difference [mm]: ``count`` of pixels or points in both, of ``asked`` in the cloud.
+    """Distribution of a difference [mm]: ``count`` of pixels or points in both, of ``points_given`` in the cloud.
 
     ``mean``, ``median``, standard ``deviation``, ``robust_deviation`` (1.4826 times the median distance from the
     median), ``low`` and ``high``, which enclose 95 % of the values; NaN with too few values.
     """
 
     count: int
-    asked: int
+    points_given: int
     mean: float
     median: float
     deviation: float
@@ -96,16 +96,16 @@ def difference_to_surface(cloud: PointCloud, reference: PointCloud) -> Floats:
     return out
 
 
-def distribution(difference: Floats, asked: int) -> Difference:
-    """Return the distribution of a difference, for a cloud that has ``asked`` points."""
+def distribution(difference: Floats, points_given: int) -> Difference:
+    """Return the distribution of a difference, for a cloud that has ``points_given`` points."""
     known = difference[np.isfinite(difference)]
     if len(known) < 2:
-        return Difference(len(known), asked, *[float("nan")] * 6)
+        return Difference(len(known), points_given, *[float("nan")] * 6)
     median = float(np.median(known))
     low, high = np.quantile(known, [0.025, 0.975])
     robust = MEDIAN_TO_STD * float(np.median(np.abs(known - median)))
     return Difference(
-        len(known), asked, float(known.mean()), median, float(known.std(ddof=1)), robust, float(low), float(high)
+        len(known), points_given, float(known.mean()), median, float(known.std(ddof=1)), robust, float(low), float(high)
     )
 
 

@@ -69,8 +69,8 @@ def overlap_correlation(distance: ArrayLike, radius: float, correlation_length: 
     weights = np.outer(weight, weight).ravel() / np.pi
     x, y = correlation_length * np.stack(np.meshgrid(node, node, indexing="ij")).reshape(2, -1)
 
-    def smoothed(apart: Floats) -> Floats:
-        return np.asarray(lens_share(np.hypot(apart[..., None] + x, y), radius) @ weights)
+    def smoothed(separation: Floats) -> Floats:
+        return np.asarray(lens_share(np.hypot(separation[..., None] + x, y), radius) @ weights)
 
     table = np.linspace(0.0, 2.0 * radius + 6.0 * correlation_length, 257)
     return np.asarray(np.interp(distance, table, smoothed(table) / smoothed(np.zeros(1)), right=0.0))
@@ -82,8 +82,8 @@ def correlation_matrix(centres: ArrayLike, radius: float, correlation_length: fl
     See :func:`overlap_correlation`.
     """
     centres = np.asarray(centres, float)
-    apart = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
-    return overlap_correlation(apart, radius, correlation_length)
+    separation = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    return overlap_correlation(separation, radius, correlation_length)
 
 
 def effective_number(correlation: ArrayLike) -> float:

@@ -284,8 +284,8 @@ def _ellipses(
     )
     surface = rays * ((coupon.centre - grid.origin) @ coupon.normal / (rays @ coupon.normal))[..., None]
 
-    def semi_axes(there: Floats) -> tuple[Floats, Floats]:
-        right, down = (there[0] - there[1]) / (2 * reach), (there[2] - there[3]) / (2 * reach)
+    def semi_axes(projected: Floats) -> tuple[Floats, Floats]:
+        right, down = (projected[0] - projected[1]) / (2 * reach), (projected[2] - projected[3]) / (2 * reach)
         a, b, c = (right**2).sum(-1), (right * down).sum(-1), (down**2).sum(-1)
         root = np.hypot((a - c) / 2, b)
         return radius_px * np.sqrt((a + c) / 2 + root), radius_px * np.sqrt(np.maximum((a + c) / 2 - root, 0.0))

@@ -90,7 +90,7 @@ def best_fit(
     shapes
         Nominal shapes in the frame of the points.
     about
-        (3,) about which turns are told.
+        (3,) [mm] Centre of the rotations.
     known
         (6, 6) covariance of the motion [w (rad), t (mm)] that is expected of each view, of mean 0.
 

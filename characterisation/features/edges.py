@@ -93,7 +93,7 @@ def fit_circle(cloud: PointCloud, plane: PlaneFit, nominal: Circle, near: float 
     FitError
         If too little of the edge is visible.
     """
-    nominal = nominal.seen_from(cloud.grid.origin).carried(plane)
+    nominal = nominal.seen_from(cloud.grid.origin).on_moved_plane(plane)
     found = _crossings(cloud, plane, nominal, near)
     circle, kept = _fit(nominal, found)
     if not 0.5 < circle.radius / nominal.radius < 1.5:
@@ -117,7 +117,7 @@ def fit_edge_point(
     d^2 / (12 k^2), regardless of their number. Here d is the spacing of the pixels along the line, and k the number of
     rows or columns that the edge crosses.
     """
-    nominal = nominal.seen_from(cloud.grid.origin).carried(plane)
+    nominal = nominal.seen_from(cloud.grid.origin).on_moved_plane(plane)
     found = _crossings(cloud, plane, nominal, near, reach)
     edge, kept = _fit(nominal, found)
     edge = edge.seen_from(cloud.grid.origin)
@@ -151,14 +151,15 @@ class _Ends(NamedTuple):
     """Places where the face ends along rows or columns.
 
     ``last`` (k, 3) [mm] is the last place on the face, ``following`` (k, 3) that of the next pixel. ``line`` (k,) is
-    the number of the column (or row) of the last. Of ``there`` pixels deeper in the face, ``shown`` show it.
+    the number of the column (or row) of the last. ``deeper`` is the
+    number of pixels deeper in the face, ``shown`` that of those which show it.
     """
 
     last: Array
     following: Array
     line: NDArray[np.int64]
     shown: int
-    there: int
+    deeper: int
 
 
 def _crossings(
@@ -175,42 +176,47 @@ def _crossings(
     limit = max(NEAR_STD * plane.residual_std, NEAR_MM) if near is None else near
     with np.errstate(invalid="ignore"):
         behind = np.sum((cloud.points[rows, columns] - places) * rays, axis=-1)
-        on = (behind <= limit) & (behind >= -2 * limit)
-    beyond, band = _beyond(figure, places, reach)
-    down, right = np.gradient(beyond)
+        on_face = (behind <= limit) & (behind >= -2 * limit)
+    signed_distance, band = _signed_distance(figure, places, reach)
+    down, right = np.gradient(signed_distance)
     steep = np.abs(right) >= np.abs(down)  # the edge crosses this row more steeply than this column
-    along_rows = _ends(on, beyond, band, steep, np.sign(right), places)
-    along_columns = _ends(on.T, beyond.T, band.T, ~steep.T, np.sign(down).T, places.swapaxes(0, 1))
-    shown, there = along_rows.shown + along_columns.shown, along_rows.there + along_columns.there
+    along_rows = _ends(on_face, signed_distance, band, steep, np.sign(right), places)
+    along_columns = _ends(on_face.T, signed_distance.T, band.T, ~steep.T, np.sign(down).T, places.swapaxes(0, 1))
+    shown, deeper = along_rows.shown + along_columns.shown, along_rows.deeper + along_columns.deeper
     last, following = (np.concatenate(pair) for pair in zip(along_rows[:2], along_columns[:2], strict=True))
     if len(last) == 0 or shown == 0:
         return _NONE
-    fraction = shown / there
+    fraction = shown / deeper
     found = last + (0.5 + (1 - fraction) / fraction) * (following - last)
     pitch = float(np.median(np.linalg.norm(following - last, axis=1)))
     spread = float(pitch * np.sqrt(1 / 12 + (1 - fraction) / fraction**2))
-    shared = float(pitch * np.sqrt(ACROSS_THE_EDGE * fraction * (1 - fraction) / there) / fraction**2)
+    shared = float(pitch * np.sqrt(ACROSS_THE_EDGE * fraction * (1 - fraction) / deeper) / fraction**2)
     lines = np.concatenate([2 * along_rows.line, 2 * along_columns.line + 1])
     return Crossings(found, spread, fraction, shared, lines)
 
 
 def _ends(
-    on: NDArray[np.bool_], beyond: Array, band: NDArray[np.bool_], steep: NDArray[np.bool_], way: Array, places: Array
+    on_face: NDArray[np.bool_],
+    signed_distance: Array,
+    band: NDArray[np.bool_],
+    steep: NDArray[np.bool_],
+    sign: Array,
+    places: Array,
 ) -> _Ends:
-    """Find where the pixels that are ``on`` the face end along each row.
+    """Find the ends of the face along each row, from the pixels that are ``on_face``.
 
-    ``beyond`` grows in the direction ``way`` (+1 or -1) along the row. Ends are searched within ``band``, and kept
-    where ``steep`` is true.
+    ``signed_distance`` grows in the direction ``sign`` (+1 or -1) along the row. Ends are searched within ``band``, and
+    kept where ``steep`` is true.
     """
     row, column = np.nonzero(band)
-    key = 2 * row + (way[row, column] > 0)  # a hole meets a row twice, once in each direction
-    depth, shows = beyond[row, column], on[row, column]
+    key = 2 * row + (sign[row, column] > 0)  # a hole meets a row twice, once in each direction
+    depth, shows = signed_distance[row, column], on_face[row, column]
     # sorted by key, then pixels on the face last, of these the outermost last
     order = np.lexsort((depth, shows, key))
     key, depth, shows, row, column = key[order], depth[order], shows[order], row[order], column[order]
     last = np.flatnonzero(np.diff(key, append=-1) != 0)
-    next_column = column[last] + way[row[last], column[last]].astype(np.intp)
-    found = shows[last] & steep[row[last], column[last]] & (next_column >= 0) & (next_column < on.shape[1])
+    next_column = column[last] + sign[row[last], column[last]].astype(np.intp)
+    found = shows[last] & steep[row[last], column[last]] & (next_column >= 0) & (next_column < on_face.shape[1])
     last, next_column = last[found], next_column[found]
     inside = band[row[last], next_column]  # otherwise the band ends here, not the face
     last, next_column = last[inside], next_column[inside]
@@ -227,19 +233,19 @@ def _ends(
     )
 
 
-def _beyond(figure: Circle | EdgePoint, places: Array, reach: float) -> tuple[Array, NDArray[np.bool_]]:
+def _signed_distance(figure: Circle | EdgePoint, places: Array, reach: float) -> tuple[Array, NDArray[np.bool_]]:
     """Return how far places (..., 3) on the plane lie outside the face [mm], and which lie where its edge is searched.
 
     The distance grows toward the middle of a hole, and along the line over an edge.
     """
     if isinstance(figure, Circle):
         local = (places - figure.centre) @ tangents(figure.normal).T
-        beyond = figure.radius - np.linalg.norm(local, axis=-1)
-        return beyond, (beyond >= -figure.radius) & (beyond <= figure.radius / 2)
+        signed_distance = figure.radius - np.linalg.norm(local, axis=-1)
+        return signed_distance, (signed_distance >= -figure.radius) & (signed_distance <= figure.radius / 2)
     local = places - figure.point
-    beyond = local @ figure.direction
+    signed_distance = local @ figure.direction
     sideways = local @ np.cross(figure.normal, figure.direction)
-    return beyond, (np.abs(beyond) <= reach) & (np.abs(sideways) <= reach)
+    return signed_distance, (np.abs(signed_distance) <= reach) & (np.abs(sideways) <= reach)
 
 
 def _window(cloud: PointCloud, figure: Circle | EdgePoint, reach: float) -> tuple[NDArray[Any], NDArray[Any]]:

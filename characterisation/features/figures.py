@@ -76,7 +76,7 @@ class Circle:
         """Return the same circle, seen from a viewpoint (3,) [mm]."""
         return Circle(self.centre, self.normal, self.radius, unit(self.centre - np.asarray(viewpoint, float)))
 
-    def carried(self, plane: Plane) -> Circle:
+    def on_moved_plane(self, plane: Plane) -> Circle:
         """Return the circle carried along with its moved plane, neglecting the effect of the tilt on the radius."""
         normal = _facing(plane.normal, self.normal)
         return Circle(_slid(self.centre, self.ray, plane), normal, self.radius, self.ray)
@@ -127,7 +127,7 @@ class EdgePoint:
         ray = unit(self.point - np.asarray(viewpoint, float))
         return EdgePoint(self.point, self.direction, self.normal, self.slope, ray)
 
-    def carried(self, plane: Plane) -> EdgePoint:
+    def on_moved_plane(self, plane: Plane) -> EdgePoint:
         """Return the point carried along with its moved plane, with the line turned into the plane."""
         normal = _facing(plane.normal, self.normal)
         direction = unit(self.direction - (self.direction @ normal) * normal)

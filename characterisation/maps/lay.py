@@ -54,12 +54,12 @@ def mirror_direction(distance: NDArray[np.floating], mirror_mm: tuple[float, flo
 def tangent_at(normals: Floats, lay_deg: float, mirror: Floats) -> Floats:
     """Return the tangents (..., 3) with a lay angle [deg], for normals and mirror directions h (..., 3)."""
     flat = np.array([np.cos(np.radians(lay_deg)), np.sin(np.radians(lay_deg)), 0.0])
-    return _carried(_carried(flat, _Z, _carried(normals, mirror, _Z)), _Z, mirror)
+    return _rotated_with(_rotated_with(flat, _Z, _rotated_with(normals, mirror, _Z)), _Z, mirror)
 
 
 def lay_angle_deg(normals: NDArray[np.floating], tangents: NDArray[np.floating], mirror: Floats) -> Floats:
     """Return the lay angle [deg], 0 to 180, of tangents at normals, for mirror directions h; all (..., 3)."""
-    flat = _carried(_carried(tangents, mirror, _Z), _carried(normals, mirror, _Z), _Z)
+    flat = _rotated_with(_rotated_with(tangents, mirror, _Z), _rotated_with(normals, mirror, _Z), _Z)
     return np.asarray(np.degrees(np.arctan2(flat[..., 1], flat[..., 0])) % 180.0)
 
 
@@ -70,7 +70,7 @@ def turned(vectors: NDArray[np.floating], angle_deg: Floats, mirror: Floats) -> 
     return np.asarray(cosine * (vectors - along) + sine * np.cross(mirror, vectors) + along)
 
 
-def _carried(vectors: NDArray[np.floating], start: NDArray[np.floating], end: NDArray[np.floating]) -> Floats:
+def _rotated_with(vectors: NDArray[np.floating], start: NDArray[np.floating], end: NDArray[np.floating]) -> Floats:
     """Return vectors (..., 3), rotated by the smallest rotation that takes one unit vector to another."""
     both = start + end
     return np.asarray(

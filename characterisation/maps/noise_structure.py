@@ -43,7 +43,7 @@ def noise_structure(
 
     Outside the characterised normals or distances, the nearest ones are used: F and sigma are NaN there anyway.
     """
-    members, rough = performance_map.known.answering(finish, roughness, light)
+    members, rough = performance_map.known.representing(finish, roughness, light)
     data = performance_map.data
     normals = np.asarray(normals, float)
     distance = np.broadcast_to(np.asarray(distance, float), normals.shape[:-1])

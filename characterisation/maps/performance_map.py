@@ -146,7 +146,7 @@ class PerformanceMap:
         normals
             Unit N (n, 3) in the view frame: z from the point to the camera, x along the baseline.
         light
-            Optical properties of the surface, see :meth:`~characterisation.maps.samples.Samples.answering`.
+            Optical properties of the surface, see :meth:`~characterisation.maps.samples.Samples.representing`.
         tangents
             Direction of the surface's parameter u in the view frame (n, 3), for a surface with a lay. Without it, or
             where it is NaN, the answer is the mean over directions. A surface without a lay ignores it.
@@ -168,7 +168,7 @@ class PerformanceMap:
 
     def surface(self, finish: str, roughness: float, light: Light | None = None) -> Surface:
         """Return the fields of one surface for look-up; arguments and errors are those of :meth:`query`."""
-        members, rough = self.known.answering(finish, roughness, light)
+        members, rough = self.known.representing(finish, roughness, light)
         return self._surface(tuple(members), "" if math.isnan(rough) else rough)
 
     def require(self, finish: str, roughness: float, light: Light | None = None) -> float:
@@ -179,7 +179,7 @@ class PerformanceMap:
         InputError
             If the surface was not characterised.
         """
-        return self.known.answering(finish, roughness, light)[1]
+        return self.known.representing(finish, roughness, light)[1]
 
     def _make_surface(self, numbers: tuple[int, ...], roughness: float | str) -> Surface:
         members = list(numbers)

@@ -49,7 +49,7 @@ class Samples:
             out.append(name + ends)
         return ", ".join(out)
 
-    def answering(self, finish: str, roughness: float, light: Light | None = None) -> tuple[list[int], float]:
+    def representing(self, finish: str, roughness: float, light: Light | None = None) -> tuple[list[int], float]:
         """Return the numbers of the samples that represent a surface, by Ra, and the Ra [um] to look up among them.
 
         With ``light``, a surface is represented by a sample with equal optical properties, whatever its name, and the

@@ -18,15 +18,15 @@ def shipped_maps() -> dict[str, Path]:
     return {path.stem: path for path in sorted(FOLDER.glob("*.nc"))}
 
 
-def map_path(name: str | Path, here: str | Path = ".") -> Path:
-    """Return the file of a map, given as a path relative to ``here``, or as the name of a sensor with a shipped map.
+def map_path(name: str | Path, folder: str | Path = ".") -> Path:
+    """Return the file of a map, given as a path relative to ``folder``, or as the name of a sensor with a shipped map.
 
     Raises
     ------
     InputError
         If there is neither.
     """
-    path = Path(here) / name
+    path = Path(folder) / name
     if is_file(path):
         return path
     known = shipped_maps()

@@ -84,7 +84,7 @@ def between_samples(stacks: Mapping[str, Floats], known: Floats, roughness: floa
     t = float(np.clip((at - x[j]) / (x[j + 1] - x[j]), 0.0, 1.0))
     if t < AT_KNOT or t > 1 - AT_KNOT:
         return [value[j + round(t)] for value in values]
-    bends = [left_out(x, values[k], values[k + 2], j) for k in (0, 1)]
+    bends = [interpolation_error(x, values[k], values[k + 2], j) for k in (0, 1)]
     return _mixed([v[j] for v in values], [v[j + 1] for v in values], np.asarray(t), bends)
 
 
@@ -107,7 +107,7 @@ def _per_probit(z: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.asarray(density * z.dtype.type(1 / (np.sqrt(2 * np.pi) * (1 - 2 * PROBIT_MARGIN))))
 
 
-def left_out(knots: Floats, values: Floats, errors: Floats, interval: int) -> Floats:
+def interpolation_error(knots: Floats, values: Floats, errors: Floats, interval: int) -> Floats:
     """Return D of an interval between knots (k,), for values and errors (k, ...); NaN without a third knot."""
     found = np.full(values.shape[1:], np.nan)
     width = knots[interval + 1] - knots[interval]
@@ -167,7 +167,8 @@ class Surface:
         pairs = range(max(len(distances) - 1, 1))
         if len(distances) > 1:
             bends = [
-                np.stack([left_out(self.knots, self.fields[k], self.fields[k + 2], j) for j in pairs]) for k in (0, 1)
+                np.stack([interpolation_error(self.knots, self.fields[k], self.fields[k + 2], j) for j in pairs])
+                for k in (0, 1)
             ]
         else:
             bends = [np.full_like(self.fields[0], np.nan) for _ in (0, 1)]
@@ -220,12 +221,12 @@ class Surface:
             plain = np.zeros_like(plain)
         chosen: slice | NDArray[np.int64] = slice(None) if plain.all() else np.flatnonzero(plain)
         for values, found in zip(
-            out, self._plainly(cell[chosen], t[chosen], column[chosen], row[chosen]), strict=False
+            out, self._with_all_corners(cell[chosen], t[chosen], column[chosen], row[chosen]), strict=False
         ):
             values[chosen] = found
         rest = np.flatnonzero(within & ~plain)
         if len(rest):
-            careful = self._carefully(cell[rest], t[rest], column[rest], row[rest])
+            careful = self._with_missing_corners(cell[rest], t[rest], column[rest], row[rest])
             for values, known in zip(out, careful, strict=True):
                 values[rest] = known
 
@@ -241,7 +242,7 @@ class Surface:
         within = (t >= -1e-9) & (t <= 1 + 1e-9)
         return interval, np.clip(t, 0, 1).astype(np.float32), within
 
-    def _plainly(self, cell: NDArray[np.int64], t: Singles, u: Singles, v: Singles) -> tuple[Singles, ...]:
+    def _with_all_corners(self, cell: NDArray[np.int64], t: Singles, u: Singles, v: Singles) -> tuple[Singles, ...]:
         """Return F, sigma and errors where all corners have values."""
         upper = u * v
         shares = (1 - u - v + upper, u - upper, v - upper, upper)
@@ -268,7 +269,7 @@ class Surface:
         fraction, per_probit = from_probit(out[0])
         return fraction, sigma, per_probit * out[1], sigma * out[3]
 
-    def _carefully(self, cell: NDArray[np.int64], t: Singles, u: Singles, v: Singles) -> list[Floats]:
+    def _with_missing_corners(self, cell: NDArray[np.int64], t: Singles, u: Singles, v: Singles) -> list[Floats]:
         """Return all six fields where some corners or knots have no value."""
         corner = cell[:, None] + np.array([0, 1, self.count, self.count + 1])
         share = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], axis=1).astype(float)

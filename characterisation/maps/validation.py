@@ -79,7 +79,7 @@ def residual_table(pairs: Sequence[Pair]) -> xr.Dataset:
     return xr.Dataset(columns, attrs={"fraction_limit": FRACTION_LIMIT, "sigma_limit": SIGMA_LIMIT})
 
 
-def holds(table: xr.Dataset) -> NDArray[np.bool_]:
+def within_limits(table: xr.Dataset) -> NDArray[np.bool_]:
     """Return which rows of a residual table are within both limits; a row without sigma is within that of sigma."""
     sigma = table["sigma_residual"].values
     return np.asarray(

@@ -77,8 +77,8 @@ def choose_set(
         if name not in task.measurements:
             raise InputError("limits", name, "no such measurement", ", ".join(task.measurements))
     best = _best_known(inputs)
-    asked = {name: measurement_model(task, name).inputs for name in limits}
-    for name, quantities in asked.items():
+    needed_inputs = {name: measurement_model(task, name).inputs for name in limits}
+    for name, quantities in needed_inputs.items():
         for quantity in quantities:
             if quantity.kind == "form":
                 raise InputError(
@@ -99,7 +99,7 @@ def choose_set(
                     f"{', '.join(quantity.features)}, which no view sees well enough",
                     "a feature that a view sees",
                 )
-    whole = _JoinedSet(task, asked, best, joining)
+    whole = _JoinedSet(task, needed_inputs, best, joining)
     views = [whole.view(one, least_chance) for one in inputs]
     information = np.array([joint_information(view, whole.rigid, joining.known) for view in views])
     features = [Feature(information, whole.quadratic)]
@@ -121,22 +121,22 @@ class _JoinedSet:
     def __init__(
         self,
         task: Task,
-        asked: dict[str, tuple[InputQuantity, ...]],
+        needed_inputs: dict[str, tuple[InputQuantity, ...]],
         best: dict[InputQuantity, ExpectedInput],
         joining: SetJoining,
     ) -> None:
-        self.quantities = list(dict.fromkeys(one for some in asked.values() for one in some))
+        self.quantities = list(dict.fromkeys(one for quantities in needed_inputs.values() for one in quantities))
         sizes = [len(best[one].fit.covariance) for one in self.quantities]
         ends = dict(zip(self.quantities, np.cumsum(sizes), strict=True))
         self.rigid = [
             np.zeros((size, 6)) if one.kind == "pose" else rigid_derivatives(best[one].estimate, joining.about)
             for one, size in zip(self.quantities, sizes, strict=True)
         ]
-        self.quadratic = np.zeros((len(asked), sum(sizes), sum(sizes)))
-        for m, (name, some) in enumerate(asked.items()):
-            places = [np.arange(ends[one] - len(best[one].fit.covariance), ends[one]) for one in some]
-            motion = np.concatenate([self.rigid[self.quantities.index(one)] for one in some])
-            variances = np.concatenate([np.diag(best[one].fit.covariance) for one in some])
+        self.quadratic = np.zeros((len(needed_inputs), sum(sizes), sum(sizes)))
+        for m, (name, quantities) in enumerate(needed_inputs.items()):
+            places = [np.arange(ends[one] - len(best[one].fit.covariance), ends[one]) for one in quantities]
+            motion = np.concatenate([self.rigid[self.quantities.index(one)] for one in quantities])
+            variances = np.concatenate([np.diag(best[one].fit.covariance) for one in quantities])
             form = invariant(joint_quadratic_form(task, name, best), motion, variances)
             self.quadratic[m][np.ix_(np.concatenate(places), np.concatenate(places))] = form
 
@@ -148,7 +148,7 @@ class _JoinedSet:
         ]
         causes = max((one.shared.shape[1] for one in fits if one is not None), default=1)
         return JoinedView(
-            tuple(None if one is None else one.own for one in fits),
+            tuple(None if one is None else one.noise_covariance for one in fits),
             tuple(
                 np.zeros((len(motion), causes)) if one is None else one.shared
                 for one, motion in zip(fits, self.rigid, strict=True)

@@ -120,7 +120,7 @@ class ExpectedPoints:
 class ExpectedFit:
     """Predicted fit about the nominal geometry.
 
-    - ``own`` (p, p): covariance of the parameters due to noise.
+    - ``noise_covariance`` (p, p): covariance of the parameters due to noise.
     - ``shared`` (p, 1 + k): changes of the parameters by the known displacement, and by each error that features share.
     - ``count`` of expected points.
     - ``chance``: probability that there are enough points, and that the fit stays near the nominal radius.
@@ -129,7 +129,7 @@ class ExpectedFit:
       sqrt(n).
     """
 
-    own: Floats
+    noise_covariance: Floats
     shared: Floats
     count: float
     chance: float
@@ -139,7 +139,7 @@ class ExpectedFit:
     @property
     def covariance(self) -> Floats:
         """Return the covariance (p, p) of all errors, including the known displacement."""
-        return np.asarray(self.own + self.shared @ self.shared.T)
+        return np.asarray(self.noise_covariance + self.shared @ self.shared.T)
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ class Sums:
     noise: float
 
 
-def expected_fit(surface: Surface, seen: ExpectedPoints, minimum_points: float) -> ExpectedFit:
+def expected_fit(surface: Surface, expected: ExpectedPoints, minimum_points: float) -> ExpectedFit:
     """Predict the fit of a surface to its own points.
 
     Raises
@@ -168,7 +168,7 @@ def expected_fit(surface: Surface, seen: ExpectedPoints, minimum_points: float) 
     FitError
         If the points would not determine the surface even if all were recovered, or nearly all are false.
     """
-    used = usable(surface, seen)
+    used = usable(surface, expected)
     jacobian = surface.linearised(np.zeros(surface.parameter_count), used.point, used.ray)[1]
     fit = solved([expected_sums(jacobian, used, minimum_points)], surface.kind)
     return replace(fit, chance=fit.chance * _convergence_chance(surface, fit.covariance))
@@ -183,7 +183,7 @@ def _convergence_chance(surface: Surface, covariance: Floats) -> float:
     return float(2 * ndtr(HELD * surface.radius / spread) - 1) if spread > 0 else 1.0
 
 
-def usable(surface: Surface, seen: ExpectedPoints) -> ExpectedPoints:
+def usable(surface: Surface, expected: ExpectedPoints) -> ExpectedPoints:
     """Return the points that a fit would use if they were recovered: neither at grazing incidence nor false.
 
     A point is false if it is displaced by more than :data:`~characterisation.point_cloud.FALSE_SHARE_OF_DISTANCE` of
@@ -194,38 +194,40 @@ def usable(surface: Surface, seen: ExpectedPoints) -> ExpectedPoints:
     FitError
         If there are none, or nearly all are false.
     """
-    if len(seen.point):
-        cosine = surface.meet(seen.point, seen.ray).cosine
-        used = (np.abs(cosine) > GRAZING_COSINE) & np.isfinite(seen.sigma) & (seen.fraction > LEAST_SHARE)
-        near = np.abs(seen.displaced) <= FALSE_SHARE_OF_DISTANCE * seen.distance
-        if seen.fraction[near].sum() < LEAST_BELONGING * seen.fraction.sum():
+    if len(expected.point):
+        cosine = surface.meet(expected.point, expected.ray).cosine
+        used = (np.abs(cosine) > GRAZING_COSINE) & np.isfinite(expected.sigma) & (expected.fraction > LEAST_SHARE)
+        near = np.abs(expected.displaced) <= FALSE_SHARE_OF_DISTANCE * expected.distance
+        if expected.fraction[near].sum() < LEAST_BELONGING * expected.fraction.sum():
             raise FitError(f"less than {100 * LEAST_BELONGING:.0f} % of the points lie near the nominal surface")
         used &= near
         if used.any():
-            rows: dict[str, Any] = {n: value[used] for n, value in vars(seen).items() if isinstance(value, np.ndarray)}
-            return replace(seen, **rows)
+            rows: dict[str, Any] = {
+                n: value[used] for n, value in vars(expected).items() if isinstance(value, np.ndarray)
+            }
+            return replace(expected, **rows)
     raise FitError("no points are expected")
 
 
-def expected_sums(g: Floats, seen: ExpectedPoints, minimum_points: float) -> Sums:
+def expected_sums(g: Floats, expected: ExpectedPoints, minimum_points: float) -> Sums:
     """Return the sums over the points of one feature, for derivatives ``g`` (n, p) of their residuals."""
-    weight = seen.fraction * seen.thinning
-    variance = seen.fraction * seen.sigma**2 * seen.area
+    weight = expected.fraction * expected.thinning
+    variance = expected.fraction * expected.sigma**2 * expected.area
     # the contribution of random losses to the noise area is not correlation
-    area = float(np.average(seen.area + 1 - 1 / seen.fraction, weights=weight))
-    spread = _averaging(g, weight, variance, area, seen.pixel, seen.thinning)
-    spread += _persistent(g * (weight * seen.persistent)[:, None], seen.pixel, seen.normal)
-    fields = seen.displaced[:, None]
-    if seen.shared is not None:
-        fields = np.concatenate([fields, seen.shared], axis=1)
+    area = float(np.average(expected.area + 1 - 1 / expected.fraction, weights=weight))
+    spread = _averaging(g, weight, variance, area, expected.pixel, expected.thinning)
+    spread += _persistent(g * (weight * expected.persistent)[:, None], expected.pixel, expected.normal)
+    fields = expected.displaced[:, None]
+    if expected.shared is not None:
+        fields = np.concatenate([fields, expected.shared], axis=1)
     count = float(weight.sum())
     return Sums(
         (g * weight[:, None]).T @ g,
         spread,
         g.T @ (weight[:, None] * fields),
         count,
-        _chance(seen, minimum_points),
-        weight @ seen.point / count,
+        _chance(expected, minimum_points),
+        weight @ expected.point / count,
         math.sqrt(float((weight * variance).sum() / count)),
     )
 
@@ -310,12 +312,12 @@ def _squares(places: Floats) -> Floats:
     return np.asarray(np.maximum(square[:, None] + square - 2 * places @ places.T, 0.0))
 
 
-def _chance(seen: ExpectedPoints, minimum: float) -> float:
+def _chance(expected: ExpectedPoints, minimum: float) -> float:
     """Return the probability that at least ``minimum`` points are recovered, with a normal number of points."""
-    fraction, each = seen.fraction, seen.thinning
+    fraction, each = expected.fraction, expected.thinning
     count = float(fraction.sum() * each)
-    losses = float((fraction * (1 - fraction) * np.maximum(seen.area, 1.0)).sum() * each)
-    spread = math.sqrt(losses + float(np.nan_to_num(seen.fraction_error).sum() * each) ** 2)
+    losses = float((fraction * (1 - fraction) * np.maximum(expected.area, 1.0)).sum() * each)
+    spread = math.sqrt(losses + float(np.nan_to_num(expected.fraction_error).sum() * each) ** 2)
     if spread == 0:
         return float(count >= minimum)
     return float(ndtr((count - minimum) / spread))

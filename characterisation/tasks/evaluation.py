@@ -157,7 +157,7 @@ def _resolved(feature: Feature, name: str, fits: Mapping[str, Any]) -> Any:
     if feature.shaped:
         return fits[name]
     (plane,) = feature.of or ("",)
-    return fits[name].carried(fits[plane])
+    return fits[name].on_moved_plane(fits[plane])
 
 
 def fit_features(

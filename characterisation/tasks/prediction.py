@@ -60,63 +60,63 @@ class ExpectedMeasurement:
 
 
 def expected_inputs(
-    task: Task, seen: Mapping[str, ExpectedPoints], minimum_points: float
+    task: Task, expected: Mapping[str, ExpectedPoints], minimum_points: float
 ) -> dict[InputQuantity, ExpectedInput | FitError]:
     """Predict all input quantities of the task's measurements for one view.
 
-    ``seen`` holds the expected points by shape, part frame.
+    ``expected`` holds the expected points by shape, part frame.
     """
     out: dict[InputQuantity, ExpectedInput | FitError] = {}
     for name in task.measurements:
         for quantity in measurement_model(task, name).inputs:
             if quantity not in out:
                 try:
-                    out[quantity] = _expected_input(quantity, task, seen, minimum_points)
+                    out[quantity] = _expected_input(quantity, task, expected, minimum_points)
                 except FitError as error:
                     out[quantity] = error
     return out
 
 
 def _expected_input(
-    quantity: InputQuantity, task: Task, seen: Mapping[str, ExpectedPoints], minimum_points: float
+    quantity: InputQuantity, task: Task, expected: Mapping[str, ExpectedPoints], minimum_points: float
 ) -> ExpectedInput:
     if quantity.kind == "pose":
-        return _pose(quantity, task, seen, minimum_points)
+        return _pose(quantity, task, expected, minimum_points)
     (name,) = quantity.features
     if not task.features[name].shaped:
-        return _figure(name, task, seen)
+        return _figure(name, task, expected)
     surface = task.features[name].nominal()
     if quantity.kind == "form":
         assert isinstance(surface, Plane | Cylinder)
-        used = usable(surface, seen[name])
+        used = usable(surface, expected[name])
         modes = form_modes(surface, used.point, used.ray)
         fit = solved([expected_sums(modes, used, minimum_points)], "form")
         slope = surface.meet(used.point, used.ray).slope
         nothing = np.zeros(modes.shape[1])
         return ExpectedInput(fit, Form(modes * slope[:, None], nothing, fit.covariance, math.nan, round(fit.count)))
-    fit = expected_fit(surface, seen[name], minimum_points)
+    fit = expected_fit(surface, expected[name], minimum_points)
     return ExpectedInput(fit, with_covariance(surface, fit.covariance))
 
 
 def _pose(
-    quantity: InputQuantity, task: Task, seen: Mapping[str, ExpectedPoints], minimum_points: float
+    quantity: InputQuantity, task: Task, expected: Mapping[str, ExpectedPoints], minimum_points: float
 ) -> ExpectedInput:
     """Predict the pose about the mean of its features' points, which is the same from every view."""
     about = np.mean([task.features[name].point_mm or (0.0, 0.0, 0.0) for name in quantity.features], axis=0)
     parts = []
     for name in quantity.features:
         surface = task.features[name].nominal()
-        used = usable(surface, seen[name])
+        used = usable(surface, expected[name])
         parts.append(expected_sums(pose_jacobian(surface, used.point, used.ray, about), used, minimum_points))
     fit = solved(parts, "pose")
     return ExpectedInput(fit, PoseFit(np.eye(4), about, fit.covariance, math.nan, round(fit.count)))
 
 
-def _figure(name: str, task: Task, seen: Mapping[str, ExpectedPoints]) -> ExpectedInput:
+def _figure(name: str, task: Task, expected: Mapping[str, ExpectedPoints]) -> ExpectedInput:
     """Predict a circle or the point of an edge in a face; the only error of the edge is that of sampling by pixels."""
     feature = task.features[name]
     (plane,) = feature.of or ("",)
-    around = usable(task.features[plane].nominal(), seen[plane])
+    around = usable(task.features[plane].nominal(), expected[plane])
     figure = task.nominal(name)
     assert isinstance(figure, Circle | EdgePoint)
     place = figure.centre if isinstance(figure, Circle) else figure.point
@@ -135,10 +135,10 @@ def _figure(name: str, task: Task, seen: Mapping[str, ExpectedPoints]) -> Expect
     return ExpectedInput(fit, with_covariance(figure, covariance))
 
 
-def _viewpoint(seen: ExpectedPoints) -> Floats:
+def _viewpoint(expected: ExpectedPoints) -> Floats:
     """Return the viewpoint (3,): the point nearest to all rays."""
-    across = np.eye(3) - seen.ray[:, :, None] * seen.ray[:, None, :]
-    solution = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, seen.point), rcond=None)[0]
+    across = np.eye(3) - expected.ray[:, :, None] * expected.ray[:, None, :]
+    solution = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, expected.point), rcond=None)[0]
     return np.asarray(solution)
 
 
@@ -165,7 +165,7 @@ def expected_measurement(
     }
     together = _at_its_points(model.value, [one.fit.middle for one in known])
     shared = np.concatenate([one.fit.shared for one in known])
-    covariance = block_diag(*[one.fit.own for one in known]) + shared @ shared.T
+    covariance = block_diag(*[one.fit.noise_covariance for one in known]) + shared @ shared.T
     total = scale * evaluate(together, [one.estimate for one in known], covariance)[1]
     if not math.isfinite(total):
         return ExpectedMeasurement(math.nan, 0.0, "the measurement has no value here", quantities, tuple(parts))

@@ -86,24 +86,24 @@ class DrawnTask:
 
 def drawn_task(information: ProductInformation, faces: Sequence[Face]) -> DrawnTask:
     """Convert a drawing: measurements for all that a task supports, sentences for the rest."""
-    maker = _Maker(faces)
-    maker.task.datums = {letter: tuple(f.name for f in maker.faces(t)) for letter, t in information.datums.items()}
+    builder = _TaskBuilder(faces)
+    builder.task.datums = {letter: tuple(f.name for f in builder.faces(t)) for letter, t in information.datums.items()}
     for dimension in information.dimensions:
-        maker.dimension(dimension)
+        builder.dimension(dimension)
     for tolerance in information.tolerances:
-        maker.tolerance(tolerance)
+        builder.tolerance(tolerance)
     for letter, target in information.datums.items():
-        if not maker.task.datums[letter]:
-            maker.task.left_out.append(f"datum {letter}: it is {_what(target)}")
-    maker.task.left_out += information.unread
-    return maker.task
+        if not builder.task.datums[letter]:
+            builder.task.left_out.append(f"datum {letter}: it is {_what(target)}")
+    builder.task.left_out += information.unread
+    return builder.task
 
 
 def _what(target: Target) -> str:
     return f"on {', '.join(target.others)}, no face" if target.others else "on no face of the part"
 
 
-class _Maker:
+class _TaskBuilder:
     """Builds a task; finds faces by the numbers of their entities."""
 
     def __init__(self, faces: Sequence[Face]) -> None:

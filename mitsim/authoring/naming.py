@@ -185,7 +185,7 @@ def _distinguished(faces: list[Face], extent: Floats) -> list[str]:
     far = spread > np.maximum(_APART * extent, 1e-3)
     words: list[list[str]] = [[] for _ in faces]
     for along in (2, 1, 0):
-        if far[along] and _two_heaps(places[:, along]):
+        if far[along] and _form_two_clusters(places[:, along]):
             middle = (places[:, along].max() + places[:, along].min()) / 2
             for word, place in zip(words, places, strict=True):
                 word.append(SIDES[along][bool(place[along] > middle)])
@@ -201,7 +201,7 @@ def _distinguished(faces: list[Face], extent: Floats) -> list[str]:
     return [out[number] for number in range(len(faces))]
 
 
-def _two_heaps(values: Floats) -> bool:
+def _form_two_clusters(values: Floats) -> bool:
     """Return whether numbers form two clusters with a gap, so that sides distinguish them; a row of holes does not."""
     ordered = np.sort(values)
     gaps = np.diff(ordered)

@@ -34,17 +34,17 @@ def own_build() -> dict[str, str]:
     return found
 
 
-def differences(mine: dict[str, str], theirs: dict[str, str]) -> str:
+def differences(own: dict[str, str], other: dict[str, str]) -> str:
     """Return all differences between two builds in words; empty if there are none.
 
     The version of Python may differ, since it does not influence any number.
     """
     out = []
-    for name, here in mine.items():
-        there = theirs.get(name, "unknown")
-        if name == "python" or there == here:
+    for name, own_version in own.items():
+        other_version = other.get(name, "unknown")
+        if name == "python" or other_version == own_version:
             continue
-        out.append("other source files" if name == "source" else f"{name} {there} in place of {here}")
+        out.append("other source files" if name == "source" else f"{name} {other_version} in place of {own_version}")
     return ", ".join(out)
 
 

@@ -82,8 +82,8 @@ class Cluster:
 
         if not items:
             return
-        mine = own_build()
-        _compare_builds(self.client, self.address, mine)
+        own = own_build()
+        _compare_builds(self.client, self.address, own)
         waiting = list(reversed(items))
         running = as_completed(loop=self.client.loop)
         of: dict[object, Item] = {}
@@ -93,7 +93,7 @@ class Cluster:
             room = AHEAD * max(sum(self.client.ncores().values()), 1)
             while waiting and len(of) < room:
                 item = waiting.pop()
-                future = self.client.submit(_of_same_build, mine, work, order(item), pure=False, retries=DEATHS)
+                future = self.client.submit(_of_same_build, own, work, order(item), pure=False, retries=DEATHS)
                 of[future.key] = item
                 running.add(future)
 
@@ -102,7 +102,7 @@ class Cluster:
             while of:
                 finished = running.next_batch(block=False)
                 if not finished:
-                    watch.look()
+                    watch.check()
                     time.sleep(_POLL_S)
                 for future in finished:
                     yield of.pop(future.key), _result(future, self.address)
@@ -189,11 +189,11 @@ def _of_same_build(build: dict[str, str], work: Callable[[Plain], Result], order
     return work(order)
 
 
-def _compare_builds(client: Any, address: str, mine: dict[str, str]) -> None:
+def _compare_builds(client: Any, address: str, own: dict[str, str]) -> None:
     """Wait for a worker, and compare the builds of all workers."""
     watch = _Watch(client, address)
     while not client.ncores():
-        watch.look()
+        watch.check()
         time.sleep(_POLL_S)
     try:
         builds = client.run(own_build, on_error="return")
@@ -202,7 +202,7 @@ def _compare_builds(client: Any, address: str, mine: dict[str, str]) -> None:
     for worker, build in builds.items():
         if isinstance(build, OSError):
             continue  # the worker died meanwhile
-        differing = differences(mine, build) if isinstance(build, dict) else f"no known build ({_in_a_line(build)})"
+        differing = differences(own, build) if isinstance(build, dict) else f"no known build ({_in_a_line(build)})"
         if differing:
             raise _other_build(address, worker, differing)
 
@@ -219,14 +219,14 @@ class _Watch:
 
     def __init__(self, client: Any, address: str) -> None:
         self.client, self.address = client, address
-        self.since = self.reported = self.looked = time.monotonic()
+        self.since = self.reported = self.checked = time.monotonic()
         self.alone = False
 
-    def look(self) -> None:
+    def check(self) -> None:
         now = time.monotonic()
-        if now - self.looked < 1.0 and self.alone:
+        if now - self.checked < 1.0 and self.alone:
             return
-        self.looked = now
+        self.checked = now
         if self.client.ncores():
             self.alone = False
             return

@@ -60,7 +60,7 @@ DeviceTable = Annotated[EnsensoTable | DepthaiTable, Field(discriminator="kind")
 
 
 @dataclass(frozen=True)
-class Taken:
+class DeviceCapture:
     """A capture, and the maker's files of it by name."""
 
     capture: Capture
@@ -73,7 +73,7 @@ class LiveDevice:
     def __init__(self, camera: EnsensoCamera | DepthaiCamera) -> None:
         self._camera = camera
 
-    def take(self) -> Taken:
+    def take(self) -> DeviceCapture:
         """Take one capture.
 
         Raises
@@ -112,7 +112,7 @@ def open_device(table: EnsensoTable | DepthaiTable) -> LiveDevice:
     return LiveDevice(open_depthai(table.settings, table.id))
 
 
-def ensenso_capture(shot: EnsensoShot) -> Taken:
+def ensenso_capture(shot: EnsensoShot) -> DeviceCapture:
     """Return the capture of an Ensenso's shot, with the calibration of the device at that moment."""
     serial = str(shot.node.get("SerialNumber", "camera"))
     capture = _read_node(shot.node, shot.images, serial)
@@ -135,10 +135,10 @@ def ensenso_capture(shot: EnsensoShot) -> Taken:
             originals["points.npy"] = _npy(shot.points)
         else:
             derived["points"] = in_place
-    return Taken(replace(capture, source=shot.source, settings=settings, derived=derived), originals)
+    return DeviceCapture(replace(capture, source=shot.source, settings=settings, derived=derived), originals)
 
 
-def depthai_capture(shot: DepthaiShot) -> Taken:
+def depthai_capture(shot: DepthaiShot) -> DeviceCapture:
     """Return the capture of a DepthAI camera's shot: raw images, and the disparity of its own matcher."""
     size = shot.images["left"].shape[::-1]
     derived = {} if shot.disparity is None else {"disparity": shot.disparity}
@@ -153,7 +153,7 @@ def depthai_capture(shot: DepthaiShot) -> Taken:
         serial=shot.serial,
         derived=derived,
     )
-    return Taken(capture, {"calibration.json": _json(shot.calibration)})
+    return DeviceCapture(capture, {"calibration.json": _json(shot.calibration)})
 
 
 def points_in_left_camera(

@@ -88,7 +88,7 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
     folder, digest = cache_folder(), one.digest(distance)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _sweep(folder)
+        _remove_partial(folder)
         work = Path(tempfile.mkdtemp(prefix="work-", dir=folder))
     except OSError as error:
         raise InputError(
@@ -104,7 +104,7 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
     return PerformanceMap.load(folder / f"{digest}.nc")  # read back, so that new and cached maps are equal
 
 
-def _sweep(folder: Path) -> None:
+def _remove_partial(folder: Path) -> None:
     """Remove folders that killed processes left at least a day ago."""
     for left in folder.glob("work-*"):
         if time.time() - left.stat().st_mtime > _ABANDONED_S:

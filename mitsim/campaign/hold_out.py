@@ -28,7 +28,7 @@ from characterisation.point_cloud import PointCloud
 from mitsim.campaign.acquire import CaptureSource, coupon_cloud, coupon_place, own_sensor, simulated_source
 from mitsim.campaign.coupons import Sample
 from mitsim.campaign.live import LiveCampaign, plan_live
-from mitsim.campaign.orders import Order, laid_out, order_of
+from mitsim.campaign.orders import Order, order_of, prepared_sensor
 from mitsim.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
 from mitsim.errors import InputError
 from mitsim.prediction import Predictor, performance
@@ -117,9 +117,9 @@ def held_out_live(
 
 def _check_map(campaign: Campaign, performance_map: PerformanceMap) -> None:
     """Check that a map belongs to a campaign's sensor, and contains its samples."""
-    whose = str(performance_map.data.attrs.get("sensor"))
-    if whose != campaign.sensor.name:
-        raise InputError("map", "sensor", repr(whose), repr(campaign.sensor.name))
+    map_sensor = str(performance_map.data.attrs.get("sensor"))
+    if map_sensor != campaign.sensor.name:
+        raise InputError("map", "sensor", repr(map_sensor), repr(campaign.sensor.name))
     for sample in campaign.samples:
         performance_map.require(sample.finish, sample.roughness, sample.light)
 
@@ -155,13 +155,13 @@ def compare(
     campaign: Campaign, performance_map: PerformanceMap, shots: list[Shot], take: CaptureSource, repeats: int = 1
 ) -> Iterator[Pair]:
     """Take and predict each shot in this process; see :func:`compared`."""
-    place = Place.of(campaign.sensor)
+    prepared = PreparedSensor.of(campaign.sensor)
     for shot in shots:
-        yield compared(shot, place, performance_map, take, repeats)
+        yield compared(shot, prepared, performance_map, take, repeats)
 
 
 @dataclass(frozen=True)
-class Place:
+class PreparedSensor:
     """A sensor with its geometry and predictor, for any number of shots."""
 
     sensor: Sensor
@@ -169,52 +169,56 @@ class Place:
     predictor: Predictor
 
     @classmethod
-    def of(cls, sensor: Sensor, geometry: Geometry | None = None) -> Place:
+    def of(cls, sensor: Sensor, geometry: Geometry | None = None) -> PreparedSensor:
         """Prepare a sensor; its geometry may be known already."""
         geometry = geometry or sensor_geometry(sensor)
         return cls(sensor, geometry, Predictor.of_sensor(sensor, geometry))
 
 
-def compared(shot: Shot, place: Place, performance_map: PerformanceMap, take: CaptureSource, repeats: int) -> Pair:
+def compared(
+    shot: Shot, prepared: PreparedSensor, performance_map: PerformanceMap, take: CaptureSource, repeats: int
+) -> Pair:
     """Take a shot ``repeats`` times with fresh noise, pool the patches, and predict it as many times.
 
     With few points sigma is uncertain in both. The shot is then repeated up to :data:`MOST_REPEATS` times as often,
     until the standard error of sigma is :data:`LARGEST_SIGMA_ERROR` of it. Pose and calibration are those of the first
     capture, since a stage is read back and a device has its own calibration.
     """
-    sensor = place.sensor
-    again = _repeated(shot, MOST_REPEATS * repeats)
-    first = take(again[0])
+    sensor = prepared.sensor
+    repeated = _repeated(shot, MOST_REPEATS * repeats)
+    first = take(repeated[0])
     sample, pose = shot.series.sample, coupon_place(first, shot)
     own = own_sensor(first, sensor)
     if own is not sensor:
-        place = Place.of(own)
+        prepared = PreparedSensor.of(own)
     coupon = sample.at(pose)
-    predictor = place.predictor
+    predictor = prepared.predictor
     surfaces = predictor.surfaces(sample.scene, pose.inverse())
     ideal, labels = predictor.ideal(surfaces), predictor.labels(sample.scene, pose.inverse(), surfaces)
     fraction, sigma = performance(ideal, sample.scene, performance_map)
     rng = np.random.default_rng([shot.seed, 1])
-    seen, predicted = list[_Measured](), list[_Measured]()
+    measured, predicted = list[_Measured](), list[_Measured]()
     known = np.empty(0, np.int64)  # patches for which the map has a value; all captures have this pose
     taken = [first]
     del first
-    for number, one in enumerate(again):
-        if number >= repeats and _sigma_is_known(_pooled(seen, known)):
+    for number, one in enumerate(repeated):
+        if number >= repeats and _sigma_is_known(_pooled(measured, known)):
             break
         # keep only one capture and cloud at a time; with many pixels they have 100 MB each
-        seen.append(_measure(coupon_cloud(taken.pop() if taken else take(one), coupon, place.geometry, sensor), coupon))
+        measured.append(
+            _measure(coupon_cloud(taken.pop() if taken else take(one), coupon, prepared.geometry, sensor), coupon)
+        )
         predicted.append(_measure(predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng), coupon))
         if number == 0:
-            known = np.flatnonzero(_known(seen[0].patches, sample, performance_map))
+            known = np.flatnonzero(_known(measured[0].patches, sample, performance_map))
     return Pair(
         sample.finish,
         sample.roughness,
         shot.series.distance,
         math.acos(min(1.0, float(shot.normal[2]))),
-        _pooled(seen, known),
+        _pooled(measured, known),
         _pooled(predicted, known),
-        _residuals(seen),
+        _residuals(measured),
         _residuals(predicted),
     )
 
@@ -235,7 +239,7 @@ def held_out_orders(campaign: Campaign, shots: list[Shot], map_path: Path, repea
     return [HeldOutOrder(order_of(shot, campaign), path, _digest(path), repeats) for shot in shots]
 
 
-def hold_out_order(asked: HeldOutOrder) -> Pair:
+def hold_out_order(held_out: HeldOutOrder) -> Pair:
     """Take, predict and compare one shot; workers call this function.
 
     Raises
@@ -243,14 +247,16 @@ def hold_out_order(asked: HeldOutOrder) -> Pair:
     InputError
         If the map is missing, or has another content.
     """
-    if _digest(asked.map_path) != asked.digest:
+    if _digest(held_out.map_path) != held_out.digest:
         raise InputError(
-            asked.map_path, "", "another map than on the machine of the command", "the same file on every machine"
+            held_out.map_path, "", "another map than on the machine of the command", "the same file on every machine"
         )
-    sensor = asked.order.sensor
-    simulated, geometry = laid_out(repr(sensor), sensor)
-    take = simulated_source(simulated, asked.order.samples_per_pixel)
-    return compared(asked.order.shot(), _place(sensor, geometry), _map(asked.map_path), take, asked.repeats)
+    sensor = held_out.order.sensor
+    simulated, geometry = prepared_sensor(repr(sensor), sensor)
+    take = simulated_source(simulated, held_out.order.samples_per_pixel)
+    return compared(
+        held_out.order.shot(), _prepared_here(sensor, geometry), _map(held_out.map_path), take, held_out.repeats
+    )
 
 
 @lru_cache(maxsize=8)
@@ -260,14 +266,14 @@ def _digest(path: str) -> str:
 
 _map = lru_cache(maxsize=2)(PerformanceMap.load)
 
-_places: list[Place] = []
+_prepared: list[PreparedSensor] = []
 
 
-def _place(sensor: Sensor, geometry: Geometry) -> Place:
+def _prepared_here(sensor: Sensor, geometry: Geometry) -> PreparedSensor:
     """Return the sensor of this worker with its predictor, made once for a geometry."""
-    if not _places or _places[0].geometry is not geometry:
-        _places[:] = [Place.of(sensor, geometry)]
-    return _places[0]
+    if not _prepared or _prepared[0].geometry is not geometry:
+        _prepared[:] = [PreparedSensor.of(sensor, geometry)]
+    return _prepared[0]
 
 
 @dataclass(frozen=True)
@@ -282,12 +288,12 @@ def _measure(cloud: PointCloud, coupon: Coupon) -> _Measured:
     return _Measured(measure_patches(cloud, coupon), patch_residuals(cloud, coupon))
 
 
-def _pooled(looked: list[_Measured], known: NDArray[np.int64]) -> Overall:
-    return overall(xr.concat([one.patches.isel(patch=known) for one in looked], "patch"))
+def _pooled(measurements: list[_Measured], known: NDArray[np.int64]) -> Overall:
+    return overall(xr.concat([one.patches.isel(patch=known) for one in measurements], "patch"))
 
 
-def _residuals(looked: list[_Measured]) -> NDArray[np.float64]:
-    return np.concatenate([one.residuals for one in looked])
+def _residuals(measurements: list[_Measured]) -> NDArray[np.float64]:
+    return np.concatenate([one.residuals for one in measurements])
 
 
 def _sigma_is_known(found: Overall) -> bool:

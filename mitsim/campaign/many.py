@@ -22,7 +22,7 @@ from pydantic import Field, field_validator
 
 from characterisation.documents import Document, read_toml
 from characterisation.errors import InputError
-from mitsim.campaign.orders import laid_out
+from mitsim.campaign.orders import prepared_sensor
 from mitsim.campaign.plan import sensor_checksum
 from mitsim.capture.folder import write_packed
 from mitsim.capture.packed_files import packed
@@ -214,7 +214,7 @@ def in_turn(jobs: Sequence[Job], simulated: SimulatedSensor) -> Iterator[tuple[J
 
 def take_job(job: Job) -> dict[str, bytes]:
     """Take and pack one capture; workers call this function. Packing takes time, but reduces the size to a fifth."""
-    simulated, _ = laid_out(repr(job.sensor), job.sensor)
+    simulated, _ = prepared_sensor(repr(job.sensor), job.sensor)
     return _taken(job, simulated)
 
 

@@ -26,7 +26,7 @@ from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
 from mitsim.sensor.preset import Sensor
 from mitsim.simulation.simulate import SimulatedSensor
-from mitsim.surface.seen import as_made
+from mitsim.surface.surface_light import nominal_light
 
 #: answers a question with yes or no
 Ask = Callable[[str], bool]
@@ -36,7 +36,7 @@ _PLAIN = {"metal", "process", "Ra", "half_size"}
 
 
 @dataclass(frozen=True)
-class Wanted:
+class NeededFinishes:
     """Finishes needed from a map, by shape name, for a ``sensor``, an interval of |V| [mm] and a scene."""
 
     sensor: Sensor
@@ -58,7 +58,7 @@ def with_lights(performance_map: PerformanceMap) -> PerformanceMap:
     if wavelength is None:
         return performance_map
     lights: list[Light | None] = [
-        None if said_more else as_made(finish, roughness, float(wavelength))
+        None if said_more else nominal_light(finish, roughness, float(wavelength))
         for (finish, roughness), said_more in zip(
             performance_map.samples, _has_other_parameters(performance_map), strict=True
         )
@@ -96,7 +96,7 @@ def unknown_finishes(known: Samples, finishes: dict[str, Finish]) -> dict[str, F
             continue
         seen.add(key)
         try:
-            known.answering(finish.name, finish.roughness, finish.light)
+            known.representing(finish.name, finish.roughness, finish.light)
         except InputError:
             out[name] = finish
     return out
@@ -107,7 +107,9 @@ def seen_finishes(scene: Scene) -> dict[str, Finish]:
     return {name: one for name, one in zip(scene.names, scene.finishes, strict=True) if one is not None}
 
 
-def map_with_finishes(performance_map: PerformanceMap, wanted: Wanted, ask: Ask | None = None) -> PerformanceMap:
+def map_with_finishes(
+    performance_map: PerformanceMap, needed: NeededFinishes, ask: Ask | None = None
+) -> PerformanceMap:
     """Return the map with samples for all needed finishes.
 
     Parameters
@@ -120,7 +122,7 @@ def map_with_finishes(performance_map: PerformanceMap, wanted: Wanted, ask: Ask 
     InputError
         If a finish is missing and may not be characterised, or the map was not simulated.
     """
-    missing = unknown_finishes(performance_map.known, wanted.finishes)
+    missing = unknown_finishes(performance_map.known, needed.finishes)
     if not missing:
         return performance_map
     source = str(performance_map.data.attrs.get("source", ""))
@@ -128,31 +130,31 @@ def map_with_finishes(performance_map: PerformanceMap, wanted: Wanted, ask: Ask 
         name, finish = next(iter(missing.items()))
         raise _unknown_finish_error(
             performance_map,
-            wanted,
+            needed,
             name,
             finish,
             "the map comes from a device: characterise a coupon of this finish with that device",
         )
-    distances = distances_about(performance_map, wanted.between)
+    distances = distances_about(performance_map, needed.between)
     largest = largest_incidence_deg(performance_map)
-    ones = {name: OneFinish(finish, wanted.sensor, largest) for name, finish in missing.items()}
+    ones = {name: OneFinish(finish, needed.sensor, largest) for name, finish in missing.items()}
     kept = {(name, at): kept_finish(one, at) for name, one in ones.items() for at in distances}
     to_make = [key for key, found in kept.items() if found is None]
     if to_make:
         seconds = sum(expected_seconds(ones[name]) for name, _ in to_make)
         names = list(dict.fromkeys(name for name, _ in to_make))
         lacking = ", ".join(_in_words(ones[name].finish) for name in names)
-        question = f"{wanted.sensor.name}: its map lacks {lacking}; characterise now (about {_minutes(seconds)})?"
+        question = f"{needed.sensor.name}: its map lacks {lacking}; characterise now (about {_minutes(seconds)})?"
         if ask is None or not ask(question):
             raise _unknown_finish_error(
                 performance_map,
-                wanted,
+                needed,
                 names[0],
                 missing[names[0]],
                 f"add --yes to characterise it now, in about {_minutes(seconds)}; the result is kept",
             )
-        say(f"{wanted.sensor.name}: characterising {lacking} in about {_minutes(seconds)}; kept in {cache_folder()}")
-        kept |= _characterise(ones, to_make, wanted.sensor)
+        say(f"{needed.sensor.name}: characterising {lacking} in about {_minutes(seconds)}; kept in {cache_folder()}")
+        kept |= _characterise(ones, to_make, needed.sensor)
     found = [one for one in kept.values() if one is not None]
     joined = with_samples(performance_map, found)
     digests = sorted(str(one.data.attrs["finish_digest"]) for one in found)
@@ -184,10 +186,10 @@ def distances_about(performance_map: PerformanceMap, between: tuple[float, float
 
 
 def _unknown_finish_error(
-    performance_map: PerformanceMap, wanted: Wanted, name: str, finish: Finish, hint: str
+    performance_map: PerformanceMap, needed: NeededFinishes, name: str, finish: Finish, hint: str
 ) -> InputError:
-    allowed = f"a finish in the map of {wanted.sensor.name}: {performance_map.known.in_words()}"
-    return InputError(wanted.scene, f"shape {name!r}", f"the finish {_in_words(finish)}", allowed, hint)
+    allowed = f"a finish in the map of {needed.sensor.name}: {performance_map.known.in_words()}"
+    return InputError(needed.scene, f"shape {name!r}", f"the finish {_in_words(finish)}", allowed, hint)
 
 
 def _in_words(finish: Finish) -> str:

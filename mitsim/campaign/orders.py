@@ -46,7 +46,7 @@ class Order:
         return Shot(series, np.array(self.normal), self.sensor_from_coupon)
 
 
-def taken_by(workers: Executor, campaign: Campaign) -> Source:
+def worker_source(workers: Executor, campaign: Campaign) -> Source:
     """Return a source whose shots are taken by workers."""
 
     def finish(shots: Sequence[Shot]) -> Iterator[tuple[Shot, Finished]]:
@@ -57,7 +57,7 @@ def taken_by(workers: Executor, campaign: Campaign) -> Source:
 
 def take_order(order: Order) -> Finished:
     """Take one shot; workers call this function."""
-    simulated, geometry = laid_out(repr(order.sensor), order.sensor)
+    simulated, geometry = prepared_sensor(repr(order.sensor), order.sensor)
     shot = order.shot()
     capture = simulated_source(simulated, order.samples_per_pixel)(shot)
     return measured(capture, shot, geometry, order.sensor, order.keep_images)
@@ -80,15 +80,15 @@ def order_of(shot: Shot, campaign: Campaign) -> Order:
     )
 
 
-_places: dict[str, tuple[SimulatedSensor, Geometry]] = {}
+_prepared: dict[str, tuple[SimulatedSensor, Geometry]] = {}
 
 
-def laid_out(key: str, sensor: Sensor) -> tuple[SimulatedSensor, Geometry]:
+def prepared_sensor(key: str, sensor: Sensor) -> tuple[SimulatedSensor, Geometry]:
     """Return the sensor on this worker's device, prepared once."""
-    if key not in _places:
+    if key not in _prepared:
         from mitsim.scene import backend
 
         backend.activate(None)
-        _places.clear()
-        _places[key] = SimulatedSensor(sensor), sensor_geometry(sensor)
-    return _places[key]
+        _prepared.clear()
+        _prepared[key] = SimulatedSensor(sensor), sensor_geometry(sensor)
+    return _prepared[key]

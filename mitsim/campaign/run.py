@@ -26,7 +26,7 @@ from characterisation.maps.building import SampleTable, build_map
 from characterisation.maps.performance_map import PerformanceMap
 from mitsim.campaign.acquire import Source
 from mitsim.campaign.plan import Campaign, Series, Shot, sensor_checksum
-from mitsim.campaign.store import Finished, keep, kept, sweep
+from mitsim.campaign.store import Finished, read_shot, remove_partial, write_shot
 from mitsim.errors import InputError
 from mitsim.progress import say, track
 from mitsim.version import __version__
@@ -53,10 +53,10 @@ def run_campaign(campaign: Campaign, source: Source, folder: str | Path) -> Perf
     """
     file, captures = campaign.file, Path(folder) / KEPT
     captures.mkdir(parents=True, exist_ok=True)
-    sweep(captures)
+    remove_partial(captures)
     normals = file.normals()
     reached = campaign.reachable(normals)
-    _tell_reach(campaign, normals, reached, Path(folder))
+    _report_reach(campaign, normals, reached, Path(folder))
     wanted = {series: [normals[reached]] for series in campaign.series}
     done: dict[tuple[str, str], Finished] = {}
     fresh = dict(wanted)
@@ -78,7 +78,7 @@ def measure_captures(campaign: Campaign, shots: Sequence[Shot], source: Source, 
     """Measure existing captures, see :func:`~mitsim.campaign.acquire.found_shots`, and make their map."""
     captures = Path(folder) / KEPT
     captures.mkdir(parents=True, exist_ok=True)
-    sweep(captures)
+    remove_partial(captures)
     done: dict[tuple[str, str], Finished] = {}
     _take_missing(shots, done, source, captures, "measure")
     shown: dict[Series, list[Shot]] = {}
@@ -101,7 +101,7 @@ def _take_missing(
         if key in done or key in missing:
             continue
         try:
-            found = kept(captures, shot)
+            found = read_shot(captures, shot)
         except InputError as error:
             damaged.append(error)
             continue
@@ -116,7 +116,7 @@ def _take_missing(
             say(f"mitsim: and {len(damaged) - NAMED} more")
         raise damaged[0]
     for shot, finished in track(_with_time(source(list(missing.values())), len(missing)), label, len(missing)):
-        keep(captures, shot, finished)
+        write_shot(captures, shot, finished)
         done[shot.series.name, shot.name] = Finished(finished.patches, finished.source)
 
 
@@ -165,7 +165,7 @@ def _refined(
     return fresh, unresolved
 
 
-def _tell_reach(campaign: Campaign, normals: NDArray[np.float64], reached: NDArray[np.bool_], folder: Path) -> None:
+def _report_reach(campaign: Campaign, normals: NDArray[np.float64], reached: NDArray[np.bool_], folder: Path) -> None:
     """Report which orientations the stage cannot show, and list them in ``unreachable.csv``."""
     listed = folder / "unreachable.csv"
     listed.unlink(missing_ok=True)

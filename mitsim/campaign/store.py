@@ -75,7 +75,7 @@ def shot_folder(captures: Path, shot: Shot) -> Path:
     return captures / shot.series.name / shot.name
 
 
-def keep(captures: Path, shot: Shot, finished: Finished) -> None:
+def write_shot(captures: Path, shot: Shot, finished: Finished) -> None:
     """Write a shot completely or not at all.
 
     Raises
@@ -86,8 +86,8 @@ def keep(captures: Path, shot: Shot, finished: Finished) -> None:
     folder = shot_folder(captures, shot)
     files = {"patches.npy": _table_bytes(finished.patches)}
     if finished.capture is not None:
-        kept = packed(finished.capture, folder / "capture")
-        files |= {f"capture/{path}": data for path, data in kept.items()}
+        capture_files = packed(finished.capture, folder / "capture")
+        files |= {f"capture/{path}": data for path, data in capture_files.items()}
     document: dict[str, Any] = {
         "schema_version": 1,
         "sample": shot.series.sample.label(),
@@ -109,7 +109,7 @@ def keep(captures: Path, shot: Shot, finished: Finished) -> None:
         ) from None
 
 
-def kept(captures: Path, shot: Shot) -> Finished | None:
+def read_shot(captures: Path, shot: Shot) -> Finished | None:
     """Return a kept shot, None if it is missing; images are checked but not read.
 
     Raises
@@ -128,7 +128,7 @@ def kept(captures: Path, shot: Shot) -> Finished | None:
     return Finished(patches.assign_attrs(source=document.source), document.source)
 
 
-def sweep(captures: Path) -> None:
+def remove_partial(captures: Path) -> None:
     """Remove partial captures, and partial files next to their folder, of a killed run."""
     for partial in captures.glob("*/.*.partial-*"):
         shutil.rmtree(partial, ignore_errors=True)

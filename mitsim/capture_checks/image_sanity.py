@@ -78,21 +78,21 @@ def image_warnings(
     stack: Levels, code: LightCode, size: tuple[int, int], settings: DecoderSettings, full_scale: float, camera: str
 ) -> list[str]:
     """Return warnings about the images (P, H, W) of one camera; ``size`` (width, height) of the pattern [px]."""
-    every = roles(code, *size)
-    lines = _lines(stack[: len(every)])
-    out = _plain_images(lines[0], every, settings, full_scale, camera)
+    image_roles = roles(code, *size)
+    lines = _lines(stack[: len(image_roles)])
+    out = _plain_images(lines[0], image_roles, settings, full_scale, camera)
     if out:
         return out
     found = smoothness(lines, code, size, settings, full_scale)
     for axis in [axis for axis in axes(code) if axis in found]:
-        warning = _unresolved(lines[0], every, axis, settings, camera)
+        warning = _unresolved(lines[0], image_roles, axis, settings, camera)
         own, order = found[axis], ""
         if not warning and (own.doubtful or own.evenness < _ASKED):
             least = BELIEVED if own.doubtful else own.evenness - own.contradicted + _BETTER
             order = _fitting_order(lines, code, size, settings, full_scale, axis, least)
         if order:
             warning = f"{_doubt(own, axis, camera)}: they fit if {order}"
-        warning = warning or _changed_exposure(lines[0], every, axis, camera)
+        warning = warning or _changed_exposure(lines[0], image_roles, axis, camera)
         if not warning and own.doubtful:
             warning = f"{_doubt(own, axis, camera)}: check that the images are in the order of [pattern]"
         out += [warning] if warning else []
@@ -172,15 +172,15 @@ def _evenness(values: NDArray[np.float64]) -> float:
         own = change[np.abs(change) > _STILL]
         groups = own[: len(own) // _CHANGES * _CHANGES].reshape(-1, _CHANGES)
         shares.append(np.abs(groups.sum(axis=1)) / np.abs(groups).sum(axis=1))
-    every = np.concatenate(shares) if shares else np.empty(0)
-    return float(np.median(every)) if len(every) >= 10 else float("nan")
+    all_shares = np.concatenate(shares) if shares else np.empty(0)
+    return float(np.median(all_shares)) if len(all_shares) >= 10 else float("nan")
 
 
 def _plain_images(
-    stack: Levels, every: list[Role], settings: DecoderSettings, full_scale: float, camera: str
+    stack: Levels, image_roles: list[Role], settings: DecoderSettings, full_scale: float, camera: str
 ) -> list[str]:
     """Return warnings about white and black images that are exchanged or wrong."""
-    kinds = [role.kind for role in every]
+    kinds = [role.kind for role in image_roles]
     coded = stack[[kind in ("gray", "gray_inverse", "phase") for kind in kinds]].astype(np.float32)
     most, least = coded.max(axis=0), coded.min(axis=0)
     lit = most - least > 4 * settings.minimum_modulation_dn * full_scale / 255
@@ -214,16 +214,18 @@ def _plain_images(
     return out
 
 
-def _pairs(stack: Levels, every: list[Role], axis: Axis) -> list[tuple[int, Floats, Floats]]:
+def _pairs(stack: Levels, image_roles: list[Role], axis: Axis) -> list[tuple[int, Floats, Floats]]:
     """Return number, image and complement of every bit of an axis that has a complement, most significant first."""
-    where = {(role.kind, role.index): image for role, image in zip(every, stack, strict=True) if role.axis == axis}
+    where = {
+        (role.kind, role.index): image for role, image in zip(image_roles, stack, strict=True) if role.axis == axis
+    }
     bits = sorted(index for kind, index in where if kind == "gray_inverse")
     return [(bit, where["gray", bit].astype(np.float32), where["gray_inverse", bit].astype(np.float32)) for bit in bits]
 
 
-def _changed_exposure(stack: Levels, every: list[Role], axis: Axis, camera: str) -> str:
+def _changed_exposure(stack: Levels, image_roles: list[Role], axis: Axis, camera: str) -> str:
     """Return a warning about bits with different exposures, or ""."""
-    sums = [float(np.median(image + other)) for _, image, other in _pairs(stack, every, axis)]
+    sums = [float(np.median(image + other)) for _, image, other in _pairs(stack, image_roles, axis)]
     if len(sums) < 2 or max(sums) - min(sums) <= _STEADY * float(np.median(sums)):
         return ""
     return (
@@ -232,9 +234,9 @@ def _changed_exposure(stack: Levels, every: list[Role], axis: Axis, camera: str)
     )
 
 
-def _unresolved(stack: Levels, every: list[Role], axis: Axis, settings: DecoderSettings, camera: str) -> str:
+def _unresolved(stack: Levels, image_roles: list[Role], axis: Axis, settings: DecoderSettings, camera: str) -> str:
     """Return a warning about fine bits whose stripes the camera does not resolve, or ""."""
-    pairs = _pairs(stack, every, axis)
+    pairs = _pairs(stack, image_roles, axis)
     if len(pairs) < 2:
         return ""
     contrast = np.max([np.abs(image - other) for _, image, other in pairs], axis=0)
@@ -243,7 +245,7 @@ def _unresolved(stack: Levels, every: list[Role], axis: Axis, settings: DecoderS
     count = next((n for n, share in enumerate(lost[::-1]) if share < CONTRADICTED), len(lost))
     if count == 0:
         return ""
-    period = {role.index: role.period for role in every if role.axis == axis and role.kind == "gray"}
+    period = {role.index: role.period for role in image_roles if role.axis == axis and role.kind == "gray"}
     which = "the finest bit" if count == 1 else f"the {count} finest bits"
     return (
         f"{camera} does not resolve {which} of the {axis}, stripes up to {period[pairs[-count][0]]:g} px: leave "
@@ -251,10 +253,10 @@ def _unresolved(stack: Levels, every: list[Role], axis: Axis, settings: DecoderS
     )
 
 
-def _other_orders(every: list[Role], axis: Axis) -> Iterator[tuple[str, list[int]]]:
+def _other_orders(image_roles: list[Role], axis: Axis) -> Iterator[tuple[str, list[int]]]:
     """Yield common alternative orders of the images with their descriptions; an order lists the image at each place."""
-    plain = list(range(len(every)))
-    place = {(role.kind, role.index): index for index, role in enumerate(every) if role.axis == axis}
+    plain = list(range(len(image_roles)))
+    place = {(role.kind, role.index): index for index, role in enumerate(image_roles) if role.axis == axis}
     bits = [index for kind, index in place if kind == "gray"]
     inverse = ("gray_inverse", 0) in place
 
@@ -291,7 +293,7 @@ def _other_orders(every: list[Role], axis: Axis) -> Iterator[tuple[str, list[int
         yield 'the complements are in another order: change inverse between "each" and "all"', back
     phases = [
         (index, at)
-        for at, role in enumerate(every)
+        for at, role in enumerate(image_roles)
         if role.kind == "phase" and role.axis == axis
         for index in [role.index]
     ]

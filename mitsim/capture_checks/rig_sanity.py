@@ -16,7 +16,7 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
-from mitsim.capture_checks.row_texture import lit_alike, textured_row_error
+from mitsim.capture_checks.row_texture import textured_row_error, uniform_light_mean
 from mitsim.decode.matching.row_error import row_error
 from mitsim.decode.matching.stereo import StereoGeometry, stereo_geometry
 from mitsim.decode.structured_light.decoder import decode_coordinates
@@ -104,8 +104,8 @@ def camera_warnings(
         return [f"{100 * behind:.0f} % of the decoded pixels meet their light behind the camera: {doubt}"]
     if len(found) == 2:
         allowed = max(LARGEST_MISS_PX, settings.epipolar_px) + max(_half_stripe(each) for each in found.values())
-        off = float(np.nanmedian(np.abs(miss))) if np.isfinite(miss).any() else np.inf
-        if off > allowed:
+        error = float(np.nanmedian(np.abs(miss))) if np.isfinite(miss).any() else np.inf
+        if error > allowed:
             names: tuple[Axis, Axis] = ("columns", "rows")
             turned = {one: found[other].value[known] for one, other in (names, names[::-1])}
             other = float(np.nanmedian(np.abs(_meeting(eye, projector, rays[known], turned)[1])))
@@ -113,7 +113,7 @@ def camera_warnings(
                 doubt = "they fit if columns and rows are exchanged in [pattern]"
             else:
                 doubt = _other_place(eye, projector, rays[known], coordinates) or doubt
-            out.append(f"view rays miss the light that they decode by {off:.1f} projector px in the median: {doubt}")
+            out.append(f"view rays miss the light that they decode by {error:.1f} projector px in the median: {doubt}")
     return out
 
 
@@ -203,15 +203,19 @@ def pair_warnings(
             doubt = f"the images of {names} fit the calibration if they are exchanged"
             return [f"{doubt}: check whether left and right are exchanged"], float("nan"), ""
         return [f"{seen}: check that the calibration belongs to these images"], float("nan"), ""
-    off, source = seen.off, "by the code of the rows"
+    offset, source = seen.row_error, "by the code of the rows"
     if "rows" not in found[0]:
-        every = roles(code, *size)
+        image_roles = roles(code, *size)
         source = "by the texture of the surface"
-        one, other = (lit_alike(stack, every, full_scale) for stack in (left, right))
-        off = textured_row_error((one, other), (found[0]["columns"].value, found[1]["columns"].value), geometry)
-    if not np.isfinite(off):
-        return [], off, ""
-    return ([row_error_warning(off)] if abs(off) > LARGEST_ROW_ERROR else []), off, source
+        one, other = (uniform_light_mean(stack, image_roles, full_scale) for stack in (left, right))
+        offset = textured_row_error((one, other), (found[0]["columns"].value, found[1]["columns"].value), geometry)
+    if not np.isfinite(offset):
+        return [], offset, ""
+    return (
+        ([row_error_warning(offset)] if abs(offset) > LARGEST_ROW_ERROR else []),
+        offset,
+        source,
+    )
 
 
 @dataclass(frozen=True)
@@ -219,14 +223,14 @@ class _Matches:
     """Correspondences of two cameras in the same rectified rows.
 
     Shares [1]: ``decoded`` of the first camera's pixels, ``matched`` of these, ``behind`` the cameras of the matched.
-    ``off``: median row error [px] of the right image; ``spread`` [px]: its variation over the image; NaN without a
-    code of the rows.
+    ``row_error`` [px]: median row error of the right image; ``spread`` [px]: its variation over the image. Both are NaN
+    without a code of the rows.
     """
 
     decoded: float
     matched: float
     behind: float
-    off: float
+    row_error: float
     spread: float
 
     @classmethod
@@ -246,13 +250,15 @@ class _Matches:
         behind = float(np.mean(disparity <= 0)) if matched.any() else 0.0
         if "rows" not in found[0] or not matched.any():
             return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
-        off, slope = _row_by_code(found, geometry, lines, place)
+        offset, slope = _row_by_code(found, geometry, lines, place)
         # the effect of a stripe, less than a step in depth
         edge = 1.5 * (2 * _half_stripe(found[0]["rows"]) / abs(slope) + 1)
         # stripe quantisation averages out over a part of the image
         row, column = np.nonzero(matched)
         part = row * _PARTS // len(lines) * _PARTS + column * _PARTS // place.shape[1]
-        means = [float(np.mean(own)) for n in np.unique(part) if (own := _core(off[part == n], edge)).size >= _ENOUGH]
+        means = [
+            float(np.mean(own)) for n in np.unique(part) if (own := _core(offset[part == n], edge)).size >= _ENOUGH
+        ]
         if len(means) < 4:
             return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
         middle = float(np.median(means))
@@ -261,7 +267,7 @@ class _Matches:
     @property
     def doubtful(self) -> bool:
         """Return whether the matches contradict this calibration."""
-        return self.matched < _LEAST_MATCHED or self.behind > 0.5 or self.spread > _LARGEST_SPREAD + abs(self.off)
+        return self.matched < _LEAST_MATCHED or self.behind > 0.5 or self.spread > _LARGEST_SPREAD + abs(self.row_error)
 
     def __str__(self) -> str:
         if self.behind > 0.5:
@@ -282,8 +288,8 @@ def _core(values: Floats, least: float) -> Floats:
     known = values[np.isfinite(values)]
     if not known.size:
         return known
-    off = np.abs(known - np.median(known))
-    return np.asarray(known[off <= max(4 * float(np.median(off)), least)])
+    deviation = np.abs(known - np.median(known))
+    return np.asarray(known[deviation <= max(4 * float(np.median(deviation)), least)])
 
 
 def _row_by_code(
@@ -332,9 +338,9 @@ def measured_row_error(images: tuple[Levels, Levels], geometry: StereoGeometry, 
     return float(np.median(known)) if len(known) >= _LEAST else float("nan")
 
 
-def row_error_warning(off: float) -> str:
+def row_error_warning(offset: float) -> str:
     """Return the warning about a row error [px]."""
     return (
-        f"the rows of the two cameras are {off:+.2f} px apart after rectification, over {LARGEST_ROW_ERROR:g} px: the "
-        "calibration belongs to another rig, or the rig has moved since"
+        f"the rows of the two cameras are {offset:+.2f} px apart after rectification, over {LARGEST_ROW_ERROR:g} px: "
+        "the calibration belongs to another rig, or the rig has moved since"
     )

@@ -34,13 +34,15 @@ _ROWS, _PATCH, _MATCHED = 6, 40, 0.3
 _OF_A_PATCH, _LEAST, _OF_ALL, _UNEVEN = 0.25, 8, 0.06, 0.05
 
 
-def lit_alike(stack: Levels, every: Sequence[Role], full_scale: float) -> Floats:
+def uniform_light_mean(stack: Levels, image_roles: Sequence[Role], full_scale: float) -> Floats:
     """Return the mean (H, W) [DN] of a code's images that light every place equally; NaN if saturated.
 
     These are white, every bit with its complement, and the steps of every fringe. NaN everywhere without any.
     """
-    where = {(role.kind, role.axis, role.index): number for number, role in enumerate(every) if role.kind != "phase"}
-    chosen = [number for number, role in enumerate(every) if role.kind in ("white", "phase")]
+    where = {
+        (role.kind, role.axis, role.index): number for number, role in enumerate(image_roles) if role.kind != "phase"
+    }
+    chosen = [number for number, role in enumerate(image_roles) if role.kind in ("white", "phase")]
     for kind, axis, index in where:
         if kind == "gray" and ("gray_inverse", axis, index) in where:
             chosen += [where[kind, axis, index], where["gray_inverse", axis, index]]

@@ -104,6 +104,6 @@ def row_error_in_words(capture: Capture, settings: Settings, found: Findings, ma
     )
 
 
-def cloud_warnings(off: float) -> list[str]:
-    """Return warnings about a decoded pair with the row error ``off`` [px]."""
-    return [row_error_warning(off)] if np.isfinite(off) and abs(off) > LARGEST_ROW_ERROR else []
+def cloud_warnings(offset: float) -> list[str]:
+    """Return warnings about a decoded pair with a row error ``offset`` [px]."""
+    return [row_error_warning(offset)] if np.isfinite(offset) and abs(offset) > LARGEST_ROW_ERROR else []

@@ -38,7 +38,7 @@ class Excluded:
 
     name: str
     given: str
-    why: str
+    reason: str
 
 
 def read_candidates(
@@ -63,7 +63,7 @@ def read_candidates(
     file = read_toml(path, StudyFile)
     candidates, excluded = list[CandidateSensor](), list[Excluded]()
     for given in _each(sensors):
-        opened = _open(path, file, given, ask)
+        opened = _open_candidate(path, file, given, ask)
         if isinstance(opened, Excluded):
             excluded.append(opened)
             continue
@@ -72,7 +72,7 @@ def read_candidates(
         candidates.append(opened)
     if not candidates:
         raise InputError(
-            "--sensors", "", "; ".join(one.why for one in excluded), "at least one sensor that can measure the study"
+            "--sensors", "", "; ".join(one.reason for one in excluded), "at least one sensor that can measure the study"
         )
     return candidates, excluded
 
@@ -88,7 +88,7 @@ def _each(sensors: Sequence[str]) -> list[str]:
     return out
 
 
-def _open(path: Path, file: StudyFile, given: str, ask: Ask | None) -> CandidateSensor | Excluded:
+def _open_candidate(path: Path, file: StudyFile, given: str, ask: Ask | None) -> CandidateSensor | Excluded:
     sensor, _, map_name = given.partition("=")
     own = sensor.endswith(".toml")
     if not own and sensor not in presets():
@@ -104,16 +104,16 @@ def _open(path: Path, file: StudyFile, given: str, ask: Ask | None) -> Candidate
             }
         )
     )
-    study, first = _try(path, table, map_name, ask)
+    study, first = _open_or_error(path, table, map_name, ask)
     if study is None and _has_distance(file) and not same:
         free = file.views.model_copy(update={"standoff_mm": None, "standoffs_mm": None})
-        study, _ = _try(path, table.model_copy(update={"views": free}), map_name, ask)
+        study, _ = _open_or_error(path, table.model_copy(update={"views": free}), map_name, ask)
     if study is None:
         assert first is not None
         return Excluded(Path(sensor).stem, given, str(first))
     if study.performance_map is None:
-        why = "its study has a campaign instead of a map: run it, and give its map as SENSOR=MAP"
-        return Excluded(study.sensor.name, given, why)
+        reason = "its study has a campaign instead of a map: run it, and give its map as SENSOR=MAP"
+        return Excluded(study.sensor.name, given, reason)
     return CandidateSensor(study.sensor.name, given, replace(study, path=path))
 
 
@@ -121,7 +121,9 @@ def _has_distance(file: StudyFile) -> bool:
     return file.views.standoff_mm is not None or file.views.standoffs_mm is not None
 
 
-def _try(path: Path, file: StudyFile, map_name: str, ask: Ask | None) -> tuple[Study | None, InputError | None]:
+def _open_or_error(
+    path: Path, file: StudyFile, map_name: str, ask: Ask | None
+) -> tuple[Study | None, InputError | None]:
     try:
         return open_study(path, file, map_name or None, ask), None
     except InputError as error:

@@ -7,7 +7,7 @@ where the common view does not suffice -> more trials for the leader -> ``choice
 
 Screening includes noise and calibration, but not finish, interreflections at edges and false points. It is therefore
 more often too small than too large, and a sensor is excluded if even the screened demand of its best view exceeds
-:data:`FAR`.
+:data:`LARGEST_DEMAND`.
 
 Finished work is on the disk, so an interrupted command continues. The sensors are measured one after the other, and the
 memory of each is released before the next.
@@ -43,7 +43,7 @@ from mitsim.study import StatementTable
 from mitsim.view_scores import screening_risk
 from mitsim.virtual.mapped import MappedMeasurements
 from mitsim.virtual.plan import map_digest, measurements_of, trial_digest
-from mitsim.virtual.race import ALL, Maker, Raced, RaceRules, run_race
+from mitsim.virtual.race import ALL, Raced, RaceRules, TrialRunner, run_race
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.screening import screen
 from mitsim.virtual.spread_out import spread_over
@@ -55,7 +55,7 @@ from mitsim.virtual.world import Unknowns
 Floats = NDArray[np.float64]
 
 #: demand by screening, relative to the limit of the decision rule, above which a sensor is not measured
-FAR = 3.0
+LARGEST_DEMAND = 3.0
 
 #: number of views raced for each measurement, trials of each view, and trials at the start of a statement
 SHORTLIST, RACE_TRIALS, FIRST_TRIALS = 3, 8, 24
@@ -74,13 +74,13 @@ _NORMAL = norm.ppf((np.arange(400) + 0.5) / 400)
 
 
 @dataclass
-class Found:
+class SensorResult:
     """Results of a sensor so far.
 
     ``screened`` (measurement,) is the demand of the best view by screening, ``screened_u`` its uncertainty,
-    ``screened_view`` its number. ``far`` excludes the sensor from measurement. ``stated`` holds statements by view
-    number; the view that is best for all measurements comes first. ``planned`` holds the exposures of these views, if
-    the study asks for them.
+    ``screened_view`` its number. ``unpromising`` excludes the sensor from measurement. ``stated`` holds statements
+    by view number; the view that is best for all measurements comes first. ``planned`` holds the exposures of these
+    views, if the study asks for them.
     """
 
     candidate: CandidateSensor
@@ -88,7 +88,7 @@ class Found:
     screened: Floats
     screened_u: Floats
     screened_view: NDArray[np.int64]
-    far: bool = False
+    unpromising: bool = False
     stated: dict[int, list[Statement]] = field(default_factory=dict)
     raced: Raced | None = None
     planned: dict[int, PlannedExposure] = field(default_factory=dict)
@@ -119,20 +119,20 @@ def choose_sensor(
     candidates: list[CandidateSensor],
     folder: Path,
     minutes: float,
-    tell: Callable[[list[Found], bool], None],
+    report_results: Callable[[list[SensorResult], bool], None],
     workers: Executor | None = None,
-) -> list[Found]:
+) -> list[SensorResult]:
     """Screen, race and state sensors; return them, best first.
 
-    After each sensor, ``tell`` receives the results so far and whether they are final.
+    After each sensor, ``report_results`` receives the results so far and whether they are final.
     """
     end = time.monotonic() + 60 * minutes
-    found = list[Found]()
+    found = list[SensorResult]()
     for number, candidate in enumerate(candidates, 1):
         found.append(_screened(candidate, folder / candidate.name))
         _say(found, f"{number} of {len(candidates)} screened", end)
     promising = _promising(found)
-    tell(_ordered(found), False)
+    report_results(_ordered(found), False)
     for place, one in enumerate(promising):
         left = end - time.monotonic()
         if left <= 0 and place:
@@ -140,47 +140,48 @@ def choose_sensor(
             break
         _measure_sensor(one, folder / one.candidate.name, max(left, 1.0) / (len(promising) - place), workers)
         _say(found, f"{place + 1} of {len(promising)} sensors measured", end)
-        tell(_ordered(found), False)
+        report_results(_ordered(found), False)
     leader = _ordered(found)[0]
     if leader.stated and time.monotonic() < end:
         _refine_leader(leader, folder / leader.candidate.name, end, workers)
-    tell(_ordered(found), True)
+    report_results(_ordered(found), True)
     return _ordered(found)
 
 
-def _promising(found: list[Found]) -> list[Found]:
+def _promising(found: list[SensorResult]) -> list[SensorResult]:
     """Return the sensors worth a virtual measurement, best first: at least one if any sensor can measure at all."""
     tolerances = any(one.tolerance is not None for one in found[0].candidate.study.task.measurements.values())
     order = sorted(found, key=lambda one: one.ratio if tolerances else _mean_demand(one))
     least = 1.0 if tolerances else _mean_demand(order[0])
     for place, one in enumerate(order):
         worst = one.ratio if tolerances else _mean_demand(one)
-        one.far = not math.isfinite(worst) or (place > 0 and worst > FAR * least)
-    return [one for one in order if not one.far]
+        one.unpromising = not math.isfinite(worst) or (place > 0 and worst > LARGEST_DEMAND * least)
+    return [one for one in order if not one.unpromising]
 
 
-def _mean_demand(one: Found) -> float:
+def _mean_demand(one: SensorResult) -> float:
     """Return the geometric mean of the screened demands; without tolerances there is no other common scale."""
     return float(np.exp(np.mean(np.log(one.screened)))) if np.isfinite(one.screened).all() else math.inf
 
 
-def _ordered(found: list[Found]) -> list[Found]:
+def _ordered(found: list[SensorResult]) -> list[SensorResult]:
     return sorted(found, key=sort_key)
 
 
-def sort_key(one: Found) -> tuple[bool, float]:
+def sort_key(one: SensorResult) -> tuple[bool, float]:
     """Return the key that sorts measured sensors before screened ones, each by its worst measurement.
 
     Without tolerances the key is the mean logarithm of the demands.
     """
-    tolerances = any(asked.tolerance is not None for asked in one.candidate.study.task.measurements.values())
+    measurements = one.candidate.study.task.measurements.values()
+    tolerances = any(measurement.tolerance is not None for measurement in measurements)
     if tolerances:
         return not one.stated, one.ratio
     rows = [math.inf if row is None else row[1] for row in one.best()] if one.stated else one.screened.tolist()
     return not one.stated, float(np.mean(np.log(rows)))
 
 
-def _screened(candidate: CandidateSensor, folder: Path) -> Found:
+def _screened(candidate: CandidateSensor, folder: Path) -> SensorResult:
     """Return the scores of all views, from the folder if they are there."""
     study, path = candidate.study, folder / "scores.nc"
     folder.mkdir(parents=True, exist_ok=True)
@@ -202,11 +203,11 @@ def _screened(candidate: CandidateSensor, folder: Path) -> Found:
     able = scores["uncertainty_possible"].transpose("measurement", "view").values.astype(bool) & (u > 0)
     best = np.where(able, screening_risk(scores), np.inf).argmin(axis=1)
     least = np.take_along_axis(np.where(able, u, np.inf), best[:, None], axis=1)[:, 0]
-    asked = [
+    demands = [
         _screened_demand(study.task, name, float(size))
         for name, size in zip(study.task.measurements, least, strict=True)
     ]
-    return Found(candidate, scores, np.array(asked), least, scores["view"].values[best].astype(np.int64))
+    return SensorResult(candidate, scores, np.array(demands), least, scores["view"].values[best].astype(np.int64))
 
 
 _OF_A_VIEW = ("measurement", "view")
@@ -250,8 +251,8 @@ class _Workspace:
 
     candidate: CandidateSensor
     unknowns: Unknowns
-    here: RenderedMeasurements | MappedMeasurements
-    maker: Maker
+    virtual_measurements: RenderedMeasurements | MappedMeasurements
+    runner: TrialRunner
     trials: TrialFolder
     digest: str
     folder: Path
@@ -260,50 +261,50 @@ class _Workspace:
     def state(self, view: int, count: int) -> list[Statement]:
         study = self.candidate.study
         chosen = next(one for one in study.views if one.number == view)
-        exposed = exposed_for(study, chosen, self.here, self.maker, self.digest, self.folder)
+        exposed = exposed_for(study, chosen, self.virtual_measurements, self.runner, self.digest, self.folder)
         if exposed.planned is not None:
             self.planned[view] = exposed.planned
         trials = exposed.trials(study, self.folder, self.trials)
-        return state_view(study, chosen, exposed.maker, trials, self.unknowns, StatementTable(trials=count, pairs=0))
+        return state_view(study, chosen, exposed.runner, trials, self.unknowns, StatementTable(trials=count, pairs=0))
 
 
 def _prepared(candidate: CandidateSensor, folder: Path, workers: Executor | None) -> _Workspace:
     study, unknowns = candidate.study, study_unknowns(candidate.study)
-    here = measurements_of(study, unknowns)
-    maker = spread_over(workers, study, unknowns, here)
-    digest = trial_digest(study, unknowns, maker.source)
+    virtual_measurements = measurements_of(study, unknowns)
+    runner = spread_over(workers, study, unknowns, virtual_measurements)
+    digest = trial_digest(study, unknowns, runner.source)
     trials = TrialFolder(folder / "trials", digest, list(study.task.measurements))
-    return _Workspace(candidate, unknowns, here, maker, trials, digest, folder)
+    return _Workspace(candidate, unknowns, virtual_measurements, runner, trials, digest, folder)
 
 
-def _measure_sensor(one: Found, folder: Path, seconds: float, workers: Executor | None) -> None:
+def _measure_sensor(one: SensorResult, folder: Path, seconds: float, workers: Executor | None) -> None:
     """Race and state one sensor in approximately ``seconds``."""
     began = time.monotonic()
-    study, worked = one.candidate.study, _prepared(one.candidate, folder, workers)
+    study, workspace = one.candidate.study, _prepared(one.candidate, folder, workers)
     table = study.file.race
     rules = RaceRules(
         min(SHORTLIST, table.shortlist), min(RACE_TRIALS, table.trials), table.margin, 0.9, _RACE_SHARE * seconds
     )
-    one.raced = run_race(study.views, one.scores, worked.maker, worked.trials, rules)
+    one.raced = run_race(study.views, one.scores, workspace.runner, workspace.trials, rules)
     if not len(one.raced.views):
         return
     view, most = one.raced.leader(ALL), study.file.statement.trials
     count = min(FIRST_TRIALS, most)
     while True:
-        one.stated[view] = worked.state(view, count)
+        one.stated[view] = workspace.state(view, count)
         for number in _own_views(one, list(study.task.measurements), view):
             if time.monotonic() - began > seconds:
                 break
-            one.stated[number] = worked.state(number, count)
-        if time.monotonic() - began > seconds or count >= most or not _open(one):
+            one.stated[number] = workspace.state(number, count)
+        if time.monotonic() - began > seconds or count >= most or not _is_undecided(one):
             break
         count = min(2 * count, most)
-    _write(one, worked, folder, view)
-    del worked
+    _write(one, workspace, folder, view)
+    del workspace
     gc.collect()
 
 
-def _say(found: list[Found], done: str, end: float) -> None:
+def _say(found: list[SensorResult], done: str, end: float) -> None:
     """Print the progress and the leading sensor."""
     first = _ordered(found)[0]
     names = list(first.candidate.study.task.measurements)
@@ -311,21 +312,20 @@ def _say(found: list[Found], done: str, end: float) -> None:
     rows: list[float] = stated if first.stated else first.screened.tolist()
     worst = int(np.argmax(rows))
     by = "measured" if first.stated else "by the screening"
-    asked = first.candidate.study.task.measurements[names[worst]]
+    measurement = first.candidate.study.task.measurements[names[worst]]
     size = f"{rows[worst]:.2g}"
-    demand_in_words = (
-        f"{size} times the limit ({names[worst]})" if asked.tolerance else f"{size} {asked.unit} ({names[worst]})"
-    )
+    unit = "times the limit" if measurement.tolerance else measurement.unit
+    demand_in_words = f"{size} {unit} ({names[worst]})"
     left = max(0.0, end - time.monotonic())
     say(f"choose: {done}; {first.candidate.name} leads {by}, at worst {demand_in_words}; {left:.0f} s left")
 
 
-def _open(one: Found) -> bool:
+def _is_undecided(one: SensorResult) -> bool:
     """Return whether more trials could change a verdict."""
     return any(row is not None and row[2].verdict == "not decided" for row in one.best())
 
 
-def _own_views(one: Found, names: list[str], view: int) -> list[int]:
+def _own_views(one: SensorResult, names: list[str], view: int) -> list[int]:
     """Return best views of measurements that do not fit from the common view and have a lower risk elsewhere."""
     assert one.raced is not None
     out = list[int]()
@@ -338,9 +338,9 @@ def _own_views(one: Found, names: list[str], view: int) -> list[int]:
     return list(dict.fromkeys(out))
 
 
-def _refine_leader(leader: Found, folder: Path, end: float, workers: Executor | None) -> None:
+def _refine_leader(leader: SensorResult, folder: Path, end: float, workers: Executor | None) -> None:
     """Add trials of the leader up to the number in the study, as long as there is time."""
-    worked = _prepared(leader.candidate, folder, workers)
+    workspace = _prepared(leader.candidate, folder, workers)
     most = leader.candidate.study.file.statement.trials
     used = {row[0] for row in leader.best() if row is not None}
     while time.monotonic() < end:
@@ -348,15 +348,15 @@ def _refine_leader(leader: Found, folder: Path, end: float, workers: Executor | 
         if not behind:
             break
         view = min(behind, key=lambda number: leader.stated[number][0].trials)
-        leader.stated[view] = worked.state(view, min(leader.stated[view][0].trials + 40, most))
-    _write(leader, worked, folder, next(iter(leader.stated)))
+        leader.stated[view] = workspace.state(view, min(leader.stated[view][0].trials + 40, most))
+    _write(leader, workspace, folder, next(iter(leader.stated)))
 
 
-def _write(one: Found, worked: _Workspace, folder: Path, view: int) -> None:
+def _write(one: SensorResult, workspace: _Workspace, folder: Path, view: int) -> None:
     study = one.candidate.study
-    one.planned.update(worked.planned)
+    one.planned.update(workspace.planned)
     chosen = next(known for known in study.views if known.number == view)
     document: dict[str, Any] = statement_document(
-        study, chosen, one.stated[view], worked.unknowns, worked.maker.source, one.planned.get(view)
+        study, chosen, one.stated[view], workspace.unknowns, workspace.runner.source, one.planned.get(view)
     )
     write_statement(folder / "statement.json", document)

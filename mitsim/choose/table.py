@@ -16,12 +16,12 @@ from characterisation.statements.decision import WORDS, decide, tolerance_of
 from characterisation.statements.statement import Statement
 from characterisation.statements.verdict_words import Judged, result_in_words
 from mitsim.choose.candidates import Excluded
-from mitsim.choose.selection import FAR, Found, screened_errors
+from mitsim.choose.selection import LARGEST_DEMAND, SensorResult, screened_errors
 from mitsim.report.choice_document import (
-    AskedEntry,
     CaptureEntry,
     CellEntry,
     ChoiceDocument,
+    ComparedMeasurement,
     PoseEntry,
     SensorEntry,
     judged,
@@ -36,12 +36,12 @@ from mitsim.virtual.plan import map_digest
 
 
 def document(
-    study: Study, found: Sequence[Found], excluded: Sequence[Excluded], seconds: float, finished: bool
+    study: Study, found: Sequence[SensorResult], excluded: Sequence[Excluded], seconds: float, finished: bool
 ) -> ChoiceDocument:
     """Return all results, best sensor first; ``study`` is the study of any of the sensors."""
     task = study.task
-    asked = {
-        name: AskedEntry(
+    named_measurements = {
+        name: ComparedMeasurement(
             unit=one.unit,
             nominal=one.nominal,
             tolerance=one.tolerance,
@@ -51,9 +51,9 @@ def document(
         for name, one in task.measurements.items()
     }
     sensors = [_sensor(one) for one in found]
-    if all(one.tolerance is None for one in asked.values()):
+    if all(one.tolerance is None for one in named_measurements.values()):
         sensors = _relative(sensors)
-    sensors = [one.model_copy(update={"words": words(one, asked)}) for one in sensors]
+    sensors = [one.model_copy(update={"words": words(one, named_measurements)}) for one in sensors]
     sensors += [_excluded(one) for one in excluded]
     return ChoiceDocument(
         schema_version=1,
@@ -64,7 +64,7 @@ def document(
         words=sentence(sensors),
         finished=finished,
         seconds=round(seconds, 1),
-        measurements=asked,
+        measurements=named_measurements,
         sensors=sensors,
     )
 
@@ -82,9 +82,9 @@ def sentence(sensors: Sequence[SensorEntry]) -> str:
     return f"{best.name}: {best.words}" + (more if toleranced and all_fit else "")
 
 
-def words(one: SensorEntry, asked: dict[str, AskedEntry]) -> str:
+def words(one: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) -> str:
     """Return the result of a sensor in one line."""
-    verdicts = [replace(each, unit=asked[each.name].unit) for each in judged(one)]
+    verdicts = [replace(each, unit=named_measurements[each.name].unit) for each in judged(one)]
     if all(each.verdict == "no tolerance" for each in verdicts):
         if one.ratio is None:
             return "not every measurement can be made"
@@ -105,11 +105,11 @@ def as_text(choice: ChoiceDocument) -> str:
     for one in choice.sensors:
         if one.status == "excluded":
             continue
-        asked = sum(choice.measurements[name].tolerance is not None for name in names)
+        toleranced = sum(choice.measurements[name].tolerance is not None for name in names)
         rows.append(
             (
                 one.name + ("" if one.status == "stated" else " *"),
-                f"{one.fits} of {asked}" if asked else "-",
+                f"{one.fits} of {toleranced}" if toleranced else "-",
                 "-" if one.ratio is None else f"{one.ratio:.2g}",
                 "-" if one.capture is None else f"{1e3 * one.capture.seconds:.0f} ms",
                 *(_cell(one.measurements[name], choice.measurements[name]) for name in names),
@@ -121,7 +121,7 @@ def as_text(choice: ChoiceDocument) -> str:
         "cells: standard uncertainty, view, verdict; worst: demand of the decision rule, at most 1 if everything fits"
     )
     if any(one.status == "screened" for one in choice.sensors):
-        lines.append(f"* by screening alone: its demand there is above {FAR:g}, or time was over")
+        lines.append(f"* by screening alone: its demand there is above {LARGEST_DEMAND:g}, or time was over")
     lines += [f"{one.name} is excluded: {one.why}" for one in choice.sensors if one.status == "excluded"]
     return "\n".join(lines)
 
@@ -129,19 +129,19 @@ def as_text(choice: ChoiceDocument) -> str:
 _SIGNS = {"fits": "fits", "does not fit": "no", "undecidable": "undecidable", "not decided": "?", "no tolerance": ""}
 
 
-def _cell(cell: CellEntry, asked: AskedEntry) -> str:
+def _cell(cell: CellEntry, measurement: ComparedMeasurement) -> str:
     if cell.uncertainty is None:
         return "none"
-    return f"{cell.uncertainty:.2g} {asked.unit} ({cell.view}) {_SIGNS[cell.verdict]}".rstrip()
+    return f"{cell.uncertainty:.2g} {measurement.unit} ({cell.view}) {_SIGNS[cell.verdict]}".rstrip()
 
 
 def _excluded(one: Excluded) -> SensorEntry:
     return SensorEntry(
-        name=one.name, given=one.given, status="excluded", why=one.why, ratio=None, fits=0, words=one.why
+        name=one.name, given=one.given, status="excluded", why=one.reason, ratio=None, fits=0, words=one.reason
     )
 
 
-def _sensor(one: Found) -> SensorEntry:
+def _sensor(one: SensorResult) -> SensorEntry:
     study = one.candidate.study
     names = list(study.task.measurements)
     rows = one.best() if one.stated else [None] * len(names)
@@ -153,7 +153,7 @@ def _sensor(one: Found) -> SensorEntry:
         name=one.candidate.name,
         given=one.candidate.given,
         status="stated" if one.stated else "screened",
-        why="" if one.stated else "out by far" if one.far else "time was over",
+        why="" if one.stated else "out by far" if one.unpromising else "time was over",
         ratio=ratio if math.isfinite(ratio) else None,
         words="",
         fits=sum(cell.verdict == "fits" and cell.by == "statement" for cell in cells.values()),
@@ -208,14 +208,14 @@ _NOTHING = CellEntry(
 )
 
 
-def _screened(found: Found, m: int, name: str) -> CellEntry:
-    """Return a cell from screening; its verdict is decided only if the demand exceeds :data:`FAR`."""
+def _screened(found: SensorResult, m: int, name: str) -> CellEntry:
+    """Return a cell from screening; its verdict is decided only if the demand exceeds :data:`LARGEST_DEMAND`."""
     u, tolerance = float(found.screened_u[m]), tolerance_of(found.candidate.study.task, name)
     if not math.isfinite(u):
         return _NOTHING.model_copy(update={"verdict": "no tolerance"}) if tolerance is None else _NOTHING
     decided = None if tolerance is None else decide(screened_errors(u), tolerance)
     demand = float(found.screened[m])
-    clear = decided is not None and demand > FAR
+    clear = decided is not None and demand > LARGEST_DEMAND
     return CellEntry(
         by="screening",
         view=int(found.screened_view[m]),

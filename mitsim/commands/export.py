@@ -168,18 +168,20 @@ def targets(
     Example: mitsim export targets runs/two_pillars --robot kuka -o views.dat
     """
     from characterisation.atomic_io import atomic_write
-    from mitsim.export.robot_targets import MAKERS, read_targets
+    from mitsim.export.robot_targets import ROBOT_FORMATS, read_targets
     from mitsim.progress import say
 
-    if robot not in MAKERS:
-        raise InputError("--robot", "", repr(robot), ", ".join(MAKERS))
-    maker = MAKERS[robot]
-    if output.suffix.lower() != maker.suffix:
-        raise InputError("--output", "", output.name, f"a name that ends in {maker.suffix}: {maker.what}")
+    if robot not in ROBOT_FORMATS:
+        raise InputError("--robot", "", repr(robot), ", ".join(ROBOT_FORMATS))
+    target_format = ROBOT_FORMATS[robot]
+    if output.suffix.lower() != target_format.suffix:
+        raise InputError(
+            "--output", "", output.name, f"a name that ends in {target_format.suffix}: {target_format.what}"
+        )
     found, tool = read_targets(folder, views)
     check_file(output)
     with atomic_write(output) as file:
-        file.write_text(maker.write(found, tool), encoding="utf-8")
+        file.write_text(target_format.write(found, tool), encoding="utf-8")
     hint = "" if tool == "flange" else "; make the tool frame the sensor frame, or give [views.flange_from_sensor]"
     say(f"targets: {output}: {len(found)} poses of the {tool} in the part frame{hint}")
 

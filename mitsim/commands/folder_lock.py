@@ -56,7 +56,7 @@ def lock_folder(folder: Path) -> Callable[[], None]:
     }
     os.ftruncate(handle, 0)
     os.pwrite(handle, json.dumps(about).encode(), 0)
-    sweep(folder)
+    remove_partial(folder)
 
     def release() -> None:
         with contextlib.suppress(OSError):
@@ -66,12 +66,12 @@ def lock_folder(folder: Path) -> Callable[[], None]:
     return release
 
 
-def sweep(folder: Path) -> list[Path]:
+def remove_partial(folder: Path) -> list[Path]:
     """Remove partial files of dead processes; return the paths removed or restored."""
     return [path for name in _WITHIN for path in _swept(folder / name)]
 
 
-def sweep_beside(path: Path) -> list[Path]:
+def remove_partial_beside(path: Path) -> list[Path]:
     """Remove partial files that dead processes left for one file or folder, and nothing else in its parent folder."""
     return _swept(path.absolute().parent, path.name)
 

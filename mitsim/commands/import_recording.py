@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from mitsim.commands.folder_lock import sweep_beside
+from mitsim.commands.folder_lock import remove_partial_beside
 from mitsim.errors import InputError
 
 #: settings of an imported capture that the user should check
@@ -138,7 +138,7 @@ def import_(
             say(f"  {name}: {capture.settings[name]}")
     for warning in capture.settings.get("warnings", []):
         say(f"warning: {warning}")
-    sweep_beside(folder)
+    remove_partial_beside(folder)
     if is_written(capture, folder, imported.originals):
         say(f"capture: {folder}, finished before")
         return

@@ -112,9 +112,9 @@ def characterise(
         if workers is None:
             source = in_turn(simulated_source(simulated, plan.file.samples_per_pixel), plan)
         else:
-            from mitsim.campaign.orders import taken_by
+            from mitsim.campaign.orders import worker_source
 
-            source = taken_by(workers, plan)
+            source = worker_source(workers, plan)
         performance_map = run_campaign(plan, source, output)
     if compact is not None:
         performance_map.save(compact, compact=True)

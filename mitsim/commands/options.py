@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from mitsim.commands.folder_lock import lock_folder, sweep_beside
+from mitsim.commands.folder_lock import lock_folder, remove_partial_beside
 from mitsim.errors import InputError
 
 Out = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")]
@@ -119,7 +119,7 @@ def check_file(file: Path) -> None:
         raise InputError("--output", "", f"the folder {file}", "a file")
     if file.exists() and not file.is_file():  # an atomic write would replace a device: /dev/null
         raise InputError("--output", "", f"{file}, a device or a pipe", "a file")
-    sweep_beside(file)
+    remove_partial_beside(file)
 
 
 def keep_finished(folder: Path, overwrite: bool, last: str) -> None:

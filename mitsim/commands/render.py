@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitsim.commands.folder_lock import sweep_beside
+from mitsim.commands.folder_lock import remove_partial_beside
 from mitsim.commands.options import (
     Defines,
     Out,
@@ -130,14 +130,14 @@ def render(
         truth,
         origin_of(scene, chosen),
     ).digest()
-    sweep_beside(output)
+    remove_partial_beside(output)
     if digest_of(output, "render") == digest:
         read_capture(output)
         say(f"capture: {output}, finished before")
         return
     check_free(output)
     capture = interface.render(loaded, chosen, pose, seed=seed, samples=samples, depth=depth, noise=noise)
-    simulated = interface.laid_out(chosen)
+    simulated = interface.prepared_sensor(chosen)
     first = next(iter(chosen.rig.cameras))
     residual = render_residual(simulated, loaded, pose, first, Rendering(samples, depth), seed=seed)
     capture.settings["render_residual"] = asdict(residual) if isfinite(residual.noise) else None

@@ -71,12 +71,12 @@ def run(
     from mitsim.report.page import write_report
     from mitsim.report.run_folder import read_run
     from mitsim.run_study import run_study
-    from mitsim.study import read_study, tell_lays, with_plan
+    from mitsim.study import read_study, report_lays, with_plan
 
     check_folder(output)
     chosen = with_plan(read_study(study, ask=asking(yes)), plan)
     keep_finished(output, overwrite, "run.json")
-    tell_lays(chosen)
+    report_lays(chosen)
     stated = run_study(chosen, output, minutes, executor_of(scheduler, processes))
     write_report(output)
     say(f"scores: {output / 'scores.csv'}\nreport: {output / 'report.html'}")
@@ -116,13 +116,13 @@ def choose(
     from characterisation.statements.verdict_words import fits_all
     from mitsim.campaign.executor import executor_of
     from mitsim.choose import choose_sensor, read_candidates
-    from mitsim.choose.selection import Found
+    from mitsim.choose.selection import SensorResult
     from mitsim.choose.table import as_text, document
     from mitsim.progress import say
     from mitsim.report.choice_document import CHOICE, judged, read_choice
     from mitsim.report.choice_page import write_choice_page
     from mitsim.report.scene_geometry import write_scene_geometry
-    from mitsim.study import tell_lays, with_plan
+    from mitsim.study import report_lays, with_plan
 
     check_folder(output)
     candidates, excluded = read_candidates(study, [sensors], asking(yes, " (and likewise for every other sensor)"))
@@ -130,18 +130,18 @@ def choose(
     done = read_choice(output)
     if done is not None and done.finished:
         keep_finished(output, overwrite, CHOICE)
-    tell_lays(candidates[0].study)
+    report_lays(candidates[0].study)
     for one in excluded:
-        say(f"{one.name} is excluded: {one.why}")
+        say(f"{one.name} is excluded: {one.reason}")
     if candidates[0].study.file.set is not None:
         say("[set] of the study is not used: sensors are compared by single views; `mitsim run` chooses the set")
     began = time.monotonic()
 
-    def tell(found: list[Found], finished: bool) -> None:
+    def report_results(found: list[SensorResult], finished: bool) -> None:
         known = document(candidates[0].study, found, excluded, time.monotonic() - began, finished)
         write_json(output / CHOICE, known.model_dump(mode="json"))
 
-    found = choose_sensor(candidates, output, minutes, tell, executor_of(scheduler, processes))
+    found = choose_sensor(candidates, output, minutes, report_results, executor_of(scheduler, processes))
     best = found[0].candidate.study
     write_scene_geometry(output, best.scene, best.sensor)
     write_choice_page(output)
@@ -226,8 +226,8 @@ def exposures(
     shown = study_view(chosen, view, "--view")
     table = chosen.file.exposure or ExposureTable()
     rules = PlanRules(most or table.most, within or table.within)
-    maker = rendered(chosen, measurements_of(chosen, study_unknowns(chosen)))
-    plan = plan_view(chosen, maker, shown, rules)
+    renderer = rendered(chosen, measurements_of(chosen, study_unknowns(chosen)))
+    plan = plan_view(chosen, renderer, shown, rules)
     document = plan_document(chosen, plan)
     write_json(output / "exposures.json", document)
     write_plan_csv(output / "exposures.csv", plan)
@@ -283,12 +283,12 @@ def score(
     from mitsim.reconstruction.cloud import sensor_geometry
     from mitsim.report.best_views import best_views
     from mitsim.run_study import claim, score_study
-    from mitsim.study import read_study, tell_lays
+    from mitsim.study import read_study, report_lays
     from mitsim.virtual.study_digest import study_digest, with_scene_files
 
     check_folder(output)
     chosen = read_study(study, map_file, asking(yes))
-    tell_lays(chosen)
+    report_lays(chosen)
     for name in measurement or ():
         if name not in chosen.task.measurements:
             raise InputError("--measurement", "", name, ", ".join(chosen.task.measurements))

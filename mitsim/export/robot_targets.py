@@ -50,7 +50,7 @@ class Target:
 
 
 @dataclass(frozen=True)
-class Maker:
+class RobotFormat:
     """A controller's file: its description, its suffix, and the function that writes targets for a tool."""
 
     what: str
@@ -174,11 +174,11 @@ def moveit_poses(targets: Sequence[Target], tool: str) -> str:
 
 
 #: controllers by name
-MAKERS = {
-    "abb": Maker("ABB RAPID module of robtargets", ".mod", rapid_module),
-    "kuka": Maker("KUKA KRL data list of FRAMEs", ".dat", krl_data),
-    "ur": Maker("Universal Robots URScript poses", ".script", urscript),
-    "moveit": Maker("MoveIt: PoseStamped in YAML", ".yaml", moveit_poses),
+ROBOT_FORMATS = {
+    "abb": RobotFormat("ABB RAPID module of robtargets", ".mod", rapid_module),
+    "kuka": RobotFormat("KUKA KRL data list of FRAMEs", ".dat", krl_data),
+    "ur": RobotFormat("Universal Robots URScript poses", ".script", urscript),
+    "moveit": RobotFormat("MoveIt: PoseStamped in YAML", ".yaml", moveit_poses),
 }
 
 

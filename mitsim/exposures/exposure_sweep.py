@@ -94,14 +94,14 @@ class ExposureSweep:
     ``dimmable``: whether all light is the projector's, so that a lower power reduces all of it.
     """
 
-    def __init__(self, maker: RenderedMeasurements, view: View) -> None:
-        world = replace(maker.unknowns, varied=()).draw(Trial(0))
-        self.maker, self.view = maker, view
-        self.lit = maker.lit(view, world)
-        self.possible = _possible_points(maker, view)
-        sensor = maker.study.sensor
+    def __init__(self, renderer: RenderedMeasurements, view: View) -> None:
+        world = replace(renderer.unknowns, varied=()).draw(Trial(0))
+        self.renderer, self.view = renderer, view
+        self.lit = renderer.lit(view, world)
+        self.possible = _possible_points(renderer, view)
+        sensor = renderer.study.sensor
         # only the light of the projector is proportional to its power
-        self.dimmable = not has_emitters(maker.study.scene) and sensor.room is None and not sensor.ambient_image
+        self.dimmable = not has_emitters(renderer.study.scene) and sensor.room is None and not sensor.ambient_image
 
     def evaluate(self, exposure: PlannedExposure, noise: int, draws: int) -> ExposureResult:
         """Return the mean result of a set of exposures over ``draws`` noise samples.
@@ -111,9 +111,9 @@ class ExposureSweep:
         results: dict[str, list[FeatureResult]] = {name: [] for name in self.possible}
         recovered: dict[str, NDArray[np.bool_]] = {}
         for k in range(draws):
-            seed = _seed(self.maker.unknowns.seed, self.view.number, noise, k)
-            capture = self.maker.exposed(self.lit, exposure, seed, keep=True)
-            cloud = self.maker.unlabelled_cloud(capture)
+            seed = _seed(self.renderer.unknowns.seed, self.view.number, noise, k)
+            capture = self.renderer.exposed(self.lit, exposure, seed, keep=True)
+            cloud = self.renderer.unlabelled_cloud(capture)
             for name, possible in self.possible.items():
                 one, mask = feature_result(cloud, possible.pixel, possible.derivatives, possible.surface)
                 results[name].append(one)
@@ -174,16 +174,19 @@ def needed_shapes(task: Task) -> list[str]:
     return list(dict.fromkeys(name for one in task.measurements for name in task.shapes_for(one)))
 
 
-def _possible_points(maker: RenderedMeasurements, view: View) -> dict[str, _PossiblePoints]:
+def _possible_points(renderer: RenderedMeasurements, view: View) -> dict[str, _PossiblePoints]:
     """Return the points of every needed feature that all cameras and the projector can see."""
-    scene, pose = maker.study.scene, view.world_from_sensor
-    surfaces = maker.predictor.surfaces(scene, pose)
-    ideal, labels = maker.predictor.ideal(surfaces), maker.predictor.labels(scene, pose, surfaces)
+    scene, pose = renderer.study.scene, view.world_from_sensor
+    surfaces = renderer.predictor.surfaces(scene, pose)
+    ideal, labels = (
+        renderer.predictor.ideal(surfaces),
+        renderer.predictor.labels(scene, pose, surfaces),
+    )
     label = labels.reshape(-1)[ideal.pixel]
     out = {}
-    for name in needed_shapes(maker.study.task):
+    for name in needed_shapes(renderer.study.task):
         mask = (label == scene.names.index(name)) & (ideal.status == Status.VALID)
-        surface = maker.study.task.features[name].nominal(pose.inverse().matrix())
+        surface = renderer.study.task.features[name].nominal(pose.inverse().matrix())
         point, ray = ideal.point[mask], ideal.ray[mask]
         derivatives = surface.linearised(np.zeros(surface.parameter_count), point, ray)[1]
         facing = np.abs(surface.meet(point, ray).cosine) > GRAZING_COSINE

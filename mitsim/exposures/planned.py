@@ -26,7 +26,7 @@ from mitsim.study import ExposureTable, Study
 from mitsim.text_table import aligned
 from mitsim.views import View
 from mitsim.virtual.mapped import MappedMeasurements
-from mitsim.virtual.race import Maker
+from mitsim.virtual.race import TrialRunner
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.trials import TrialFolder
 
@@ -41,7 +41,7 @@ PLAN_VERSION = 1
 class Exposable(Protocol):
     """Virtual measurements whose exposure can be set."""
 
-    def exposed_as(self, planned: PlannedExposure | None) -> Maker:
+    def exposed_as(self, planned: PlannedExposure | None) -> TrialRunner:
         """Return the same measurements with other exposures; None is the sensor's own rule."""
 
 
@@ -49,12 +49,12 @@ class Exposable(Protocol):
 class Exposed:
     """Virtual measurements of one view with their exposures.
 
-    - ``maker``: makes the trials.
+    - ``runner``: makes the trials.
     - ``digest``: identifies everything that determines them.
     - ``planned``: exposures, None for the sensor's own rule.
     """
 
-    maker: Maker
+    runner: TrialRunner
     digest: str
     planned: PlannedExposure | None
 
@@ -69,7 +69,7 @@ def exposed_for(
     study: Study,
     view: View,
     measurements: RenderedMeasurements | MappedMeasurements,
-    maker: Maker,
+    runner: TrialRunner,
     digest: str,
     folder: Path,
 ) -> Exposed:
@@ -79,7 +79,7 @@ def exposed_for(
     ----------
     measurements
         The measurements of this process, with which exposures are planned.
-    maker
+    runner
         The same measurements, in this process or spread over several; it makes the trials.
     digest
         Identifies everything but the exposures that determines a trial.
@@ -88,9 +88,9 @@ def exposed_for(
     """
     planned = planned_for(study, view, measurements, digest, folder)
     if planned is None:
-        return Exposed(maker, digest, None)
-    assert isinstance(maker, Exposable)  # planned_for rejects a map
-    return Exposed(maker.exposed_as(planned), with_exposure(digest, planned), planned)
+        return Exposed(runner, digest, None)
+    assert isinstance(runner, Exposable)  # planned_for rejects a map
+    return Exposed(runner.exposed_as(planned), with_exposure(digest, planned), planned)
 
 
 class _StoredPlan(Document):
@@ -119,7 +119,7 @@ def planned_for(
     table = study.file.exposure
     if table is None:
         return None
-    maker = rendered(study, measurements)
+    renderer = rendered(study, measurements)
     if table.exposures_s is not None:
         given = PlannedExposure(tuple(sorted(table.exposures_s)), table.power)
         _check_given(study, given, table)
@@ -134,20 +134,20 @@ def planned_for(
             stored = None
         if stored is not None and stored.digest == digest_of_plan:
             return PlannedExposure(tuple(stored.exposures_s), stored.power)
-    plan = plan_view(study, maker, view, rules)
+    plan = plan_view(study, renderer, view, rules)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, plan_document(study, plan) | {"digest": digest_of_plan})
     say(f"view {view.number}: {plan_in_words(plan)}")
     return plan.exposure
 
 
-def plan_view(study: Study, maker: RenderedMeasurements, view: View, rules: PlanRules) -> ExposurePlan:
+def plan_view(study: Study, renderer: RenderedMeasurements, view: View, rules: PlanRules) -> ExposurePlan:
     """Plan the exposures of one view; its light is traced once."""
     policy = study.sensor.exposure
     if policy.limits_s == _NO_LIMITS:
         say(f"{study.sensor.name} states no exposure limits: any exposure is allowed")
     own = PlannedExposure(policy.exposures(None, float(study.sensor.imager.full_well)))
-    sweep = ExposureSweep(maker, view)
+    sweep = ExposureSweep(renderer, view)
     if not study.sensor.merges_exposures:
         say(f"{study.sensor.name} cannot merge exposures: the plan has one exposure")
         rules = PlanRules(1, rules.within)

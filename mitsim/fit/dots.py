@@ -19,7 +19,7 @@ from scipy.ndimage import fourier_gaussian
 from scipy.optimize import brentq
 
 from mitsim.fit.observation import Floats, View
-from mitsim.fit.white_coupon import Bench, coupon_roi
+from mitsim.fit.white_coupon import WhiteCouponRenderer, coupon_roi
 
 #: largest blur [px]
 _LARGEST_BLUR = 4.0
@@ -43,15 +43,15 @@ class Dots:
     power: float
 
 
-def compare_dots(view: View, bench: Bench) -> Dots:
+def compare_dots(view: View, renderer: WhiteCouponRenderer) -> Dots:
     """Compare the dots of a view with those of the first frame of the sensor's own pattern.
 
     ``view`` comes from :func:`~mitsim.fit.observation.observe` with the pattern ``level``, so that its ``unit`` light
     has no dots.
     """
-    camera = bench.sensor.rig.cameras[view.camera]
+    camera = renderer.sensor.rig.cameras[view.camera]
     roi = coupon_roi(camera, view.place)
-    spectrum = np.fft.fft2(bench.white(view.place, view.camera, roi, "first") * view.exposure_s)
+    spectrum = np.fft.fft2(renderer.white(view.place, view.camera, roi, "first") * view.exposure_s)
     rows, columns = view.rows - roi.top, view.columns - roi.left
     pairs, none = _neighbours(view), np.zeros(len(view.unit))
 

@@ -63,30 +63,30 @@ def fit_table(found: CouponFit) -> str:
 
 def remarks(found: CouponFit) -> list[str]:
     """Return remarks that limit the use of the results."""
-    fit, told = found.fit, []
+    fit, lines = found.fit, []
     if found.metal is not None and fit.log_alpha is not None:
         low, high = found.metal.alpha_range
         if fit.at_limit:
-            told.append("alpha reached the end of its range: these poses do not determine the width of the lobe")
+            lines.append("alpha reached the end of its range: these poses do not determine the width of the lobe")
         elif fit.log_alpha.uncertainty > 0.3:
-            told.append("alpha is very uncertain: use poses closer to the mirror direction, or shorter exposures")
+            lines.append("alpha is very uncertain: use poses closer to the mirror direction, or shorter exposures")
         if math.isnan(found.roughness[0]):
             ends = [f"{end:g}" for end in np.round(found.metal.roughness_range, 3)]
-            told.append(
+            lines.append(
                 f"no Ra-equivalent: {found.finish} has alpha {low:.3f} to {high:.3f}, of Ra {' to '.join(ends)} um"
             )
     if fit.reduced_chi_square > 2:
-        told.append("the residuals exceed the noise: uncertainties are increased accordingly, but the bias is unknown")
+        lines.append("the residuals exceed the noise: uncertainties are increased accordingly, but the bias is unknown")
     if fit.neighbours > _ALIKE:
-        told.append("residuals of neighbouring blocks are correlated: light, form or lobe differ from the model")
+        lines.append("residuals of neighbouring blocks are correlated: light, form or lobe differ from the model")
     if found.pattern_unknown:
-        told.append("the pattern is not known to be that of the sensor file: block means were compared, not dots")
+        lines.append("the pattern is not known to be that of the sensor file: block means were compared, not dots")
     if any(not math.isnan(place.off_plane) for place in found.places):
         worst = max(place.off_plane for place in found.places if not math.isnan(place.off_plane))
-        told.append(
+        lines.append(
             f"the place of the coupon is the plane of its cloud, which scatters by up to {worst:.2g} mm about it"
         )
-    return told
+    return lines
 
 
 def fit_figure(found: CouponFit) -> Figure:

@@ -35,17 +35,17 @@ def finest_detail(image: Floats) -> Floats:
     return np.asarray(correlate1d(correlate1d(np.asarray(image, float), FINEST, axis=0), FINEST, axis=1))
 
 
-def level_variances(image: Floats, there: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
+def level_variances(image: Floats, mask: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
     """Return level, noise variance and number of pixels (n,) of bins of an image's pixels by their local mean.
 
-    ``there`` (H, W) selects the pixels. The level of a bin is the median of the local means. The variance is the median
+    ``mask`` (H, W) selects the pixels. The level of a bin is the median of the local means. The variance is the median
     of the squared detail over 0.455, the median of chi-square with one degree of freedom.
     """
     mean, squares = uniform_filter(np.asarray(image, float), _MEAN_PX), finest_detail(image) ** 2
     rim = _MEAN_PX // 2
-    if min(there.shape) > 4 * _MEAN_PX:  # at the image's edges the filter uses mirrored pixels
-        there = there & np.pad(np.ones((there.shape[0] - 2 * rim, there.shape[1] - 2 * rim), bool), rim)
-    level, square = mean[there], squares[there]
+    if min(mask.shape) > 4 * _MEAN_PX:  # at the image's edges the filter uses mirrored pixels
+        mask = mask & np.pad(np.ones((mask.shape[0] - 2 * rim, mask.shape[1] - 2 * rim), bool), rim)
+    level, square = mean[mask], squares[mask]
     bins = int(np.clip(len(level) // _PIXELS_PER_BIN, 1, _BINS))
     edges = np.quantile(level, np.linspace(0, 1, bins + 1))
     where = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, bins - 1)
@@ -56,9 +56,9 @@ def level_variances(image: Floats, there: NDArray[np.bool_]) -> tuple[Floats, Fl
     return levels, variances, counts
 
 
-def noise_of_levels(image: Floats, there: NDArray[np.bool_]) -> Callable[[Floats], Floats]:
+def noise_of_levels(image: Floats, mask: NDArray[np.bool_]) -> Callable[[Floats], Floats]:
     """Return a function of the level that gives the noise variance of an image, never below 0."""
-    levels, variances, counts = level_variances(image, there)
+    levels, variances, counts = level_variances(image, mask)
     if len(levels) < 3 or np.ptp(levels) <= 0:
         flat = float(np.median(variances)) if len(variances) else 0.0
         return lambda level: np.full(np.shape(level), flat)

@@ -29,7 +29,7 @@ from mitsim.capture.capture import Capture
 from mitsim.errors import InputError
 from mitsim.fit.electrons import PixelNoise, chip_of, linearised, pixel_noise
 from mitsim.fit.place import Place
-from mitsim.fit.white_coupon import Bench, Pattern, coupon_roi
+from mitsim.fit.white_coupon import Pattern, WhiteCouponRenderer, coupon_roi
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import AmplitudeModulation
@@ -58,10 +58,10 @@ class View:
     - ``unit`` (N,) [e-]: electrons for pi f = 1 at the power of the sensor file.
     - ``ambient`` (N,) [s]: electrons from the light of the room, over its e-/s in the middle of the image. It is 0 if
       there is none, or if it was subtracted.
-    - ``view``, ``lamp`` (N, 3): unit directions toward camera and projector, in the frame of the coupon.
+    - ``toward_camera``, ``toward_projector`` (N, 3): unit directions, in the frame of the coupon.
     - ``noise`` of a pixel's mean.
     - ``whole``: number of blocks on the coupon, saturated ones included; ``place`` of the coupon.
-    - ``nothing``: reason why there is no block on the coupon, "" otherwise.
+    - ``why_no_block``: reason why there is no block on the coupon, "" otherwise.
     """
 
     capture: int
@@ -76,12 +76,12 @@ class View:
     electrons: Floats = field(repr=False)
     unit: Floats = field(repr=False)
     ambient: Floats = field(repr=False)
-    view: Floats = field(repr=False)
-    lamp: Floats = field(repr=False)
+    toward_camera: Floats = field(repr=False)
+    toward_projector: Floats = field(repr=False)
     noise: PixelNoise = field(repr=False)
     whole: int
     place: Place = field(repr=False)
-    nothing: str = ""
+    why_no_block: str = ""
 
     @property
     def size(self) -> int:
@@ -104,7 +104,7 @@ class View:
 
     def off_mirror(self) -> tuple[float, float]:
         """Return the least and largest angle between half vector and normal [rad], over the pixels."""
-        half = self.view + self.lamp
+        half = self.toward_camera + self.toward_projector
         angle = np.arccos(np.clip(half[:, 2] / np.linalg.norm(half, axis=1), -1.0, 1.0))
         return float(angle.min()), float(angle.max())
 
@@ -120,15 +120,20 @@ class CouponCapture:
 
 
 def observe(
-    taken: CouponCapture, bench: Bench, block_px: int, *, pattern: Pattern, lit_room: bool = False
+    coupon_capture: CouponCapture,
+    renderer: WhiteCouponRenderer,
+    block_px: int,
+    *,
+    pattern: Pattern,
+    lit_room: bool = False,
 ) -> list[View]:
     """Return the view of a coupon by every camera at every exposure.
 
     Parameters
     ----------
-    taken
+    coupon_capture
         Capture, and place of the coupon in it.
-    bench
+    renderer
         Renders the white coupon; its sensor has the cameras of the capture.
     block_px
         Side of a block [px].
@@ -142,7 +147,7 @@ def observe(
     InputError
         If the capture is one of time of flight or has no images, or its exposures or its number of images are wrong.
     """
-    sensor, capture, place, where = bench.sensor, taken.capture, taken.place, taken.where
+    sensor, capture, place, where = renderer.sensor, coupon_capture.capture, coupon_capture.place, coupon_capture.where
     if isinstance(sensor.pattern, AmplitudeModulation):
         raise InputError(where, "technology", capture.technology, "images of light, not of its correlation")
     if not capture.images:
@@ -160,30 +165,30 @@ def observe(
             )
         camera = sensor.rig.cameras[name]
         roi = coupon_roi(camera, place)
-        white = bench.white(place, name, roi, pattern)
-        loss = bench.corner_loss(name)
-        seen = _Seen.of(camera, place, sensor, roi, _read_out(capture, name), white, loss)
+        white = renderer.white(place, name, roi, pattern)
+        loss = renderer.corner_loss(name)
+        region = _CouponRegion.of(camera, place, sensor, roi, _read_out(capture, name), white, loss)
         each = len(stack) // len(exposures)
         shown = stack[:, *roi.slices]
         for number, seconds in enumerate(exposures):
             images = shown[number * each : (number + 1) * each]
             chip = chip_of(capture, sensor.imager, where)
             noise = pixel_noise(sensor.imager, chip, each - ambient, float(seconds), ambient)
-            blocks = _Blocks.of(seen, images, chip, block_px)
+            blocks = _Blocks.of(region, images, chip, block_px)
             lit, dark = (images[:-1], images[-1]) if ambient else (images, None)
             frames = _Frames(lit, dark, chip, float(seconds), float(seconds) if lit_room and not ambient else 0.0)
-            views.append(_view(taken, name, seen, blocks, frames, noise))
+            views.append(_view(coupon_capture, name, region, blocks, frames, noise))
     return views
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _CouponRegion:
     """A coupon in a region (h, w) of a camera's image.
 
     - ``inside`` (h, w): pixels on the coupon, inside its edge.
     - ``points`` (h, w, 3) [mm]: where the view rays meet the plane, in the frame of the coupon.
     - ``white`` (h, w) [e-/s] of a white coupon; ``loss`` (h, w) [1]: relative illumination of the lens.
-    - ``camera_centre``, ``lamp_centre`` (3,) [mm]: centres of camera and projector, in the frame of the coupon.
+    - ``camera_centre``, ``projector_centre`` (3,) [mm]: centres of camera and projector, in the frame of the coupon.
     """
 
     roi: Roi
@@ -192,7 +197,7 @@ class _Seen:
     white: Floats
     loss: Floats
     camera_centre: Floats
-    lamp_centre: Floats
+    projector_centre: Floats
 
     @classmethod
     def of(
@@ -204,13 +209,13 @@ class _Seen:
         read_out: Roi | None,
         white: Floats,
         corner_loss: NDArray[np.float32] | None,
-    ) -> _Seen:
+    ) -> _CouponRegion:
         """Intersect the view rays of a region with the plane of the coupon, and select the pixels inside its edge.
 
         ``read_out`` is the region that the camera read out, None for the whole image.
         """
         pose = place.world_from_sensor
-        centre, lamp = pose.points(camera.centre), pose.points(sensor.projector.optics.centre)
+        centre, projector_centre = pose.points(camera.centre), pose.points(sensor.projector.optics.centre)
         columns, rows = roi.pixels()
         rays = camera.rays(np.stack([columns, rows], axis=-1).astype(float))
         rays = pose.directions(camera.sensor_from_camera.directions(rays))
@@ -220,12 +225,12 @@ class _Seen:
         focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
         footprint = reach / (focal * np.where(down, -rays[..., 2], 1.0))
         inside = down & (white > _UNLIT * white.max())
-        inside[inside] = place.holds(points[inside][:, :2], _EDGE_PX * footprint[inside])
+        inside[inside] = place.contains(points[inside][:, :2], _EDGE_PX * footprint[inside])
         if read_out is not None:
             inside &= (columns >= read_out.left) & (columns < read_out.right)
             inside &= (rows >= read_out.top) & (rows < read_out.bottom)
         loss = np.ones(white.shape) if corner_loss is None else corner_loss[rows, columns].astype(float)
-        return cls(roi, inside, points, white, loss, centre, lamp)
+        return cls(roi, inside, points, white, loss, centre, projector_centre)
 
     def toward(self, centre: Floats, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
         """Return unit directions (N, 3) from the points of pixels toward a ``centre`` (3,) [mm]."""
@@ -248,13 +253,13 @@ class _Blocks:
     whole: int
 
     @classmethod
-    def of(cls, seen: _Seen, images: NDArray[np.unsignedinteger[Any]], chip: Imager, width: int) -> _Blocks:
+    def of(cls, region: _CouponRegion, images: NDArray[np.unsignedinteger[Any]], chip: Imager, width: int) -> _Blocks:
         """Group the pixels on the coupon in blocks of ``width`` px, without saturated blocks and their neighbours."""
-        rows, columns = np.nonzero(seen.inside)
-        shape = tuple(-(-size // width) for size in seen.inside.shape)
+        rows, columns = np.nonzero(region.inside)
+        shape = tuple(-(-size // width) for size in region.inside.shape)
         number = (rows // width) * shape[1] + columns // width
         held = np.bincount(number, minlength=shape[0] * shape[1]) >= _BLOCK_SHARE * width**2
-        bright_rows, bright_columns = np.nonzero((images >= chip.full_scale).any(axis=0) & seen.inside)
+        bright_rows, bright_columns = np.nonzero((images >= chip.full_scale).any(axis=0) & region.inside)
         saturated = np.zeros(shape, bool)
         saturated[bright_rows // width, bright_columns // width] = True
         used = held & ~ndimage.binary_dilation(saturated, np.ones((3, 3), bool)).ravel()
@@ -285,43 +290,50 @@ class _Frames:
         return np.asarray(mean if self.dark is None else mean - linearised(self.dark[rows, columns], self.chip))
 
 
-def _view(taken: CouponCapture, camera: str, seen: _Seen, blocks: _Blocks, frames: _Frames, noise: PixelNoise) -> View:
-    rows, columns, place = blocks.rows, blocks.columns, taken.place
+def _view(
+    coupon_capture: CouponCapture,
+    camera: str,
+    region: _CouponRegion,
+    blocks: _Blocks,
+    frames: _Frames,
+    noise: PixelNoise,
+) -> View:
+    rows, columns, place = blocks.rows, blocks.columns, coupon_capture.place
     return View(
-        taken.index,
-        taken.where,
+        coupon_capture.index,
+        coupon_capture.where,
         camera,
         frames.seconds,
-        columns + seen.roi.left,
-        rows + seen.roi.top,
+        columns + region.roi.left,
+        rows + region.roi.top,
         blocks.block,
         blocks.width,
         blocks.grid,
         frames.electrons(rows, columns),
-        seen.white[rows, columns] * frames.seconds,
-        seen.loss[rows, columns] * frames.room_seconds,
-        seen.toward(seen.camera_centre, rows, columns),
-        seen.toward(seen.lamp_centre, rows, columns),
+        region.white[rows, columns] * frames.seconds,
+        region.loss[rows, columns] * frames.room_seconds,
+        region.toward(region.camera_centre, rows, columns),
+        region.toward(region.projector_centre, rows, columns),
         noise,
         blocks.whole,
         place,
-        "" if blocks.whole else _why_nothing(seen, place, blocks.width),
+        "" if blocks.whole else _why_no_block(region, place, blocks.width),
     )
 
 
-def _why_nothing(seen: _Seen, place: Place, width: int) -> str:
+def _why_no_block(region: _CouponRegion, place: Place, width: int) -> str:
     """Return the reason why a camera has no block on a coupon, in words."""
-    met = np.isfinite(seen.points).all(axis=-1) & place.holds(
-        seen.points[..., :2].reshape(-1, 2), np.zeros(seen.points[..., 0].size)
-    ).reshape(seen.points.shape[:2])
+    met = np.isfinite(region.points).all(axis=-1) & place.contains(
+        region.points[..., :2].reshape(-1, 2), np.zeros(region.points[..., 0].size)
+    ).reshape(region.points.shape[:2])
     if not met.any():
         return "the coupon is not in the image: its pose, or the plane of its cloud, is elsewhere"
-    lit = seen.white > _UNLIT * max(float(seen.white.max()), np.finfo(float).tiny)
+    lit = region.white > _UNLIT * max(float(region.white.max()), np.finfo(float).tiny)
     if not (met & lit).any():
         return "the projector of the sensor file does not illuminate the coupon"
-    if not seen.inside.any():
+    if not region.inside.any():
         return f"within {2 * _EDGE_PX:g} px the coupon has two edges: it is too small, or was not read out"
-    inside = int(seen.inside.sum())
+    inside = int(region.inside.sum())
     return f"its {inside} pixels, {_EDGE_PX:g} px inside the edge, fill half of no block of {width} x {width} px"
 
 

@@ -63,7 +63,7 @@ class Place:
         xs, ys = np.meshgrid([self.low[0], high[0]], [self.low[1], high[1]])
         return self.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1).reshape(-1, 3))
 
-    def holds(self, points: NDArray[np.floating], margin: NDArray[np.floating]) -> NDArray[np.bool_]:
+    def contains(self, points: NDArray[np.floating], margin: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return which points (N, 2) [mm] of the plane lie on the coupon, ``margin`` (N,) [mm] or more inside its edge.
 
         The margin is tested at four positions, in both directions of x and y.

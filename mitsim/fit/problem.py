@@ -97,7 +97,7 @@ class Problem:
         self.first_linear = 0 if finish is None else 2
         if finish is not None:
             self.lobe = SpecularLobe(finish.index)
-            self.directions = Directions(joined("view"), joined("lamp"))
+            self.directions = Directions(joined("toward_camera"), joined("toward_projector"))
         self._last: tuple[float, Floats, Floats] | None = None
 
     def means(self, values: Floats) -> Floats:

@@ -27,7 +27,7 @@ from mitsim.fit.observation import CouponCapture, View, observe
 from mitsim.fit.place import Place
 from mitsim.fit.problem import Residual
 from mitsim.fit.specimen import place_of
-from mitsim.fit.white_coupon import Bench, pattern_is_known, with_rig
+from mitsim.fit.white_coupon import WhiteCouponRenderer, pattern_is_known, with_rig
 from mitsim.progress import say, track
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.sensor.camera import Rig
@@ -102,28 +102,28 @@ class CouponFit:
     def worst(self) -> Residual:
         """Residuals of the view with the largest (chi-square - n) / sqrt(2 n), with n its number of blocks."""
 
-        def beyond(residual: Residual) -> float:
+        def excess(residual: Residual) -> float:
             blocks = residual.view.size
             return (float(residual.in_noise @ residual.in_noise) - blocks) / math.sqrt(2 * blocks)
 
-        return max((residual for residual in self.fit.residuals if residual.view.size), key=beyond)
+        return max((residual for residual in self.fit.residuals if residual.view.size), key=excess)
 
     def numbers(self) -> dict[str, Any]:
         """Return the fit as JSON values, null for unknown ones; the keys are in docs/reference/formats/fit.md."""
         fit, (ra, ra_uncertainty) = self.fit, self.roughness
-        told: dict[str, Any] = json_values(
+        document: dict[str, Any] = json_values(
             {
                 "sensor": self.sensor.name,
                 "source": self.source,
                 "finish": self.finish,
                 "captures": list(self.captures),
-                "alpha": _told(self.alpha, fit.log_alpha),
+                "alpha": _uncertain(self.alpha, fit.log_alpha),
                 "ra_equivalent_um": {
                     "value": ra,
                     "uncertainty": ra_uncertainty,
                     "range_um": list(self.metal.roughness_range) if self.metal else None,
                 },
-                "power_w": _told(self.power, fit.log_power) | {"times_albedo": self.metal is None},
+                "power_w": _uncertain(self.power, fit.log_power) | {"times_albedo": self.metal is None},
                 "wide_angle_share": _linear(fit.wide_angle),
                 "room_electrons_per_s": _linear(fit.ambient),
                 "reduced_chi_square": fit.reduced_chi_square,
@@ -140,7 +140,7 @@ class CouponFit:
                 "views": [_view_numbers(residual) for residual in fit.residuals],
             }
         )
-        return told
+        return document
 
 
 def fit_captures(
@@ -191,26 +191,26 @@ def fit_captures(
     views: list[View] = []
     dots: list[Dots] = []
     places: list[Place] = []
-    ready: tuple[Rig, Bench] | None = None
+    rig_and_renderer: tuple[Rig, WhiteCouponRenderer] | None = None
     unknown = False
     for index, folder in enumerate(track(list(captures), "captures", len(captures))):
         capture = read_capture(folder)
         if capture.sensor != first.sensor:
             raise InputError(folder, "sensor", capture.sensor, f"{first.sensor}, as in {captures[0]}")
-        if ready is None or not _same(ready[0], capture.rig):
-            ready = capture.rig, Bench(with_rig(chosen, capture.rig))
-        bench, known = ready[1], pattern_is_known(capture, chosen)
+        if rig_and_renderer is None or not _same(rig_and_renderer[0], capture.rig):
+            rig_and_renderer = capture.rig, WhiteCouponRenderer(with_rig(chosen, capture.rig))
+        renderer, known = rig_and_renderer[1], pattern_is_known(capture, chosen)
         unknown |= not known
-        place = place_of(capture, bench.sensor, (sample.width, sample.height), str(folder), roi)
+        place = place_of(capture, renderer.sensor, (sample.width, sample.height), str(folder), roi)
         lit = capture.source != "simulated" or has_emitters(sample.scene)
-        taken = CouponCapture(capture, place, index, str(folder))
-        seen = observe(taken, bench, block, pattern="mean" if known else "level", lit_room=lit)
+        coupon_capture = CouponCapture(capture, place, index, str(folder))
+        capture_views = observe(coupon_capture, renderer, block, pattern="mean" if known else "level", lit_room=lit)
         if not known and isinstance(chosen.pattern, DotPattern):
-            dots += [compare_dots(view, bench) for view in seen if view.size]
-        views += seen
+            dots += [compare_dots(view, renderer) for view in capture_views if view.size]
+        views += capture_views
         places.append(place)
     if not sum(view.whole for view in views):
-        why = "; ".join(dict.fromkeys(f"{view.camera} of {view.name}: {view.nothing}" for view in views[:4]))
+        why = "; ".join(dict.fromkeys(f"{view.camera} of {view.name}: {view.why_no_block}" for view in views[:4]))
         raise InputError(
             "captures",
             "images",
@@ -282,7 +282,7 @@ def _exponential(parameter: Parameter | None) -> tuple[float, float]:
     return value, value * parameter.uncertainty
 
 
-def _told(pair: tuple[float, float], parameter: Parameter | None) -> dict[str, Any]:
+def _uncertain(pair: tuple[float, float], parameter: Parameter | None) -> dict[str, Any]:
     relative = (math.nan, math.nan) if parameter is None else (parameter.by_covariance, parameter.by_jackknife)
     return {
         "value": pair[0],

@@ -73,10 +73,10 @@ def specimen_place(capture: Capture, settings: Settings, roi: Roi | None, where:
         flat = found_place(cloud, where)
         return replace(flat, bend=_bend_of(flat, cloud.points[cloud.valid].astype(float)))
     camera, geometry = capture.rig.reference, capture_geometry(capture, settings)
-    asked = [roi.left, roi.top, roi.width, roi.height]
+    window = [roi.left, roi.top, roi.width, roi.height]
     if not roi.fits(camera.width, camera.height):
         allowed = f"COLUMN ROW WIDTH HEIGHT within {camera.width} x {camera.height} pixels"
-        raise InputError("--window", "", asked, allowed)
+        raise InputError("--window", "", window, allowed)
     grid = geometry.grid
     low, high = np.array([roi.left, roi.top]), np.array([roi.right, roi.bottom])
 
@@ -90,13 +90,14 @@ def specimen_place(capture: Capture, settings: Settings, roi: Roi | None, where:
     # outliers of a decoder lie far away along the rays, and a fit that starts with them would follow the rays
     points = found[plane_points(found)]
     if len(points) < _FEWEST_POINTS:
-        told = f"{len(found)} points in {asked}" + (f", {len(points)} of them in one plane" if len(found) else "")
-        raise InputError("--window", "", told, f"{_FEWEST_POINTS} or more, to find its plane")
+        coplanar = f", {len(points)} of them in one plane" if len(found) else ""
+        number = f"{len(found)} points in {window}{coplanar}"
+        raise InputError("--window", "", number, f"{_FEWEST_POINTS} or more, to find its plane")
     try:
         plane = fit_plane(points[:: -(-len(points) // _PLANE_POINTS)], camera.centre)
     except FitError as error:
         hint = "give a region that shows a flat specimen, from a less oblique view"
-        raise InputError("--window", "", f"{asked}, where {error}", "a plane", hint) from None
+        raise InputError("--window", "", f"{window}, where {error}", "a plane", hint) from None
     off = (points - plane.point) @ plane.normal
     across = np.array([1.0, 0.0, 0.0]) - plane.normal[0] * plane.normal
     across /= np.linalg.norm(across)
@@ -145,7 +146,7 @@ def _bend_of(place: Place, points: Floats) -> Bend | None:
     local = place.world_from_sensor.points(points)
     near = np.abs(local[:, 2]) < _NEAR_PLANE * np.linalg.norm(place.world_from_sensor.translation)
     inside = np.zeros(len(local), bool)
-    inside[near] = place.holds(local[near, :2], np.zeros(int(near.sum())))
+    inside[near] = place.contains(local[near, :2], np.zeros(int(near.sum())))
     return fit_bend(local[inside]) if inside.sum() >= _FEWEST_POINTS else None
 
 
@@ -159,7 +160,7 @@ def on_specimen(place: Place, origin: Floats, rays: Floats, pitch: float, margin
     down = cosine > GRAZING
     inside = np.zeros(rays.shape[:-1], bool)
     margin = margin_px * pitch * reach[down] / cosine[down]
-    inside[down] = place.holds(points[down], margin)
+    inside[down] = place.contains(points[down], margin)
     return inside
 
 

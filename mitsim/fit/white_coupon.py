@@ -36,7 +36,7 @@ Pattern = Literal["mean", "level", "first"]
 _MARGIN_PX = 12
 
 
-class Bench:
+class WhiteCouponRenderer:
     """A sensor that renders white coupons, prepared once; its projector shows one image in place of its patterns."""
 
     def __init__(self, sensor: Sensor, samples: int = 16) -> None:

@@ -330,34 +330,34 @@ def fault_of(error: BaseException, dai: Any, where: str, what: str) -> BaseExcep
     """Return the error to raise instead of ``error``: a DeviceError for errors of the package, else itself."""
     if isinstance(error, DeviceError) or not isinstance(error, RuntimeError):
         return error
-    said = " ".join(str(error).split())[:200]
+    message = " ".join(str(error).split())[:200]
     listed: list[str] = []
     with suppress(Exception):
         listed = [str(info.getDeviceId()) for info in dai.Device.getAllAvailableDevices()]
     there = f"Connected: {', '.join(listed)}" if listed else "None is connected"
-    lowered = said.lower()
+    lowered = message.lower()
     if "no available devices" in lowered or "cannot find any device" in lowered or "failed to find device" in lowered:
         return DeviceError(
             where,
             what,
-            f"no such camera ({said})",
+            f"no such camera ({message})",
             "one that answers",
             f"{there}. Check the cable. On Linux its udev rule is needed: docs.luxonis.com",
         )
     if "already_in_use" in lowered or "already used" in lowered:
-        return DeviceError(where, what, f"the camera in use ({said})", "a free camera", "Close the other program")
+        return DeviceError(where, what, f"the camera in use ({message})", "a free camera", "Close the other program")
     if "permission" in lowered:
         return DeviceError(
             where,
             what,
-            f"permission denied ({said})",
+            f"permission denied ({message})",
             "a camera that you may open",
             "On Linux its udev rule is needed: docs.luxonis.com",
         )
     return DeviceError(
         where,
         what,
-        f"the camera disconnected or failed ({said})",
+        f"the camera disconnected or failed ({message})",
         "a connected camera",
         "Check the cable and the power, then open it again",
     )

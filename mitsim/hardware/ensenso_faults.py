@@ -82,14 +82,14 @@ def fault_of(error: BaseException, nxlib: Any, where: str, what: str, known: lis
     ``known``: serial numbers of the cameras that NxLib lists.
     """
     if isinstance(error, nxlib.NxLibException):
-        words, said = _command_words(error, what) if error.get_error_code() == _EXECUTION_FAILED else (None, "")
+        words, detail = _command_words(error, what) if error.get_error_code() == _EXECUTION_FAILED else (None, "")
         words = words or _CODES.get(error.get_error_code())
-        said = said or f"{error.get_error_text()} at {error.get_item_path()}"
+        detail = detail or f"{error.get_error_text()} at {error.get_item_path()}"
         if words is None:
             return DeviceError(
-                where, what, f"an error of NxLib: {said}", "none", "Check whether NxView can take such a capture"
+                where, what, f"an error of NxLib: {detail}", "none", "Check whether NxView can take such a capture"
             )
-        return DeviceError(where, what, f"{words.found} ({said})", words.expected, words.hint)
+        return DeviceError(where, what, f"{words.found} ({detail})", words.expected, words.hint)
     match type(error).__name__:  # nxlib.context's own, which the package does not export
         case "CameraNotFoundError":
             listed = f"NxLib lists {', '.join(known) or 'none'}"

@@ -75,8 +75,8 @@ class Grbl:
         about = self._ask("$I")
         versions = [version for version in map(parse_version, about) if version]
         if not versions or versions[0][0] != "1.1":
-            said = versions[0][1] if versions else " ".join(about)
-            raise self._fault("identify ($I)", shown(said), "GRBL 1.1")
+            version = versions[0][1] if versions else " ".join(about)
+            raise self._fault("identify ($I)", shown(version), "GRBL 1.1")
         self.identity = versions[0][1]
         check_model(connection, self.identity)
         settings = dict(setting for setting in map(parse_setting, self._ask("$$")) if setting)
@@ -202,8 +202,8 @@ class Grbl:
                     raise self._setting(number + column, value, "more than 0")
             check_steps(self._connection, index, steps)
             resolution.append(1 / steps)
-            asked = (self._connection.speed_deg_s or math.inf) * abs(axis.gear)
-            if self._connection.speed_deg_s is not None and asked > rate / 60 * (1 + 1e-9):
+            speed = (self._connection.speed_deg_s or math.inf) * abs(axis.gear)
+            if self._connection.speed_deg_s is not None and speed > rate / 60 * (1 + 1e-9):
                 raise InputError(
                     "stage.connection",
                     "speed_deg_s",
@@ -211,7 +211,7 @@ class Grbl:
                     f"at most {rate / 60 / abs(axis.gear):.4g} for axis {axis.name}",
                     f"the board's ${110 + column}",
                 )
-            rates.append(min(asked, rate / 60))
+            rates.append(min(speed, rate / 60))
             accelerations.append(slope)
             low_end = int(settings.get(23, 0)) >> column & 1
             if settings.get(20, 0) == 0:
@@ -263,13 +263,13 @@ class Grbl:
                 self._passing(line.strip(), command, "silence before a command")
         self._line.send(command.encode() + b"\n")
         deadline = self._line.clock.now() + (timeout_s or self._connection.reply_timeout_s)
-        said: list[str] = []
+        lines: list[str] = []
         while (line := self._line.receive(deadline, command, "ok")) != "ok":
             if parse_setting(line) or (line.startswith("[") and line.endswith("]")):
-                said.append(line)
+                lines.append(line)
             elif not parse_status(line):
                 self._passing(line, command, "ok")
-        return said
+        return lines
 
     def _passing(self, line: str, what: str, expected: str) -> None:
         """Ignore a message that is not a reply, and raise an error for an unexpected one."""

@@ -77,11 +77,11 @@ class PanTiltUnit:
         deadline = self._line.clock.now() + timeout_s
         while True:
             line = self._line.receive(deadline, "reset (R)", "!T!T!P!P*, when both axes have found their ends")
-            said = _LIMIT.sub("", line).strip()
-            if said.endswith("*"):
+            answer = _LIMIT.sub("", line).strip()
+            if answer.endswith("*"):
                 break
-            if said.startswith("!"):
-                raise self._fault("reset (R)", shown(said), "*", "Check for a heavy load or a blocked axis")
+            if answer.startswith("!"):
+                raise self._fault("reset (R)", shown(answer), "*", "Check for a heavy load or a blocked axis")
         self._make_terse()
         for channel, step in self._by_channel():
             if abs(own := self._count(f"{channel}P") * step) > step:
@@ -135,12 +135,12 @@ class PanTiltUnit:
         self._line.drain(PAUSE_S, self._connection.opening_timeout_s)
 
     def _identity(self) -> str:
-        said = [self._result("V")]
+        answer = [self._result("V")]
         self._line.drain(PAUSE_S, self._connection.opening_timeout_s)  # the version may have several lines
         if (model := self._reply("VM")).startswith("*"):  # the E series; others answer with an error
-            said.append(model[1:].strip())
+            answer.append(model[1:].strip())
         self._line.drain(PAUSE_S, self._connection.opening_timeout_s)
-        return ", ".join(said)
+        return ", ".join(answer)
 
     def _travel(self, channel: str, step: float) -> tuple[float, float]:
         low, high = self._count(f"{channel}N"), self._count(f"{channel}X")
@@ -157,9 +157,9 @@ class PanTiltUnit:
         """Return speed [own deg/s] and acceleration [own deg/s^2] of an axis, after setting the connection's speed."""
         channel, step, axis = self._channels[index], self.resolution[index], self._connection.axes[index]
         if self._connection.speed_deg_s is not None:
-            asked = round(self._connection.speed_deg_s * abs(axis.gear) / step)
+            steps = round(self._connection.speed_deg_s * abs(axis.gear) / step)
             low, high = self._count(f"{channel}L"), self._count(f"{channel}U")
-            if not low <= asked <= high:
+            if not low <= steps <= high:
                 raise InputError(
                     "stage.connection",
                     "speed_deg_s",
@@ -167,7 +167,7 @@ class PanTiltUnit:
                     f"{low * step / abs(axis.gear):.3g} to {high * step / abs(axis.gear):.3g} for axis {axis.name}",
                     "the unit's own limits",
                 )
-            self._order(f"{channel}S{asked}")
+            self._order(f"{channel}S{steps}")
         speed, acceleration = self._count(f"{channel}S"), self._count(f"{channel}A")
         if speed <= 0 or acceleration <= 0:
             raise self._fault(f"pace, channel {channel}", f"{speed} counts/s, {acceleration} counts/s^2", "more than 0")
@@ -213,23 +213,23 @@ class PanTiltUnit:
             if reply:
                 raise self._not_terse(command, reply, "a reply that begins with *")
 
-    def _checked(self, said: str, command: str) -> str:
+    def _checked(self, answer: str, command: str) -> str:
         """Return a text if it has no sign that an axis has hit its end; raise an error otherwise."""
-        if hit := _LIMIT.search(said):
+        if hit := _LIMIT.search(answer):
             raise self._fault(
                 f"{command}, channel {hit[1]}",
                 f"!{hit[1]}: the {_NAMES[hit[1]]} axis has hit its end",
                 "an axis within its travel",
                 "Its position is lost. Remove the obstacle",
             )
-        return said
+        return answer
 
-    def _not_terse(self, command: str, said: str, expected: str) -> DeviceError:
-        words = re.match(r"[A-Za-z]{1,2}[-+\d]* ?[*!]|[A-Za-z]+[- ][A-Za-z]+", said)
+    def _not_terse(self, command: str, answer: str, expected: str) -> DeviceError:
+        words = re.match(r"[A-Za-z]{1,2}[-+\d]* ?[*!]|[A-Za-z]+[- ][A-Za-z]+", answer)
         if words:
             hint = "It has restarted and lost its position. Check its power"
-            return self._fault(command, f"verbose replies again, {shown(said)}", expected, hint)
-        return self._fault(command, shown(said), expected, "Check that this is a PTU, and the baud rate")
+            return self._fault(command, f"verbose replies again, {shown(answer)}", expected, hint)
+        return self._fault(command, shown(answer), expected, "Check that this is a PTU, and the baud rate")
 
     def _fault(self, what: str, found: str, expected: str, hint: str = "") -> DeviceError:
         return DeviceError(self._connection.where, what, found, expected, hint)

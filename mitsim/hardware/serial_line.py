@@ -101,8 +101,8 @@ class SerialLine:
             If no line or only a part of one arrives by the deadline, or the port failed. It states the request
             ``what`` and the ``expected`` reply.
         """
-        asked = self.clock.now()
-        waited = f"within {max(deadline - asked, 0):.2g} s"
+        began = self.clock.now()
+        waited = f"within {max(deadline - began, 0):.2g} s"
         while self.clock.now() < deadline:
             if line := self._cut():
                 return line
@@ -111,7 +111,7 @@ class SerialLine:
                 found = f"{len(self._buffer)} bytes without the end of a line, {shown(text_of(self._buffer))}"
                 self._buffer.clear()
                 raise DeviceError(self.where, what, found, expected, "Check the baud rate")
-        if asked >= deadline:  # lines arrived all the time, but no reply
+        if began >= deadline:  # lines arrived all the time, but no reply
             raise DeviceError(self.where, what, "other lines until the time-out", expected, SILENT)
         if line := self._cut():
             return line
@@ -221,14 +221,14 @@ def known_ports() -> list[str]:
 
 def _not_opened(port: str, where: str, error: Exception) -> DeviceError:
     """Return the reason why a port could not be opened, with advice."""
-    number, said = getattr(error, "errno", None), str(error).lower()
-    if number in (errno.EACCES, errno.EPERM) or "permission" in said:
+    number, message = getattr(error, "errno", None), str(error).lower()
+    if number in (errno.EACCES, errno.EPERM) or "permission" in message:
         hint = "Let your user open serial ports: sudo usermod -aG dialout $USER, then log in again"
         return DeviceError(where, "open", "permission denied", "a port that you may open", hint)
-    if number in (errno.EAGAIN, errno.EBUSY) or "exclusively lock" in said or "busy" in said:
+    if number in (errno.EAGAIN, errno.EBUSY) or "exclusively lock" in message or "busy" in message:
         hint = "Close the other program (a terminal, another mitsim), or find it: fuser -v " + port
         return DeviceError(where, "open", "the port busy: another program uses it", "a free port", hint)
-    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "filenotfound" in said:
+    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "filenotfound" in message:
         there = ", ".join(known_ports()) or "none"
         return DeviceError(where, "open", "no such port", "an existing port", f"Ports of this machine: {there}")
     hint = (

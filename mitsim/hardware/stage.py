@@ -135,17 +135,17 @@ class LiveStage:
         DeviceError
             If the stage has not been homed, does not arrive, or stands elsewhere; it is stopped first.
         """
-        asked = self._within_limits(angles_deg)
+        requested = self._within_limits(angles_deg)
         self._check_homed("move")
         with self._stopped_on_error("move"):
-            targets = [axis.own(angle) for axis, angle in zip(self.connection.axes, asked, strict=True)]
+            targets = [axis.device_angle(angle) for axis, angle in zip(self.connection.axes, requested, strict=True)]
             started = self._clock.now()
             seconds = PATIENCE * self._controller.start(targets) + self.connection.reply_timeout_s
             self._await_rest(targets, started + seconds)
             self._clock.sleep(self.connection.settle_s)
-            stands = self._angles(self._controller.report()[0])
-            self._check_arrival(asked, stands)
-            return stands
+            position = self._angles(self._controller.report()[0])
+            self._check_arrival(requested, position)
+            return position
 
     def stop(self) -> None:
         """Stop the axes at their current position.
@@ -180,8 +180,8 @@ class LiveStage:
     ) -> None:
         self.close()
 
-    def _angles(self, own: Sequence[float]) -> Angles:
-        return np.array([axis.angle(value) + 0.0 for axis, value in zip(self.connection.axes, own, strict=True)])
+    def _angles(self, readings: Sequence[float]) -> Angles:
+        return np.array([axis.angle(value) + 0.0 for axis, value in zip(self.connection.axes, readings, strict=True)])
 
     def _within_limits(self, angles_deg: ArrayLike) -> list[float]:
         angles = np.asarray(angles_deg, float)
@@ -209,7 +209,7 @@ class LiveStage:
     def _check_travel(self) -> None:
         """Reject a connection that exceeds the device's range, before a plan fails half-way."""
         for index, (axis, step) in enumerate(zip(self.connection.axes, self.resolution, strict=True)):
-            low, high = sorted(axis.angle(own) for own in self._controller.travel[index])
+            low, high = sorted(axis.angle(reading) for reading in self._controller.travel[index])
             if axis.limits_deg[0] < low - step or axis.limits_deg[1] > high + step:
                 raise InputError(
                     "stage.connection",
@@ -232,17 +232,18 @@ class LiveStage:
         last: tuple[float, ...] = ()
         since = self._clock.now()
         while True:
-            own, moving = self._controller.report()
+            readings, moving = self._controller.report()
             now = self._clock.now()
-            if own != last:
-                last, since = own, now
+            if readings != last:
+                last, since = readings, now
             there = all(
-                abs(a - b) <= step for a, b, step in zip(own, targets, self._controller.resolution, strict=True)
+                abs(a - b) <= step for a, b, step in zip(readings, targets, self._controller.resolution, strict=True)
             )
             if moving is False or (moving is None and (there or now - since >= STANDSTILL_S)):
                 return
             if now >= deadline:
-                at = ", ".join(f"{name} {angle:.3f}" for name, angle in zip(self.axes, self._angles(own), strict=True))
+                angles = zip(self.axes, self._angles(readings), strict=True)
+                at = ", ".join(f"{name} {angle:.3f}" for name, angle in angles)
                 expected = "arrival in the time that follows from distance and speed"
                 raise DeviceError(
                     self.connection.where,
@@ -253,8 +254,8 @@ class LiveStage:
                 )
             self._clock.sleep(POLL_S)
 
-    def _check_arrival(self, asked: Sequence[float], stands: Angles) -> None:
-        for name, wanted, found in zip(self.axes, asked, stands, strict=True):
+    def _check_arrival(self, requested: Sequence[float], position: Angles) -> None:
+        for name, wanted, found in zip(self.axes, requested, position, strict=True):
             if not abs(found - wanted) <= self.connection.tolerance_deg:
                 raise DeviceError(
                     f"{self.connection.where}, axis {name}",

@@ -50,13 +50,13 @@ class AxisConnection(Document):
             raise ValueError("a gear that turns the axis")
         return self
 
-    def own(self, angle: float) -> float:
+    def device_angle(self, angle: float) -> float:
         """Return the device's own reading [own deg] at an angle of the axis [deg]."""
         return self.zero_deg + self.gear * angle
 
-    def angle(self, own: float) -> float:
+    def angle(self, reading: float) -> float:
         """Return the angle of the axis [deg] at a reading of the device [own deg]."""
-        return (own - self.zero_deg) / self.gear
+        return (reading - self.zero_deg) / self.gear
 
 
 class StageConnection(Document):

@@ -26,7 +26,7 @@ from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.surface.scatter import NOMINAL, Deviation
 
 #: the last sensor and its simulation: preparing the patterns takes longer than tracing an image
-_laid_out: list[tuple[Sensor, SimulatedSensor]] = []
+_prepared: list[tuple[Sensor, SimulatedSensor]] = []
 
 
 def load_sensor(name_or_path: str | Path) -> Sensor:
@@ -101,11 +101,11 @@ def load_scene(
     return load.load_scene(path, sensor.wavelength_nm, given, deviation)
 
 
-def laid_out(sensor: Sensor) -> SimulatedSensor:
+def prepared_sensor(sensor: Sensor) -> SimulatedSensor:
     """Return a sensor ready to take captures; the last one is kept for the next call."""
-    if not (_laid_out and _laid_out[0][0] is sensor):
-        _laid_out[:] = [(sensor, SimulatedSensor(sensor))]
-    return _laid_out[0][1]
+    if not (_prepared and _prepared[0][0] is sensor):
+        _prepared[:] = [(sensor, SimulatedSensor(sensor))]
+    return _prepared[0][1]
 
 
 def render(
@@ -159,10 +159,12 @@ def render(
     for name, value, low, high in (("samples", samples, 1, 65536), ("depth", depth, 1, 16), ("seed", seed, 0, 2**63)):
         if not low <= value <= high:
             raise InputError("render", name, value, f"{low} to {high}")
-    stands = as_pose(pose, "render")
+    world_from_sensor = as_pose(pose, "render")
     chosen = Noise.parse(noise, "render: noise")
-    taken = laid_out(sensor).capture(scene, stands, seed=seed, rendering=Rendering(samples, depth), noise=chosen)
-    return replace(taken, taken_by=sensor)
+    rendered = prepared_sensor(sensor).capture(
+        scene, world_from_sensor, seed=seed, rendering=Rendering(samples, depth), noise=chosen
+    )
+    return replace(rendered, taken_by=sensor)
 
 
 def read_capture(path: str | Path) -> Capture:

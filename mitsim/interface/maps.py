@@ -12,7 +12,7 @@ from characterisation.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from characterisation.point_cloud import PointCloud
-from mitsim.campaign.missing_finishes import Wanted, map_with_finishes, seen_finishes, with_lights
+from mitsim.campaign.missing_finishes import NeededFinishes, map_with_finishes, seen_finishes, with_lights
 from mitsim.interface.poses import as_pose
 from mitsim.prediction import CharacterisedScene, Predictor
 from mitsim.reconstruction.cloud import sensor_geometry
@@ -115,6 +115,6 @@ def predict(
     predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor))
     radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
     away = float(np.linalg.norm(np.subtract(eye, scene.centre)))
-    wanted = Wanted(sensor, scene.where, seen_finishes(scene), (max(away - radius, 1.0), away + radius))
-    characterised = CharacterisedScene(scene, map_with_finishes(performance_map, wanted, ask))
+    needed = NeededFinishes(sensor, scene.where, seen_finishes(scene), (max(away - radius, 1.0), away + radius))
+    characterised = CharacterisedScene(scene, map_with_finishes(performance_map, needed, ask))
     return predictor.predict(characterised, stands, np.random.default_rng(seed), correlated)

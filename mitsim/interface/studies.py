@@ -192,14 +192,16 @@ def stated_view(
     ``workers`` run the trials; without them, this process does. ``table`` replaces the study's own numbers.
     """
     unknowns = study_unknowns(study)
-    maker = measurements_of(study, unknowns)
-    digest = with_scene_files(trial_digest(study, unknowns, maker.source), study)
-    trial_maker = spread_over(workers, study, unknowns, maker)
+    virtual_measurements = measurements_of(study, unknowns)
+    digest = with_scene_files(trial_digest(study, unknowns, virtual_measurements.source), study)
+    runner = spread_over(workers, study, unknowns, virtual_measurements)
     claim(folder, f"budget of view {view.number}", study_digest(study, digest))
-    exposed = exposed_for(study, view, maker, trial_maker, digest, folder)
+    exposed = exposed_for(study, view, virtual_measurements, runner, digest, folder)
     trials = TrialFolder(folder / "trials", exposed.digest, list(study.task.measurements))
-    stated = state_view(study, view, exposed.maker, trials, unknowns, table or study.file.statement)
-    return StatedView(stated, statement_document(study, view, stated, unknowns, maker.source, exposed.planned))
+    stated = state_view(study, view, exposed.runner, trials, unknowns, table or study.file.statement)
+    return StatedView(
+        stated, statement_document(study, view, stated, unknowns, virtual_measurements.source, exposed.planned)
+    )
 
 
 def study_view(study: Study, number: int, where: str) -> View:

@@ -40,7 +40,7 @@ def repeatability_table(found: Sequence[Repeatability]) -> str:
         rows.append(
             [
                 one.name,
-                f"{one.count}/{one.asked}",
+                f"{one.count}/{one.cloud_count}",
                 _value_text(one.mean, one.deviation),
                 _uncertainty_text(one.deviation),
                 one.unit,
@@ -96,7 +96,7 @@ def measured_document(
                 "name": one.name,
                 "unit": one.unit,
                 "count": one.count,
-                "asked": one.asked,
+                "asked": one.cloud_count,
                 "mean": _number(one.mean),
                 "standard_deviation": _number(one.deviation),
                 "fit_uncertainty": _number(one.uncertainty),

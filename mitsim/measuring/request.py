@@ -179,7 +179,7 @@ def read_request(
 
 def _difference_results(difference: Difference) -> list[Result]:
     """Return the results of a difference, without uncertainties, because its points are not independent."""
-    result = partial(Result, unit="mm", points=difference.count, points_given=difference.asked)
+    result = partial(Result, unit="mm", points=difference.count, points_given=difference.points_given)
     values = {
         "mean": difference.mean,
         "median": difference.median,
@@ -189,8 +189,10 @@ def _difference_results(difference: Difference) -> list[Result]:
         "97.5 %": difference.high,
     }
     if difference.count < 2:
-        reason = f"only {difference.count} of {difference.asked} points have a counterpart in the reference"
-        return [failed(f"difference {name}", "mm", reason, difference.count, difference.asked) for name in values]
+        reason = f"only {difference.count} of {difference.points_given} points have a counterpart in the reference"
+        return [
+            failed(f"difference {name}", "mm", reason, difference.count, difference.points_given) for name in values
+        ]
     return [result(f"difference {name}", value=value) for name, value in values.items()]
 
 

@@ -67,7 +67,7 @@ class Result:
 class Repeatability:
     """One measurement over several clouds, in ``unit``.
 
-    - ``count``: number of clouds with a value, of ``asked`` clouds.
+    - ``count``: number of clouds with a value, of ``cloud_count`` clouds.
     - ``mean`` of the values, NaN without one; ``nominal`` value.
     - ``deviation``: standard deviation with count - 1 degrees of freedom, NaN for fewer than two values.
     - ``uncertainty``: root mean square of the known standard uncertainties, NaN without one.
@@ -76,7 +76,7 @@ class Repeatability:
     name: str
     unit: str
     count: int
-    asked: int
+    cloud_count: int
     mean: float
     deviation: float
     uncertainty: float

@@ -57,8 +57,9 @@ Floats = NDArray[np.float64]
 #: number of pixels of the coarse camera, and number of its pixels that a fringe covers at least
 PIXELS, PIXELS_OF_FRINGE = 20_000, 6
 
-#: camera paths and photons per render of interreflections. A phase code has two renders, since their noise must be told
-#: from a bias. With large pixels photons are efficient: 300 000 remove two thirds of the noise of 80 000 camera paths
+#: camera paths and photons per render of interreflections. A phase code has two renders, which
+#: distinguish their noise from a bias. With large pixels photons are efficient: 300 000 remove two thirds of the noise
+#: of 80 000 camera paths
 PATHS, PHOTONS = 180_000, 400_000
 
 #: number of views that are rendered at once: recording a kernel takes about as long as rendering one of them
@@ -160,7 +161,7 @@ class InterreflectionEffect:
 
     def __call__(self, view: SceneView) -> Perturbation:
         """Return the perturbation of the ideal points of a view."""
-        found = self._ahead(view.scene, view.world_from_sensor).at(view.ideal.point)
+        found = self._rendered_with_next(view.scene, view.world_from_sensor).at(view.ideal.point)
         rho = np.where(np.isfinite(found.rho), found.rho, 0.0)
         nothing = Perturbation.none(len(rho))
         if isinstance(self.sensor.settings, MatcherSettings):
@@ -177,28 +178,28 @@ class InterreflectionEffect:
             )
         return Perturbation(kept, np.sqrt(1 + rho), displaced, np.abs(scattered), nothing.shared)
 
-    def _ahead(self, scene: Scene, pose: Transform) -> InterreflectionImage:
+    def _rendered_with_next(self, scene: Scene, pose: Transform) -> InterreflectionImage:
         """Return the image of a view; if it is one of ``poses``, render it together with those that follow."""
         place = self.places.get(_key(pose))
         if place is None:
-            return self.look(scene, pose)
+            return self.render(scene, pose)
         if place not in self.ready:
             end = place + TOGETHER
             if len(self.poses) == end + 1:  # a render of one view would be another kernel
                 end += 1
-            images = self.look_from(scene, self.poses[place:end])
+            images = self.render_views(scene, self.poses[place:end])
             self.ready = dict(enumerate(images, place))
         return self.ready.pop(place)
 
-    def look(self, scene: Scene, world_from_sensor: Transform, seed: int = 1) -> InterreflectionImage:
+    def render(self, scene: Scene, world_from_sensor: Transform, seed: int = 1) -> InterreflectionImage:
         """Render the interreflections in a view."""
-        return self.look_from(scene, [world_from_sensor], seed)[0]
+        return self.render_views(scene, [world_from_sensor], seed)[0]
 
-    def look_from(self, scene: Scene, poses: Sequence[Transform], seed: int = 1) -> list[InterreflectionImage]:
-        """Render the interreflections in several views at once; each image is the one that :meth:`look` returns."""
+    def render_views(self, scene: Scene, poses: Sequence[Transform], seed: int = 1) -> list[InterreflectionImage]:
+        """Render the interreflections in several views at once; each image is the one that :meth:`render` returns."""
         given = scene, self.rays, self.light, poses
         direct = trace_poses(*given, LightPaths(samples=self.samples, seed=seed))
-        later = [
+        indirect = [
             trace_poses(
                 *given,
                 LightPaths(
@@ -212,19 +213,19 @@ class InterreflectionEffect:
             for half in range(1 if self.fringe is None else 2)
         ]
         return [
-            self._image(shapes_met(scene, self.middles, pose), direct[k], [one[k] for one in later])
+            self._image(shapes_met(scene, self.middles, pose), direct[k], [one[k] for one in indirect])
             for k, pose in enumerate(poses)
         ]
 
     def _image(
-        self, shape: NDArray[np.integer], direct: NDArray[np.float32], later: Sequence[NDArray[np.float32]]
+        self, shape: NDArray[np.integer], direct: NDArray[np.float32], indirect: Sequence[NDArray[np.float32]]
     ) -> InterreflectionImage:
         """Return the interreflections of one view from its direct light and one or two renders of the other light."""
         code = self.sensor.pattern
         own = (
             1 if not isinstance(code, AmplitudeModulation) else code.steps
         )  # number of images whose mean is the total light
-        white = np.stack([direct[:own].mean(axis=0), np.mean([one[:own].mean(axis=0) for one in later], axis=0)])
+        white = np.stack([direct[:own].mean(axis=0), np.mean([one[:own].mean(axis=0) for one in indirect], axis=0)])
         first, other = smoothed(white, shape, SMOOTHED_PX / self.step).astype(float)
         with np.errstate(divide="ignore", invalid="ignore"):
             rho = np.where(first > 0, other / first, np.nan)
@@ -234,7 +235,7 @@ class InterreflectionEffect:
             levels = self._levels()
             displaced, rejected = path_bias(
                 path_amplitudes(direct, code) * levels,
-                path_amplitudes(later[0], code) * levels,
+                path_amplitudes(indirect[0], code) * levels,
                 code,
                 self.sensor.settings,
                 self.sensor.imager,
@@ -242,7 +243,7 @@ class InterreflectionEffect:
                 self.step,
             )
         elif self.fringe is not None:
-            one, *two = (amplitude(images[1:]) for images in (direct, *later))
+            one, *two = (amplitude(images[1:]) for images in (direct, *indirect))
             displaced, scattered = phase_bias(one, (two[0], two[1]), shape, self.step)
         return InterreflectionImage(self.coarse, np.stack([rho, displaced, scattered, rejected]))
 

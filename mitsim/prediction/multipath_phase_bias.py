@@ -60,21 +60,21 @@ _PHASE_SHIFTS = 2 * np.pi * np.arange(3) / 3
 class Fringe:
     """Fringe of a camera and a projector, with ``period`` relative to the focal length [1].
 
-    The coordinate of a point P is ``along``.(P - ``centre``) / ``ahead``.(P - ``centre``) in the sensor frame. The
-    change of the projector's distortion over a period is neglected.
+    The coordinate of a point P is ``along``.(P - ``centre``) / ``optical_axis``.(P - ``centre``) in the sensor
+    frame. The change of the projector's distortion over a period is neglected.
     """
 
     period: float
     centre: Floats
     along: Floats
-    ahead: Floats
+    optical_axis: Floats
 
     def range_bias(self, phase: Floats, ideal: Ideal) -> Floats:
         """Return the range bias (n,) [mm] along the rays for a phase bias ``phase`` (n,) [rad]; positive is too far."""
         place = ideal.point - self.centre
         with np.errstate(divide="ignore", invalid="ignore"):
-            read = (place @ self.along) / (place @ self.ahead) + phase / (2 * math.pi) * self.period
-            normal = self.along - read[:, None] * self.ahead  # of the plane of points with this coordinate
+            read = (place @ self.along) / (place @ self.optical_axis) + phase / (2 * math.pi) * self.period
+            normal = self.along - read[:, None] * self.optical_axis  # of the plane of points with this coordinate
             moved = -(normal * place).sum(1) / (normal * ideal.ray).sum(1)
         return np.where(np.isfinite(moved), moved, 0.0)
 

@@ -68,16 +68,16 @@ _WAVE_POINTS, _LOOK_UP_POINTS = 2048, 32768
 
 
 def correlated_noise(
-    scene: Scene, performance_map: PerformanceMap, seen: MappedView, rng: np.random.Generator
+    scene: Scene, performance_map: PerformanceMap, mapped: MappedView, rng: np.random.Generator
 ) -> Singles:
     """Return the errors (h, w) of the points of a view in units of the map's sigma; 0 where the map has none.
 
-    ``seen`` includes normals.
+    ``mapped`` includes normals.
     """
-    assert seen.normal is not None
-    predicted = np.isfinite(seen.sigma)
-    pixel, normal = np.argwhere(predicted), seen.normal[:, predicted].T
-    shape, distance, fraction = seen.shape[predicted], seen.distance[predicted], seen.fraction[predicted]
+    assert mapped.normal is not None
+    predicted = np.isfinite(mapped.sigma)
+    pixel, normal = np.argwhere(predicted), mapped.normal[:, predicted].T
+    shape, distance, fraction = mapped.shape[predicted], mapped.distance[predicted], mapped.fraction[predicted]
     area, share = np.full((2, len(pixel)), np.nan)
     members = {index: np.flatnonzero(shape == index) for index in range(len(scene.names))}
     for index, finish in enumerate(scene.finishes):
@@ -99,7 +99,7 @@ def correlated_noise(
         lasting = np.nan_to_num(share[chosen]).astype(np.float32)
         if lasting.any():
             noise[chosen] += lasting * persistent_field(pixel[chosen], normal[chosen], rng)
-    out = np.zeros(seen.sigma.shape, np.float32)
+    out = np.zeros(mapped.sigma.shape, np.float32)
     out[predicted] = noise
     return out
 
@@ -139,16 +139,16 @@ def averaging_field(area: Floats, pixel: NDArray[np.int64], rng: np.random.Gener
     out = np.empty(len(area), np.float32)
     for number in used:
         mask = np.flatnonzero(low == number)
-        alike = _grade_correlation(number, size)
-        ratio = _ratio(area[mask], 2.0**number, 2.0 ** (number + 1), alike)
+        correlation = _grade_correlation(number, size)
+        ratio = _ratio(area[mask], 2.0**number, 2.0 ** (number + 1), correlation)
         total = graded(number)[at[mask]] + ratio.astype(np.float32) * graded(number + 1)[at[mask]]
-        out[mask] = total / np.sqrt(1 + 2 * alike * ratio + ratio**2)
+        out[mask] = total / np.sqrt(1 + 2 * correlation * ratio + ratio**2)
     return out
 
 
-def _ratio(area: Floats, lower: float, upper: float, alike: float) -> Floats:
+def _ratio(area: Floats, lower: float, upper: float, correlation: float) -> Floats:
     """Return the weight q of the grade with the larger area, relative to that with the smaller one."""
-    a, b, c = upper - area, math.sqrt(lower * upper) - area * alike, lower - area
+    a, b, c = upper - area, math.sqrt(lower * upper) - area * correlation, lower - area
     return np.asarray((-b + np.sqrt(np.maximum(b**2 - a * c, 0.0))) / a)
 
 

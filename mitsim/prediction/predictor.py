@@ -205,8 +205,8 @@ class Predictor:
             )
         )
         rays = PixelRays(self.every.origin, self.every.rays_at(column, row))
-        alike = (shapes_met(scene, rays, world_from_sensor) == own).all(axis=0)
-        labels[rows[alike], columns[alike]] = own[alike]
+        agree = (shapes_met(scene, rays, world_from_sensor) == own).all(axis=0)
+        labels[rows[agree], columns[agree]] = own[agree]
         return labels
 
     def look_up(

@@ -29,13 +29,13 @@ def best_views(scores: xr.Dataset, measurement: str, count: int) -> str:
 
     The text ends with an empty line.
     """
-    here = scores.sel(measurement=measurement)
-    unit, tolerance = str(here["unit"].values), float(here["tolerance"].values)
+    measured = scores.sel(measurement=measurement)
+    unit, tolerance = str(measured["unit"].values), float(measured["tolerance"].values)
     ranked = ranked_views(scores, measurement)
     title = f"{measurement} [{unit}]: {len(ranked)} of {scores.sizes['view']} views can make it"
     if not math.isnan(tolerance):
         title += f"; tolerance {tolerance:g} {unit}"
-    rows = [_HEAD, *(_row(here, int(v), tolerance) for v in ranked[:count])]
+    rows = [_HEAD, *(_row(measured, int(v), tolerance) for v in ranked[:count])]
     widths = [max(len(row[k]) for row in rows) for k in range(len(_HEAD))]
     lines = [
         "  ".join(
@@ -47,8 +47,8 @@ def best_views(scores: xr.Dataset, measurement: str, count: int) -> str:
     return "\n".join([title, *lines, ""])
 
 
-def _row(here: xr.Dataset, view: int, tolerance: float) -> tuple[str, ...]:
-    at = {str(name): values.values[view] for name, values in here.data_vars.items() if values.dims == ("view",)}
+def _row(measured: xr.Dataset, view: int, tolerance: float) -> tuple[str, ...]:
+    at = {str(name): values.values[view] for name, values in measured.data_vars.items() if values.dims == ("view",)}
     feature, limit = str(at["limiting_feature"]), str(at["limit"])
     u = float(at["predicted_uncertainty"])
     return (

@@ -23,7 +23,7 @@ class _Loose(Document):
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
 
-class AskedEntry(_Loose):
+class ComparedMeasurement(_Loose):
     """One measurement: its tolerance as in the task, and its decision rule in words."""
 
     unit: str
@@ -117,7 +117,7 @@ class ChoiceDocument(_Loose):
     words: str
     finished: bool
     seconds: float
-    measurements: dict[str, AskedEntry]
+    measurements: dict[str, ComparedMeasurement]
     sensors: list[SensorEntry]
 
     @model_validator(mode="after")

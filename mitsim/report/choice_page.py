@@ -83,12 +83,12 @@ def _asked(choice: ChoiceDocument, name: str) -> dict[str, str]:
 
 
 def _row(choice: ChoiceDocument, one: SensorEntry) -> dict[str, Any]:
-    asked = sum(entry.tolerance is not None for entry in choice.measurements.values())
+    toleranced = sum(entry.tolerance is not None for entry in choice.measurements.values())
     return {
         "name": one.name,
         "stated": one.status == "stated",
         "why": one.why,
-        "fits": f"{one.fits} of {asked}" if asked else "",
+        "fits": f"{one.fits} of {toleranced}" if toleranced else "",
         "ratio": NONE if one.ratio is None else two_digits(one.ratio),
         "capture": NONE if one.capture is None else f"{rounded(1e3 * one.capture.seconds)}\N{NO-BREAK SPACE}ms",
         "exposures": "" if one.capture is None else _exposures(one),

@@ -86,21 +86,23 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
         words = with_sets("No view can make the measurements", False, run.about.view_sets).words
         return FirstScreen(words, "bad", [], None, [], {})
     results = [_judged(name, one) for name, one in document.measurements.items()]
-    here = run.scores.sel(view=document.view)
+    view_scores = run.scores.sel(view=document.view)
     asked = {
         name: (run.about.measurements[name].features, one.verdict)
         for name, one in document.measurements.items()
         if name in run.about.measurements
     }
-    poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", here["world_from_sensor"].values)]
+    poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", view_scores["world_from_sensor"].values)]
     verdicts = face_verdicts(asked)
     result = with_sets(result_in_words(results), fits_all(results), run.about.view_sets)
     best = f"the best of {count(run.scores.sizes['view'])} views for all measurements together"
-    pose = pose_words(*(float(here[name]) for name in ("standoff_mm", "azimuth_deg", "elevation_deg", "roll_deg")))
+    pose = pose_words(
+        *(float(view_scores[name]) for name in ("standoff_mm", "azimuth_deg", "elevation_deg", "roll_deg"))
+    )
     return FirstScreen(
         with_degree_signs(result.words[:1].upper() + result.words[1:]),
         tone_of(results) if result.good else "bad",
-        [_run_row(run, here, name, one) for name, one in document.measurements.items()],
+        [_run_row(run, view_scores, name, one) for name, one in document.measurements.items()],
         _picture(geometry, poses, verdicts, f"{run.about.sensor} in view {document.view}, {best}: {pose}"),
         poses,
         verdicts,
@@ -172,14 +174,14 @@ def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[Row]:
     ]
 
 
-def _run_row(run: Run, here: xr.Dataset, name: str, one: StatedMeasurement) -> Row:
-    """Return the row of a measurement of a run; ``here`` are the scores of the stated view."""
+def _run_row(run: Run, view_scores: xr.Dataset, name: str, one: StatedMeasurement) -> Row:
+    """Return the row of a measurement of a run; ``view_scores`` are the scores of the stated view."""
     entry, decision = run.about.measurements.get(name), one.decision
     limit = feature = ""
     points = None
     if entry is not None:
-        limit, feature = (str(here[key].sel(measurement=name).values) for key in ("limit", "limiting_feature"))
-        points = float(here["n"].sel(feature=feature)) if feature in here["feature"].values else None
+        limit, feature = (str(view_scores[key].sel(measurement=name).values) for key in ("limit", "limiting_feature"))
+        points = float(view_scores["n"].sel(feature=feature)) if feature in view_scores["feature"].values else None
     tolerance = one.tolerance if entry is None or entry.tolerance is None else entry.tolerance
     return RowValues(
         name=name,

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from characterisation.maps.validation import Pair, holds
+from characterisation.maps.validation import Pair, within_limits
 from mitsim.report.numbers import finish_name
 from mitsim.report.style import BLUE, VERMILION, drawing
 
@@ -71,7 +71,7 @@ def validation_table(table: xr.Dataset) -> str:
         "| by poses | Wasserstein | holds |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
-    kept = holds(table)
+    kept = within_limits(table)
     for row in range(table.sizes["row"]):
         one = {str(name): values.values[row] for name, values in table.data_vars.items()}
         name = finish_name(str(one["finish"]), float(one["roughness"]))

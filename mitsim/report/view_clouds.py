@@ -76,8 +76,8 @@ def box_around(clouds: Iterable[Floats]) -> Box:
     return Box(low, max(float((high - low).max()), 1e-6) / LAST_STEP)
 
 
-def choose_clouds(scores: xr.Dataset, there: Sequence[int], first: Sequence[int]) -> list[int]:
-    """Return the numbers of the views whose clouds are shown, ascending, at most :data:`MOST_CLOUDS` of ``there``.
+def choose_clouds(scores: xr.Dataset, available: Sequence[int], first: Sequence[int]) -> list[int]:
+    """Return the numbers of the views whose clouds are shown, ascending, at most :data:`MOST_CLOUDS` of ``available``.
 
     The choice takes ``first`` (checked views, sets), then the best of every measurement by uncertainty and by V_m in
     turn, then others, evenly spaced in number.
@@ -86,8 +86,8 @@ def choose_clouds(scores: xr.Dataset, there: Sequence[int], first: Sequence[int]
     ranks = [scores[name].transpose("measurement", "view").values for name in ("uncertainty_rank", "rank")]
     by_rank = np.argsort(np.concatenate(ranks), axis=1, kind="stable").T.ravel()
     wanted = dict.fromkeys([*first, *numbers[by_rank[: 10 * 2 * scores.sizes["measurement"]]].tolist()])
-    chosen = [view for view in wanted if view in set(there)][:MOST_CLOUDS]
-    rest = [view for view in there if view not in set(chosen)]
+    chosen = [view for view in wanted if view in set(available)][:MOST_CLOUDS]
+    rest = [view for view in available if view not in set(chosen)]
     more = min(MOST_CLOUDS - len(chosen), len(rest))
     return sorted(chosen + [rest[i * len(rest) // more] for i in range(more)])
 

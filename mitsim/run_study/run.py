@@ -43,7 +43,7 @@ from mitsim.view_sets.confirmed_set import (
     write_set_csv,
 )
 from mitsim.virtual.plan import measurements_of, race_rules, rendering_of, trial_digest
-from mitsim.virtual.race import Maker, run_race
+from mitsim.virtual.race import TrialRunner, run_race
 from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.spread_out import spread_over
@@ -89,22 +89,22 @@ def run_study(
     folder = Path(folder)
     clock = _Clock()
     unknowns = study_unknowns(study)
-    maker = measurements_of(study, unknowns)
-    trial_maker = spread_over(workers, study, unknowns, maker)
-    digest = with_scene_files(trial_digest(study, unknowns, maker.source), study)
+    virtual_measurements = measurements_of(study, unknowns)
+    runner = spread_over(workers, study, unknowns, virtual_measurements)
+    digest = with_scene_files(trial_digest(study, unknowns, virtual_measurements.source), study)
     claim(folder, "run", study_digest(study, digest))
     (folder / "clouds").mkdir(parents=True, exist_ok=True)
     (folder / "captures").mkdir(exist_ok=True)
-    twin = maker if isinstance(maker, RenderedMeasurements) else None
+    twin = virtual_measurements if isinstance(virtual_measurements, RenderedMeasurements) else None
     residuals = [] if study.campaign is None or twin is None else coupon_residuals(twin.simulated, study.campaign)
     performance_map = _map(study, twin, folder)
     clock.lap("characterise")
 
-    predictor = maker.predictor
+    predictor = virtual_measurements.predictor
     scores, chosen, search = score_study(study, predictor, performance_map, folder)
     clock.lap("score")
     trials = TrialFolder(folder / "trials", digest, list(study.task.measurements))
-    raced = run_race(study.views, scores, trial_maker, trials, race_rules(study.file.race, minutes))
+    raced = run_race(study.views, scores, runner, trials, race_rules(study.file.race, minutes))
     scores = with_race(scores, raced)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="final_rank")
     write_netcdf(scores, folder / "scores.nc")
@@ -113,11 +113,11 @@ def run_study(
     leaders = list(dict.fromkeys(raced.leaders().values()))
     planned = None
     if leaders:
-        exposed = exposed_for(study, study.views[leaders[0]], maker, trial_maker, digest, folder)
-        planned, trial_maker, trials = exposed.planned, exposed.maker, exposed.trials(study, folder, trials)
-    stated = _state(study, leaders, trial_maker, trials, unknowns, folder, planned)
+        exposed = exposed_for(study, study.views[leaders[0]], virtual_measurements, runner, digest, folder)
+        planned, runner, trials = exposed.planned, exposed.runner, exposed.trials(study, folder, trials)
+    stated = _state(study, leaders, runner, trials, unknowns, folder, planned)
     clock.lap("state")
-    tried = _confirm(study, chosen, search, maker, digest, folder)
+    tried = _confirm(study, chosen, search, virtual_measurements, digest, folder)
     chosen = tried[-1].chosen if tried else chosen
     clock.lap("confirm")
     drawn = sorted({*leaders, *_best(scores), *(chosen.views if chosen else ())})
@@ -142,7 +142,7 @@ def claim(folder: Path, command: str, digest: str) -> None:
 
 
 def _confirm(
-    study: Study, chosen: ViewSet | None, search: Search, maker: Maker, digest: str, folder: Path
+    study: Study, chosen: ViewSet | None, search: Search, virtual_measurements: TrialRunner, digest: str, folder: Path
 ) -> list[TriedSet]:
     """Measure sets of views virtually until one keeps its limits; the best set comes last.
 
@@ -151,10 +151,10 @@ def _confirm(
     table = study.file.set
     if table is None or chosen is None or not chosen.views or table.trials < 2:
         return []
-    if not isinstance(maker, RenderedMeasurements):
+    if not isinstance(virtual_measurements, RenderedMeasurements):
         say("the set of views is not confirmed: clouds drawn from a map cannot be joined")
         return []
-    tried = confirmed_set(study, chosen, search, maker, digest, folder)
+    tried = confirmed_set(study, chosen, search, virtual_measurements, digest, folder)
     best = tried[-1]
     write_set_csv(folder / "view_set.csv", table, best.chosen, best.stated)
     kept = "keeps its limits" if best.excess(table.limits) <= 1 else "the best set found, misses a limit"
@@ -170,7 +170,7 @@ def _confirm(
 def _state(
     study: Study,
     leaders: list[int],
-    maker: Maker,
+    runner: TrialRunner,
     trials: TrialFolder,
     unknowns: Unknowns,
     folder: Path,
@@ -180,8 +180,8 @@ def _state(
     if not leaders:
         return []
     view = study.views[leaders[0]]
-    stated = state_view(study, view, maker, trials, unknowns, study.file.statement)
-    document = statement_document(study, view, stated, unknowns, maker.source, planned)
+    stated = state_view(study, view, runner, trials, unknowns, study.file.statement)
+    document = statement_document(study, view, stated, unknowns, runner.source, planned)
     write_statement(folder / "statement.json", document)
     return stated
 
@@ -226,10 +226,14 @@ def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderRe
 
 
 def _show(
-    study: Study, maker: RenderedMeasurements, numbers: list[int], folder: Path, planned: dict[int, PlannedExposure]
+    study: Study,
+    renderer: RenderedMeasurements,
+    numbers: list[int],
+    folder: Path,
+    planned: dict[int, PlannedExposure],
 ) -> None:
     """Write image and cloud of some views, rendered with best estimates of all unknowns and planned exposures."""
     for number in track(numbers, "render pictures"):
-        capture, cloud = maker.exposed_as(planned.get(number)).best_guess(study.views[number])
+        capture, cloud = renderer.exposed_as(planned.get(number)).at_best_estimates(study.views[number])
         write_capture(capture, folder / "captures" / f"view_{number:04d}", overwrite=True)
         write_ply(cloud, folder / "clouds" / f"rendered_{number:04d}.ply")

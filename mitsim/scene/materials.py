@@ -38,7 +38,7 @@ from mitsim.surface.microfacet import fresnel
 from mitsim.surface.paint import ALPHA_RANGE, matt_white, paint
 from mitsim.surface.processes import PROCESSES
 from mitsim.surface.scatter import NOMINAL, Deviation, Scatter
-from mitsim.surface.seen import USUAL_REFLECTANCE, light_seen
+from mitsim.surface.surface_light import USUAL_REFLECTANCE, surface_light
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ def _paint(kind: str, greatest: float, describe: Callable[[float, Scatter], dict
 
 def _finish(kind: str, reflectance: float, scatter: Scatter, name: str, roughness: float) -> Finish:
     return Finish(
-        name, roughness, scatter, light_seen(kind, reflectance, scatter, name, roughness, _current.wavelength_nm)
+        name, roughness, scatter, surface_light(kind, reflectance, scatter, name, roughness, _current.wavelength_nm)
     )
 
 

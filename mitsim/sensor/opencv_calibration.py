@@ -72,22 +72,22 @@ def with_calibration(path: Path, table: dict[str, Any]) -> tuple[dict[str, Any],
     """
     if "calibration" not in table:
         return table, []
-    asked = validate(path, {"calibration": table["calibration"]}, _Calibrated).calibration
-    eyes = [*asked.cameras, *(["projector"] if asked.projector else [])]
-    for name in asked.keys:
+    calibration_table = validate(path, {"calibration": table["calibration"]}, _Calibrated).calibration
+    eyes = [*calibration_table.cameras, *(["projector"] if calibration_table.projector else [])]
+    for name in calibration_table.keys:
         if name not in eyes:
             raise InputError(path, f"calibration.keys.{name}", "an unknown name", ", ".join(eyes), nearest(name, eyes))
-    named = [asked.file] if isinstance(asked.file, str) else asked.file
-    for name, keys in asked.keys.items():
+    named = [calibration_table.file] if isinstance(calibration_table.file, str) else calibration_table.file
+    for name, keys in calibration_table.keys.items():
         if keys.file is not None and keys.file not in named:
             raise InputError(path, f"calibration.keys.{name}.file", repr(keys.file), " | ".join(named))
-    values = _Values(read_tree([path.parent / name for name in named]), asked)
+    values = _Values(read_tree([path.parent / name for name in named]), calibration_table)
     out = dict(table)
     out["cameras"] = {}
-    for index, name in enumerate(asked.cameras):
+    for index, name in enumerate(calibration_table.cameras):
         own = _own(table, "cameras", name)
         out["cameras"][name] = _eye(values, name, min(index, 1), own) | own
-    if asked.projector:
+    if calibration_table.projector:
         own = _own(table, "projector")
         out["projector"] = _eye(values, "projector", 2, own) | own
     if values.missing:
@@ -127,21 +127,23 @@ def _own(table: dict[str, Any], *names: str) -> dict[str, Any]:
 class _Values:
     """Values of a calibration by request; missing values are collected and reported together."""
 
-    def __init__(self, tree: CalibrationTree, asked: CalibrationTable) -> None:
-        self.tree, self.asked = tree, asked
+    def __init__(self, tree: CalibrationTree, calibration_table: CalibrationTable) -> None:
+        self.tree, self.calibration_table = tree, calibration_table
         self.missing: list[tuple[str, str, Names]] = []
 
     def find(
         self, name: str, place: int, what: str, shapes: tuple[tuple[int, ...], ...], needed: bool = True
     ) -> NDArray[np.float64] | None:
         """Return one value of an eye; None if it is missing."""
-        keys = self.asked.keys.get(name, EyeKeys())
+        keys = self.calibration_table.keys.get(name, EyeKeys())
         given = getattr(keys, what)
         names = (given,) if given else USUAL_NAMES[what][place]
         if keys.file and what in ("matrix", "distortion", "size"):
             # a file of one eye uses the names of a single camera
             names = tuple(f"{keys.file}:{key}" for key in ((given,) if given else names + USUAL_NAMES[what][0]))
-        elif place == 2 and len(self.asked.cameras) == 2 and not given:  # R and T are those of the second camera
+        elif (
+            place == 2 and len(self.calibration_table.cameras) == 2 and not given
+        ):  # R and T are those of the second camera
             names = tuple(key for key in names if key not in USUAL_NAMES[what][1])
         for key in names:
             found = self.tree.find(key)
@@ -166,8 +168,8 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
 
     The sensor file's ``own`` keys may be missing in the calibration.
     """
-    asked, file = values.asked, ", ".join(str(each) for each in values.tree.files)
-    counts = ((4,),) if asked.model == "fisheye" and place < 2 else ((4,), (5,), (8,), (12,), (14,))
+    calibration_table, file = values.calibration_table, ", ".join(str(each) for each in values.tree.files)
+    counts = ((4,),) if calibration_table.model == "fisheye" and place < 2 else ((4,), (5,), (8,), (12,), (14,))
     K = values.find(name, place, "matrix", ((3, 3),), needed="focal_px" not in own)
     distortion = values.find(name, place, "distortion", ((0,), *counts), needed=False)
     size = values.find(name, place, "size", ((2,),), needed=False)
@@ -175,7 +177,7 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
     if place > 0:
         R = values.find(name, place, "rotation", ((3, 3), (3,), (3, 1), (1, 3)), "rotation_deg" not in own)
         T = values.find(name, place, "translation", ((3,),), "position_mm" not in own)
-    out: dict[str, Any] = {"model": asked.model if place < 2 else "perspective"}
+    out: dict[str, Any] = {"model": calibration_table.model if place < 2 else "perspective"}
     out["distortion"] = [] if distortion is None else distortion.tolist()
     if K is not None:
         if abs(K[0, 1]) > 1e-9 and K[0, 0] > 0:
@@ -186,8 +188,8 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
         out |= {"focal_px": [float(K[0, 0]), float(K[1, 1])], "principal_px": [float(K[0, 2]), float(K[1, 2])]}
     if size is not None:
         out |= {"width": int(size[0]), "height": int(size[1])}
-    elif place < 2 or asked.keys.get(name, EyeKeys()).file:
-        own_file = asked.keys.get(name, EyeKeys()).file
+    elif place < 2 or calibration_table.keys.get(name, EyeKeys()).file:
+        own_file = calibration_table.keys.get(name, EyeKeys()).file
         found = [values.tree.find(f"{own_file}:{key}" if own_file else key) for key in ("image_width", "image_height")]
         if found[0] is not None and found[1] is not None:
             shapes: tuple[tuple[int, ...], ...] = ((1,),)
@@ -203,7 +205,7 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
         warnings.simplefilter("ignore")  # at 90 deg about y the angles are not unique; any solution is valid
         turn = Rotation.from_matrix(R.T)
         out["rotation_deg"] = turn.as_euler("xyz", degrees=True).tolist()
-    out["position_mm"] = (-turn.apply(T) * asked.to_mm).tolist()
+    out["position_mm"] = (-turn.apply(T) * calibration_table.to_mm).tolist()
     return out
 
 

@@ -10,7 +10,7 @@ from mitsim.study.reading import (
     open_study,
     read_map,
     read_study,
-    tell_lays,
+    report_lays,
     with_limits,
     with_plan,
 )
@@ -42,7 +42,7 @@ __all__ = [
     "open_study",
     "read_map",
     "read_study",
-    "tell_lays",
+    "report_lays",
     "with_limits",
     "with_plan",
 ]

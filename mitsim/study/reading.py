@@ -21,7 +21,7 @@ from characterisation.statements.decision import needed, tolerance_of
 from characterisation.tasks.evaluation import Task, check_features, read_task
 from mitsim.campaign.missing_finishes import (
     Ask,
-    Wanted,
+    NeededFinishes,
     map_with_finishes,
     samples_of,
     seen_finishes,
@@ -108,15 +108,15 @@ def open_study(
         As :func:`read_study`.
     """
     path = Path(path)
-    here = path.parent
-    own_sensor = here / file.sensor if file.sensor.endswith(".toml") else file.sensor
+    folder = path.parent
+    own_sensor = folder / file.sensor if file.sensor.endswith(".toml") else file.sensor
     sensor = load_sensor(own_sensor)
     check_exposure(sensor)
-    task = read_task(here / file.task)
+    task = read_task(folder / file.task)
     scene = load_scene(
-        here / file.scene, sensor.wavelength_nm, {name: str(value) for name, value in file.parameters.items()}
+        folder / file.scene, sensor.wavelength_nm, {name: str(value) for name, value in file.parameters.items()}
     )
-    check_features(task, here / file.task, scene.names)
+    check_features(task, folder / file.task, scene.names)
     file = with_limits(path, file, task)
     radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
     standoffs = chosen_standoffs(path, file.views, sensor, radius)
@@ -124,7 +124,7 @@ def open_study(
     if file.characterisation.campaign and map_name is None:
         near, far = sensor.working_range_mm
         around = [max(math.floor(standoffs[0] - radius), near), min(math.ceil(standoffs[-1] + radius), far)]
-        campaign = read_campaign(here / file.characterisation.campaign, sensor, around)
+        campaign = read_campaign(folder / file.characterisation.campaign, sensor, around)
         known = samples_of([(one.finish, one.roughness, one.light) for one in campaign.samples], "the campaign")
         distances = list(campaign.distances)
     else:
@@ -137,7 +137,7 @@ def open_study(
                 'map = "map.nc" or campaign = "campaign.toml" in [characterisation]',
                 f"mitsim characterise CAMPAIGN --sensor {own_sensor} -o FOLDER writes FOLDER/map.nc",
             )
-        performance_map = read_map(map_name or own, sensor, "." if map_name else here)
+        performance_map = read_map(map_name or own, sensor, "." if map_name else folder)
         distances = performance_map.data["distance"].values.tolist()
         known = performance_map.known
     _check_finishes(path, scene, task, known)
@@ -148,7 +148,7 @@ def open_study(
     if performance_map is not None and mapped:
         stood = [view.standoff for view in candidates.views]
         depths = (min(stood) - radius, max(stood) + radius)
-        wanted = Wanted(sensor, scene.where, seen_finishes(scene), depths)
+        wanted = NeededFinishes(sensor, scene.where, seen_finishes(scene), depths)
         performance_map = map_with_finishes(performance_map, wanted, ask)
     return Study(path, file, scene, task, sensor, candidates, campaign, performance_map)
 
@@ -158,7 +158,7 @@ def finishes_of_features(study: Study) -> dict[str, Finish | None]:
     return {name: study.scene.finishes[study.scene.names.index(name)] for name in study.task.shapes}
 
 
-def tell_lays(study: Study) -> None:
+def report_lays(study: Study) -> None:
     """Say what the prediction leaves out of the direction of machining marks on the features of the study."""
     finishes = finishes_of_features(study)
     for sentence in lays_in_words({name: (one.name, one.scatter) for name, one in finishes.items() if one is not None}):
@@ -172,7 +172,7 @@ def with_plan(study: Study, plan: bool) -> Study:
     return replace(study, file=study.file.model_copy(update={"exposure": ExposureTable()}))
 
 
-def read_map(name: str | Path, sensor: Sensor, here: str | Path = ".") -> PerformanceMap:
+def read_map(name: str | Path, sensor: Sensor, folder: str | Path = ".") -> PerformanceMap:
     """Read the performance map of a sensor: a file, or a map that comes with mitsim.
 
     Raises
@@ -180,7 +180,7 @@ def read_map(name: str | Path, sensor: Sensor, here: str | Path = ".") -> Perfor
     InputError
         If there is no map, or it belongs to another sensor.
     """
-    file = map_path(name, here)
+    file = map_path(name, folder)
     performance_map = with_lights(PerformanceMap.load(file))
     attributes = performance_map.data.attrs
     if (whose := str(attributes.get("sensor"))) != sensor.name:

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
+from mitsim.twin.input_captures import InputCapture
 from mitsim.twin.modulation import fitted_blur
-from mitsim.twin.takes import Take
 
 Floats = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ class Defocus:
     covariance: Floats
 
 
-def fit_defocus(take: Take, white: Floats, black: Floats, pairs: Floats, widths: Floats) -> Defocus | None:
+def fit_defocus(source: InputCapture, white: Floats, black: Floats, pairs: Floats, widths: Floats) -> Defocus | None:
     """Fit the focus of a capture's projector; None if there are too few blocks.
 
     Parameters
@@ -60,14 +60,14 @@ def fit_defocus(take: Take, white: Floats, black: Floats, pairs: Floats, widths:
     widths
         (n,) of the stripes [projector px].
     """
-    projector = take.capture.rig.projector
+    projector = source.capture.rig.projector
     assert projector is not None
-    settings, _ = decoder_settings(take.capture)
-    points = capture_cloud(take.capture, settings).points.astype(float)
+    settings, _ = decoder_settings(source.capture)
+    points = capture_cloud(source.capture, settings).points.astype(float)
     depth = projector.sensor_from_camera.inverse().points(points.reshape(-1, 3)).reshape(points.shape)[..., 2]
     fine = widths < _WIDEST_PX
     difference = np.abs(pairs[fine, 0] - pairs[fine, 1])
-    least = _LEAST_DN * (2**take.capture.bits - 1) / 255
+    least = _LEAST_DN * (2**source.capture.bits - 1) / 255
     rows = []
     for top in range(0, white.shape[0] - _BLOCK_PX + 1, _BLOCK_PX):
         for left in range(0, white.shape[1] - _BLOCK_PX + 1, _BLOCK_PX):

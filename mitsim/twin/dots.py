@@ -2,7 +2,7 @@
 
 Signal chain: capture -> plane and bend of the sheet -> features over the field (:mod:`mitsim.twin.figures`) -> power,
 room light, dots, noise and corner losses by simulated moments (:mod:`mitsim.twin.moments`,
-:mod:`mitsim.twin.parameters`) with the forward model (:mod:`mitsim.twin.bench`).
+:mod:`mitsim.twin.parameters`) with the forward model (:mod:`mitsim.twin.specimen_simulator`).
 
 The six terms of room light may not explain the level and contrast over the field within chance. The mean square of the
 remainder is then added to the covariance of these terms, and the fit is repeated. If the misfit is still significant,
@@ -25,11 +25,11 @@ from mitsim.fit.specimen import MARGIN_PX, image_mask
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import Roi
-from mitsim.twin.bench import Bench
 from mitsim.twin.estimate import scaled, unscaled
 from mitsim.twin.figures import TERMS, Field, field_figures
-from mitsim.twin.moments import Found, Prior, match_moments
+from mitsim.twin.moments import MomentFit, Prior, match_moments
 from mitsim.twin.parameters import CORNER_BLUR, SMOOTHING, Parameter, room_parameters, with_room
+from mitsim.twin.specimen_simulator import SpecimenSimulator
 from mitsim.validation.specimen_patches import run_length
 
 Floats = NDArray[np.float64]
@@ -60,24 +60,24 @@ class DotsFit:
 
     sensor: Sensor
     parameters: tuple[Parameter, ...]
-    found: Found
+    moment_fit: MomentFit
     patches: int
     uneven: float
     undetermined: tuple[Parameter, ...] = ()
 
-    def built(self, theta: Floats) -> Sensor:
+    def with_values(self, theta: Floats) -> Sensor:
         """Return the sensor with the varied numbers (k,) inserted."""
-        return built(self.sensor, self.parameters, theta)
+        return with_values(self.sensor, self.parameters, theta)
 
     def in_file_units(self) -> tuple[Floats, Floats]:
         """Return the numbers (k,) in the file's units, and their standard uncertainties, each on its scale.
 
         The covariance is propagated through numerical derivatives of the file's numbers by the varied ones.
         """
-        theta, spread = self.found.values, np.sqrt(np.diag(self.found.covariance))
+        theta, spread = self.moment_fit.values, np.sqrt(np.diag(self.moment_fit.covariance))
 
         def numbers(at: Floats) -> Floats:
-            sensor = self.built(at)
+            sensor = self.with_values(at)
             return np.array([scaled(parameter.read(sensor), parameter.scale) for parameter in self.parameters])
 
         jacobian = np.empty((len(theta), len(theta)))
@@ -88,10 +88,10 @@ class DotsFit:
             low, high = (np.where(np.arange(len(theta)) == index, end, theta) for end in ends)
             jacobian[:, index] = (numbers(high) - numbers(low)) / max(float(ends[1] - ends[0]), 1e-12)
         found = [unscaled(x, p.scale) for x, p in zip(numbers(theta), self.parameters, strict=True)]
-        return np.array(found), np.sqrt(np.diag(jacobian @ self.found.covariance @ jacobian.T))
+        return np.array(found), np.sqrt(np.diag(jacobian @ self.moment_fit.covariance @ jacobian.T))
 
 
-def built(sensor: Sensor, parameters: Sequence[Parameter], theta: Floats) -> Sensor:
+def with_values(sensor: Sensor, parameters: Sequence[Parameter], theta: Floats) -> Sensor:
     """Return the sensor with varied numbers (k,) of parameters inserted."""
     for parameter, value in zip(parameters, theta, strict=True):
         sensor = parameter.put(sensor, float(value))
@@ -142,12 +142,12 @@ def fit_dots(
     if len(field.corners) < FEWEST_PATCHES:
         seen = f"{len(field.corners)} patches of {patch_px} px of it"
         raise InputError(where, "specimen", seen, f"{FEWEST_PATCHES} or more", "a larger --window, or a nearer view")
-    roi = Roi(field.column, field.row, *field.there.shape[::-1])
+    roi = Roi(field.column, field.row, *field.mask.shape[::-1])
     window = int(np.clip(np.nan_to_num(_RUNS * run_length(capture, place), nan=_WINDOWS[1]), *_WINDOWS)) // 2 * 2 + 1
     black = sensor.imager.black_level
     real = field_figures(capture.images[name][0][roi.slices].astype(float), field, window, black)
-    bench = Bench(sensor, place, roi)
-    unit = bench.projector_irradiance(sensor, seed)
+    simulator = SpecimenSimulator(sensor, place, roi)
+    unit = simulator.projector_irradiance(sensor, seed)
     own = list(parameters)
     if room is None:
         own += room_parameters(unit / sensor.projector.flux)
@@ -165,7 +165,7 @@ def fit_dots(
     wanted, covariance = real.of(names)
 
     def simulate(theta: Floats, number: int) -> tuple[Floats, Floats]:
-        levels = bench.levels(_with_other_dots(built(sensor, own, theta), number), 1000 * seed + number)
+        levels = simulator.levels(_with_other_dots(with_values(sensor, own, theta), number), 1000 * seed + number)
         return field_figures(levels.astype(float), field, window, black).of(names)
 
     start = np.array([parameter.get(sensor) for parameter in own])
@@ -196,7 +196,7 @@ def fit_dots(
     return DotsFit(sensor, tuple(own), found, len(field.corners), uneven, undetermined)
 
 
-def _is_determined(found: Found, index: int, parameter: Parameter) -> bool:
+def _is_determined(found: MomentFit, index: int, parameter: Parameter) -> bool:
     """Return whether a parameter stays in the fit: the room's always, smoothing and corner blur if significant."""
     if parameter.key.startswith("room."):
         return True

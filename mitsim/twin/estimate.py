@@ -41,7 +41,7 @@ def unscaled(value: float, scale: Scale) -> float:
 class Estimate:
     """A fitted number: ``key`` in the sensor file, ``value``, standard ``uncertainty`` on its ``scale``, ``unit``.
 
-    ``captures`` that determine it, and the method ``how``. Noise determines the inverse of the full well, so that
+    ``captures`` that determine it, and the method ``method``. Noise determines the inverse of the full well, so that
     inverse is approximately normal.
     """
 
@@ -50,7 +50,7 @@ class Estimate:
     uncertainty: float
     unit: str
     captures: tuple[str, ...]
-    how: str
+    method: str
     scale: Scale = "linear"
 
     def interval(self, coverage: float = 1.959964) -> tuple[float, float]:
@@ -62,11 +62,11 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Undetermined:
-    """A number that no capture determines: it keeps the file's ``value``; capture ``without`` would determine it."""
+    """A number that no capture determines. It keeps the file's ``value``; ``determined_by`` is a capture that would."""
 
     key: str
     value: float
-    without: str
+    determined_by: str
 
 
 def combined(values: Sequence[float], uncertainties: Sequence[float]) -> tuple[float, float]:

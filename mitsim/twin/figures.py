@@ -57,7 +57,7 @@ class Field:
     """Pixels of a camera's image window that show the specimen, divided into patches.
 
     - ``column``, ``row`` of the window's first pixel.
-    - ``there`` (h, w): pixels of the specimen; ``patch_px``: side of a patch.
+    - ``mask`` (h, w): pixels of the specimen; ``patch_px``: side of a patch.
     - ``corners`` (P, 2): rows and columns of the patches in the window.
     - ``basis`` (P, 6): the :data:`TERMS` at the patch centres. x and y are slopes of the view ray from the centre of
       the specimen, over their largest value. All terms but the first have zero mean.
@@ -65,7 +65,7 @@ class Field:
 
     column: int
     row: int
-    there: NDArray[np.bool_]
+    mask: NDArray[np.bool_]
     patch_px: int
     corners: NDArray[np.int64]
     basis: Floats
@@ -75,16 +75,18 @@ class Field:
         """Divide the specimen's pixels (H, W) of a camera into patches with at least ``least_share`` on it."""
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         row, column = (int(rows[0]), int(columns[0])) if len(rows) else (0, 0)
-        there = mask[row : rows[-1] + 1, column : columns[-1] + 1] if len(rows) else np.zeros((0, 0), bool)
+        window_mask = mask[row : rows[-1] + 1, column : columns[-1] + 1] if len(rows) else np.zeros((0, 0), bool)
         corners = np.array(
             [
                 (top, left)
-                for top in range(0, there.shape[0] - patch_px + 1, patch_px)
-                for left in range(0, there.shape[1] - patch_px + 1, patch_px)
-                if there[top : top + patch_px, left : left + patch_px].mean() >= least_share
+                for top in range(0, window_mask.shape[0] - patch_px + 1, patch_px)
+                for left in range(0, window_mask.shape[1] - patch_px + 1, patch_px)
+                if window_mask[top : top + patch_px, left : left + patch_px].mean() >= least_share
             ]
         ).reshape(-1, 2)
-        return cls(column, row, there, patch_px, corners, _basis(camera, corners + np.array([row, column]), patch_px))
+        return cls(
+            column, row, window_mask, patch_px, corners, _basis(camera, corners + np.array([row, column]), patch_px)
+        )
 
 
 def _basis(camera: Camera, corners: NDArray[np.int64], patch_px: int) -> Floats:
@@ -133,19 +135,19 @@ def patch_figures(image: Floats, field: Field, window_px: int) -> Floats:
     out = np.empty((len(field.corners), len(FIGURES)))
     for index, (row, column) in enumerate(field.corners):
         part = np.s_[row : row + size, column : column + size]
-        there = field.there[part]
-        level, spread = mean[part][there].mean(), deviation[part][there]
-        bright = near[part] > np.median(near[part][there])
+        inside = field.mask[part]
+        level, spread = mean[part][inside].mean(), deviation[part][inside]
+        bright = near[part] > np.median(near[part][inside])
         amounts = np.abs(fine[part])
-        energy = float((fine[part][there] ** 2).mean())
+        energy = float((fine[part][inside] ** 2).mean())
         out[index] = (
             level,
-            (spread / np.maximum(mean[part][there], 1.0)).mean(),
-            crossing[part][there].mean(),
-            (along[part] + down[part])[there].mean() / max(2 * float((spread**2).mean()), _LEAST),
-            amounts[there & ~bright].mean(),
-            amounts[there & bright].mean(),
+            (spread / np.maximum(mean[part][inside], 1.0)).mean(),
+            crossing[part][inside].mean(),
+            (along[part] + down[part])[inside].mean() / max(2 * float((spread**2).mean()), _LEAST),
+            amounts[inside & ~bright].mean(),
+            amounts[inside & bright].mean(),
             # 1 plus the correlation of neighbours; it is -0.8 for white noise after these weights
-            1.0 + float(grain[part][there].mean()) / (2 * max(energy, _LEAST)),
+            1.0 + float(grain[part][inside].mean()) / (2 * max(energy, _LEAST)),
         )
     return np.asarray(np.log(np.maximum(out, _LEAST)))

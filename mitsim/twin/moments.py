@@ -33,7 +33,7 @@ DETERMINED_SHARE = 0.35
 
 
 @dataclass(frozen=True)
-class Found:
+class MomentFit:
     """Parameters (k,), their ``covariance`` (k, k) and whether they are ``determined``; chi-square, freedom."""
 
     values: Floats
@@ -57,7 +57,7 @@ class Prior:
 
 def match_moments(
     real: Floats, covariance: Floats, simulate: Simulate, prior: Prior, draws: int = 2, label: str = ""
-) -> Found:
+) -> MomentFit:
     """Find the parameters at which simulations reproduce the features of a recording.
 
     Parameters
@@ -117,7 +117,7 @@ def match_moments(
     total = np.linalg.inv(jacobian.T @ weight @ jacobian + inverse_prior)
     off = real - seen
     determined = np.sqrt(np.diag(total)) < DETERMINED_SHARE * prior.spread
-    return Found(
+    return MomentFit(
         theta, np.asarray(total, float), determined, float(off @ weight @ off), len(real) - int(determined.sum())
     )
 

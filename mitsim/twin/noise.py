@@ -23,6 +23,7 @@ from mitsim.sensor.imager import Imager
 from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import Sensor
 from mitsim.twin.estimate import Estimate, Undetermined
+from mitsim.twin.input_captures import InputCapture
 from mitsim.twin.photon_transfer import (
     Repeats,
     TransferLine,
@@ -33,7 +34,6 @@ from mitsim.twin.photon_transfer import (
     widths,
 )
 from mitsim.twin.response import first_knee, quiet_pixels
-from mitsim.twin.takes import Take
 from mitsim.validation.denoise import denoised
 
 Floats = NDArray[np.float64]
@@ -60,7 +60,7 @@ class ImagerFit:
     known: bool
 
 
-def fit_imager(groups: list[list[Take]], sensor: Sensor, places: dict[str, Place]) -> ImagerFit:
+def fit_imager(groups: list[list[InputCapture]], sensor: Sensor, places: dict[str, Place]) -> ImagerFit:
     """Fit the noise of the reference camera's imager."""
     repeated = [group for group in groups if len(group) > 1]
     dark = [group for group in groups if group[0].kind == "dark"]
@@ -71,20 +71,20 @@ def fit_imager(groups: list[list[Take]], sensor: Sensor, places: dict[str, Place
     imager, curve = _with_curve(imager, groups, sensor)
     estimates += curve
     if repeated:
-        line = repeated_line([_repeats(group, _there(group[0], places)) for group in repeated], imager)
+        line = repeated_line([_repeats(group, _specimen_mask(group[0], places)) for group in repeated], imager)
         if line is not None:
-            names = tuple(take.name for group in repeated for take in group)
+            names = tuple(source.name for group in repeated for source in group)
             imager, found = _with_line(imager, line, names, "photon transfer of repeats")
             imager, fixed, undetermined = _with_fixed(imager, sensor.imager, repeated, places)
             return ImagerFit(imager, (*estimates, *found, *fixed), tuple(undetermined), True)
     for group in groups:
         if group[0].kind == "off":
-            found_one = _one_image(group[0], imager, places)
+            found_one = _from_one_image(group[0], imager, places)
             if found_one is not None:
                 imager, found = found_one
-                without = "repeats of one pose; until then read_noise_e and full_well_e include it"
+                determined_by = "repeats of one pose; until then read_noise_e and full_well_e include it"
                 undetermined = [
-                    Undetermined(key, 0.0, without)
+                    Undetermined(key, 0.0, determined_by)
                     for key in (*_EVERY_SOURCE, "imager.row_noise_e", "imager.column_pattern_e")
                 ]
                 return ImagerFit(imager, (*estimates, *found), tuple(undetermined), True)
@@ -92,7 +92,7 @@ def fit_imager(groups: list[list[Take]], sensor: Sensor, places: dict[str, Place
 
 
 def smoothing_of(
-    image: NDArray[np.unsignedinteger], there: NDArray[np.bool_], rounding: float = 1 / 12
+    image: NDArray[np.unsignedinteger], mask: NDArray[np.bool_], rounding: float = 1 / 12
 ) -> tuple[float, float]:
     """Return the standard deviation [px] of the Gaussian that smoothed an image's noise, and its uncertainty.
 
@@ -100,8 +100,8 @@ def smoothing_of(
     [DN^2] is the white noise of whole grey levels; it is subtracted first.
     """
     fine = finest_detail(image.astype(float))
-    size = 1.4826 * float(np.median(np.abs(fine[there])))
-    usable = there & (np.abs(fine) < 4 * max(size, 0.5))
+    size = 1.4826 * float(np.median(np.abs(fine[mask])))
+    usable = mask & (np.abs(fine) < 4 * max(size, 0.5))
     energy, products = float((fine[usable] ** 2).mean()), []
     for first, second in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
         both = usable[first] & usable[second]
@@ -142,78 +142,80 @@ def _correlation(smoothing: float) -> float:
     return product / energy
 
 
-def _there(take: Take, places: dict[str, Place]) -> NDArray[np.bool_]:
-    camera = take.capture.rig.reference
-    if take.kind == "dark":
+def _specimen_mask(source: InputCapture, places: dict[str, Place]) -> NDArray[np.bool_]:
+    camera = source.capture.rig.reference
+    if source.kind == "dark":
         return np.ones((camera.height, camera.width), bool)
-    return image_mask(places[take.name], camera, MARGIN_PX)
+    return image_mask(places[source.name], camera, MARGIN_PX)
 
 
-def _with_curve(imager: Imager, groups: list[list[Take]], sensor: Sensor) -> tuple[Imager, list[Estimate]]:
+def _with_curve(imager: Imager, groups: list[list[InputCapture]], sensor: Sensor) -> tuple[Imager, list[Estimate]]:
     """Return the imager with the knee of its curve, if one image shows it; only stereo sensor files may have one.
 
     The whole image is used: a curve belongs to the imager, whatever it sees. Black and saturated pixels are left out.
     """
     if sensor.technology != "active_stereo" or imager.companding or imager.gamma != 1:
         return imager, []
-    for take in (group[0] for group in groups if group[0].kind == "off"):
-        image = next(iter(take.capture.images.values()))[0]
-        levels, there = image.astype(float), (image > 0) & (image < imager.full_scale)
-        knee = first_knee(levels, there, imager)
+    for source in (group[0] for group in groups if group[0].kind == "off"):
+        image = next(iter(source.capture.images.values()))[0]
+        levels, mask = image.astype(float), (image > 0) & (image < imager.full_scale)
+        knee = first_knee(levels, mask, imager)
         if knee is not None:
-            how = f"noise by level of one image: the first knee, {knee.slope:g} times as steep beyond it"
-            told = Estimate("imager.companding_dn", knee.level, knee.uncertainty, "DN", (take.name,), how)
-            return replace(imager, companding=knee.companding(imager.bits)), [told]
+            method = f"noise by level of one image: the first knee, {knee.slope:g} times as steep beyond it"
+            knee_estimate = Estimate("imager.companding_dn", knee.level, knee.uncertainty, "DN", (source.name,), method)
+            return replace(imager, companding=knee.companding(imager.bits)), [knee_estimate]
     return imager, []
 
 
-def _repeats(group: list[Take], there: NDArray[np.bool_]) -> Repeats:
+def _repeats(group: list[InputCapture], mask: NDArray[np.bool_]) -> Repeats:
     """Return the first image of every repeat."""
-    images = np.stack([next(iter(take.capture.images.values()))[0] for take in group])
-    return Repeats.of(images, there, _PIXELS)
+    images = np.stack([next(iter(source.capture.images.values()))[0] for source in group])
+    return Repeats.of(images, mask, _PIXELS)
 
 
-def _with_black_level(imager: Imager, dark: list[list[Take]]) -> tuple[Imager, Estimate]:
-    takes = [take for group in dark for take in group]
-    levels = [float(next(iter(take.capture.images.values()))[0].mean()) for take in takes]
-    image = next(iter(takes[0].capture.images.values()))[0]
-    value, spread = float(np.mean(levels)), float(image.std() / np.sqrt(image.size * len(takes)))
-    names = tuple(take.name for take in takes)
+def _with_black_level(imager: Imager, dark: list[list[InputCapture]]) -> tuple[Imager, Estimate]:
+    input_captures = [source for group in dark for source in group]
+    levels = [float(next(iter(source.capture.images.values()))[0].mean()) for source in input_captures]
+    image = next(iter(input_captures[0].capture.images.values()))[0]
+    value, spread = float(np.mean(levels)), float(image.std() / np.sqrt(image.size * len(input_captures)))
+    names = tuple(source.name for source in input_captures)
     estimate = Estimate("imager.black_level_dn", value, spread, "DN", names, "mean grey level in the dark")
     return replace(imager, black_level=value), estimate
 
 
-def _with_line(imager: Imager, line: TransferLine, names: tuple[str, ...], how: str) -> tuple[Imager, list[Estimate]]:
+def _with_line(
+    imager: Imager, line: TransferLine, names: tuple[str, ...], method: str
+) -> tuple[Imager, list[Estimate]]:
     (well, well_u), (read, read_u) = line.full_well(imager), line.read_noise()
     return replace(imager, full_well=well, read_noise=read, row_noise=0.0), [
-        Estimate("imager.full_well_e", well, well_u, "e-", names, how),
-        Estimate("imager.read_noise_e", read, read_u, "e-", names, how),
+        Estimate("imager.full_well_e", well, well_u, "e-", names, method),
+        Estimate("imager.read_noise_e", read, read_u, "e-", names, method),
     ]
 
 
 def _with_fixed(
-    imager: Imager, before: Imager, repeated: list[list[Take]], places: dict[str, Place]
+    imager: Imager, before: Imager, repeated: list[list[InputCapture]], places: dict[str, Place]
 ) -> tuple[Imager, list[Estimate], list[Undetermined]]:
     """Estimate DSNU from dark repeats, PRNU from repeats in uniform light."""
     estimates: list[Estimate] = []
     undetermined = [Undetermined("imager.row_noise_e", 0.0, "the mean of rows in the dark; read_noise_e includes it")]
-    for kind, key, without in (
+    for kind, key, determined_by in (
         ("dark", "imager.dsnu_e", "repeats in the dark"),
         ("off", "imager.prnu", "repeats with the projector off"),
     ):
         groups = [group for group in repeated if group[0].kind == kind]
         if not groups:
-            undetermined.append(Undetermined(key, before.dsnu if kind == "dark" else before.prnu, without))
+            undetermined.append(Undetermined(key, before.dsnu if kind == "dark" else before.prnu, determined_by))
             continue
         group = groups[0]
-        images = np.stack([next(iter(take.capture.images.values()))[0] for take in group])
-        level, variance, spread = fixed_variance(images, _there(group[0], places), imager)
+        images = np.stack([next(iter(source.capture.images.values()))[0] for source in group])
+        level, variance, spread = fixed_variance(images, _specimen_mask(group[0], places), imager)
         if kind == "off":
             variance -= imager.dsnu**2
         root = float(np.sqrt(max(variance, 0.0)))
         spread_root = spread / (2 * root) if root > 0 else float(np.sqrt(spread))
         scale = 1.0 if kind == "dark" else level
-        names = tuple(take.name for take in group)
+        names = tuple(source.name for source in group)
         estimates.append(
             Estimate(
                 key,
@@ -228,14 +230,16 @@ def _with_fixed(
     return imager, estimates, undetermined
 
 
-def _one_image(take: Take, imager: Imager, places: dict[str, Place]) -> tuple[Imager, list[Estimate]] | None:
-    image, there = next(iter(take.capture.images.values()))[0], _there(take, places)
-    names, how = (take.name,), "finest detail of one image by level, including its fixed pattern"
+def _from_one_image(
+    source: InputCapture, imager: Imager, places: dict[str, Place]
+) -> tuple[Imager, list[Estimate]] | None:
+    image, mask = next(iter(source.capture.images.values()))[0], _specimen_mask(source, places)
+    names, method = (source.name,), "finest detail of one image by level, including its fixed pattern"
     estimates = []
     bare = replace(imager, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0)
-    smoothing, spread = smoothing_of(image, there)
-    quiet = quiet_pixels(image.astype(float), denoised(image.astype(float), there), there)
-    there = quiet if quiet.mean() > _LEAST_QUIET * there.mean() else there
+    smoothing, spread = smoothing_of(image, mask)
+    quiet = quiet_pixels(image.astype(float), denoised(image.astype(float), mask), mask)
+    mask = quiet if quiet.mean() > _LEAST_QUIET * mask.mean() else mask
     gain = 1.0
     if smoothing > max(_SURE * spread, 0.2):
         bare, gain = replace(bare, smoothing_px=smoothing), fine_gain(smoothing)
@@ -244,26 +248,26 @@ def _one_image(take: Take, imager: Imager, places: dict[str, Place]) -> tuple[Im
                 "imager.smoothing_px", smoothing, spread, "px", names, "correlation of neighbours in finest detail"
             )
         )
-    line = one_image_line(image, there, imager)
+    line = one_image_line(image, mask, imager)
     if line is not None:
         line = TransferLine(
             line.offset / gain, line.slope / gain, line.covariance / gain**2, line.bins, line.chi_square
         )
         line = line.not_negative()
         if line.full_well(imager)[1] < 0.3 * line.full_well(imager)[0] and line.offset >= 0:
-            found, from_line = _with_line(bare, line, names, how)
+            found, from_line = _with_line(bare, line, names, method)
             return found, [*estimates, *from_line]
     # nearly one level: keep the file's full well and attribute the rest to read noise; without a rest, fit the well
     electrons = linearised(image, imager)
-    level = float(np.median(electrons[there]))
+    level = float(np.median(electrons[mask]))
     fine = finest_detail(electrons)
-    variance = float(np.median(fine[there] ** 2)) / 0.45493642311957283
-    variance = (variance - float(widths(np.array(float(np.median(image[there]))), imager)) ** 2 / 12) / gain
-    relative = float(np.sqrt(2 / (there.sum() * 0.37 * independent_share())))
+    variance = float(np.median(fine[mask] ** 2)) / 0.45493642311957283
+    variance = (variance - float(widths(np.array(float(np.median(image[mask]))), imager)) ** 2 / 12) / gain
+    relative = float(np.sqrt(2 / (mask.sum() * 0.37 * independent_share())))
     read = imager.read_noise
     if variance > level + 1.0:
         value = float(np.sqrt(variance - level))
-        estimates.append(Estimate("imager.read_noise_e", value, relative * variance / (2 * value), "e-", names, how))
+        estimates.append(Estimate("imager.read_noise_e", value, relative * variance / (2 * value), "e-", names, method))
         return replace(bare, read_noise=value), estimates
     if variance <= 0:
         return None
@@ -271,7 +275,7 @@ def _one_image(take: Take, imager: Imager, places: dict[str, Place]) -> tuple[Im
     share = level / (level + read**2)
     kappa = variance * share / level
     well = imager.full_well / kappa
-    estimates.append(Estimate("imager.full_well_e", well, relative * well, "e-", names, how))
+    estimates.append(Estimate("imager.full_well_e", well, relative * well, "e-", names, method))
     value = float(np.sqrt(variance * (1 - share))) / kappa
-    estimates.append(Estimate("imager.read_noise_e", value, relative * value, "e-", names, how))
+    estimates.append(Estimate("imager.read_noise_e", value, relative * value, "e-", names, method))
     return replace(bare, full_well=well, read_noise=value), estimates

@@ -8,7 +8,7 @@ The varied quantities are chosen so that each changes one feature:
 - logarithms of factors;
 - squares of blurs and of read noise, since variances add.
 
-The order of a list therefore matters: full well, power, room. ``without`` describes the capture that determines a
+The order of a list therefore matters: full well, power, room. ``determined_by`` describes the capture that determines a
 parameter if dots alone do not.
 """
 
@@ -36,7 +36,7 @@ class Parameter:
     - ``spread`` about the file's value, one sigma; ``step`` for derivatives; ``low`` and ``high``: bounds. All of the
       varied quantity.
     - ``scale`` on which the number in the file is approximately normal.
-    - ``without``: the capture that would determine it.
+    - ``determined_by``: the capture that would determine it.
     """
 
     key: str
@@ -49,7 +49,7 @@ class Parameter:
     low: float = -np.inf
     high: float = np.inf
     scale: Scale = "linear"
-    without: str = ""
+    determined_by: str = ""
 
 
 #: full well [e-], and read noise as a share of it, whose varied quantity is 1
@@ -117,7 +117,7 @@ FULL_WELL = Parameter(
     0.05,
     0.02,
     scale="inverse",
-    without="repeats of one pose",
+    determined_by="repeats of one pose",
 )
 
 READ_NOISE = Parameter(
@@ -130,7 +130,7 @@ READ_NOISE = Parameter(
     0.1,
     0.0,
     scale="linear",
-    without="a capture in the dark",
+    determined_by="a capture in the dark",
 )
 
 SMOOTHING = Parameter(
@@ -143,7 +143,7 @@ SMOOTHING = Parameter(
     0.05,
     0.0,
     4.0,
-    without="repeats of one pose",
+    determined_by="repeats of one pose",
 )
 
 FLUX = Parameter(
@@ -155,7 +155,7 @@ FLUX = Parameter(
     4.0,
     0.1,
     scale="inverse",
-    without="a capture with the projector on",
+    determined_by="a capture with the projector on",
 )
 
 PROJECTOR_CORNER = Parameter(
@@ -169,7 +169,7 @@ PROJECTOR_CORNER = Parameter(
     -4.6,
     0.0,
     scale="logarithm",
-    without="a capture of a sheet that fills the field",
+    determined_by="a capture of a sheet that fills the field",
 )
 
 CORNER_BLUR = Parameter(
@@ -182,7 +182,7 @@ CORNER_BLUR = Parameter(
     0.3,
     0.0,
     25.0,
-    without="a capture of a sheet that fills the field, projector on",
+    determined_by="a capture of a sheet that fills the field, projector on",
 )
 
 BLACK_LEVEL = Parameter(
@@ -195,7 +195,7 @@ BLACK_LEVEL = Parameter(
     0.05,
     0.0,
     0.95,
-    without="a capture with the projector off",
+    determined_by="a capture with the projector off",
 )
 
 
@@ -229,7 +229,7 @@ def _of_pattern(field: str, squared: bool, spread: float, step: float) -> Parame
         step,
         0.0 if squared else -np.inf,
         scale="linear" if squared else "logarithm",
-        without="a capture with the projector on, of an even sheet",
+        determined_by="a capture with the projector on, of an even sheet",
     )
 
 
@@ -255,7 +255,7 @@ def room_parameters(unit: float) -> list[Parameter]:
             step,
             0.02 if index == 0 else -np.inf,
             scale="inverse" if index == 0 else "linear",
-            without="a capture with the projector off",
+            determined_by="a capture with the projector off",
         )
         for index, (key, spread, step) in enumerate(zip(ROOM_KEYS, spreads, steps, strict=True))
     ]

@@ -103,11 +103,11 @@ class Repeats:
     around: Floats
 
     @classmethod
-    def of(cls, images: NDArray[np.unsignedinteger[Any]], there: NDArray[np.bool_], pixels: int) -> Repeats:
-        """Take up to ``pixels`` of the pixels ``there`` of images (n, H, W)."""
+    def of(cls, images: NDArray[np.unsignedinteger[Any]], mask: NDArray[np.bool_], pixels: int) -> Repeats:
+        """Take up to ``pixels`` of the pixels ``mask`` of images (n, H, W)."""
         around = uniform_filter(images.mean(axis=0), _AROUND_PX)
-        step = max(1, int(there.sum()) // pixels)
-        rows, columns = (axis[::step] for axis in np.nonzero(there))
+        step = max(1, int(mask.sum()) // pixels)
+        rows, columns = (axis[::step] for axis in np.nonzero(mask))
         return cls(images[:, rows, columns], around[rows, columns])
 
 
@@ -124,14 +124,14 @@ def repeated_line(repeats: list[Repeats], chip: Imager) -> TransferLine | None:
 
 
 def one_image_line(
-    image: NDArray[np.unsignedinteger[Any]], there: NDArray[np.bool_], chip: Imager
+    image: NDArray[np.unsignedinteger[Any]], mask: NDArray[np.bool_], chip: Imager
 ) -> TransferLine | None:
-    """Return the line of the finest detail of one image (H, W), or of a mean, in pixels ``there`` without a pattern.
+    """Return the line of the finest detail of one image (H, W), or of a mean, in pixels ``mask`` without a pattern.
 
     The fixed pattern counts as noise, and a smoothed image has too little noise. None for a single level.
     """
     electrons = linearised(image, chip)
-    levels, variances, counts = level_variances(electrons, there)
+    levels, variances, counts = level_variances(electrons, mask)
     rows, every = [], np.arange(chip.full_scale + 1.0)
     for level, variance, count in zip(levels, variances, counts, strict=True):
         shown = float(np.interp(level, linearised(every, chip), every))
@@ -150,17 +150,17 @@ def independent_share() -> float:
 
 
 def fixed_variance(
-    images: NDArray[np.unsignedinteger[Any]], there: NDArray[np.bool_], chip: Imager
+    images: NDArray[np.unsignedinteger[Any]], mask: NDArray[np.bool_], chip: Imager
 ) -> tuple[float, float, float]:
     """Return mean level [e-], variance [e-^2] of the fixed pattern in uniform light, and its uncertainty."""
     electrons = linearised(images, chip)
     mean = electrons.mean(axis=0)
-    temporal = float(electrons.var(axis=0, ddof=1)[there].mean())
-    levels, variances, counts = level_variances(mean, there)
+    temporal = float(electrons.var(axis=0, ddof=1)[mask].mean())
+    levels, variances, counts = level_variances(mean, mask)
     weight = counts  # weights by estimated variances would favour bins that are small by chance
     total = float((weight * variances).sum() / weight.sum())
     spread = np.sqrt(2 / (counts.sum() * _MEDIAN_EFFICIENCY * independent_share())) * total
-    left = 2 / (there.sum() * (len(images) - 1)) * temporal**2 / len(images) ** 2
+    left = 2 / (mask.sum() * (len(images) - 1)) * temporal**2 / len(images) ** 2
     level = float((weight * levels).sum() / weight.sum())
     return level, total - temporal / len(images), float(np.sqrt(spread**2 + left))
 

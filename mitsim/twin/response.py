@@ -87,19 +87,19 @@ class Knee:
         return (self.level, self.level), (reached, near), (float(last), full)
 
 
-def quiet_pixels(image: Floats, clean: Floats, there: Mask) -> Mask:
-    """Pixels ``there`` of an image (H, W) whose finest detail is noise and not the edge of a print.
+def quiet_pixels(image: Floats, clean: Floats, mask: Mask) -> Mask:
+    """Pixels ``mask`` of an image (H, W) whose finest detail is noise and not the edge of a print.
 
     ``clean`` is the image without its noise.
     """
     own = finest_detail(clean) ** 2
-    return there & (own < _QUIET**2 * np.maximum(noise_of_levels(image, there)(clean), 1e-12))
+    return mask & (own < _QUIET**2 * np.maximum(noise_of_levels(image, mask)(clean), 1e-12))
 
 
-def first_knee(image: Floats, there: Mask, imager: Imager) -> Knee | None:
-    """Find the first knee [DN] in the pixels ``there`` of an image (H, W); None if a straight curve explains it."""
-    clean = denoised(image, there)
-    tiles = _Tiles.of(image, clean, quiet_pixels(image, clean, there), imager.black_level)
+def first_knee(image: Floats, mask: Mask, imager: Imager) -> Knee | None:
+    """Find the first knee [DN] in the pixels ``mask`` of an image (H, W); None if a straight curve explains it."""
+    clean = denoised(image, mask)
+    tiles = _Tiles.of(image, clean, quiet_pixels(image, clean, mask), imager.black_level)
     if tiles is None:
         return None
     low, high = np.quantile(tiles.clean[tiles.inside], [_BESIDE, 1 - _BESIDE])
@@ -112,11 +112,11 @@ def first_knee(image: Floats, there: Mask, imager: Imager) -> Knee | None:
     gain = away.best(np.inf, 1.0) - away.best(level, slope)
     if gain.sum() < max(_GAIN, _SURE * float(gain.std()) * np.sqrt(len(gain))) or not low < level < high:
         return None
-    bias, spread = _bias(clean, there, tiles, Knee(level, 0.0, slope))
+    bias, spread = _bias(clean, mask, tiles, Knee(level, 0.0, slope))
     return Knee(level - bias, float(np.hypot(tiles.uncertainty(level, slope), spread)), slope)
 
 
-def _bias(clean: Floats, there: Mask, tiles: _Tiles, knee: Knee) -> tuple[float, float]:
+def _bias(clean: Floats, mask: Mask, tiles: _Tiles, knee: Knee) -> tuple[float, float]:
     """By how much a knee is off since levels come from an image without noise, not from the light; and its uncertainty.
 
     The image without noise serves as light: noise is drawn, and the knee found once with the levels of that image after
@@ -132,8 +132,8 @@ def _bias(clean: Floats, there: Mask, tiles: _Tiles, knee: Knee) -> tuple[float,
         drawn = light + np.interp(light, every, spread) * stream.normal(size=light.shape)
         drawn = np.rint(np.minimum(drawn, k) + knee.slope * np.maximum(drawn - k, 0.0))
         both = [
-            _Tiles.of(drawn, levels, quiet_pixels(drawn, levels, there), tiles.black)
-            for levels in (denoised(drawn, there), clean)
+            _Tiles.of(drawn, levels, quiet_pixels(drawn, levels, mask), tiles.black)
+            for levels in (denoised(drawn, mask), clean)
         ]
         found.append([np.nan if one is None else _least(one, knee.level, knee.slope) for one in both])
     off = np.array(found) @ [1.0, -1.0]

@@ -20,8 +20,8 @@ from mitsim.sensor.preset import Sensor
 from mitsim.sensor.vignetting import camera_illumination
 from mitsim.twin.estimate import Estimate
 from mitsim.twin.figures import Field
+from mitsim.twin.input_captures import InputCapture
 from mitsim.twin.parameters import ROOM_KEYS
-from mitsim.twin.takes import Take
 from mitsim.validation.plate import REFLECTANCE
 from mitsim.validation.rebuild import like
 
@@ -38,20 +38,20 @@ class RoomFit:
     estimates: tuple[Estimate, ...]
 
 
-def fit_room(takes: list[Take], sensor: Sensor, places: dict[str, Place]) -> RoomFit | None:
+def fit_room(input_captures: list[InputCapture], sensor: Sensor, places: dict[str, Place]) -> RoomFit | None:
     """Fit the light of the room to captures with the projector off; None if none shows enough of a sheet."""
     rows, values = [], []
-    for take in takes:
-        name, camera = next(iter(take.capture.rig.cameras.items()))
-        own = like(take.capture, sensor, take.name)
+    for source in input_captures:
+        name, camera = next(iter(source.capture.rig.cameras.items()))
+        own = like(source.capture, sensor, source.name)
         if own.exposure.base_s is None:
             continue
-        chip = chip_of(take.capture, sensor.imager, take.name)
-        electrons = linearised(take.capture.images[name][0], chip)
+        chip = chip_of(source.capture, sensor.imager, source.name)
+        electrons = linearised(source.capture.images[name][0], chip)
         loss = camera_illumination(sensor.imager.corner_illumination, camera)
         scale = electrons_per_radiance(sensor.imager, sensor.wavelength_nm, own.exposure.base_s) * REFLECTANCE / np.pi
         irradiance = electrons / scale / (1.0 if loss is None else loss)
-        field = Field.of(camera, image_mask(places[take.name], camera, MARGIN_PX), _PATCH_PX)
+        field = Field.of(camera, image_mask(places[source.name], camera, MARGIN_PX), _PATCH_PX)
         corners = field.corners + np.array([field.row, field.column])
         if not len(corners):
             continue
@@ -70,7 +70,7 @@ def fit_room(takes: list[Take], sensor: Sensor, places: dict[str, Place]) -> Roo
     covariance = float(rest @ rest) / max(len(seen) - design.shape[1], 1) * np.linalg.inv(design.T @ design)
     terms = np.zeros(len(ROOM_KEYS))
     terms[: len(found)] = found
-    names, estimates = tuple(take.name for take in takes), []
+    names, estimates = tuple(source.name for source in input_captures), []
     for index in range(len(found)):
         gradient = np.zeros(len(found))
         if index == 0:

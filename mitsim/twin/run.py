@@ -1,6 +1,6 @@
 """Run ``mitsim fit sensor``: from captures of a flat object and a sensor file to the file of one unit in its room.
 
-Signal chain: captures, sorted (:mod:`mitsim.twin.takes`) -> repeats and dark captures: photon transfer
+Signal chain: captures, sorted (:mod:`mitsim.twin.input_captures`) -> repeats and dark captures: photon transfer
 (:mod:`mitsim.twin.photon_transfer`) -> projector off: light of the room (:mod:`mitsim.twin.room`) -> dots: the
 remaining parameters (:mod:`mitsim.twin.dots`) -> row errors (:mod:`mitsim.twin.rows`) -> several captures combined
 (:mod:`mitsim.twin.estimate`) -> the sensor file (:mod:`mitsim.twin.sensor_text`).
@@ -28,6 +28,7 @@ from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.roi import Roi
 from mitsim.twin.dots import DotDraws, DotsFit, fit_dots
 from mitsim.twin.estimate import Estimate, Undetermined, combined, pooled, scaled, unscaled
+from mitsim.twin.input_captures import InputCapture, read_input_captures, repeats
 from mitsim.twin.noise import ImagerFit, fit_imager
 from mitsim.twin.parameters import (
     BLACK_LEVEL,
@@ -43,7 +44,6 @@ from mitsim.twin.parameters import (
 from mitsim.twin.room import RoomFit, fit_room
 from mitsim.twin.rows import Rows, row_turns
 from mitsim.twin.stripes import fit_stripes
-from mitsim.twin.takes import Take, read_takes, repeats
 from mitsim.validation.rebuild import like
 
 Floats = NDArray[np.float64]
@@ -58,7 +58,7 @@ class SensorFit:
     """Result of a fit: ``estimates``, undetermined numbers (``undetermined``), and the fits of every capture."""
 
     sensor: Sensor = field(repr=False)
-    takes: tuple[Take, ...] = field(repr=False)
+    input_captures: tuple[InputCapture, ...] = field(repr=False)
     estimates: tuple[Estimate, ...]
     undetermined: tuple[Undetermined, ...]
     dots: dict[str, DotsFit] = field(repr=False)
@@ -95,12 +95,12 @@ def fit_sensor(
         If captures and sensor do not belong together, or too little is visible.
     """
     chosen = load_sensor(sensor)
-    takes = read_takes(captures, off, dark, chosen)
-    groups = repeats(takes)
+    input_captures = read_input_captures(captures, off, dark, chosen)
+    groups = repeats(input_captures)
     first = groups[0][0]
-    base = _seconds(like(first.capture, chosen, first.name), first)
+    base = _check_exposure(like(first.capture, chosen, first.name), first)
     say(
-        f"{len(takes)} captures: "
+        f"{len(input_captures)} captures: "
         + ", ".join(f"{g[0].name} {g[0].kind}" + (f" x {len(g)}" if len(g) > 1 else "") for g in groups)
     )
     places: dict[str, Place] = {}
@@ -114,26 +114,26 @@ def fit_sensor(
     room = fit_room(lit, base, places) if lit and any(group[0].kind == "on" for group in groups) else None
     estimates += room.estimates if room is not None else []
     dots = _dots([g[0] for g in groups if g[0].kind == "on"], base, places, imager, room, seed, draws)
-    shared, undetermined = _together(dots, base, imager, room)
+    shared, undetermined = _combined_estimates(dots, base, imager, room)
     estimates += shared
     if isinstance(base.pattern, LightCode):
         coded: list[Estimate] = []
-        for take in (group[0] for group in groups if group[0].kind == "on"):
-            own = replace(like(take.capture, base, take.name), imager=base.imager)
-            coded += fit_stripes(take, own, places[take.name])[1]
+        for source in (group[0] for group in groups if group[0].kind == "on"):
+            own = replace(like(source.capture, base, source.name), imager=base.imager)
+            coded += fit_stripes(source, own, places[source.name])[1]
         estimates += pooled(coded)
     rows = {}
     for group in groups:
         if group[0].kind != "dark":
             settings, _ = decoder_settings(group[0].capture)
-            found = row_turns(group[0].capture, settings, places[group[0].name], _believed(chosen))
+            found = row_turns(group[0].capture, settings, places[group[0].name], _assumed_deviations(chosen))
             if found is not None:
                 rows[group[0].name] = found
-    estimates += _turns(rows)
-    return SensorFit(base, tuple(takes), tuple(estimates), tuple(undetermined), dots, places, rows)
+    estimates += _turn_estimates(rows)
+    return SensorFit(base, tuple(input_captures), tuple(estimates), tuple(undetermined), dots, places, rows)
 
 
-def _believed(sensor: Sensor) -> tuple[float, float]:
+def _assumed_deviations(sensor: Sensor) -> tuple[float, float]:
     """Standard deviations [mrad] of the second camera's turn about x and of its roll, by the sensor's unknowns."""
     own = sensor.unknowns.calibration
     return own.row_mrad, own.roll_mrad
@@ -146,28 +146,28 @@ def sensor_path(name: str | Path) -> Path:
     return Path(str(files("mitsim.sensor") / "presets" / f"{name}.toml"))
 
 
-def _seconds(sensor: Sensor, take: Take) -> Sensor:
+def _check_exposure(sensor: Sensor, source: InputCapture) -> Sensor:
     if sensor.exposure.base_s is None:
         raise InputError(
-            take.folder / "settings.json",
+            source.folder / "settings.json",
             "exposure_s",
-            repr(take.capture.settings.get("exposure_s")),
+            repr(source.capture.settings.get("exposure_s")),
             "the exposure [s], since the sensor file has automatic exposure",
         )
     return sensor
 
 
-def _place(take: Take, roi: Roi | None) -> Place:
-    settings, _ = decoder_settings(take.capture)
-    place = specimen_place(take.capture, settings, roi, take.name)
+def _place(source: InputCapture, roi: Roi | None) -> Place:
+    settings, _ = decoder_settings(source.capture)
+    place = specimen_place(source.capture, settings, roi, source.name)
     distance = float(np.linalg.norm(place.world_from_sensor.translation))
     bend = "flat" if place.bend is None else f"bent by {place.bend.rms:.2g} mm rms"
-    say(f"{take.name}: a sheet at {distance:.0f} mm, {bend}")
+    say(f"{source.name}: a sheet at {distance:.0f} mm, {bend}")
     return place
 
 
 def _dots(
-    takes: list[Take],
+    input_captures: list[InputCapture],
     base: Sensor,
     places: dict[str, Place],
     imager: ImagerFit,
@@ -182,25 +182,26 @@ def _dots(
     if room is not None:
         parameters.append(BLACK_LEVEL)
     out = {}
-    for take in takes:
-        sensor = replace(like(take.capture, base, take.name), imager=base.imager, room=base.room)
+    for source in input_captures:
+        sensor = replace(like(source.capture, base, source.name), imager=base.imager, room=base.room)
         if not imager.known:  # one image cannot separate the fixed pattern from noise
             sensor = replace(sensor, imager=_without_fixed(sensor.imager))
-        out[take.name] = fit_dots(
-            take.capture,
-            _seconds(sensor, take),
-            places[take.name],
+        out[source.name] = fit_dots(
+            source.capture,
+            _check_exposure(sensor, source),
+            places[source.name],
             parameters,
-            take.name,
+            source.name,
             room=None if room is None else room.terms,
             draws=DotDraws(draws, seed),
         )
+        fit = out[source.name].moment_fit
         say(
-            f"{take.name}: {out[take.name].patches} patches, chi-square {out[take.name].found.chi_square:.1f} of "
-            f"{out[take.name].found.freedom}, unevenness beyond the model {100 * out[take.name].uneven:.1f} %"
+            f"{source.name}: {out[source.name].patches} patches, chi-square {fit.chi_square:.1f} of "
+            f"{fit.freedom}, unevenness beyond the model {100 * out[source.name].uneven:.1f} %"
         )
-        if (fit := out[take.name].found).chi_square > _MISFIT * max(fit.freedom, 1):
-            say(f"{take.name}: no parameters reproduce these dots with the file's pattern; the best fit is used")
+        if fit.chi_square > _MISFIT * max(fit.freedom, 1):
+            say(f"{source.name}: no parameters reproduce these dots with the file's pattern; the best fit is used")
     return out
 
 
@@ -208,7 +209,7 @@ def _without_fixed(imager: Imager) -> Imager:
     return replace(imager, dsnu=0.0, prnu=0.0, column_pattern=0.0, row_noise=0.0)
 
 
-def _together(
+def _combined_estimates(
     dots: dict[str, DotsFit], base: Sensor, imager: ImagerFit, room: RoomFit | None
 ) -> tuple[list[Estimate], list[Undetermined]]:
     """Combine the estimates of all captures of dots key by key, and list the keys that none determines."""
@@ -225,7 +226,7 @@ def _together(
         parameter = rows[0][1]
         some = [row for row in rows if row[4]]
         if not some:
-            undetermined.append(Undetermined(key, parameter.read(base), parameter.without))
+            undetermined.append(Undetermined(key, parameter.read(base), parameter.determined_by))
             continue
         middle, spread = combined([scaled(row[2], parameter.scale) for row in some], [row[3] for row in some])
         estimates.append(
@@ -256,7 +257,7 @@ def _together(
     return estimates, undetermined
 
 
-def _turns(rows: dict[str, Rows]) -> list[Estimate]:
+def _turn_estimates(rows: dict[str, Rows]) -> list[Estimate]:
     out = []
     for key in ("row_mrad", "roll_mrad"):
         pairs = [getattr(found, key) for found in rows.values()]

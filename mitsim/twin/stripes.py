@@ -25,9 +25,9 @@ from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.twin.defocus import Defocus, fit_defocus
 from mitsim.twin.estimate import Estimate
+from mitsim.twin.input_captures import InputCapture
 from mitsim.twin.modulation import fitted_blur
 from mitsim.twin.photon_transfer import one_image_line
-from mitsim.twin.takes import Take
 
 Floats = NDArray[np.float64]
 
@@ -55,15 +55,15 @@ class Stripes:
     across: NDArray[np.bool_]
 
 
-def stripes_of(take: Take) -> Stripes | None:
+def stripes_of(source: InputCapture) -> Stripes | None:
     """Extract the stripes of a capture; None if it has no stripes with their inverse.
 
     The brightest and the darkest of the stripes replace a missing white or black image.
     """
-    code, projector = capture_pattern(take.capture), take.capture.rig.projector
+    code, projector = capture_pattern(source.capture), source.capture.rig.projector
     if not isinstance(code, LightCode) or projector is None:
         return None
-    images = next(iter(take.capture.images.values()))
+    images = next(iter(source.capture.images.values()))
     kinds: list[Role] = list(roles(code, projector.width, projector.height))
     names = [role.kind for role in kinds]
     pairs, widths, across = [], [], []
@@ -83,27 +83,29 @@ def stripes_of(take: Take) -> Stripes | None:
     return Stripes(white, black, every, np.array(widths), np.array(across))
 
 
-def fit_stripes(take: Take, sensor: Sensor, place: Place) -> tuple[Sensor, list[Estimate]]:
+def fit_stripes(source: InputCapture, sensor: Sensor, place: Place) -> tuple[Sensor, list[Estimate]]:
     """Fit one capture of stripes; the sensor must have the capture's own cameras and exposure."""
-    seen = stripes_of(take)
+    seen = stripes_of(source)
     if seen is None:
         return sensor, []
-    camera = take.capture.rig.reference
-    there = image_mask(place, camera, MARGIN_PX)
-    full = 2**take.capture.bits - 1
-    clear = there & (maximum_filter(seen.white, 3) < _UNSATURATED * full)
+    camera = source.capture.rig.reference
+    mask = image_mask(place, camera, MARGIN_PX)
+    full = 2**source.capture.bits - 1
+    clear = mask & (maximum_filter(seen.white, 3) < _UNSATURATED * full)
     spread = maximum_filter(seen.white, _EVEN_PX) - minimum_filter(seen.white, _EVEN_PX)
     even = clear & (spread < np.maximum(_EVEN_SHARE * seen.white, 4.0))
     estimates: list[Estimate] = []
-    sensor, first = _levels(take, sensor, seen, even)
+    sensor, first = _levels(source, sensor, seen, even)
     estimates += first
-    sensor, second = _noise(take, sensor, seen, even)
+    sensor, second = _noise(source, sensor, seen, even)
     estimates += second
-    sensor, third = _blur(take, sensor, place, seen, even)
+    sensor, third = _blur(source, sensor, place, seen, even)
     return sensor, estimates + third
 
 
-def _levels(take: Take, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]) -> tuple[Sensor, list[Estimate]]:
+def _levels(
+    source: InputCapture, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]
+) -> tuple[Sensor, list[Estimate]]:
     """Estimate the imager's black level and the light without a pattern from the line of black over white."""
     white, black = seen.white[even], seen.black[even]
     if len(white) < 500 or np.percentile(white, 95) < 2 * np.percentile(white, 5):
@@ -120,33 +122,37 @@ def _levels(take: Take, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]) 
     slope, intercept = float(whole[0]), float(whole[1])
     # black = level + slope (white - level)
     level = intercept / (1 - slope)
-    how, names = "line of the black image over the white one through the print", (take.name,)
+    method, names = "line of the black image over the white one through the print", (source.name,)
     imager = replace(sensor.imager, black_level=max(level, 0.0))
-    estimates = [Estimate("imager.black_level_dn", max(level, 0.0), float(spread[1]) / (1 - slope), "DN", names, how)]
+    estimates = [
+        Estimate("imager.black_level_dn", max(level, 0.0), float(spread[1]) / (1 - slope), "DN", names, method)
+    ]
     share = float(np.clip(slope, 0.0, 0.95))
     estimates.append(
-        Estimate("projector.black_level", share, float(spread[0]), "1", names, how + "; includes the room")
+        Estimate("projector.black_level", share, float(spread[0]), "1", names, method + "; includes the room")
     )
     return replace(sensor, imager=imager, projector=replace(sensor.projector, black_level=share)), estimates
 
 
-def _noise(take: Take, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]) -> tuple[Sensor, list[Estimate]]:
+def _noise(
+    source: InputCapture, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]
+) -> tuple[Sensor, list[Estimate]]:
     line = one_image_line(seen.white.astype(np.uint16), even, sensor.imager)
     if line is None:
         return sensor, []
     (well, well_u), (read, read_u) = line.full_well(sensor.imager), line.read_noise()
-    how, names = "finest detail of the white image by level, including its fixed pattern", (take.name,)
+    method, names = "finest detail of the white image by level, including its fixed pattern", (source.name,)
     chip: Imager = replace(
         sensor.imager, full_well=well, read_noise=read, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0
     )
     return replace(sensor, imager=chip), [
-        Estimate("imager.full_well_e", well, well_u / well**2, "e-", names, how, "inverse"),
-        Estimate("imager.read_noise_e", read, read_u, "e-", names, how),
+        Estimate("imager.full_well_e", well, well_u / well**2, "e-", names, method, "inverse"),
+        Estimate("imager.read_noise_e", read, read_u, "e-", names, method),
     ]
 
 
 def _blur(
-    take: Take, sensor: Sensor, place: Place, seen: Stripes, even: NDArray[np.bool_]
+    source: InputCapture, sensor: Sensor, place: Place, seen: Stripes, even: NDArray[np.bool_]
 ) -> tuple[Sensor, list[Estimate]]:
     """Estimate the blur of camera and projector together from the modulation of stripes of every width, by blocks."""
     chip = sensor.imager
@@ -155,11 +161,11 @@ def _blur(
     if usable.sum() < 500:
         return sensor, []
     off = np.abs(linearised(seen.pairs[:, 0], chip) - linearised(seen.pairs[:, 1], chip))
-    scales = _pixels_per_stripe(take, place)
+    scales = _pixels_per_stripe(source, place)
     pairs = np.stack([linearised(seen.pairs[:, side], chip) for side in (0, 1)], axis=1)
-    focus = fit_defocus(take, linearised(seen.white, chip), linearised(seen.black, chip), pairs, seen.widths)
+    focus = fit_defocus(source, linearised(seen.white, chip), linearised(seen.black, chip), pairs, seen.widths)
     if focus is not None and focus.aperture_mm > _SURE * np.sqrt(focus.covariance[1, 1]):
-        return _with_focus(take, sensor, focus, float(np.mean(scales)))
+        return _with_focus(source, sensor, focus, float(np.mean(scales)))
     values = []
     rows, columns = np.nonzero(usable)
     block = (rows // _BLOCK_PX) * 10_000 + columns // _BLOCK_PX
@@ -180,32 +186,32 @@ def _blur(
         min(blur, 5.0),
         spread,
         "px",
-        (take.name,),
+        (source.name,),
         "modulation of stripes by width, including the projector's blur",
     )
     projector = replace(sensor.projector, aperture_mm=0.0)
     return replace(sensor, imager=replace(chip, blur_px=min(blur, 5.0)), projector=projector), [
         estimate,
-        Estimate("projector.aperture_mm", 0.0, 0.0, "mm", (take.name,), "imager.blur_px includes its blur"),
+        Estimate("projector.aperture_mm", 0.0, 0.0, "mm", (source.name,), "imager.blur_px includes its blur"),
     ]
 
 
-def _with_focus(take: Take, sensor: Sensor, focus: Defocus, scale: float) -> tuple[Sensor, list[Estimate]]:
+def _with_focus(source: InputCapture, sensor: Sensor, focus: Defocus, scale: float) -> tuple[Sensor, list[Estimate]]:
     """Return the sensor with the fitted focus; one projector pixel is ``scale`` camera pixels."""
-    spread, names = np.sqrt(np.diag(focus.covariance)), (take.name,)
-    how = "modulation of stripes by width and depth"
+    spread, names = np.sqrt(np.diag(focus.covariance)), (source.name,)
+    method = "modulation of stripes by width and depth"
     blur = min(focus.still_px * scale, 5.0)
     projector = replace(sensor.projector, aperture_mm=focus.aperture_mm, focus_mm=focus.focus_mm)
     return replace(sensor, imager=replace(sensor.imager, blur_px=blur), projector=projector), [
-        Estimate("imager.blur_px", blur, float(spread[0]) * scale, "px", names, how + ", independent of depth"),
-        Estimate("projector.aperture_mm", focus.aperture_mm, float(spread[1]), "mm", names, how),
-        Estimate("projector.focus_mm", focus.focus_mm, float(spread[2]), "mm", names, how),
+        Estimate("imager.blur_px", blur, float(spread[0]) * scale, "px", names, method + ", independent of depth"),
+        Estimate("projector.aperture_mm", focus.aperture_mm, float(spread[1]), "mm", names, method),
+        Estimate("projector.focus_mm", focus.focus_mm, float(spread[2]), "mm", names, method),
     ]
 
 
-def _pixels_per_stripe(take: Take, place: Place) -> tuple[float, float]:
+def _pixels_per_stripe(source: InputCapture, place: Place) -> tuple[float, float]:
     """Return the camera pixels per projector pixel, along columns and rows, at the centre of the specimen."""
-    camera, projector = take.capture.rig.reference, take.capture.rig.projector
+    camera, projector = source.capture.rig.reference, source.capture.rig.projector
     assert projector is not None
     pose: Transform = place.world_from_sensor.inverse()
     middle = place.low + place.cell * place.occupied.shape[::-1] / 2

@@ -22,11 +22,12 @@ def write_sensor(fit: SensorFit, sensor: str | Path, output: Path) -> None:
     """Write the sensor file of a fit: the file of ``sensor`` with the fitted numbers."""
     path = sensor_path(sensor)
     text = moved_paths(path.read_text(encoding="utf-8"), path.parent, output.parent)
-    first = fit.takes[0]
+    first = fit.input_captures[0]
     entries = {
         "name": Entry(
             f'"{output.stem}"',
-            f"fitted by `mitsim fit sensor` from {path.stem}: " + ", ".join(sorted({take.name for take in fit.takes})),
+            f"fitted by `mitsim fit sensor` from {path.stem}: "
+            + ", ".join(sorted({source.name for source in fit.input_captures})),
         )
     }
     entries |= _entries(fit)
@@ -52,11 +53,11 @@ def fit_table(fit: SensorFit) -> str:
         low, high = one.interval()
         lines.append(
             f"| {one.key} | {one.value:.4g} | {low:.4g} to {high:.4g} | {one.unit} | "
-            f"{', '.join(one.captures)} | {one.how} |"
+            f"{', '.join(one.captures)} | {one.method} |"
         )
     if fit.undetermined:
         lines += ["", "| not determined, kept | value | a capture that would determine it |", "| --- | --- | --- |"]
-        lines += [f"| {one.key} | {one.value:.4g} | {one.without} |" for one in fit.undetermined]
+        lines += [f"| {one.key} | {one.value:.4g} | {one.determined_by} |" for one in fit.undetermined]
     return "\n".join(lines) + "\n"
 
 
@@ -67,32 +68,32 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
         match = _ARRAY.match(one.key)
         if one.key == "imager.companding_dn":
             knees = ", ".join(numbers(knee, 6) for knee in fit.sensor.imager.companding)
-            entries[one.key] = Entry(f"[{knees}]", _said(one) + "; unknown beyond the brightest level seen")
+            entries[one.key] = Entry(f"[{knees}]", _comment(one) + "; unknown beyond the brightest level seen")
         elif match:
             arrays.setdefault(match[1], {})[int(match[2])] = one
         else:
-            entries[one.key] = Entry(number(one.value), _said(one))
+            entries[one.key] = Entry(number(one.value), _comment(one))
     for key, parts in arrays.items():
         count, limit = (3, 200.0) if key == "room.curvature" else (2, 20.0)
         values = [parts[index].value if index in parts else 0.0 for index in range(count)]
         spreads = [two_digits(parts[index].uncertainty) if index in parts else "-" for index in range(count)]
         some = next(iter(parts.values()))
-        said = f"fitted: standard uncertainties {', '.join(spreads)}; {some.how}; {', '.join(some.captures)}"
-        entries[key] = Entry(numbers(np.clip(values, -limit, limit), 5), said)
+        comment = f"fitted: standard uncertainties {', '.join(spreads)}; {some.method}; {', '.join(some.captures)}"
+        entries[key] = Entry(numbers(np.clip(values, -limit, limit), 5), comment)
     for kept in fit.undetermined:
         if _ARRAY.match(kept.key):
             continue  # a term of the room without an estimate: none
-        entries[kept.key] = Entry(number(kept.value), f"not determined; needs {kept.without}")
+        entries[kept.key] = Entry(number(kept.value), f"not determined; needs {kept.determined_by}")
     if "misalignment.row_mrad" in entries:
         row, roll = (next(e for e in fit.estimates if e.key == f"misalignment.{key}_mrad") for key in ("row", "roll"))
-        said = "rotation of one unit's second camera off its calibration, assumed for the next unit too"
+        comment = "rotation of one unit's second camera off its calibration, assumed for the next unit too"
         for key, one in (("row", row), ("roll", roll)):
             size = float(np.hypot(one.value, one.uncertainty))
-            entries[f"unknowns.calibration.{key}_mrad"] = Entry(number(size), said)
+            entries[f"unknowns.calibration.{key}_mrad"] = Entry(number(size), comment)
     return entries
 
 
-def _said(one: Estimate) -> str:
+def _comment(one: Estimate) -> str:
     low, high = one.interval()
     found = f"fitted: {one.value:.4g} {one.unit}, 95 % interval {low:.4g} to {high:.4g}"
-    return f"{found}; {one.how}; {', '.join(one.captures)}"
+    return f"{found}; {one.method}; {', '.join(one.captures)}"

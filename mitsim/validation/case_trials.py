@@ -27,7 +27,7 @@ from mitsim.validation.kept_trials import take_up_trials, write_trials
 from mitsim.validation.part_cases import PartCase
 from mitsim.views import View
 from mitsim.virtual.plan import measured_by, measurements_of, trial_digest
-from mitsim.virtual.race import Job, Maker
+from mitsim.virtual.race import Job, TrialRunner
 from mitsim.virtual.spread_out import spread_over
 from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
@@ -37,7 +37,7 @@ from mitsim.virtual.world import OWN_FINISH_DAYS, Trial, Unknowns
 KINDS = {"tool": 0, "truth": 1 << 20, "apart": 1 << 21, "choice": 3 << 20}
 
 
-class Bench:
+class CaseTrials:
     """Makes the trials of one kind of a case, and keeps them."""
 
     def __init__(self, case: PartCase, study: Study, folder: Path, kind: str, workers: Executor | None = None) -> None:
@@ -45,20 +45,20 @@ class Bench:
             measured_with = study.file.measure.model_copy(update={"light_path_depth": case.table.surfaces})
             study = replace(study, file=study.file.model_copy(update={"measure": measured_with}))
         self.name, self.study, self.kind, self.workers = case.name, study, kind, workers
-        apart = kind == "apart"
+        separate_light = kind == "apart"
         unknowns = study_unknowns(study)
-        self.unknowns: Unknowns = replace(unknowns, seed=unknowns.seed + KINDS[kind], pooled=not apart)
-        self._maker: Maker | None = None
-        digest = trial_digest(study, self.unknowns, measured_by(study), apart)
+        self.unknowns: Unknowns = replace(unknowns, seed=unknowns.seed + KINDS[kind], pooled=not separate_light)
+        self._runner: TrialRunner | None = None
+        digest = trial_digest(study, self.unknowns, measured_by(study), separate_light)
         self.trials = TrialFolder(folder / case.name / kind, digest, list(study.task.measurements))
 
     @property
-    def maker(self) -> Maker:
-        """Return the maker of measurements, created on first use: a case with all trials renders nothing."""
-        if self._maker is None:
-            here = measurements_of(self.study, self.unknowns, self.kind == "apart")
-            self._maker = spread_over(self.workers, self.study, self.unknowns, here)
-        return self._maker
+    def runner(self) -> TrialRunner:
+        """Return the runner of trials, created on first use: a case with all trials renders nothing."""
+        if self._runner is None:
+            virtual_measurements = measurements_of(self.study, self.unknowns, self.kind == "apart")
+            self._runner = spread_over(self.workers, self.study, self.unknowns, virtual_measurements)
+        return self._runner
 
     def measure(self, views: Iterable[View], worlds: dict[int, Sequence[Trial]]) -> None:
         """Measure views in the ``worlds`` of each, by its number, and reuse existing trials."""
@@ -69,54 +69,55 @@ class Bench:
             if trial not in self.trials.known(view.number)
         ]
         if jobs:
-            for job, outcome in track(
-                self.maker.run(self.maker.in_order(jobs)), f"{self.name}: {self.kind}", len(jobs)
-            ):
+            label = f"{self.name}: {self.kind}"
+            for job, outcome in track(self.runner.run(self.runner.in_order(jobs)), label, len(jobs)):
                 self.trials.add(job.view.number, job.trial, outcome)
 
 
-def benches(case: PartCase, study: Study, folder: Path, workers: Executor | None = None) -> dict[str, Bench]:
-    """Return a bench for each kind of trials, with the trials in the folder and in the cases file."""
-    found = {kind: Bench(case, study, folder, kind, workers) for kind in KINDS}
+def trials_by_kind(
+    case: PartCase, study: Study, folder: Path, workers: Executor | None = None
+) -> dict[str, CaseTrials]:
+    """Return the trials of each kind, with those in the folder and in the cases file."""
+    found = {kind: CaseTrials(case, study, folder, kind, workers) for kind in KINDS}
     if case.measured is not None:
         take_up_trials(case.measured / f"{case.name}.nc", {kind: one.trials for kind, one in found.items()})
     return found
 
 
-def keep_trials(case: PartCase, folder: Path, found: dict[str, Bench]) -> None:
+def keep_trials(case: PartCase, folder: Path, found: dict[str, CaseTrials]) -> None:
     """Write all trials of a case to one file in the folder."""
     trials = {kind: one.trials for kind, one in found.items()}
     views = [view.number for view in found["truth"].study.views]
     write_trials(folder / f"{case.name}.nc", trials, views)
 
 
-def measured_truth(case: PartCase, bench: Bench) -> NDArray[np.float64]:
+def measured_truth(case: PartCase, case_trials: CaseTrials) -> NDArray[np.float64]:
     """Measure every candidate in the worlds of the truth.
 
     Returns errors (measurement, view, world): NaN where a world gave no value, infinite where the view was not measured
     in a world. Raced views are measured in more worlds.
     """
-    file, study = case.file, bench.study
+    file, study = case.file, case_trials.study
     views = study.views
     worlds = {
         view.number: file.raced_worlds if case.table.raced and place < file.raced_candidates else file.worlds
         for place, view in enumerate(views)
     }
-    bench.measure(views, {number: days(count) for number, count in worlds.items()})
+    case_trials.measure(views, {number: days(count) for number, count in worlds.items()})
     truth = np.full((len(study.task.measurements), len(views), max(worlds.values())), np.inf)
     for v, view in enumerate(views):
-        truth[:, v, : worlds[view.number]] = bench.trials.errors(view.number, days(worlds[view.number]))
+        truth[:, v, : worlds[view.number]] = case_trials.trials.errors(view.number, days(worlds[view.number]))
     return truth
 
 
-def measured_choice(case: PartCase, bench: Bench) -> NDArray[np.float64]:
+def measured_choice(case: PartCase, case_trials: CaseTrials) -> NDArray[np.float64]:
     """Measure the candidates of a race in worlds with their own finishes.
 
     Returns errors (measurement, candidate, world), NaN where a world gave no value.
     """
-    views, worlds = bench.study.views[: case.file.raced_candidates], days(case.file.raced_worlds, OWN_FINISH_DAYS)
-    bench.measure(views, {view.number: worlds for view in views})
-    return np.stack([bench.trials.errors(view.number, worlds) for view in views], axis=1)
+    views, worlds = case_trials.study.views[: case.file.raced_candidates], days(case.file.raced_worlds, OWN_FINISH_DAYS)
+    case_trials.measure(views, {view.number: worlds for view in views})
+    return np.stack([case_trials.trials.errors(view.number, worlds) for view in views], axis=1)
 
 
 def days(count: int, first: int = 0) -> list[Trial]:

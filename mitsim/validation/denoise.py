@@ -24,9 +24,9 @@ Floats = NDArray[np.float64]
 _SIDE_PX, _THRESHOLD = 8, 3.0
 
 
-def denoised(image: Floats, there: NDArray[np.bool_]) -> Floats:
-    """An image (H, W) less its white noise, whose variance by level is found in the pixels ``there``."""
-    variance = noise_of_levels(image, there)
+def denoised(image: Floats, mask: NDArray[np.bool_]) -> Floats:
+    """An image (H, W) less its white noise, whose variance by level is found in the pixels ``mask``."""
+    variance = noise_of_levels(image, mask)
     margin = _SIDE_PX - 1
     wide = np.pad(np.asarray(image, float), margin, mode="symmetric")
     total, weight = np.zeros(wide.shape), np.zeros(wide.shape)

@@ -70,28 +70,32 @@ def points_of_cases(cases: Sequence[PartCase], views: int) -> dict[str, dict[str
         kind = kind_of(study.sensor)
         if kind == FLIGHT:  # its decoder predicts its losses
             continue
-        maker = measurements_of(study, study_unknowns(study, varied=()))
-        if not isinstance(maker, RenderedMeasurements):
+        renderer = measurements_of(study, study_unknowns(study, varied=()))
+        if not isinstance(renderer, RenderedMeasurements):
             continue
         say(f"case: {case.name}")
-        light, predictor = InterreflectionEffect(study.sensor), maker.predictor.thinned(_STEP)
+        light, predictor = InterreflectionEffect(study.sensor), renderer.predictor.thinned(_STEP)
         out[kind][case.name] = [
-            seen_points(study, view, maker, light, predictor) for view in track(study.views[:views], "views", views)
+            seen_points(study, view, renderer, light, predictor) for view in track(study.views[:views], "views", views)
         ]
     return out
 
 
 def seen_points(
-    study: Study, view: View, maker: RenderedMeasurements, light: InterreflectionEffect, predictor: Predictor
+    study: Study,
+    view: View,
+    renderer: RenderedMeasurements,
+    light: InterreflectionEffect,
+    predictor: Predictor,
 ) -> SeenPoints:
     """Return which points of a view are found, with F and rho of each."""
     assert study.performance_map is not None
     scene, pose, step = study.scene, view.world_from_sensor, predictor.step
-    cloud = maker.best_guess(view)[1]
+    cloud = renderer.at_best_estimates(view)[1]
     surfaces = predictor.surfaces(scene, pose)
     ideal, labels = predictor.ideal(surfaces), predictor.labels(scene, pose, surfaces)
     fraction = performance(ideal, scene, study.performance_map)[0]
-    rho = light.look(scene, pose).at(ideal.point).rho
+    rho = light.render(scene, pose).at(ideal.point).rho
     decoded = cloud.points[step // 2 :: step, step // 2 :: step].reshape(-1, 3)[ideal.pixel]
     off = np.abs(np.linalg.norm(decoded - predictor.grid.origin, axis=1) - ideal.distance)
     found = off <= FALSE_SHARE_OF_DISTANCE * ideal.distance  # false where nothing was decoded

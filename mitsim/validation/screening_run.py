@@ -39,7 +39,7 @@ from mitsim.prediction import Predictor
 from mitsim.progress import say
 from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.study import Study
-from mitsim.validation.case_trials import benches, days, keep_trials, measured_truth
+from mitsim.validation.case_trials import days, keep_trials, measured_truth, trials_by_kind
 from mitsim.validation.part_cases import PartCase
 from mitsim.view_scores import RAYS, screening_risk
 from mitsim.virtual.race import FIRST, first_of_each, prior_risk
@@ -93,15 +93,15 @@ def screen_case(case: PartCase, folder: Path, workers: Executor | None = None) -
     """Screen and measure the candidates of one case."""
     say(f"case: {case.name}")
     study = case.open()
-    bench = benches(case, study, folder, workers)
+    trials_of_kind = trials_by_kind(case, study, folder, workers)
     predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
     assert study.performance_map is not None
     scores, _ = screen(study, predictor, study.performance_map)
-    truth = measured_truth(case, bench["truth"])[:, :, : case.file.worlds]
-    tool, numbers = bench["tool"], [view.number for view in study.views]
+    truth = measured_truth(case, trials_of_kind["truth"])[:, :, : case.file.worlds]
+    tool, numbers = trials_of_kind["tool"], [view.number for view in study.views]
     tool.measure(study.views, dict.fromkeys(numbers, days(FIRST)))
     once = np.stack([tool.trials.errors(number, days(FIRST)) for number in numbers], axis=1)
-    keep_trials(case, folder, bench)
+    keep_trials(case, folder, trials_of_kind)
     return judged(case, study, scores, seen_by_all(study, predictor), truth, once)
 
 

@@ -23,7 +23,7 @@ from mitsim.prediction import Predictor
 from mitsim.progress import say
 from mitsim.reconstruction.cloud import sensor_geometry
 from mitsim.study import StatementTable, Study
-from mitsim.validation.case_trials import Bench, benches, days, keep_trials, measured_choice, measured_truth
+from mitsim.validation.case_trials import CaseTrials, days, keep_trials, measured_choice, measured_truth, trials_by_kind
 from mitsim.validation.part_cases import PartCase
 from mitsim.view_scores import screening_risk
 from mitsim.views import View
@@ -78,20 +78,20 @@ def run_case(case: PartCase, folder: Path, workers: Executor | None = None) -> J
     """Measure and judge one case."""
     say(f"case: {case.name}")
     study = case.open()
-    bench = benches(case, study, folder, workers)
+    trials_of_kind = trials_by_kind(case, study, folder, workers)
     assert study.performance_map is not None
     predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
     scores, _ = screen(study, predictor, study.performance_map)
     raced = None
     if case.table.raced:
-        few, tool = study.views[: case.file.raced_candidates], bench["tool"]
+        few, tool = study.views[: case.file.raced_candidates], trials_of_kind["tool"]
         few_scores = scores.sel(view=[view.number for view in few])
-        raced = run_race(few, few_scores, tool.maker, tool.trials, race_rules(study.file.race))
-    truth = measured_truth(case, bench["truth"])
-    choice = None if raced is None else measured_choice(case, bench["choice"])
+        raced = run_race(few, few_scores, tool.runner, tool.trials, race_rules(study.file.race))
+    truth = measured_truth(case, trials_of_kind["truth"])
+    choice = None if raced is None else measured_choice(case, trials_of_kind["choice"])
     chosen = None if raced is None else raced.leaders().get(ALL)
-    stated = [_stated(case, bench, view, why) for view, why in _to_state(case, study, scores, chosen)]
-    keep_trials(case, folder, bench)
+    stated = [_stated(case, trials_of_kind, view, why) for view, why in _to_state(case, study, scores, chosen)]
+    keep_trials(case, folder, trials_of_kind)
     numbers = np.array([view.number for view in study.views])
     return JudgedCase(
         case, study.sensor.name, tuple(study.task.measurements), numbers, truth, scores, raced, choice, tuple(stated)
@@ -115,9 +115,9 @@ def _to_state(case: PartCase, study: Study, scores: xr.Dataset, chosen: int | No
     return [(by_number[number], why) for number, why in [(first, "chosen"), *((others[i], "at random") for i in drawn)]]
 
 
-def _stated(case: PartCase, bench: dict[str, Bench], view: View, why: str) -> StatedView:
-    tool, apart, count = bench["tool"], bench["apart"], case.file.stated_worlds
+def _stated(case: PartCase, trials_of_kind: dict[str, CaseTrials], view: View, why: str) -> StatedView:
+    tool, apart, count = trials_of_kind["tool"], trials_of_kind["apart"], case.file.stated_worlds
     table = StatementTable(trials=tool.study.file.statement.trials, pairs=0)
-    statements = state_view(tool.study, view, tool.maker, tool.trials, tool.unknowns, table)
+    statements = state_view(tool.study, view, tool.runner, tool.trials, tool.unknowns, table)
     apart.measure([view], {view.number: days(count)})
     return StatedView(view.number, why, tuple(statements), apart.trials.errors(view.number, days(count)))

@@ -72,7 +72,7 @@ class TriedSet:
 
 
 def confirmed_set(
-    study: Study, first: ViewSet, search: Search, here: RenderedMeasurements, digest: str, folder: Path
+    study: Study, first: ViewSet, search: Search, renderer: RenderedMeasurements, digest: str, folder: Path
 ) -> list[TriedSet]:
     """Measure the first set, and sets for stricter limits until one keeps the limits.
 
@@ -83,7 +83,7 @@ def confirmed_set(
     assert table is not None
     chosen, searched, tried = first, dict(table.limits), list[TriedSet]()
     while True:
-        stated = state_set(study, chosen, here, digest, folder)
+        stated = state_set(study, chosen, renderer, digest, folder)
         tried.append(TriedSet(chosen, dict(searched), tuple(stated)))
         if tried[-1].excess(table.limits) <= 1:
             break
@@ -154,7 +154,9 @@ def _excess(one: Statement, limit: float) -> float:
     return one.root_mean_square / limit if math.isfinite(one.root_mean_square) else math.inf
 
 
-def state_set(study: Study, chosen: ViewSet, here: RenderedMeasurements, digest: str, folder: Path) -> list[Statement]:
+def state_set(
+    study: Study, chosen: ViewSet, renderer: RenderedMeasurements, digest: str, folder: Path
+) -> list[Statement]:
     """State every measurement from a set of views together, and reuse trials in the folder."""
     table = study.file.set
     assert table is not None
@@ -163,10 +165,10 @@ def state_set(study: Study, chosen: ViewSet, here: RenderedMeasurements, digest:
     )
     trials = TrialFolder(folder / "set_trials" / decided_by, decided_by, list(study.task.measurements))
     by_number = {view.number: view for view in study.views}
-    maker = JoinedMeasurements(here, [by_number[number] for number in chosen.views], table)
+    runner = JoinedMeasurements(renderer, [by_number[number] for number in chosen.views], table)
     days = [SET_DAYS + k for k in range(table.trials)]
     missing = [day for day in days if Trial(day) not in trials.known(0)]
-    for day, outcome in track(maker.run(missing), "confirm the set", len(missing)):
+    for day, outcome in track(runner.run(missing), "confirm the set", len(missing)):
         trials.add(0, Trial(day), outcome)
     wanted = [Trial(day) for day in days]
     found = trials.errors(0, wanted)

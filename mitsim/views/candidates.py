@@ -25,7 +25,7 @@ from mitsim.progress import track_if_long
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.sensor.working_volume import in_image
-from mitsim.views.collision import Box, Obstacle, comes_near, is_inside, obstacle, sensor_box
+from mitsim.views.collision import Box, Obstacle, is_inside, is_near, obstacle, sensor_box
 from mitsim.views.reach import reach_directions, reach_rotations, stage_from_part, stage_from_sensor
 from mitsim.views.table import PartStage, ViewsTable
 
@@ -276,7 +276,7 @@ def _first_free(
     inside: bool | None = None  # None: unknown. Between two free steps the body does not cross the surface
     for distance in distances.tolist():
         pose = Transform(nearest.rotation, nearest.translation + (distance - distances[0]) * outward)
-        if comes_near(part, box, pose, clearance):
+        if is_near(part, box, pose, clearance):
             inside = None
             continue
         if inside is None:

@@ -138,7 +138,7 @@ def _solids(triangles: Floats) -> Solids:
     return Solids(chosen, middles, areas[closed], reach, bounds)
 
 
-def comes_near(part: Obstacle, box: Box, part_from_sensor: Transform, clearance: float) -> bool:
+def is_near(part: Obstacle, box: Box, part_from_sensor: Transform, clearance: float) -> bool:
     """Return whether any triangle of a part is nearer to a box than ``clearance`` [mm], or meets it."""
     centre = part_from_sensor.points(box.centre)
     reach = float(np.linalg.norm(box.half)) + clearance

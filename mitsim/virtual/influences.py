@@ -31,7 +31,7 @@ def influences(table: UnknownsTable, source: str, depth: int) -> list[Influence]
     """
     rendered = source == "render"
     form, pose, temperature, light = table.form.features, table.pose, table.temperature, table.light
-    told = [
+    listed_influences = [
         Influence("calibration of the sensor", True, "drawn from the covariance of the calibration"),
         Influence(
             "drift since the calibration",
@@ -83,4 +83,4 @@ def influences(table: UnknownsTable, source: str, depth: int) -> list[Influence]
         Influence("deformation by clamping", False, "clamp as in use"),
         Influence("datums and choice of features", False, "the task is assumed to agree with the drawing"),
     ]
-    return told
+    return listed_influences

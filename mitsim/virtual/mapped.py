@@ -80,23 +80,23 @@ class MappedMeasurements:
 
     def _take(self, job: Job) -> tuple[PointCloud, World, NDArray[np.int16], Surfaces | None]:
         world = self.unknowns.draw(job.trial)
-        true, told = (motion.inverse() @ job.view.world_from_sensor for motion in (world.placed, world.told))
+        true, assumed = (motion.inverse() @ job.view.world_from_sensor for motion in (world.placed, world.assumed))
         rng = np.random.default_rng(world.seed)
         cloud = self.predictor.predict(self._scene(world.finish), true, rng, correlated=True)
-        labels = self.predictor.quick_labels(self.study.scene, told)
-        surfaces = self.predictor.surfaces(self.study.scene, told) if self._has_form and world.form else None
+        labels = self.predictor.quick_labels(self.study.scene, assumed)
+        surfaces = self.predictor.surfaces(self.study.scene, assumed) if self._has_form and world.form else None
         return cloud, world, labels, surfaces
 
-    def _finish(self, taken: tuple[PointCloud, World, NDArray[np.int16], Surfaces | None], job: Job) -> Outcome:
-        cloud, world, labels, surfaces = taken
-        scene, told = self.study.scene, world.told.inverse() @ job.view.world_from_sensor
+    def _finish(self, drawing: tuple[PointCloud, World, NDArray[np.int16], Surfaces | None], job: Job) -> Outcome:
+        cloud, world, labels, surfaces = drawing
+        scene, assumed = self.study.scene, world.assumed.inverse() @ job.view.world_from_sensor
         cloud = replace(cloud, points=moved_by_calibration(cloud, self.study.sensor, world))
-        points = displaced(cloud, world, told, scene.centre)
+        points = displaced(cloud, world, assumed, scene.centre)
         if surfaces is not None:
             form = self.unknowns.table.form.features
-            points = form_deviation(points, surfaces, scene, form, told, cloud.grid, world.form)
+            points = form_deviation(points, surfaces, scene, form, assumed, cloud.grid, world.form)
         labelled = replace(cloud, points=points, feature=labels, feature_names=scene.names)
-        found = measure(labelled, self.study.task, told.inverse().matrix(), MINIMUM_POINTS, False)
+        found = measure(labelled, self.study.task, assumed.inverse().matrix(), MINIMUM_POINTS, False)
         return self._with_beyond(Outcome.of(found), job.view, world)
 
     def _predict(self, views: dict[int, View]) -> None:

@@ -60,11 +60,16 @@ def measured_by(study: Study) -> str:
     return "map" if known is not None and known.data.attrs.get("source") not in (None, "", "simulated") else "render"
 
 
-def measurements_of(study: Study, unknowns: Unknowns, apart: bool = False) -> RenderedMeasurements | MappedMeasurements:
-    """Prepare a study's sensor, or its map, for virtual measurements; with ``apart`` renderings share no light."""
+def measurements_of(
+    study: Study, unknowns: Unknowns, separate_light: bool = False
+) -> RenderedMeasurements | MappedMeasurements:
+    """Prepare a study's sensor, or its map, for virtual measurements.
+
+    With ``separate_light``, renderings share no light.
+    """
     if measured_by(study) == "map":
         return MappedMeasurements(study, unknowns)
-    return RenderedMeasurements(study, unknowns, rendering_of(study), apart)
+    return RenderedMeasurements(study, unknowns, rendering_of(study), separate_light)
 
 
 def race_rules(table: RaceTable, minutes: float | None = None) -> RaceRules:
@@ -86,10 +91,10 @@ def map_digest(study: Study) -> str:
     return digest.hexdigest()[:16]
 
 
-def trial_digest(study: Study, unknowns: Unknowns, source: str, apart: bool = False) -> str:
+def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: bool = False) -> str:
     """Return sixteen hexadecimal digits of everything that determines a trial."""
     file = study.file
-    told = {
+    content = {
         "version": TRIAL_VERSION,
         "mitsim": __version__,
         "source": source,
@@ -107,12 +112,12 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, apart: bool = Fa
             np.array([v.world_from_sensor.matrix().round(9) for v in study.views]).tobytes()
         ).hexdigest(),
     }
-    if apart or not unknowns.pooled:
-        told["apart"] = [apart, unknowns.pooled]
+    if separate_light or not unknowns.pooled:
+        content["apart"] = [separate_light, unknowns.pooled]
     if source == "map":
         assert study.performance_map is not None
-        told["map"] = hashlib.sha256(repr(study.performance_map.data.attrs).encode()).hexdigest()
-    return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()[:16]
+        content["map"] = hashlib.sha256(repr(study.performance_map.data.attrs).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
 def _varied(unknowns: Unknowns, source: str) -> list[str]:

@@ -54,7 +54,7 @@ class Job:
     trial: Trial
 
 
-class Maker(Protocol):
+class TrialRunner(Protocol):
     """Makes virtual measurements, by rendering or from the map."""
 
     source: str
@@ -142,7 +142,9 @@ def prior_risk(u: Floats) -> Floats:
     return np.where(np.isfinite(known), known, 3 * worst)
 
 
-def run_race(views: Sequence[View], scores: xr.Dataset, maker: Maker, trials: TrialFolder, rules: RaceRules) -> Raced:
+def run_race(
+    views: Sequence[View], scores: xr.Dataset, runner: TrialRunner, trials: TrialFolder, rules: RaceRules
+) -> Raced:
     """Race the views on the shortlist, and reuse trials in the folder."""
     numbers = shortlist(scores, rules.shortlist)
     if not numbers:
@@ -164,7 +166,7 @@ def run_race(views: Sequence[View], scores: xr.Dataset, maker: Maker, trials: Tr
             for trial in _first_trials(count)
             if trial not in trials.known(number)
         ]
-        for done, (job, outcome) in enumerate(maker.run(maker.in_order(jobs)), 1):
+        for done, (job, outcome) in enumerate(runner.run(runner.in_order(jobs)), 1):
             trials.add(job.view.number, job.trial, outcome)
             if time.monotonic() - last > _SAY_EVERY_S:
                 last = time.monotonic()
@@ -204,12 +206,12 @@ def standings(
         mean, covariance = posterior(errors[m], prior_risk(u[m]), chance[m])
         samples.append(sampled(mean, covariance, seed=m))
         found[name] = judge(samples[-1], rules.margin)
-    found[ALL] = judge(together(np.array(samples), tolerances), rules.margin)
+    found[ALL] = judge(combined_risk(np.array(samples), tolerances), rules.margin)
     decided = all(one.confidence >= rules.confidence for one in found.values())
     return Raced(np.array(numbers), found, errors, decided)
 
 
-def together(samples: Floats, tolerances: Floats) -> Floats:
+def combined_risk(samples: Floats, tolerances: Floats) -> Floats:
     """Return the logarithm (s, v) of the combined risk of all measurements, from that of each, (m, s, v).
 
     If every measurement has a tolerance, it is the largest ratio of risk to tolerance; else the geometric mean of the

@@ -7,8 +7,8 @@ measurement at the assumed pose -> error of every measurement.
 
 Interreflections are rendered at the nominal pose and calibration of the view. They are smooth, and the random pose and
 calibration shift them by about a pixel. Trials sorted by finish (:func:`in_order`) render them once for each finish.
-With ``apart``, every trial renders all of its light at its own pose and calibration. That takes two to three times as
-long, and is the reference for this approximation.
+With ``separate_light``, every trial renders all of its light at its own pose and calibration. That takes two to three
+times as long, and is the reference for this approximation.
 
 Temperature and form displace the decoded points together with the surface, to first order. At 50 um on 500 mm, the
 change of the image position is far below a pixel, and that of the brightness far below a grey level.
@@ -57,34 +57,34 @@ _PLACEMENTS = 3.0
 
 @dataclass(frozen=True)
 class _SharedLight:
-    """What of a view's light is the same in all worlds of one finish."""
+    """Light of a view that is the same in all worlds of one finish: interreflections, and the light of the room."""
 
     view: int
     finish: int
-    later: IndirectImages
+    indirect: IndirectImages
     room: dict[str, NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
-class Lit:
+class TracedLight:
     """Light of one world on the imagers of a view before exposure: one tracing serves any number of exposures.
 
     ``light`` is that of the projector at its nominal power, ``room`` all other light by camera, (h, w) [W / (mm^2 sr)]
-    each. ``sensor`` is the true sensor of the world. ``told`` is the assumed pose of the sensor.
+    each. ``sensor`` is the true sensor of the world. ``assumed`` is the assumed pose of the sensor.
     """
 
     sensor: SimulatedSensor
     light: LightOnImagers
     room: dict[str, NDArray[np.float32]]
     world: World
-    told: Transform
+    assumed: Transform
 
 
 @dataclass(frozen=True)
-class _Taken:
+class _Captured:
     capture: Capture
     world: World
-    told: Transform
+    assumed: Transform
     surfaces: Surfaces | None
     labels: NDArray[np.int16]
 
@@ -94,8 +94,8 @@ class RenderedMeasurements:
 
     source = "render"
 
-    def __init__(self, study: Study, unknowns: Unknowns, rendering: Rendering, apart: bool = False) -> None:
-        self.study, self.unknowns, self.rendering, self.apart = study, unknowns, rendering, apart
+    def __init__(self, study: Study, unknowns: Unknowns, rendering: Rendering, separate_light: bool = False) -> None:
+        self.study, self.unknowns, self.rendering, self.separate_light = study, unknowns, rendering, separate_light
         self.planned: PlannedExposure | None = None
         self.simulated = SimulatedSensor(study.sensor)
         self.geometry = sensor_geometry(study.sensor)
@@ -124,57 +124,57 @@ class RenderedMeasurements:
         """
         return one_ahead(jobs, self._take, self._finish)
 
-    def best_guess(self, view: View) -> tuple[Capture, PointCloud]:
+    def at_best_estimates(self, view: View) -> tuple[Capture, PointCloud]:
         """Return capture and labelled cloud of a view with every unknown at its best estimate."""
-        taken = self._taken(view, replace(self.unknowns, varied=()).draw(Trial(0)))
-        return taken.capture, self._cloud(taken)
+        captured = self._captured(view, replace(self.unknowns, varied=()).draw(Trial(0)))
+        return captured.capture, self._cloud(captured)
 
-    def _take(self, job: Job) -> _Taken:
-        return self._taken(job.view, self.unknowns.draw(job.trial))
+    def _take(self, job: Job) -> _Captured:
+        return self._captured(job.view, self.unknowns.draw(job.trial))
 
     def cloud_of(self, view: View, world: World) -> tuple[PointCloud, Transform]:
         """Return the labelled cloud of a view in a world, and the assumed pose of the sensor."""
-        taken = self._taken(view, world)
-        return self._cloud(taken), taken.told
+        captured = self._captured(view, world)
+        return self._cloud(captured), captured.assumed
 
-    def measured(self, lit: Lit, planned: PlannedExposure | None) -> tuple[PointCloud, Outcome]:
+    def measured(self, lit: TracedLight, planned: PlannedExposure | None) -> tuple[PointCloud, Outcome]:
         """Return the labelled cloud of a world's light with planned exposures, and the outcome of its measurement.
 
         The light is kept for other exposures.
         """
-        taken = self._exposed(lit, planned, True)
-        cloud = self._cloud(taken)
-        return cloud, self._outcome(cloud, taken)
+        captured = self._exposed(lit, planned, True)
+        cloud = self._cloud(captured)
+        return cloud, self._outcome(cloud, captured)
 
-    def _finish(self, taken: _Taken, job: Job) -> Outcome:
-        return self._outcome(self._cloud(taken), taken)
+    def _finish(self, captured: _Captured, job: Job) -> Outcome:
+        return self._outcome(self._cloud(captured), captured)
 
-    def _outcome(self, cloud: PointCloud, taken: _Taken) -> Outcome:
-        return Outcome.of(measure(cloud, self.study.task, taken.told.inverse().matrix(), MINIMUM_POINTS, False))
+    def _outcome(self, cloud: PointCloud, captured: _Captured) -> Outcome:
+        return Outcome.of(measure(cloud, self.study.task, captured.assumed.inverse().matrix(), MINIMUM_POINTS, False))
 
-    def _taken(self, view: View, world: World) -> _Taken:
+    def _captured(self, view: View, world: World) -> _Captured:
         return self._exposed(self.lit(view, world), self.planned, False)
 
-    def _exposed(self, lit: Lit, planned: PlannedExposure | None, keep: bool) -> _Taken:
+    def _exposed(self, lit: TracedLight, planned: PlannedExposure | None, keep: bool) -> _Captured:
         world = lit.world
         capture = self.exposed(lit, planned, world.seed, keep)
-        labels = self.predictor.quick_labels(self.study.scene, lit.told)
-        surfaces = self.predictor.surfaces(self.study.scene, lit.told) if self._has_form and world.form else None
-        return _Taken(capture, world, lit.told, surfaces, labels)
+        labels = self.predictor.quick_labels(self.study.scene, lit.assumed)
+        surfaces = self.predictor.surfaces(self.study.scene, lit.assumed) if self._has_form and world.form else None
+        return _Captured(capture, world, lit.assumed, surfaces, labels)
 
-    def lit(self, view: View, world: World) -> Lit:
+    def lit(self, view: View, world: World) -> TracedLight:
         """Trace the light of a world in a view, which all of its exposures share."""
-        true, told = (motion.inverse() @ view.world_from_sensor for motion in (world.placed, world.told))
+        true, assumed = (motion.inverse() @ view.world_from_sensor for motion in (world.placed, world.assumed))
         sensor = self.simulated.recalibrated(world.rig, world.unit)
         scene = self._scene(world.finish)[0]
-        if self.apart:
-            before = self._render_shared_light(sensor, true, view, world.finish, world.seed)
+        if self.separate_light:
+            shared = self._render_shared_light(sensor, true, view, world.finish, world.seed)
         else:
-            before = self._shared_with(view, world.finish)
-        light = sensor.light(scene, true, seed=world.seed, rendering=replace(self.rendering, indirect=before.later))
-        return Lit(sensor, light, before.room, world, told)
+            shared = self._shared_with(view, world.finish)
+        light = sensor.light(scene, true, seed=world.seed, rendering=replace(self.rendering, indirect=shared.indirect))
+        return TracedLight(sensor, light, shared.room, world, assumed)
 
-    def exposed(self, lit: Lit, planned: PlannedExposure | None, seed: int, keep: bool = False) -> Capture:
+    def exposed(self, lit: TracedLight, planned: PlannedExposure | None, seed: int, keep: bool = False) -> Capture:
         """Expose light as planned, or by the sensor's own rule; every ``seed`` gives another capture.
 
         Unless ``keep`` is true, the light is overwritten, since it may be large.
@@ -197,13 +197,15 @@ class RenderedMeasurements:
         sensor = self.study.sensor
         return capture_cloud(capture, sensor.settings, self.geometry, imager=sensor.imager)
 
-    def _cloud(self, taken: _Taken) -> PointCloud:
-        scene, cloud = self.study.scene, self.unlabelled_cloud(taken.capture)
-        points = displaced(cloud, taken.world, taken.told, scene.centre)
-        if taken.surfaces is not None:
+    def _cloud(self, captured: _Captured) -> PointCloud:
+        scene, cloud = self.study.scene, self.unlabelled_cloud(captured.capture)
+        points = displaced(cloud, captured.world, captured.assumed, scene.centre)
+        if captured.surfaces is not None:
             form = self.unknowns.table.form.features
-            points = form_deviation(points, taken.surfaces, scene, form, taken.told, cloud.grid, taken.world.form)
-        return replace(cloud, points=points, feature=taken.labels, feature_names=scene.names)
+            points = form_deviation(
+                points, captured.surfaces, scene, form, captured.assumed, cloud.grid, captured.world.form
+            )
+        return replace(cloud, points=points, feature=captured.labels, feature_names=scene.names)
 
     def _scene(self, finish: int) -> tuple[Scene, list[Floats]]:
         """Return the part in the finishes of a number, and the directional albedos of its shapes."""
@@ -256,8 +258,8 @@ class RenderedMeasurements:
                 images[name] = np.zeros((0, roi.height, roi.width), np.float32)
             lit = room_radiance(scene, albedos, simulated.pixel_rays[name], pose)[roi.slices]
             rois[name], room[name] = roi, simulated.apply_lens(lit, name, roi)
-        later = IndirectImages(images, rois, how, self.rendering.depth)
-        return _SharedLight(view.number, finish, later, room)
+        indirect = IndirectImages(images, rois, how, self.rendering.depth)
+        return _SharedLight(view.number, finish, indirect, room)
 
 
 #: corners of a cube, which widen the box of a part by a shift in any direction

@@ -21,7 +21,7 @@ from mitsim.progress import say
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study, StudyFile, open_study
 from mitsim.virtual.plan import rendering_of, trial_digest
-from mitsim.virtual.race import Job, Maker
+from mitsim.virtual.race import Job, TrialRunner
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.trials import Outcome
 from mitsim.virtual.world import Unknowns
@@ -37,7 +37,7 @@ class TrialOrder:
     path: str
     file: StudyFile
     unknowns: Unknowns
-    apart: bool
+    separate_light: bool
     digest: str
     jobs: tuple[Job, ...]
     planned: PlannedExposure | None = None
@@ -48,10 +48,12 @@ class SpreadMeasurements:
 
     source = "render"
 
-    def __init__(self, workers: Executor, study: Study, unknowns: Unknowns, here: RenderedMeasurements) -> None:
-        self.workers, self.here = workers, here
-        digest = trial_digest(study, unknowns, self.source, here.apart)
-        self._order = TrialOrder(str(Path(study.path).absolute()), study.file, unknowns, here.apart, digest, ())
+    def __init__(self, workers: Executor, study: Study, unknowns: Unknowns, renderer: RenderedMeasurements) -> None:
+        self.workers, self.renderer = workers, renderer
+        digest = trial_digest(study, unknowns, self.source, renderer.separate_light)
+        self._order = TrialOrder(
+            str(Path(study.path).absolute()), study.file, unknowns, renderer.separate_light, digest, ()
+        )
 
     def exposed_as(self, planned: PlannedExposure | None) -> SpreadMeasurements:
         """Return the same measurements with other exposures than the sensor's own."""
@@ -61,7 +63,7 @@ class SpreadMeasurements:
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
         """Return the jobs sorted by view and finish."""
-        return self.here.in_order(jobs)
+        return self.renderer.in_order(jobs)
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
         """Yield the outcome of every virtual measurement, job by job as they arrive."""
@@ -71,34 +73,37 @@ class SpreadMeasurements:
 
     def _rows(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, ...]]:
         """Yield runs of jobs that share light, at most :data:`_IN_A_ROW` each."""
-        draw = self.here.unknowns.draw
+        draw = self.renderer.unknowns.draw
         for _, some in groupby(jobs, key=lambda job: (job.view.number, draw(job.trial).finish)):
             row = tuple(some)
             for first in range(0, len(row), _IN_A_ROW):
                 yield row[first : first + _IN_A_ROW]
 
 
-def spread_over(workers: Executor | None, study: Study, unknowns: Unknowns, here: Maker) -> Maker:
-    """Return the given maker, or one whose trials workers make; clouds from a map are always drawn in this process."""
+def spread_over(workers: Executor | None, study: Study, unknowns: Unknowns, runner: TrialRunner) -> TrialRunner:
+    """Return the given runner, or one that distributes its trials to workers.
+
+    Clouds from a map are always drawn in this process.
+    """
     if workers is None:
-        return here
-    if not isinstance(here, RenderedMeasurements):
+        return runner
+    if not isinstance(runner, RenderedMeasurements):
         say("clouds are drawn from a map in this process, not by workers")
-        return here
-    return SpreadMeasurements(workers, study, unknowns, here)
+        return runner
+    return SpreadMeasurements(workers, study, unknowns, runner)
 
 
-_laid_out: dict[str, RenderedMeasurements] = {}
+_prepared: dict[str, RenderedMeasurements] = {}
 
 
 def make_trials(order: TrialOrder) -> list[Outcome]:
     """Make the trials of an order; workers call this function."""
-    if order.digest not in _laid_out:
+    if order.digest not in _prepared:
         from mitsim.scene import backend
 
         backend.activate(None)
-        _laid_out.clear()
+        _prepared.clear()
         study = open_study(order.path, order.file, mapped=False)  # trials are rendered
-        _laid_out[order.digest] = RenderedMeasurements(study, order.unknowns, rendering_of(study), order.apart)
-    maker = _laid_out[order.digest].exposed_as(order.planned)
-    return [outcome for _, outcome in maker.run(order.jobs)]
+        _prepared[order.digest] = RenderedMeasurements(study, order.unknowns, rendering_of(study), order.separate_light)
+    renderer = _prepared[order.digest].exposed_as(order.planned)
+    return [outcome for _, outcome in renderer.run(order.jobs)]

@@ -25,13 +25,13 @@ from mitsim.text_table import aligned
 from mitsim.version import __version__
 from mitsim.views import View
 from mitsim.virtual.influences import influences
-from mitsim.virtual.race import Job, Maker
+from mitsim.virtual.race import Job, TrialRunner
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import BEYOND, FRESH, GROUPS, STATEMENT_DAYS, Trial, Unknowns
 
 
 def state_view(
-    study: Study, view: View, maker: Maker, trials: TrialFolder, unknowns: Unknowns, table: StatementTable
+    study: Study, view: View, runner: TrialRunner, trials: TrialFolder, unknowns: Unknowns, table: StatementTable
 ) -> list[Statement]:
     """State every measurement from one view, and reuse trials in the folder.
 
@@ -39,12 +39,12 @@ def state_view(
     """
     base = [Trial(STATEMENT_DAYS + k) for k in range(table.trials)]
     pairs = base[: min(table.pairs, table.trials)]
-    groups = budget_groups(unknowns, maker.source)
+    groups = budget_groups(unknowns, runner.source)
     swapped = {group: [Trial(one.day, one.capture, group) for one in pairs] for group in groups}
     repeats = [Trial(one.day, one.capture + 1) for one in pairs]
     wanted = [*base, *repeats, *(trial for some in swapped.values() for trial in some)]
     missing = [Job(view, trial) for trial in wanted if trial not in trials.known(view.number)]
-    for job, outcome in track(maker.run(maker.in_order(missing)), f"state view {view.number}", len(missing)):
+    for job, outcome in track(runner.run(runner.in_order(missing)), f"state view {view.number}", len(missing)):
         trials.add(view.number, job.trial, outcome)
     found = trials.errors(view.number, base)
     second = trials.errors(view.number, repeats)

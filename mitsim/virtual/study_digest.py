@@ -20,17 +20,17 @@ def study_digest(study: Study, trials: str) -> str:
     ``trials`` is the digest of its trials (:func:`mitsim.virtual.plan.trial_digest`), which covers sensor, scene, task,
     views and unknowns.
     """
-    told = {
+    content = {
         "trials": trials,
-        "file": _told(study),
+        "file": _study_keys(study),
         "series": [] if study.campaign is None else [one.name for one in study.campaign.series],
         "campaign": None if study.campaign is None else study.campaign.file.model_dump(mode="json"),
         "map": None if study.performance_map is None else map_digest(study),
     }
-    return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()[:32]
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
 
-def _told(study: Study) -> dict[str, Any]:
+def _study_keys(study: Study) -> dict[str, Any]:
     """Return all keys of a study, without a missing table that older versions did not have.
 
     Folders of older versions then keep their digest.

@@ -53,11 +53,11 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
         if name not in study.task.shapes:
             allowed = ", ".join(study.task.shapes)
             raise InputError(study.path, f"unknowns.form.features.{name}", "no shape of the task", allowed)
-    here = study.path.parent
+    folder = study.path.parent
     return Unknowns(
         table,
         sensor.rig,
-        calibration_covariance(sensor, table.calibration, here),
+        calibration_covariance(sensor, table.calibration, folder),
         sensor.wavelength_nm,
         _expansion(study),
         np.asarray(study.scene.centre, float),
@@ -66,10 +66,10 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
     )
 
 
-def calibration_covariance(sensor: Sensor, table: CalibrationUnknowns, here: Path) -> RigCovariance:
+def calibration_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: Path) -> RigCovariance:
     """Return the covariance of a sensor's calibration, with the drift since then."""
     if table.covariance is not None:
-        return with_drift(read_rig_covariance(here / table.covariance, sensor.rig), sensor.rig, table.drift())
+        return with_drift(read_rig_covariance(folder / table.covariance, sensor.rig), sensor.rig, table.drift())
     if sensor.name in presets():
         try:
             return preset_covariance(sensor, table.drift())

@@ -154,7 +154,7 @@ class TrialFolder:
         ):  # OverflowError: an integer of 400 digits
             return None
         known = all(
-            math.isfinite(value) for value, told in zip(values, table["errors"], strict=True) if told is not None
+            math.isfinite(value) for value, listed in zip(values, table["errors"], strict=True) if listed is not None
         )
         if not known or len(values) != len(self.measurements) or trial.swapped not in ("", *GROUPS):
             return None

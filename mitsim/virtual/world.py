@@ -77,7 +77,7 @@ class World:
     ``rig`` is the sensor's true geometry. ``path`` is offset [mm] and scale [1] of a time-of-flight distance.
     ``finish`` numbers the deviation of the finishes (:func:`finish_deviation`), -1 for the best estimate. ``form`` and
     ``unit`` are seeds, 0 for none. ``room`` is irradiance [W/mm^2]. ``power`` and ``exposure`` are relative to nominal
-    [1]. ``expansion`` of the part is relative [1]. ``placed`` and ``told`` (world to world) are the true and the
+    [1]. ``expansion`` of the part is relative [1]. ``placed`` and ``assumed`` (world to world) are the true and the
     assumed motion of the part from its nominal pose. ``seed`` is that of the capture, ``beyond`` that of effects
     outside the map, 0 for none.
     """
@@ -91,7 +91,7 @@ class World:
     exposure: float
     expansion: float
     placed: Transform
-    told: Transform
+    assumed: Transform
     unit: int
     seed: int
     beyond: int = 0
@@ -128,7 +128,7 @@ class Unknowns:
         )
         names, values = self._geometry(streams["calibration"], float(sensor_kelvin))
         room, power, exposure = self._light(streams["light"])
-        placed, told = self._poses(streams["pose"])
+        placed, assumed = self._poses(streams["pose"])
         return World(
             rig=moved(self.rig, names, values),
             path=path_error(names, values),
@@ -139,7 +139,7 @@ class Unknowns:
             exposure=exposure,
             expansion=self.expansion * float(part_kelvin),
             placed=placed,
-            told=told,
+            assumed=assumed,
             unit=_seed(streams["unit"]) if "unit" in self.varied else 0,
             seed=_seed(streams["noise"]),
             beyond=_seed(streams[BEYOND]) if BEYOND in self.varied else 0,

@@ -23,7 +23,9 @@ def main(first: int, last: int, draws: int) -> None:
     for seed in range(first, last):
         found, errors = standard_errors(seed, draws)
         every.append(errors)
-        print(f"unit {seed}: chi-square {found.found.chi_square:.1f} of {found.found.freedom}", file=sys.stderr)
+        print(
+            f"unit {seed}: chi-square {found.moment_fit.chi_square:.1f} of {found.moment_fit.freedom}", file=sys.stderr
+        )
     print("| number | units | mean error / u | its standard deviation | in the 95 % interval |")
     print("| --- | --- | --- | --- | --- |")
     for key in sorted({key for errors in every for key in errors}):

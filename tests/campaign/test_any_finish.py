@@ -19,7 +19,7 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 from mitsim.campaign import finish_cache, missing_finishes, one_finish
 from mitsim.campaign.finish_cache import cache_folder, kept_finish
-from mitsim.campaign.missing_finishes import Wanted, distances_about, map_with_finishes, with_lights
+from mitsim.campaign.missing_finishes import NeededFinishes, distances_about, map_with_finishes, with_lights
 from mitsim.campaign.one_finish import OneFinish, one_finish_campaign, plan_of
 from mitsim.choose import read_candidates
 from mitsim.commands.options import asking
@@ -45,7 +45,7 @@ def shipped(n10):
 
 
 def wanted_of(n10, finish, between=(480.0, 620.0)):
-    return Wanted(n10, "part.xml", {"seat": finish}, between)
+    return NeededFinishes(n10, "part.xml", {"seat": finish}, between)
 
 
 def test_what_is_known_is_answered_by_the_map_itself(shipped, n10, quick):
@@ -229,7 +229,7 @@ def test_shipped_maps_answer_for_the_coupons_that_they_were_made_of(sensor, scen
         parameters = {} if math.isnan(roughness) else {"Ra": str(roughness)}
         coupon = "matt_white.xml" if math.isnan(roughness) else "coupon.xml"
         shown = load_scene(scenes / "coupon" / coupon, wavelength, parameters).finishes[0]
-        members, _ = known.known.answering(name, roughness, shown.light)
+        members, _ = known.known.representing(name, roughness, shown.light)
         assert str(known.samples[members[0]]) == str((name, roughness))
 
 

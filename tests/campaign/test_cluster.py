@@ -9,7 +9,7 @@ import pytest
 
 from mitsim.campaign.acquire import in_turn, simulated_source
 from mitsim.campaign.cluster import Cluster
-from mitsim.campaign.orders import taken_by
+from mitsim.campaign.orders import worker_source
 from mitsim.campaign.run import run_campaign
 from mitsim.errors import InputError, MissingEnvironmentError
 from mitsim.simulation.simulate import SimulatedSensor
@@ -40,7 +40,7 @@ def test_workers_give_the_same_map_though_one_is_killed(tmp_path, planned, n10, 
     run_campaign(plan, in_turn(simulated_source(SimulatedSensor(n10), 1), plan), tmp_path / "here")
     with distributed.Client(cluster, set_as_default=False) as client:
         workers = client.run(os.getpid)
-        source, killed = taken_by(Cluster(cluster.scheduler_address), plan), []
+        source, killed = worker_source(Cluster(cluster.scheduler_address), plan), []
 
         def killing(shots):
             for number, done in enumerate(source(shots)):
@@ -127,7 +127,7 @@ def test_a_worker_of_another_mitsim_takes_nothing(tmp_path, planned, cluster, mo
             monkeypatch.setattr("mitsim.campaign.cluster._compare_builds", lambda *_: None)
         try:
             with pytest.raises(MissingEnvironmentError, match="other source files"):
-                run_campaign(plan, taken_by(Cluster(cluster.scheduler_address), plan), tmp_path)
+                run_campaign(plan, worker_source(Cluster(cluster.scheduler_address), plan), tmp_path)
         finally:
             client.run(_mend)
     assert not list((tmp_path / "coupons").rglob("shot.json"))
@@ -188,7 +188,7 @@ def test_a_scheduler_without_workers_is_told_and_given_up(planned, monkeypatch, 
     ):
         plan = planned(distances_mm=[500], orientations=[{"up_to_deg": 10, "subdivisions": 0}])
         normal = plan.file.normals()[0]
-        next(taken_by(Cluster(empty.scheduler_address), plan)([plan.shot(plan.series[0], normal)]))
+        next(worker_source(Cluster(empty.scheduler_address), plan)([plan.shot(plan.series[0], normal)]))
     assert "no workers yet, waiting" in capsys.readouterr().err
 
 

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from characterisation.atomic_io import FULL, write_json, write_netcdf
 from mitsim.campaign.plan import read_campaign
 from mitsim.campaign.run import run_campaign
-from mitsim.campaign.store import kept
+from mitsim.campaign.store import read_shot
 from mitsim.capture.folder import write_capture
 from mitsim.commands.options import check_file
 from mitsim.errors import InputError
@@ -110,7 +110,7 @@ def whole_captures(plan, folder) -> dict[Path, int]:
     """The captures that are kept, each checked, and when each was written; nothing half-written is beside them."""
     assert not list(folder.rglob(".*partial*"))
     shots = [plan.shot(series, normal) for series in plan.series for normal in plan.file.normals()]
-    found = [shot for shot in shots if kept(folder / "coupons", shot) is not None]
+    found = [shot for shot in shots if read_shot(folder / "coupons", shot) is not None]
     folders = list((folder / "coupons").glob("*/*"))
     assert len(found) == len(folders)
     return {place: place.stat().st_mtime_ns for place in folders}

@@ -174,11 +174,11 @@ def test_every_file_of_every_capture_is_named_when_it_is_truncated(kept, tmp_pat
             for length in (0, len(data) // 2, len(data) - 2):  # shot.json ends in a line feed that says nothing
                 file.write_bytes(data[:length])
                 with pytest.raises(InputError) as caught:
-                    store.kept(captures, shot)
+                    store.read_shot(captures, shot)
                 assert caught.value.where == str(file)
                 tried += 1
             file.write_bytes(data)
-        assert store.kept(captures, shot) is not None
+        assert store.read_shot(captures, shot) is not None
     assert tried == 3 * len([path for path in captures.rglob("*") if path.is_file()]) > 3 * 7 * len(shots)
 
 

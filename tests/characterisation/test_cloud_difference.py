@@ -66,7 +66,7 @@ def test_the_distribution_is_that_of_the_values_that_are_there(rng):
     values = np.full((100, 100), np.nan)
     values[:60] = rng.normal(0.3, 0.2, (60, 100))
     found = distribution(values, 8000)
-    assert (found.count, found.asked) == (6000, 8000)
+    assert (found.count, found.points_given) == (6000, 8000)
     assert found.mean == pytest.approx(0.3, abs=4 * 0.2 / np.sqrt(6000))
     assert found.robust_deviation == pytest.approx(0.2, rel=0.06)
     assert (found.low, found.high) == pytest.approx((0.3 - 0.392, 0.3 + 0.392), abs=0.03)

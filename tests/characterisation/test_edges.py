@@ -206,11 +206,11 @@ def test_a_figure_slides_along_its_ray_when_its_plane_moves():
     z = np.array([0.0, 0, 1])
     ray = np.array([0.6, 0, -0.8])
     up = Plane(np.array([0.0, 0, 1]), z)
-    circle = Circle(np.array([3.0, 4, 0]), z, 5.0, ray).carried(up)
+    circle = Circle(np.array([3.0, 4, 0]), z, 5.0, ray).on_moved_plane(up)
     assert circle.centre == pytest.approx([3 - 0.75, 4, 1])
     edge = EdgePoint(np.array([3.0, 4, 0]), np.eye(3)[0], z, 0.1, ray)
-    assert edge.carried(up).point == pytest.approx([2.25, 4, 1])
-    leaning = edge.carried(Plane(np.zeros(3), -np.array([0.6, 0, 0.8])))
+    assert edge.on_moved_plane(up).point == pytest.approx([2.25, 4, 1])
+    leaning = edge.on_moved_plane(Plane(np.zeros(3), -np.array([0.6, 0, 0.8])))
     assert leaning.direction == pytest.approx([0.8, 0, -0.6])
     assert leaning.normal == pytest.approx([0.6, 0, 0.8])  # toward the side it faced before
 

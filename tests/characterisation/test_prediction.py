@@ -138,7 +138,7 @@ def test_of_a_perfect_face_flatness_is_what_its_noise_makes(inputs) -> None:
     found = expected_measurement(TASK, "flat", inputs)
     assert 0 < found.uncertainty < SIGMA
     twice = {
-        q: replace(one, fit=replace(one.fit, own=4 * one.fit.own, shared=2 * one.fit.shared))
+        q: replace(one, fit=replace(one.fit, noise_covariance=4 * one.fit.noise_covariance, shared=2 * one.fit.shared))
         for q, one in inputs.items()
     }
     assert expected_measurement(TASK, "flat", twice).uncertainty == pytest.approx(2 * found.uncertainty)

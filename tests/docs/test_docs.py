@@ -41,7 +41,7 @@ from mitsim.sensor.rig_covariance import CovarianceFile
 from mitsim.sensor.sensor_file import SensorFile
 from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.study import StudyFile
-from mitsim.surface.seen import as_made
+from mitsim.surface.surface_light import nominal_light
 from mitsim.validation.part_cases import PartCasesFile
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -376,7 +376,7 @@ def flat_cloud() -> PointCloud:
 
 
 def test_documented_variables_of_samples_and_map(patches):
-    table = SampleTable("matt_white", np.nan, 500.0, patches, light=as_made("matt_white", np.nan, 850.0))
+    table = SampleTable("matt_white", np.nan, 500.0, patches, light=nominal_light("matt_white", np.nan, 850.0))
     written = {*map(str, _all_patches([table]).variables), "orientation"}  # added where a campaign counts its captures
     assert first_column("columns: samples.nc") == written
     data = build_map([table], {}, 0.3, nodes=5).data

@@ -99,7 +99,8 @@ def test_the_axes_share_the_time_of_the_slowest_and_keep_their_speed():
     stage.home()
     stage.move([0.0, 0.0, 0.0])
     before = port.time
-    stage._controller.start([axis.own(angle) for axis, angle in zip(stage.connection.axes, [20, 5, 1], strict=True)])
+    axes = zip(stage.connection.axes, [20, 5, 1], strict=True)
+    stage._controller.start([axis.device_angle(angle) for axis, angle in axes])
     while port.device.busy(port.time):
         port.wait(0.01)
     assert port.time - before == pytest.approx(2.0, abs=0.05)  # 20 deg at 10 deg/s

@@ -102,7 +102,7 @@ def test_an_exception_of_the_caller_stops_the_axes_and_closes_the_port(kind):
 
 
 def start(stage, angle):
-    stage._controller.start([axis.own(angle) for axis in stage.connection.axes])
+    stage._controller.start([axis.device_angle(angle) for axis in stage.connection.axes])
 
 
 @KINDS

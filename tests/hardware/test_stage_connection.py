@@ -23,12 +23,12 @@ def test_ports_have_the_speed_that_devices_are_delivered_with():
 @given(st.floats(-500, 500), st.floats(-10, 10).filter(lambda gear: abs(gear) > 0.01), st.floats(-360, 360))
 def test_own_degrees_and_angles_are_inverse(angle, gear, zero):
     axis = AxisConnection(name="pan", channel="P", limits_deg=(-1, 1), gear=gear, zero_deg=zero)
-    assert axis.angle(axis.own(angle)) == pytest.approx(angle, abs=1e-9)
+    assert axis.angle(axis.device_angle(angle)) == pytest.approx(angle, abs=1e-9)
 
 
 def test_a_reversed_axis_turns_the_other_way():
     axis = AxisConnection(name="tilt", channel="Y", limits_deg=(-1, 1), gear=-2, zero_deg=-90)
-    assert (axis.own(0), axis.own(10)) == (-90, -110)
+    assert (axis.device_angle(0), axis.device_angle(10)) == (-90, -110)
 
 
 @pytest.mark.parametrize(

@@ -88,7 +88,7 @@ def test_the_uncertainty_is_the_scatter_of_independent_noise(trials, name):
 def test_repeatability_is_mean_and_standard_deviation_over_clouds(trials):
     over = {one.name: one for one in repeatability(trials)}
     values = [by_name(one)["ball diameter"].value for one in trials]
-    assert over["ball diameter"].count == over["ball diameter"].asked == 60
+    assert over["ball diameter"].count == over["ball diameter"].cloud_count == 60
     assert over["ball diameter"].mean == pytest.approx(np.mean(values))
     assert over["ball diameter"].deviation == pytest.approx(np.std(values, ddof=1))
 

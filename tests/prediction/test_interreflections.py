@@ -31,7 +31,7 @@ def test_a_surface_that_faces_nothing_has_none(n10):
     )
     pose = look_at([0, 0, 600], [0, 0, 0], [0, 1, 0])
     places = pose.inverse().points(np.array([[0.0, 0, 0], [50, 20, 0], [-60, -40, 0]]))
-    light = InterreflectionEffect(n10).look(plate, pose).at(places)
+    light = InterreflectionEffect(n10).render(plate, pose).at(places)
     np.testing.assert_array_equal(light.rho, 0)
     assert not light.displaced.any()
 
@@ -63,7 +63,7 @@ def test_in_a_sphere_the_second_surface_adds_the_same_everywhere(n10):
     origin = camera.centre
     along = rays @ origin
     points = origin + rays * (-along + np.sqrt(along**2 - origin @ origin + radius**2))[:, None]
-    rho = effect.look(scene, Transform.identity()).at(points).rho
+    rho = effect.render(scene, Transform.identity()).at(points).rho
     toward = projector.optics.centre - points
     distance = np.linalg.norm(toward, axis=1)
     theta = projector.optics.sensor_from_camera.inverse().points(points)
@@ -93,7 +93,7 @@ def test_coarse_and_cheap_it_is_what_the_full_render_shows(n10, scenes):
         (both[r - 2 : r + 3, c - 2 : c + 3].sum() / direct[r - 2 : r + 3, c - 2 : c + 3].sum() - 1)
         for r, c in zip(row, column, strict=True)
     ]
-    found = InterreflectionEffect(n10, paths=1_500_000).look(scene, pose).at(points).rho
+    found = InterreflectionEffect(n10, paths=1_500_000).render(scene, pose).at(points).rho
     seen = np.isfinite(found) & np.isfinite(known)
     assert seen.mean() > 0.9
     assert 0.02 < np.median(np.array(known)[seen]) < 0.3
@@ -154,8 +154,8 @@ def test_views_rendered_together_are_those_rendered_alone(name):
     scene = white_corner(sensor)
     poses = [look_at([x, -0.7 * near, 0.7 * near], [0, 0, 0], [0, 0, 1]) for x in (-200, 0, 150)]
     effect = InterreflectionEffect(sensor, paths=20_000, photons=100_000)
-    alone = [effect.look(scene, pose).values for pose in poses]
-    together = [image.values for image in effect.look_from(scene, poses)]
+    alone = [effect.render(scene, pose).values for pose in poses]
+    together = [image.values for image in effect.render_views(scene, poses)]
     assert not np.array_equal(alone[0], alone[1], equal_nan=True)
     for one, other in zip(alone, together, strict=True):
         np.testing.assert_array_equal(one, other)

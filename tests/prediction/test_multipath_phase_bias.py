@@ -95,8 +95,8 @@ def test_a_phase_becomes_the_depth_at_which_the_ray_meets_that_stripe(david):
     ideal = Ideal(np.arange(50), point, ray, distance, ray, np.zeros(50, np.int16), np.zeros(50, np.uint8))
     found = fringe.range_bias(phase, ideal)
     place = point + found[:, None] * ray - fringe.centre
-    before = (point - fringe.centre) @ fringe.along / ((point - fringe.centre) @ fringe.ahead)
-    after = place @ fringe.along / (place @ fringe.ahead)
+    before = (point - fringe.centre) @ fringe.along / ((point - fringe.centre) @ fringe.optical_axis)
+    after = place @ fringe.along / (place @ fringe.optical_axis)
     np.testing.assert_allclose(after - before, phase / (2 * math.pi) * fringe.period, rtol=1e-8)
     assert fringe.period == pytest.approx(16 / 1800)
 
@@ -142,7 +142,7 @@ def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david):
     high = world[:, 2]
     strip = (ideal.shape == 1) & (np.abs(world[:, 0]) < 4) & (high > 1) & (high < 11)
 
-    light = InterreflectionEffect(david, paths=3_000_000, photons=6_000_000).look(scene, pose).at(ideal.point)
+    light = InterreflectionEffect(david, paths=3_000_000, photons=6_000_000).render(scene, pose).at(ideal.point)
     predicted = finest_fringe(david).range_bias(light.displaced, ideal)
     around = pose.inverse().points(np.array([[x, 30, z] for x in (-5.0, 5) for z in (0.0, 12)]))
     noise = Noise(**dict.fromkeys(Noise.__dataclass_fields__, False))

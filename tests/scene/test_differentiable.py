@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mitsim.fit.finish import metal_finish
 from mitsim.fit.place import known_place
-from mitsim.fit.white_coupon import Bench, coupon_roi
+from mitsim.fit.white_coupon import WhiteCouponRenderer, coupon_roi
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
 from mitsim.sensor.transforms import look_at
@@ -117,7 +117,7 @@ def test_white_light_times_the_lobe_is_what_the_renderer_gives(n10, lobe, scenes
     pose = look_at([60.0, -150.0, 580.0], [0, 0, 0], [0, 0, 1])
     place, camera = known_place(pose, 120.0, 120.0), n10.rig.cameras["left"]
     part = coupon_roi(camera, place)
-    white = Bench(n10, samples=4).white(place, "left", part, "mean")
+    white = WhiteCouponRenderer(n10, samples=4).white(place, "left", part, "mean")
     rendered = SimulatedSensor(n10).radiance(scene, pose, "left", Rendering(samples=4, depth=1), seed=1, roi=part)[0]
     rendered = rendered * n10.electrons()
     columns, rows = np.meshgrid(np.arange(part.width) + part.left, np.arange(part.height) + part.top)

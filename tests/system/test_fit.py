@@ -27,7 +27,7 @@ from mitsim.fit.observation import CouponCapture, View, observe
 from mitsim.fit.place import found_place, known_place
 from mitsim.fit.run import KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX, fit_captures
 from mitsim.fit.specimen import place_of
-from mitsim.fit.white_coupon import Bench
+from mitsim.fit.white_coupon import WhiteCouponRenderer
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
 from mitsim.sensor.image_formation import expose
@@ -57,7 +57,7 @@ def ground(coupon):
 
 @pytest.fixture(scope="module")
 def bench(n10):
-    return Bench(n10, samples=4)
+    return WhiteCouponRenderer(n10, samples=4)
 
 
 def pose_at(tilt_deg, azimuth_deg, distance=600.0):
@@ -361,7 +361,7 @@ def test_a_coupon_without_a_block_says_why(captures, bench, spoil, why):
     place = spoil(known_place(capture.world_from_sensor, 120.0, 120.0))
     views = observe(CouponCapture(capture, place, 0, "capture"), bench, UNKNOWN_BLOCK_PX, pattern="mean")
     assert {view.whole for view in views} == {0}
-    assert all(why in view.nothing for view in views)
+    assert all(why in view.why_no_block for view in views)
 
 
 def test_a_window_names_the_coupon_whatever_the_pose_says(captures, bench):

@@ -12,7 +12,7 @@ import pytest
 from shell import ROOT, mitsim_here
 
 from characterisation.atomic_io import HOST, atomic_write, atomic_write_named, write_folder
-from mitsim.commands.folder_lock import LOCK, lock_folder, sweep, sweep_beside
+from mitsim.commands.folder_lock import LOCK, lock_folder, remove_partial, remove_partial_beside
 from mitsim.errors import InputError
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
@@ -34,7 +34,7 @@ def test_a_folder_that_is_held_is_refused_and_a_dead_holder_keeps_nothing(tmp_pa
     left = tmp_path / f".scores.csv.{holder.pid}.partial"
     with pytest.raises(InputError, match=rf"process {holder.pid} on .*since \d{{4}}-"):
         lock_folder(tmp_path)
-    assert sweep(tmp_path) == [] and left.exists()
+    assert remove_partial(tmp_path) == [] and left.exists()
     os.kill(holder.pid, signal.SIGKILL)
     holder.wait()
     release = lock_folder(tmp_path)
@@ -58,11 +58,11 @@ def test_only_left_overs_of_the_dead_are_swept(tmp_path):
     ]
     for name in kept:
         (tmp_path / name).write_text("", encoding="utf-8")
-    assert [path.name for path in sweep(tmp_path)] == [f".view_0001.partial-999999999-{HOST}1b"]
+    assert [path.name for path in remove_partial(tmp_path)] == [f".view_0001.partial-999999999-{HOST}1b"]
     assert {path.name for path in tmp_path.iterdir()} == {*kept, "captures"}
     day_old = time.time() - 25 * 3600
     os.utime(tmp_path / ".k.partial-999999999-0000000f", (day_old, day_old))
-    assert [path.name for path in sweep(tmp_path)] == [".k.partial-999999999-0000000f"]
+    assert [path.name for path in remove_partial(tmp_path)] == [".k.partial-999999999-0000000f"]
 
 
 def test_beside_a_file_only_its_own_left_overs_are_swept(tmp_path):
@@ -76,7 +76,7 @@ def test_beside_a_file_only_its_own_left_overs_are_swept(tmp_path):
     ):  # its folder has letters behind the name
         mine = partial.parent.name
         (tmp_path / mine.replace(str(os.getpid()), "999999999")).mkdir()
-        assert {path.name for path in sweep_beside(tmp_path / "a.ply")} == {
+        assert {path.name for path in remove_partial_beside(tmp_path / "a.ply")} == {
             *gone,
             mine.replace(str(os.getpid()), "999999999"),
         }

@@ -18,9 +18,9 @@ from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
+from mitsim.twin.input_captures import read_input_captures, repeats
 from mitsim.twin.run import sensor_path
 from mitsim.twin.sensor_text import Entry, moved_paths, with_cameras, with_entries, with_exposure
-from mitsim.twin.takes import read_takes, repeats
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -78,8 +78,8 @@ def recorded(tmp_path_factory):
 
 
 def test_repeats_are_found_and_the_dark_is_told_by_the_settings(recorded):
-    takes = read_takes(sorted(recorded.iterdir()), (), (), load_sensor("ensenso-n10"))
-    groups = {(group[0].kind, len(group)) for group in repeats(takes)}
+    input_captures = read_input_captures(sorted(recorded.iterdir()), (), (), load_sensor("ensenso-n10"))
+    groups = {(group[0].kind, len(group)) for group in repeats(input_captures)}
     assert groups == {("dark", 2), ("on", 3)}
 
 
@@ -102,11 +102,11 @@ def test_a_file_of_ones_own_camera(recorded, tmp_path):
 def test_what_cannot_be_is_one_message(recorded, tmp_path):
     preset = load_sensor("ensenso-n10")
     with pytest.raises(InputError, match="CAPTURES: found none"):
-        read_takes([], (), (), preset)
+        read_input_captures([], (), (), preset)
     with pytest.raises(InputError, match="a folder twice"):
-        read_takes([recorded / "on_0"], (), [recorded / "on_0"], preset)
+        read_input_captures([recorded / "on_0"], (), [recorded / "on_0"], preset)
     with pytest.raises(InputError, match=r"technology: found active_stereo"):
-        read_takes([recorded / "on_0"], (), (), load_sensor("david-sls-3"))
+        read_input_captures([recorded / "on_0"], (), (), load_sensor("david-sls-3"))
     with pytest.raises(InputError, match=r"--output.* a .toml file"):
         CliRunner().invoke(
             app, ["fit", "sensor", "x", "--sensor", "ensenso-n10", "-o", "x.json"], catch_exceptions=False

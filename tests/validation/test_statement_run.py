@@ -115,7 +115,7 @@ def test_a_file_that_is_none_is_refused(tmp_path, content):
 def test_the_truth_may_have_light_that_the_tool_leaves_out(cases, tmp_path):
     cases.write_text(cases.read_text() + "surfaces = 5\n")
     (case,) = read_part_cases(cases)
-    found = case_trials.benches(case, case.open(), tmp_path / "run")
+    found = case_trials.trials_by_kind(case, case.open(), tmp_path / "run")
     depth = {kind: bench.study.file.measure.light_path_depth for kind, bench in found.items()}
     assert depth == {"tool": 2, "truth": 5, "apart": 5, "choice": 5}
     assert found["truth"].trials.digest != found["tool"].trials.digest

@@ -24,7 +24,7 @@ FROM_ABOVE = Transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 500.0]))
 class World:
     finish: int
     placed: Transform
-    told: Transform
+    assumed: Transform
     seed: int
 
 
@@ -118,7 +118,7 @@ def test_the_part_lies_still_while_its_views_are_taken_and_noise_is_fresh():
         by_day.setdefault(world.seed // 1000, []).append(world)
     for worlds in by_day.values():
         assert len({world.seed for world in worlds}) == 2
-        assert worlds[0].placed is worlds[1].placed and worlds[0].told is worlds[1].told
+        assert worlds[0].placed is worlds[1].placed and worlds[0].assumed is worlds[1].assumed
 
 
 def test_the_same_days_come_out_the_same_in_any_order():

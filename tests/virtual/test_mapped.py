@@ -77,8 +77,8 @@ def test_a_longer_baseline_shrinks_what_is_measured(drawn):
         eye = world.rig.projector
         longer = replace(eye, sensor_from_camera=Transform(eye.sensor_from_camera.rotation, scale * eye.centre))
         rig = replace(world.rig, projector=longer)
-    nominal = maker._finish(taken, Job(view, Trial(0)))
-    changed = maker._finish((taken[0], replace(world, rig=rig), *taken[2:]), Job(view, Trial(0)))
+    nominal = maker._finish(taken, Job(view, Trial(0))).errors
+    changed = maker._finish((taken[0], replace(world, rig=rig), *taken[2:]), Job(view, Trial(0))).errors
     assert changed[DISTANCE] - nominal[DISTANCE] == pytest.approx(70 / scale - 70, rel=0.1)
 
 

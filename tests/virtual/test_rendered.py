@@ -58,7 +58,7 @@ def fringes():
 def errors_in(fringes, **changes):
     """Errors with some of the world changed; all noise is the same."""
     _, maker, view, world = fringes
-    return maker._finish(maker._taken(view, replace(world, **changes)), Job(view, Trial(0)))
+    return maker._finish(maker._captured(view, replace(world, **changes)), Job(view, Trial(0))).errors
 
 
 @pytest.fixture(scope="module")
@@ -84,8 +84,8 @@ def test_a_warm_part_is_measured_larger(fringes, nominal):
 
 
 def test_a_pose_that_is_told_wrong_does_not_matter_to_sizes(fringes, nominal):
-    told = Transform.from_degrees((0.0, 0.0, 0.2), (0.3, -0.2, 0.1))
-    changed = errors_in(fringes, told=told)
+    assumed = Transform.from_degrees((0.0, 0.0, 0.2), (0.3, -0.2, 0.1))
+    changed = errors_in(fringes, assumed=assumed)
     assert changed[DISTANCE] == pytest.approx(nominal[DISTANCE], abs=0.01)
 
 
@@ -96,8 +96,8 @@ def test_everything_nominal_leaves_noise_alone(nominal):
 def test_light_of_the_room_reaches_the_images_by_photon_transfer(fringes):
     study, maker, view, world = fringes
     irradiance = 2e-6
-    dark = maker._taken(view, replace(world, room=0.0)).capture
-    lit = maker._taken(view, replace(world, room=irradiance)).capture
+    dark = maker._captured(view, replace(world, room=0.0)).capture
+    lit = maker._captured(view, replace(world, room=irradiance)).capture
     imager, sensor = study.sensor.imager, study.sensor
     scale = electrons_per_radiance(imager, sensor.wavelength_nm, dark.settings["exposure_s"])
     seen = maker.predictor.surfaces(study.scene, view.world_from_sensor).shape == study.scene.names.index("plane")
@@ -206,12 +206,12 @@ def test_form_moves_points_by_what_was_asked():
     unknowns = study_unknowns(study, ("form",))
     maker = measurements_of(study, unknowns)
     view = min(study.views, key=lambda one: abs(one.elevation_deg - 60))
-    nominal = maker._cloud(maker._taken(view, replace(unknowns.draw(Trial(0)), form=0)))
+    nominal = maker._cloud(maker._captured(view, replace(unknowns.draw(Trial(0)), form=0)))
     moves = []
     for day in range(6):
         world = unknowns.draw(Trial(day))
         assert world.form
-        cloud = maker._cloud(maker._taken(view, replace(world, seed=unknowns.draw(Trial(0)).seed)))
+        cloud = maker._cloud(maker._captured(view, replace(world, seed=unknowns.draw(Trial(0)).seed)))
         on = nominal.valid & cloud.valid & (nominal.feature == study.scene.names.index("plane"))
         height = (
             view.world_from_sensor.points(cloud.points[on].astype(float))

@@ -41,7 +41,7 @@ def told(world):
         "light": (world.room, world.power, world.exposure),
         "temperature": world.expansion,
         "unit": world.unit,
-        "pose": np.concatenate([world.placed.matrix().ravel(), world.told.matrix().ravel()]),
+        "pose": np.concatenate([world.placed.matrix().ravel(), world.assumed.matrix().ravel()]),
         "noise": world.seed,
         "beyond_map": world.beyond,
     }
@@ -73,7 +73,7 @@ def test_a_swapped_group_changes_alone(unknowns, group):
         assert same(one[name], other[name]) == (name != group), name
 
 
-def test_a_group_that_is_not_varied_stays_at_its_best_guess(unknowns):
+def test_a_group_that_is_not_varied_stays_at_its_best_estimate(unknowns):
     nominal = replace(unknowns, varied=())
     worlds = [nominal.draw(Trial(day)) for day in range(3)]
     for world in worlds:
@@ -93,7 +93,7 @@ def test_poses_scatter_as_the_table_says_about_the_middle(unknowns):
     worlds = [only.draw(Trial(day)) for day in range(400)]
     shifts = np.array([world.placed.translation for world in worlds])
     assert shifts.std(axis=0) == pytest.approx(0.7 * np.ones(3), rel=0.12)
-    errors = [world.told @ world.placed.inverse() for world in worlds]
+    errors = [world.assumed @ world.placed.inverse() for world in worlds]
     turns = np.array([one.rotation[[2, 0, 1], [1, 2, 0]] for one in errors])
     assert np.degrees(turns).std(axis=0) == pytest.approx(0.2 * np.ones(3), rel=0.12)
     middle = np.array([one.points(unknowns.centre) for one in errors]) - unknowns.centre

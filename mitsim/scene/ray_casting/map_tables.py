@@ -97,7 +97,7 @@ class MapTables:
         directed = active & dr.gather(mi.Bool, self.has_lay, number, active)
         mirror = dr.normalize(mi.Vector3f(self.mirror[0] / distance, self.mirror[1] / distance, 1))
         z = mi.Vector3f(0, 0, 1)
-        flat = _carried(_carried(along, mirror, z), _carried(normal, mirror, z), z)
+        flat = _rotated_with(_rotated_with(along, mirror, z), _rotated_with(normal, mirror, z), z)
         place = dr.atan2(flat.y, flat.x) * (self.directions / math.pi)
         place -= self.directions * dr.floor(place / self.directions)
         before = dr.minimum(mi.UInt32(place), self.directions - 1)
@@ -150,7 +150,7 @@ def _turned(vector: Any, angle: Any, axis: Any) -> Any:
     return cosine * (vector - along) + sine * dr.cross(axis, vector) + along
 
 
-def _carried(vector: Any, start: Any, end: Any) -> Any:
+def _rotated_with(vector: Any, start: Any, end: Any) -> Any:
     """Return a vector, rotated by the smallest rotation that takes one unit vector to another."""
     both = start + end
     return vector - both * (dr.dot(both, vector) / (1 + dr.dot(start, end))) + end * (2 * dr.dot(start, vector))

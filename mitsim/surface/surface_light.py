@@ -39,7 +39,7 @@ def light_of_scatter(kind: str, reflectance: float, scatter: Scatter) -> Light:
     )
 
 
-def as_made(finish: str, roughness_um: float, wavelength_nm: float) -> Light | None:
+def nominal_light(finish: str, roughness_um: float, wavelength_nm: float) -> Light | None:
     """Return the light of a finish known only by its name and its Ra [um]; None for an unknown name."""
     if finish == "matt_white":
         return replace(light_of_scatter("matt", USUAL_REFLECTANCE[finish], matt_white()), as_made=True)
@@ -57,9 +57,9 @@ def as_made(finish: str, roughness_um: float, wavelength_nm: float) -> Light | N
     return replace(light_of_scatter("metal", reflectance, scatter), as_made=True)
 
 
-def light_seen(
+def surface_light(
     kind: str, reflectance: float, scatter: Scatter, finish: str, roughness_um: float, wavelength_nm: float
 ) -> Light:
     """Return the light of a surface, and whether its finish and Ra alone would give the same."""
-    light, usual = light_of_scatter(kind, reflectance, scatter), as_made(finish, roughness_um, wavelength_nm)
+    light, usual = light_of_scatter(kind, reflectance, scatter), nominal_light(finish, roughness_um, wavelength_nm)
     return replace(light, as_made=usual is not None and same_light(light, usual))

@@ -27,7 +27,7 @@ _MEAN_PX, _FACTOR, _ROUNDING_DN = 5, 3.0, 0.1
 
 
 @dataclass(frozen=True)
-class Take:
+class InputCapture:
     """One capture: its ``folder``, and its kind: projector ``on`` or ``off``, or all light off (``dark``)."""
 
     folder: Path
@@ -40,7 +40,9 @@ class Take:
         return str(self.folder)
 
 
-def read_takes(folders: Sequence[Path], off: Sequence[Path], dark: Sequence[Path], sensor: Sensor) -> list[Take]:
+def read_input_captures(
+    folders: Sequence[Path], off: Sequence[Path], dark: Sequence[Path], sensor: Sensor
+) -> list[InputCapture]:
     """Read the captures; those of ``off`` and ``dark`` are of that kind, the settings of the others state theirs.
 
     Raises
@@ -48,37 +50,37 @@ def read_takes(folders: Sequence[Path], off: Sequence[Path], dark: Sequence[Path
     InputError
         If there is none, one is given twice, or one is of another technology or has no images.
     """
-    every: list[tuple[Path, Kind | None]] = [(folder, None) for folder in folders]
-    every += [(folder, "off") for folder in off] + [(folder, "dark") for folder in dark]
-    if not every:
+    requested: list[tuple[Path, Kind | None]] = [(folder, None) for folder in folders]
+    requested += [(folder, "off") for folder in off] + [(folder, "dark") for folder in dark]
+    if not requested:
         raise InputError("CAPTURES", "", "none", "one capture folder or more")
-    if len({folder.resolve() for folder, _ in every}) < len(every):
+    if len({folder.resolve() for folder, _ in requested}) < len(requested):
         raise InputError("CAPTURES", "", "a folder twice", "each capture once", "the same noise twice is not a repeat")
-    takes = []
-    for folder, name_given in every:
+    input_captures = []
+    for folder, given_kind in requested:
         capture = read_capture(folder)
         if capture.technology != sensor.technology:
             allowed = f"{sensor.technology}, as --sensor {sensor.name}"
             raise InputError(folder, "technology", capture.technology, allowed)
         if not capture.images:
             raise InputError(folder, "images", "none", "a capture with images")
-        own: Kind = "off" if capture.settings.get("projector_on") is False else "on"
+        stated_kind: Kind = "off" if capture.settings.get("projector_on") is False else "on"
         if capture.settings.get("dark") is True:
-            own = "dark"
-        takes.append(Take(folder, capture, name_given or own))
-    return takes
+            stated_kind = "dark"
+        input_captures.append(InputCapture(folder, capture, given_kind or stated_kind))
+    return input_captures
 
 
-def repeats(takes: Sequence[Take]) -> list[list[Take]]:
+def repeats(input_captures: Sequence[InputCapture]) -> list[list[InputCapture]]:
     """Group captures that repeat one another, in the given order; a group of one has no repeat."""
-    groups: list[list[Take]] = []
-    for take in takes:
+    groups: list[list[InputCapture]] = []
+    for source in input_captures:
         for group in groups:
-            if group[0].kind == take.kind and same_light(group[0].capture, take.capture):
-                group.append(take)
+            if group[0].kind == source.kind and same_light(group[0].capture, source.capture):
+                group.append(source)
                 break
         else:
-            groups.append([take])
+            groups.append([source])
     return groups
 
 

@@ -40,7 +40,7 @@ _SAMPLES, _KEPT = 16, 48
 MARGIN_PX = 12
 
 
-class Bench:
+class SpecimenSimulator:
     """The reference camera of a sensor in front of a specimen; ``part`` is the evaluated window of its image."""
 
     def __init__(self, sensor: Sensor, place: Place, roi: Roi) -> None:
