@@ -56,7 +56,7 @@ def study_folder(tmp_path_factory):
         views = 2
     """)
     started = time.monotonic()
-    done = mitsim("run", folder / "study.toml", "-o", folder / "out")
+    done = mitsim_here("run", folder / "study.toml", "-o", folder / "out")
     print(f"small study: {time.monotonic() - started:.0f} s")
     return folder, done
 
