@@ -1,7 +1,10 @@
 """A tiny run folder, as mitsim run would leave it: 12 views, 3 of them checked, in which all names are hostile."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from characterisation.scores.view_score import score_views, view_statistics
 from characterisation.tasks.evaluation import Feature, Measurement, Task
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import write_capture
+from mitsim.report import style
 from mitsim.report.page import write_report
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import look_at
@@ -264,6 +268,16 @@ def statement_of(view):
     }
 
 
+@contextmanager
+def plain_pictures() -> Iterator[None]:
+    """Pages whose pictures have all their parts, but not in their final places, which take half the time of a page.
+
+    For tests of the page around the pictures.
+    """
+    with mock.patch.object(style, "_lay_out", lambda figure: figure.set_layout_engine("none")):
+        yield
+
+
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory) -> Path:
     """Made once; tests that change something copy it."""
@@ -285,4 +299,5 @@ def expecting(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def page(expecting) -> Path:
-    return write_report(expecting)
+    with plain_pictures():
+        return write_report(expecting)

@@ -15,19 +15,13 @@ from mitsim.report import numbers
 from mitsim.report.run_folder import read_run
 from mitsim.report.view_sphere import view_sphere
 
-from .chromium import BROWSER, Chromium
+from .chromium import BROWSER
 from .conftest import FEATURES, MEASUREMENTS
 from .view_sphere_run import IMPOSSIBLE, SET, WITH_CLOUD
 
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")]
 
 REPORT = Path(__file__).parents[2] / "mitsim" / "report"
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with Chromium(tmp_path_factory.mktemp("profile")) as chromium:
-        yield chromium
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from shell import ROOT, mitsim, mitsim_here
+from shell import ROOT, mitsim_here
 
 from characterisation.cloud_files import read_ply
 from characterisation.maps.performance_map import PerformanceMap
