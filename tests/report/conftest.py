@@ -11,6 +11,7 @@ import pytest
 import trimesh
 import xarray as xr
 
+from characterisation.atomic_io import write_netcdf
 from characterisation.cloud_files import write_ply
 from characterisation.coupon.patch_table import patch_table
 from characterisation.maps.performance_map import PerformanceMap
@@ -94,7 +95,7 @@ def expect(scores: xr.Dataset, u: np.ndarray, chance: np.ndarray) -> None:
 def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
     (folder / "clouds").mkdir(parents=True)
     make_map().save(folder / "map.nc")
-    make_patches().to_netcdf(folder / "samples.nc")
+    write_netcdf(make_patches(), folder / "samples.nc")
 
     rng = np.random.default_rng(5)
     numbers, azimuth = np.arange(12), np.radians(np.arange(12) * 60.0)
@@ -125,7 +126,7 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
     u = rng.uniform(0.02, 0.1, (2, 12))
     u[1, 9] = np.nan
     expect(scores, u, np.where(np.isfinite(u), 0.99, 0.0))
-    scores.to_netcdf(folder / "scores.nc")
+    write_netcdf(scores, folder / "scores.nc")
 
     errors = rng.normal(0, 0.3, (2, len(checked), 2))
     if checked:
@@ -134,7 +135,7 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
     dims = ("measurement", "view", "repeat")
     fields = dict.fromkeys(("value", "error", "standard_uncertainty"), (dims, errors))
     names = {"measurement": list(MEASUREMENTS), "view": np.array(checked, int)}
-    xr.Dataset(fields, names).to_netcdf(folder / "checks.nc")
+    write_netcdf(xr.Dataset(fields, names), folder / "checks.nc")
 
     K = np.array([[40.0, 0, 15.5], [0, 40.0, 11.5], [0, 0, 1]])
     camera = Camera(K, np.zeros(0), WIDTH, HEIGHT)

@@ -106,7 +106,7 @@ def set_errors(folder, errors) -> None:
     """Checks that found these errors (measurement, view, repeat)."""
     checks = xr.load_dataset(folder / "checks.nc")
     checks["error"] = (("measurement", "view", "repeat"), errors)
-    checks.to_netcdf(folder / "checks.nc")
+    write_netcdf(checks, folder / "checks.nc")
 
 
 def test_the_best_view_of_each_measurement_is_the_leader_of_its_race(text, run_folder):
