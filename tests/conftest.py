@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -67,6 +69,22 @@ def scenes() -> Path:
 def n10() -> Sensor:
     """The Ensenso N10 preset."""
     return load_sensor("ensenso-n10")
+
+
+@pytest.fixture(scope="session")
+def started_browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A headless Chromium, for tests that are marked ``browser``: one for all of them, as its start takes a second."""
+    from tests.report.chromium import Chromium
+
+    with Chromium(tmp_path_factory.mktemp("profile")) as chromium:
+        yield chromium
+
+
+@pytest.fixture(scope="module")
+def browser(started_browser: Any) -> Any:
+    """The Chromium of :func:`started_browser` on an empty page, with nothing left of what other files did."""
+    started_browser.reset()
+    return started_browser
 
 
 @pytest.fixture

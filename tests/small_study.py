@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import re
+
 from shell import ROOT
+
+#: measurements of :func:`few_measurements`: one of all three features, and the radii
+MEASUREMENTS = ("point1_point2_distance", "pillar1_radius", "pillar2_radius")
 
 SCENES = ROOT / "scenes" / "two_pillars"
 
@@ -30,3 +35,10 @@ pairs = 0
 [check]
 views = 0
 """
+
+
+def few_measurements() -> str:
+    """The text of the task of the two pillars with :data:`MEASUREMENTS` alone: a page of them has half the pictures."""
+    head, *tables = re.split(r"(?m)^(?=\[measurements\.)", (SCENES / "task.toml").read_text(encoding="utf-8"))
+    kept = tuple(f"[measurements.{name}]" for name in MEASUREMENTS)
+    return head + "".join(table for table in tables if table.startswith(kept))

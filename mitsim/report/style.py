@@ -18,6 +18,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
@@ -64,6 +65,9 @@ STYLE: dict[Any, Any] = {
 
 _DPI = 160
 
+#: of SVG in matplotlib, whatever is asked for
+_SVG_DPI = 72
+
 
 def drawing() -> AbstractContextManager[None]:
     """Return the context in which every figure is drawn."""
@@ -83,7 +87,10 @@ def as_svg(figure: Figure, alt: str) -> str:
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     with drawing():
-        figure.savefig(buffer, format="svg", metadata=nothing, dpi=_DPI)
+        canvas = FigureCanvasSVG(figure)
+        _lay_out(figure)
+        figure.dpi = _DPI
+        canvas.print_svg(buffer, metadata=nothing)
     text = buffer.getvalue()
     text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text[text.index("<svg") :], flags=re.DOTALL)
     text = re.sub(r'<g id="[^"]*"', "<g", text)  # ids of groups would not be unique on a page
@@ -95,6 +102,15 @@ def as_svg(figure: Figure, alt: str) -> str:
         f'style="max-width:{width:.0f}px">'
     )
     return opening + re.sub(r"\n\s*", "\n", text[text.index(">") + 1 :].strip())
+
+
+def _lay_out(figure: Figure) -> None:
+    """Place the axes of a figure for SVG, as ``savefig`` does, which draws everything a second time for it."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        figure.dpi = _SVG_DPI
+        engine.execute(figure)
+        figure.set_layout_engine("none")
 
 
 def write_png(figure: Figure, path: Path, dpi: int = _DPI) -> Path:

@@ -70,7 +70,8 @@ def lobe_numbers(
             mean = 0.5 * (cosine + out)
             kept = share * weight * (1 - coherent_weight(phase_variance, mean))
             u = np.maximum(1 - mean / EVEN_FROM, 0.0)
-            sums += [(kept * u**power).sum() for power in (2, 3, 4)]
+            square = u * u
+            sums += [kept @ square, kept @ (square * u), kept @ (square * square)]
             lacking += share * weight.sum() * (1 - float(coherent_weight(phase_variance, cosine))) - kept.sum()
         returned.append(sums)
         missing.append(lacking)

@@ -56,17 +56,30 @@ def facets(
     of the shares is the directional albedo.
     """
     radii, azimuths, several = counts
-    share = (np.arange(radii) + 0.5) / radii
-    radius = np.sqrt(-np.log1p(-share)) if distribution == "beckmann" else np.sqrt(share / (1 - share))
-    turn = 2 * np.pi * (np.arange(azimuths) + 0.5) / azimuths
-    sx = alpha_u * radius[:, None] * np.cos(turn)
-    sy = alpha_v * radius[:, None] * np.sin(turn)
-    # an isotropic lobe needs one azimuth; an elongated one is symmetric in both its axes
-    views = [0.0] if alpha_u == alpha_v else np.pi / 2 * (np.arange(several) + 0.5) / several
+    # an isotropic lobe needs one azimuth, and half of the facets, as the others are their mirror images; an elongated
+    # one is symmetric in both its axes
+    isotropic = alpha_u == alpha_v
+    slope_u, slope_v = _unit_slopes(radii, azimuths, isotropic and azimuths % 2 == 0, distribution)
+    sx, sy = alpha_u * slope_u, alpha_v * slope_v
+    views = [0.0] if isotropic else np.pi / 2 * (np.arange(several) + 0.5) / several
     lobe = _Lobe(alpha_u, alpha_v, distribution, index)
     seen = [_facets_from(incidence, view, sx, sy, lobe) for view in views]
     weights, cosines = (np.concatenate([one[k].ravel() for one in seen]) for k in (0, 1))
     return weights / weights.size, cosines
+
+
+@lru_cache(maxsize=16)
+def _unit_slopes(
+    radii: int, azimuths: int, half: bool, distribution: Distribution
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return slopes along u and v [1] of a lobe of width 1, each of equal weight; ``half``: of those with v > 0."""
+    share = (np.arange(radii) + 0.5) / radii
+    radius = np.sqrt(-np.log1p(-share)) if distribution == "beckmann" else np.sqrt(share / (1 - share))
+    turn = 2 * np.pi * (np.arange(azimuths // 2 if half else azimuths) + 0.5) / azimuths
+    slopes = radius[:, None] * np.cos(turn), radius[:, None] * np.sin(turn)
+    for one in slopes:
+        one.setflags(write=False)
+    return slopes
 
 
 @dataclass(frozen=True)
@@ -85,11 +98,11 @@ def _facets_from(
     x, y = np.sin(incidence) * np.cos(azimuth), np.sin(incidence) * np.sin(azimuth)
     z = np.cos(incidence)
     facing = z - x * sx - y * sy  # i.m / cos(theta_m), the facet's normal being (-sx, -sy, 1) cos(theta_m)
-    steepness = 1 + sx**2 + sy**2
+    steepness = 1 + sx * sx + sy * sy
     scale = 2 * facing / steepness
     out_x, out_y, out_z = -sx * scale - x, -sy * scale - y, scale - z
     seen = (facing > 0) & (out_z > 0)
-    tangent_out = np.hypot(lobe.alpha_u * out_x, lobe.alpha_v * out_y) / np.where(seen, out_z, 1.0)
+    tangent_out = np.sqrt((lobe.alpha_u * out_x) ** 2 + (lobe.alpha_v * out_y) ** 2) / np.where(seen, out_z, 1.0)
     weight = np.where(seen, facing / z, 0.0) * shadowing(tangent_out, lobe.distribution)
     if lobe.index is not None:
         weight = weight * fresnel(np.clip(facing / np.sqrt(steepness), 0, 1), *lobe.index)

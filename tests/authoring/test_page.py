@@ -22,7 +22,7 @@ from mitsim.report.author_page import fair_share
 from mitsim.study import read_study
 from tests.authoring.author import Author
 from tests.authoring.bracket import bracket, write_step
-from tests.report.chromium import BROWSER, Chromium
+from tests.report.chromium import BROWSER
 
 ROOT = Path(__file__).resolve().parents[2]
 needs_step = pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which reads STEP, is not installed")
@@ -94,12 +94,6 @@ def covered(words, lines):
             bad |= other != own and bool(within.all(axis=1).any())
         found += [words[k]] if bad else []
     return found
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with Chromium(tmp_path_factory.mktemp("profile")) as chromium:
-        yield chromium
 
 
 @needs_step

@@ -13,6 +13,7 @@ from report.conftest import FEATURES as SEEN
 from report.conftest import MEASUREMENTS
 from report.view_sphere_run import write_expecting_run
 
+from characterisation.atomic_io import write_netcdf
 from characterisation.errors import InputError
 from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.task_reading import read_task
@@ -277,7 +278,7 @@ def with_names_of_tasks(folder):
             for name in ("measurement", "feature")
             if name in data
         }
-        data.assign_coords(own).to_netcdf(file)
+        write_netcdf(data.assign_coords(own), file)
     return folder
 
 

@@ -144,6 +144,7 @@ def child(name, folder, start, count, telling) -> None:
     import numpy as np
     import xarray as xr
 
+    from characterisation.atomic_io import write_netcdf
     from characterisation.errors import InputError
     from mitsim.errors import MissingEnvironmentError
     from mutations.mutate import mutated_bytes, mutated_dataset
@@ -169,7 +170,7 @@ def child(name, folder, start, count, telling) -> None:
         else:
             path.unlink()
             try:
-                mutated_dataset(data, rng).to_netcdf(path)
+                write_netcdf(mutated_dataset(data, rng), path)  # sealed, so that no probe of its bytes is started
             except Exception:  # a dataset that netCDF cannot hold is no mutation
                 telling.send("accepted")
                 path.write_bytes(sound)

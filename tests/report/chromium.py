@@ -12,6 +12,25 @@ from pathlib import Path
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
+#: run before every page: what it will still do by itself within a second, so that tests wait no longer than it
+WATCH = """(() => {
+  const waiting = new Set(), { setTimeout: later, clearTimeout: cancel, requestAnimationFrame: frame } = window;
+  window.setTimeout = (act, after = 0, ...given) => {
+    const number = later(() => { waiting.delete(number); act(...given); }, after);
+    if (after < 1000) waiting.add(number);
+    return number;
+  };
+  window.clearTimeout = (number) => { waiting.delete(number); cancel(number); };
+  window.requestAnimationFrame = (act) => {
+    const number = frame((now) => { waiting.delete(`frame ${number}`); act(now); });
+    waiting.add(`frame ${number}`);
+    return number;
+  };
+  const frames = (count, then) => (count ? frame(() => frames(count - 1, then)) : then());
+  window.atRest = (done) => frames(2, () => (waiting.size ? window.atRest(done) : done(1)));
+})()"""
+
+
 def _high(descriptor: int) -> int:
     """The same pipe under a number that the browser's own do not take."""
     high = fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, 10)
@@ -54,7 +73,20 @@ class Chromium:
         self._session = self.call("Target.attachToTarget", targetId=page["targetId"], flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.call("Page.addScriptToEvaluateOnNewDocument", source=WATCH)
+        self._size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.reset()
+
+    def reset(self) -> None:
+        """An empty page of the first size in light colours: nothing is left of what was done before."""
+        self.call("Emulation.setScriptExecutionDisabled", value=False)
+        self.call("Emulation.setDeviceMetricsOverride", **self._size)
+        light = [{"name": "prefers-color-scheme", "value": "light"}]
+        self.call("Emulation.setEmulatedMedia", media="", features=light)
+        self.call("Page.navigate", url="about:blank")
+        self.until("document.readyState === 'complete'")
+        self.problems.clear()
+        self.requests.clear()
 
     def __enter__(self) -> "Chromium":
         return self
@@ -130,8 +162,8 @@ class Chromium:
             time.sleep(0.05)
 
     def rest(self) -> None:
-        """Wait until pictures that moved have been drawn finely."""
-        time.sleep(0.3)
+        """Wait until the page has drawn, and finely what moved: until no frame and no short timer of it is open."""
+        self.tell("new Promise((done) => (window.atRest ?? requestAnimationFrame)(done))")
         self.tell("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))")
 
     def scheme(self, name: str) -> None:

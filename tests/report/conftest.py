@@ -1,13 +1,17 @@
 """A tiny run folder, as mitsim run would leave it: 12 views, 3 of them checked, in which all names are hostile."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 import trimesh
 import xarray as xr
 
+from characterisation.atomic_io import write_netcdf
 from characterisation.cloud_files import write_ply
 from characterisation.coupon.patch_table import patch_table
 from characterisation.maps.performance_map import PerformanceMap
@@ -16,6 +20,7 @@ from characterisation.scores.view_score import score_views, view_statistics
 from characterisation.tasks.evaluation import Feature, Measurement, Task
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import write_capture
+from mitsim.report import style
 from mitsim.report.page import write_report
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import look_at
@@ -90,7 +95,7 @@ def expect(scores: xr.Dataset, u: np.ndarray, chance: np.ndarray) -> None:
 def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
     (folder / "clouds").mkdir(parents=True)
     make_map().save(folder / "map.nc")
-    make_patches().to_netcdf(folder / "samples.nc")
+    write_netcdf(make_patches(), folder / "samples.nc")
 
     rng = np.random.default_rng(5)
     numbers, azimuth = np.arange(12), np.radians(np.arange(12) * 60.0)
@@ -121,7 +126,7 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
     u = rng.uniform(0.02, 0.1, (2, 12))
     u[1, 9] = np.nan
     expect(scores, u, np.where(np.isfinite(u), 0.99, 0.0))
-    scores.to_netcdf(folder / "scores.nc")
+    write_netcdf(scores, folder / "scores.nc")
 
     errors = rng.normal(0, 0.3, (2, len(checked), 2))
     if checked:
@@ -130,7 +135,7 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
     dims = ("measurement", "view", "repeat")
     fields = dict.fromkeys(("value", "error", "standard_uncertainty"), (dims, errors))
     names = {"measurement": list(MEASUREMENTS), "view": np.array(checked, int)}
-    xr.Dataset(fields, names).to_netcdf(folder / "checks.nc")
+    write_netcdf(xr.Dataset(fields, names), folder / "checks.nc")
 
     K = np.array([[40.0, 0, 15.5], [0, 40.0, 11.5], [0, 0, 1]])
     camera = Camera(K, np.zeros(0), WIDTH, HEIGHT)
@@ -264,6 +269,16 @@ def statement_of(view):
     }
 
 
+@contextmanager
+def plain_pictures() -> Iterator[None]:
+    """Pages whose pictures have all their parts, but not in their final places, which take half the time of a page.
+
+    For tests of the page around the pictures.
+    """
+    with mock.patch.object(style, "_lay_out", lambda figure: figure.set_layout_engine("none")):
+        yield
+
+
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory) -> Path:
     """Made once; tests that change something copy it."""
@@ -285,4 +300,5 @@ def expecting(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def page(expecting) -> Path:
-    return write_report(expecting)
+    with plain_pictures():
+        return write_report(expecting)

@@ -52,6 +52,14 @@ def test_agreement_of_checked_views():
     assert found.trials == 5 and found.coverage == pytest.approx(0.8) and found.ratio == pytest.approx(1.0)
 
 
+def test_errors_that_are_whole_numbers_are_numbers_too():
+    scores, errors = scores_of([0.1, 0.2], [2, 1]), [[1, -3], [0, 2]]
+    checks = checks_of([0, 1], errors)
+    whole = checks.assign(error=checks["error"].astype("i8"))
+    np.testing.assert_array_equal(agreement(scores, whole, "m").error, [2.0, 1.0])
+    np.testing.assert_array_equal(agreement(scores, whole, "m").least, [1.0, 0.0])
+
+
 def test_nothing_is_known_where_no_view_was_measured():
     """The race measures none if the map predicts that no view can make the measurement."""
     checks = xr.Dataset(

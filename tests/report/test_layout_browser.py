@@ -9,8 +9,8 @@ from mitsim.report.numbers import percent
 from mitsim.report.page import write_report
 
 from .choice_run import write_choice
-from .chromium import BROWSER, Chromium
-from .conftest import write_run
+from .chromium import BROWSER
+from .conftest import plain_pictures
 from .view_sphere_run import write_expecting_run
 
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")]
@@ -49,9 +49,8 @@ OVERLAPS = """(() => {
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory):
+def pages(report, tmp_path_factory):
     folder = tmp_path_factory.mktemp("layout")
-    run = write_report(write_run(folder / "run"))
     # a set of so many views that they fill several lines, and a bracket of planned exposures
     sets = write_expecting_run(folder / "sets")
     about, statement = (
@@ -64,17 +63,9 @@ def pages(tmp_path_factory):
     (sets / "run.json").write_text(json.dumps(about), encoding="utf-8")
     statement["exposure"] = {"exposures_s": [0.000815, 0.00231, 0.0131], "power": 0.5}
     (sets / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
-    return {
-        "run": run,
-        "choice": write_choice_page(write_choice(folder / "choice")),
-        "sets": write_report(sets),
-    }
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with Chromium(tmp_path_factory.mktemp("profile")) as chromium:
-        yield chromium
+    with plain_pictures():
+        choice, sets = write_choice_page(write_choice(folder / "choice")), write_report(sets)
+    return {"run": report, "choice": choice, "sets": sets}
 
 
 def set_size(browser, width: int, medium: str, scheme: str) -> None:

@@ -106,7 +106,7 @@ def set_errors(folder, errors) -> None:
     """Checks that found these errors (measurement, view, repeat)."""
     checks = xr.load_dataset(folder / "checks.nc")
     checks["error"] = (("measurement", "view", "repeat"), errors)
-    checks.to_netcdf(folder / "checks.nc")
+    write_netcdf(checks, folder / "checks.nc")
 
 
 def test_the_best_view_of_each_measurement_is_the_leader_of_its_race(text, run_folder):
@@ -199,11 +199,11 @@ def test_a_broken_run_leaves_the_former_report_alone(run_folder, tmp_path):
     assert (folder / "report.html").read_text() == "former"
 
 
-def test_marks_whose_direction_is_left_out_are_named_with_their_faces(tmp_path):
+def test_marks_whose_direction_is_left_out_are_named_with_their_faces(tmp_path, written):
     folder = write_run(tmp_path / "run")
     about = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     lay = {FEATURES[0]: "round", FEATURES[1]: "averaged"}
     (folder / "run.json").write_text(json.dumps(about | {"lay": lay}), encoding="utf-8")
-    text = re.sub(r"\s+", " ", write_report(folder).read_text(encoding="utf-8"))
+    text = re.sub(r"\s+", " ", written(folder))
     assert f"on {html.escape(FEATURES[0])}. Such marks" in text and "does not give their direction" in text
     assert f"on {FEATURES[1]}. Such marks" in text and "the mean over all directions" in text

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from characterisation.atomic_io import write_netcdf
 from characterisation.cloud_files import write_ply
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, ViewGrid
@@ -79,10 +80,10 @@ def test_a_wrong_value_in_run_json_is_named(folder, key, value):
 
 def test_files_of_different_runs_are_refused(folder):
     checks = xr.load_dataset(folder / "checks.nc")
-    checks.assign_coords(measurement=["one", "two"]).to_netcdf(folder / "checks.nc")
+    write_netcdf(checks.assign_coords(measurement=["one", "two"]), folder / "checks.nc")
     with pytest.raises(InputError, match="found one, two"):
         read_run(folder)
-    checks.assign_coords(view=[0, 1, 99]).to_netcdf(folder / "checks.nc")
+    write_netcdf(checks.assign_coords(view=[0, 1, 99]), folder / "checks.nc")
     with pytest.raises(InputError, match="found 99"):
         read_run(folder)
 
@@ -90,7 +91,7 @@ def test_files_of_different_runs_are_refused(folder):
 @pytest.mark.parametrize("name", ["predicted_uncertainty", "uncertainty_possible", "chance", "limit", "n_only_white"])
 def test_a_run_of_before_is_refused_with_what_to_do(folder, name):
     scores = xr.load_dataset(folder / "scores.nc")
-    scores.drop_vars(name).to_netcdf(folder / "scores.nc")
+    write_netcdf(scores.drop_vars(name), folder / "scores.nc")
     with pytest.raises(InputError, match=rf"scores\.nc: {name}") as caught:
         read_run(folder)
     assert "run the study again: mitsim run" in str(caught.value)
@@ -109,7 +110,7 @@ def test_features_of_other_scores_are_refused(folder):
     names = scores["feature"].values.astype(object)
     scores["feature"] = ("feature", ["another", *names[1:]])
     scores.attrs.pop("content_sha256", None)
-    scores.to_netcdf(folder / "scores.nc")
+    write_netcdf(scores, folder / "scores.nc")
     with pytest.raises(InputError, match=r"run\.json: measurements\..*features"):
         read_run(folder)
 

@@ -17,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from characterisation.atomic_io import write_netcdf
 from characterisation.cloud_files import read_ply
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
@@ -274,7 +275,7 @@ def test_views_of_a_stage_with_a_roll_each_share_one_disc_and_several_standoffs_
     folder = copied(expecting, tmp_path)
     scores = xr.load_dataset(folder / "scores.nc")
     scores["roll_deg"] = ("view", 10.0 * np.arange(VIEWS))  # the last view stands 600 mm away, the others 500
-    scores.to_netcdf(folder / "scores.nc")
+    write_netcdf(scores, folder / "scores.nc")
     run = read_run(folder)
     figure = uncertainty_figure(run.scores, MEASUREMENTS[0], "deg", run.checked, 0)
     assert [axes.get_title() for axes in figure.axes if axes.get_title()] == ["all rolls"]

@@ -11,23 +11,18 @@ import xarray as xr
 from jinja2 import Environment, FileSystemLoader
 from matplotlib import colormaps
 
+from characterisation.atomic_io import write_netcdf
 from mitsim.report import numbers
 from mitsim.report.run_folder import read_run
 from mitsim.report.view_sphere import view_sphere
 
-from .chromium import BROWSER, Chromium
+from .chromium import BROWSER
 from .conftest import FEATURES, MEASUREMENTS
 from .view_sphere_run import IMPOSSIBLE, SET, WITH_CLOUD
 
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")]
 
 REPORT = Path(__file__).parents[2] / "mitsim" / "report"
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with Chromium(tmp_path_factory.mktemp("profile")) as chromium:
-        yield chromium
 
 
 @pytest.fixture
@@ -332,7 +327,7 @@ def test_a_measurement_that_no_view_can_make_and_a_run_without_part_or_clouds_ar
     scores = xr.load_dataset(folder / "scores.nc")
     scores["predicted_uncertainty"][0], scores["chance"][0], scores["uncertainty_possible"][0] = np.nan, 0.0, False
     scores["limiting_feature"][1] = "hole"  # no shape, so its points are not told
-    scores.to_netcdf(folder / "scores.nc")
+    write_netcdf(scores, folder / "scores.nc")
     content = view_sphere(read_run(folder))
     section = Environment(loader=FileSystemLoader(REPORT)).get_template("view_sphere.html.j2").render(sphere=content)
     text = f"<!doctype html><meta charset=utf-8>{section}<script>{content['script']}</script>"

@@ -13,6 +13,7 @@ import numpy as np
 import trimesh
 import xarray as xr
 
+from characterisation.atomic_io import write_netcdf
 from characterisation.cloud_files import write_ply
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.sensor.transforms import look_at
@@ -69,7 +70,7 @@ def write_expecting_run(folder: Path) -> Path:
     poses = [look_at(s * d, [0, 0, 0], [0, 0, 1]).matrix() for s, d in zip(standoff, direction, strict=True)]
     scores["direction"], scores["world_from_sensor"] = (("view", "xyz"), direction), (("view", "i", "j"), poses)
     scores["azimuth_deg"], scores["standoff_mm"] = ("view", azimuth), ("view", standoff)
-    scores.to_netcdf(folder / "scores.nc")
+    write_netcdf(scores, folder / "scores.nc")
 
     for view in WITH_CLOUD:
         write_ply(cloud_of(view), folder / "clouds" / f"predicted_{view:04d}.ply")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import shell
+from small_study import MEASUREMENTS, few_measurements
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
 
@@ -29,9 +30,9 @@ trials = 4
 trials = 24
 """
 
-#: plus or minus, of radii [mm] and of all else: ones that the better sensor holds, although it is judged by its map
+#: plus or minus, of radii and of the distance [mm]: ones that the better sensor holds, although it is judged by its map
 #: alone, with all that maps do not know
-RADIUS, REST = 8.0, 60.0
+RADIUS, DISTANCE = 8.0, 60.0
 
 
 mitsim_here = partial(shell.mitsim_here, code=None)
@@ -41,12 +42,11 @@ mitsim_here = partial(shell.mitsim_here, code=None)
 def chosen(tmp_path_factory):
     folder = tmp_path_factory.mktemp("choose")
     (folder / "study.toml").write_text(STUDY)
-    task = (SCENES / "task.toml").read_text()
-    task = re.sub(r"(nominal = 20.0)", rf"\1\ntolerance = {RADIUS}", task)
-    task = re.sub(r"(nominal = (?:0|70).0)", rf"\1\ntolerance = {REST}", task)
+    task = re.sub(r"(nominal = 20.0)", rf"\1\ntolerance = {RADIUS}", few_measurements())
+    task = re.sub(r"(nominal = 70.0)", rf"\1\ntolerance = {DISTANCE}", task)
     (folder / "task.toml").write_text(task)
     arguments = ("choose", folder / "study.toml", "--sensors", "kinect-v2,zivid-2-m70", "-o")
-    return folder, arguments, shell.mitsim(*arguments, folder / "out", code=None)
+    return folder, arguments, mitsim_here(*arguments, folder / "out")
 
 
 def test_sensors_are_listed_best_first_with_what_they_fit(chosen):
@@ -57,7 +57,7 @@ def test_sensors_are_listed_best_first_with_what_they_fit(chosen):
     assert names == ["zivid-2-m70", "kinect-v2"]
     assert [line.split()[0] for line in done.stdout.splitlines()[1:3]] == names
     best, last = choice["sensors"][0], choice["sensors"][-1]
-    assert best["status"] == "stated" and best["fits"] == 7 and best["ratio"] <= 1
+    assert best["status"] == "stated" and best["fits"] == len(MEASUREMENTS) and best["ratio"] <= 1
     assert last["status"] == "screened" and last["why"] == "out by far" and last["ratio"] is None
     assert {cell["by"] for cell in last["measurements"].values()} == {"screening", "none"}
     for cell in best["measurements"].values():
@@ -72,7 +72,7 @@ def test_progress_names_the_leader_and_the_last_line_is_the_result(chosen):
     lines = done.stderr.splitlines()
     assert any(re.match(r"choose: 2 of 2 screened; \S+ leads by the screening, at worst", line) for line in lines)
     assert any("leads measured" in line for line in lines)
-    assert lines[-1] == "zivid-2-m70: fits 7 of 7 tolerances"
+    assert lines[-1] == "zivid-2-m70: fits 3 of 3 tolerances"
 
 
 def test_a_finished_comparison_is_kept_and_overwritten_on_request_from_its_own_trials(chosen):
@@ -92,7 +92,7 @@ def test_a_finished_comparison_is_kept_and_overwritten_on_request_from_its_own_t
 def test_page_and_sheet(chosen):
     folder, _, _ = chosen
     page = (folder / "out" / "choice.html").read_text()
-    assert page.count("<svg") == 1 and "fits 7 of 7 tolerances" in page and "screened only: out by far" in page
+    assert page.count("<svg") == 1 and "fits 3 of 3 tolerances" in page and "screened only: out by far" in page
     done = mitsim_here("report", folder / "out", "--pdf")
     assert done.returncode == 0, done.stderr
     sheet = (folder / "out" / "sheet.pdf").read_bytes()

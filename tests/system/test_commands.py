@@ -60,7 +60,7 @@ def test_quiet_leaves_out_progress_and_keeps_results(capsys):
 
 
 def test_doctor_says_what_is_there():
-    findings = {f["what"]: f for f in json.loads(mitsim("doctor", "--json").stdout)}
+    findings = {f["what"]: f for f in json.loads(mitsim_here("doctor", "--json").stdout)}
     assert findings["renderer"]["verdict"] == "ok"
     assert "llvm_ad_mono" in findings["renderer"]["detail"] or "cuda_ad_mono" in findings["renderer"]["detail"]
     assert findings["mitsim"]["detail"]
@@ -68,7 +68,7 @@ def test_doctor_says_what_is_there():
 
 
 def test_render_decode_and_back(tmp_path):
-    mitsim(
+    mitsim_here(
         "render",
         "scenes/coupon/matt_white.xml",
         "--position",

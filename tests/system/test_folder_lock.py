@@ -7,9 +7,11 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from shell import ROOT, mitsim_here
+from small_study import small_study
 
 from characterisation.atomic_io import HOST, atomic_write, atomic_write_named, write_folder
 from mitsim.commands.folder_lock import LOCK, lock_folder, remove_partial, remove_partial_beside
@@ -113,8 +115,9 @@ def test_signals_end_a_command_as_ctrl_c_does(tmp_path, number):
 
 
 @pytest.mark.timeout(120)
-def test_commands_hold_their_folders_and_let_them_go(tmp_path, holder):
-    study, into = "scenes/two_pillars/study.toml", ("-o", str(tmp_path))
+def test_commands_hold_their_folders_and_let_them_go(tmp_path, tmp_path_factory, holder):
+    study, into = str(tmp_path_factory.mktemp("study") / "study.toml"), ("-o", str(tmp_path))
+    Path(study).write_text(small_study("{ plane_Ra = 0.37, pillar_Ra = 0.37 }"), encoding="utf-8")
     for call in (("score", study, *into), ("run", study, *into), ("budget", study, "--view", "1", *into)):
         assert f"process {holder.pid}" in mitsim_here(*call, code=2).stderr
     assert {path.name for path in tmp_path.iterdir()} == {LOCK, f".scores.csv.{holder.pid}.partial"}

@@ -161,7 +161,10 @@ def flat_white():
 
 
 def test_the_light_s_own_noise_is_none_at_depth_1_and_falls_with_samples_at_depth_3(simulated, scenes):
-    """White floor and ball: no noise of direct light; that of interreflections falls as the root of the samples."""
+    """White floor and ball: no noise of direct light; that of interreflections falls as the root of the samples.
+
+    In the 6600 pixels around the ball's foot, where most of it is: the ratio is known to 2 % there.
+    """
     white = {"type": "matt_white"}
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([100, 100, 1]), "bsdf": white}
     scene = scene_from_dict(
@@ -169,8 +172,11 @@ def test_the_light_s_own_noise_is_none_at_depth_1_and_falls_with_samples_at_dept
     )
     pose = look_at([0, -400, 300], [0, 0, 20], [0, 0, 1])
 
-    def residual(samples, depth):
-        return render_residual(simulated, scene, pose, "left", Rendering(samples=samples, depth=depth), seed=5)
+    around = pose.inverse().points(np.array([[x, y, 10.0] for x in (-45, 45) for y in (-45, 20)]))
+
+    def residual(samples, depth, scene=scene):
+        rendering = Rendering(samples=samples, depth=depth)
+        return render_residual(simulated, scene, pose, "left", rendering, seed=5, around=around)
 
     coarse, fine = residual(16, 1), residual(36, 1)
     assert coarse.noise == fine.noise == 0
@@ -179,7 +185,7 @@ def test_the_light_s_own_noise_is_none_at_depth_1_and_falls_with_samples_at_dept
     assert few.noise > 0
     assert np.isclose(few.noise / many.noise, 3, rtol=0.15)
     part = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
-    assert render_residual(simulated, part, pose, "left", Rendering(samples=16, depth=1), seed=5).worst < 0.2
+    assert residual(16, 1, part).worst < 0.2
 
 
 def test_temporal_noise_is_what_the_imager_adds(n10, rng):

@@ -1,5 +1,7 @@
 """Folders of a read-only file system: whoever wants to write there is told so in one line."""
 
+import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,27 +15,30 @@ from report.conftest import write_run  # noqa: E402
 
 MOUNT = 'mount --bind "$0" "$0" && mount -o remount,ro,bind "$0" && exec "$@"'
 
+#: commands, ``{}`` being the folder, and what the last line says
+COMMANDS = {
+    "report": (["report", "{}/run"], "report.html: found Read-only file system"),
+    "report --pdf": (["report", "--pdf", "{}/run"], "sheet.pdf: found Read-only file system"),
+    "check": (["check", "scenes/coupon/matt_white.xml", "--html", "{}/a.html"], "which is not writable"),
+    "score": (["score", "scenes/two_pillars/study.toml", "-o", "{}/run"], "which is not writable"),
+    "import": (["import", "{}/a.pcd", "-o", "{}/c"], "a.pcd"),
+}
+
+#: one process for all commands, as only processes that are started there see the mount, and each imports for seconds
+CALL_ALL = """
+import json, sys
+from shell import mitsim_here
+calls = json.loads(sys.argv[1])
+ended = {name: mitsim_here(*call, code=None) for name, call in calls.items()}
+print(json.dumps({name: [done.returncode, done.stderr] for name, done in ended.items()}))
+"""
+
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A folder with a run, which no command here can change."""
-    made = tmp_path_factory.mktemp("read_only")
-    write_run(made / "run")
-    return made
-
-
-@pytest.mark.parametrize(
-    ("command", "told"),
-    [
-        (["report", "{}/run"], "report.html: found Read-only file system"),
-        (["report", "--pdf", "{}/run"], "sheet.pdf: found Read-only file system"),
-        (["check", "scenes/coupon/matt_white.xml", "--html", "{}/a.html"], "which is not writable"),
-        (["score", "scenes/two_pillars/study.toml", "-o", "{}/run"], "which is not writable"),
-        (["import", "{}/a.pcd", "-o", "{}/c"], "a.pcd"),
-    ],
-    ids=lambda value: value[0] if isinstance(value, list) else "",
-)
-def test_a_read_only_folder_is_one_line(folder, command, told):
+def ended(tmp_path_factory):
+    """Exit code and messages of each command, on a folder with a run that no command here can change."""
+    folder = tmp_path_factory.mktemp("read_only")
+    write_run(folder / "run")
     for names in ("-rm", "-m"):  # as anybody, where user namespaces are allowed; as root, where they are not
         unshared = ["unshare", names, "sh", "-c", MOUNT, str(folder)]
         try:
@@ -43,8 +48,17 @@ def test_a_read_only_folder_is_one_line(folder, command, told):
             pytest.skip("no unshare on this system")
     else:
         pytest.skip("no mounts here")
-    call = [sys.executable, "-m", "mitsim", *(one.format(folder) for one in command)]
-    done = subprocess.run([*unshared, *call], capture_output=True, text=True, cwd=ROOT, check=False)
-    assert done.returncode == 2, done.stderr
-    assert told in done.stderr.splitlines()[-1]
-    assert "Traceback" not in done.stderr and ".partial" not in done.stderr
+    calls = {name: [word.format(folder) for word in call] for name, (call, _) in COMMANDS.items()}
+    call = [*unshared, sys.executable, "-c", CALL_ALL, json.dumps(calls)]
+    paths = {"PYTHONPATH": os.pathsep.join([str(ROOT / "tests"), str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, env=os.environ | paths, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_read_only_folder_is_one_line(ended, command):
+    code, said = ended[command]
+    assert code == 2, said
+    assert COMMANDS[command][1] in said.splitlines()[-1]
+    assert "Traceback" not in said and ".partial" not in said
