@@ -5,9 +5,6 @@ import json
 import math
 import os
 import shutil
-import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -15,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from known_clouds import known_source, smooth, stepped
+from quick_process import QuickProcess
 
 from characterisation import atomic_io
 from characterisation.coupon.orientations import sphere_directions
@@ -201,23 +199,22 @@ def test_a_campaign_that_is_killed_goes_on_and_ends_the_same(tmp_path, scenes):
         f"samples = [{{ scene = '{(scenes / 'coupon/matt_white.xml').as_posix()}' }}]\n"
     )
     (tmp_path / "campaign.toml").write_text(text)
-    command = [sys.executable, Path(__file__).with_name("known_clouds.py"), tmp_path / "campaign.toml"]
-    subprocess.run([*command, tmp_path / "whole"], check=True, capture_output=True)
+    command = [Path(__file__).with_name("known_clouds.py"), tmp_path / "campaign.toml"]
+    assert QuickProcess(*command, tmp_path / "whole").wait()[0] == 0
     rng, kept = np.random.default_rng(5), tmp_path / "killed/coupons"
     counts = []
     for _ in range(4):
-        running = subprocess.Popen([*command, tmp_path / "killed", "0.05"], stderr=subprocess.DEVNULL)
+        running = QuickProcess(*command, tmp_path / "killed", "0.05")
         before = len(list(kept.glob("*/[+-]*")))
         deadline = time.monotonic() + 60
-        while len(list(kept.glob("*/[+-]*"))) < before + 1 and running.poll() is None and time.monotonic() < deadline:
+        while len(list(kept.glob("*/[+-]*"))) < before + 1 and running.running and time.monotonic() < deadline:
             time.sleep(0.01)
         time.sleep(rng.uniform(0, 0.2))
-        running.send_signal(signal.SIGKILL)
-        running.wait()
+        running.kill()
         counts.append(len(list(kept.glob("*/[+-]*"))))
     assert counts[0] > 0
     assert counts == sorted(counts)
-    subprocess.run([*command, tmp_path / "killed"], check=True, capture_output=True)
+    assert QuickProcess(*command, tmp_path / "killed").wait()[0] == 0
     assert result(tmp_path / "killed") == result(tmp_path / "whole")
     assert not list(kept.rglob(".*partial*"))
 

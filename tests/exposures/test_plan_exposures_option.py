@@ -14,7 +14,7 @@ from shell import mitsim_here
 from small_study import small_study
 
 from mitsim.cli import app
-from mitsim.exposures import planned
+from mitsim.exposures import exposure_plan, planned
 
 #: ground aluminium of Ra 0.37: from the side the N10's own exposure, 1.15 ms, is too short
 STUDY = small_study("{ plane_Ra = 0.37, pillar_Ra = 0.37 }")
@@ -50,6 +50,14 @@ class Plans:
                 self.taken_again += 1
                 return plan
         return self.anew(*given)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_plans():
+    """Plans of few noise samples and of exposures an octave apart: all commands plan by the same rules."""
+    few = {exposure_plan.SEARCH: 1, exposure_plan.DECISION: 2, exposure_plan.REPORT: 2}
+    with mock.patch.multiple(exposure_plan, DRAWS=few, STEP=2.0):
+        yield
 
 
 @pytest.fixture(scope="module")
