@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import re
-from functools import partial
 from pathlib import Path
 from unittest import mock
 
 import pytest
 import typer.main
+from plain_pages import without_pictures
 from shell import mitsim_here
 from small_study import small_study
 
@@ -23,7 +23,9 @@ SAID = r"view {view}: expose (.* ms, at full power): every (other )?feature is a
 
 
 # a tolerance that does not fit ends with 1
-invoked = partial(mitsim_here, code=(0, 1))
+def invoked(*arguments):
+    with without_pictures():
+        return mitsim_here(*arguments, code=(0, 1))
 
 
 def asked(study, _, view, rules):
