@@ -38,7 +38,7 @@ def quick(monkeypatch, tmp_path):
     """Clouds of a known F and sigma in place of light, few orientations, and a cache of its own; counts campaigns."""
     made = []
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(one_finish, "BANDS", ((80.0, 1),))
+    monkeypatch.setattr(one_finish, "BANDS", ((80.0, 0),))
     monkeypatch.setattr(one_finish, "REFINED", None)
     monkeypatch.setattr(missing_finishes, "SimulatedSensor", lambda sensor: None)
     monkeypatch.setattr(one_finish, "simulated_source", lambda *_: None)

@@ -14,12 +14,15 @@ import select
 import subprocess
 import sys
 import time
-from functools import partial
-from pathlib import Path
+from unittest import mock
 
 import pytest
+from plain_pages import without_pictures
 from shell import mitsim_here
 from small_study import small_study
+
+from mitsim import cli
+from mitsim.exposures import exposure_plan
 
 #: milled steel of Ra 3.2 on the plane: the map of the N10 knows ground aluminium from 0.09 to 0.74, and matt white
 STUDY = small_study("{ plane_Ra = 3.2 }")
@@ -35,7 +38,9 @@ def study(tmp_path):
 
 
 # a tolerance that does not fit ends with 1
-invoked = partial(mitsim_here, code=(0, 1))
+def invoked(*arguments):
+    with without_pictures():
+        return mitsim_here(*arguments, code=(0, 1))
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -55,48 +60,67 @@ def test_with_yes_the_finish_is_characterised_and_the_command_goes_on(command, s
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_at_a_terminal_the_user_is_asked_and_may_refuse(command, study, tmp_path):
-    told, code = at_a_terminal(
-        [command, str(study), *COMMANDS[command], "-o", str(tmp_path / "out")], "n\n", tmp_path / "cache"
-    )
+def test_at_a_terminal_the_user_is_asked_and_may_refuse(command, study, tmp_path, monkeypatch):
+    """`run` in a process of its own, as a user starts it; the others in this one, with the streams of a terminal."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("COLUMNS", "500")
+    started = at_a_terminal if command == "run" else here_at_a_terminal
+    told, code = started([command, str(study), *COMMANDS[command], "-o", str(tmp_path / "out")], "n\n")
     assert re.search(QUESTION, " ".join(told.split())), told
+    assert "[y/N]" in told
     assert code == 2
     assert "--yes" in told and "Traceback" not in told
 
 
-def test_exposures_of_a_view_need_no_map(study, tmp_path):
+def test_exposures_of_a_view_need_no_map(study, tmp_path, monkeypatch):
     """The view is rendered, so a finish that the map does not know is no question and no error."""
+    monkeypatch.setattr(exposure_plan, "DRAWS", dict.fromkeys(exposure_plan.DRAWS, 1))
+    monkeypatch.setattr(exposure_plan, "STEP", 4.0)
     done = invoked("exposures", study, "--view", "1", "--most", "1", "-o", tmp_path / "out")
     assert "characterise" not in done.stderr
     assert json.loads((tmp_path / "out/exposures.json").read_text())["view"] == 1
 
 
-def at_a_terminal(arguments: list[str], typed: str, cache: Path) -> tuple[str, int]:
+def here_at_a_terminal(arguments: list[str], typed: str) -> tuple[str, int]:
+    """As :func:`at_a_terminal`, in this process: the answer is typed before the question."""
+    ours, theirs = pty.openpty()
+    os.write(ours, typed.encode())
+    with os.fdopen(theirs, "r", closefd=False) as read, os.fdopen(theirs, "w", buffering=1, closefd=False) as write:
+        streams = {"stdin": read, "stdout": write, "stderr": write}
+        with (
+            mock.patch.object(cli, "_stop_as_by_hand"),
+            mock.patch.multiple(sys, argv=["mitsim", *arguments], **streams),
+            pytest.raises(SystemExit) as ended,
+        ):
+            cli.main()
+    os.close(theirs)
+    shown = _shown_until(ours, None)
+    os.close(ours)
+    return shown, int(ended.value.code or 0)
+
+
+def at_a_terminal(arguments: list[str], typed: str) -> tuple[str, int]:
     """Run a command at a terminal, type an answer to its question, and return what it showed and its exit code."""
     ours, theirs = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mitsim", *arguments],
-        stdin=theirs,
-        stdout=theirs,
-        stderr=theirs,
-        close_fds=True,
-        env={**os.environ, "XDG_CACHE_HOME": str(cache), "COLUMNS": "500"},
-    )
+    streams = dict.fromkeys(("stdin", "stdout", "stderr"), theirs)
+    process = subprocess.Popen([sys.executable, "-m", "mitsim", *arguments], close_fds=True, **streams)
     os.close(theirs)
-    shown, answered, end = b"", False, time.monotonic() + 300
     try:
-        while time.monotonic() < end:
-            if select.select([ours], [], [], 0.5)[0]:
-                try:
-                    shown += os.read(ours, 65536)
-                except OSError:  # the other side is closed
-                    break
-            elif process.poll() is not None:
-                break
-            if not answered and b"?" in shown and b"[y/N]" in shown:
-                os.write(ours, typed.encode())
-                answered = True
-        return shown.decode(errors="replace"), process.wait(timeout=60)
+        shown = _shown_until(ours, b"[y/N]")
+        os.write(ours, typed.encode())
+        return shown + _shown_until(ours, None), process.wait(timeout=60)
     finally:
         process.kill()
         os.close(ours)
+
+
+def _shown_until(terminal: int, mark: bytes | None) -> str:
+    """What a terminal shows until it has shown a mark, or until its other side is closed."""
+    shown, end = b"", time.monotonic() + 300
+    while (mark is None or mark not in shown) and time.monotonic() < end:
+        if select.select([terminal], [], [], 0.5)[0]:
+            try:
+                shown += os.read(terminal, 65536)
+            except OSError:  # the other side is closed
+                break
+    return shown.decode(errors="replace")

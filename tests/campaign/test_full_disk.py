@@ -9,9 +9,9 @@ from __future__ import annotations
 import errno
 import os
 import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ import trimesh
 import xarray as xr
 from known_clouds import known_source, smooth
 from matplotlib.figure import Figure
+from quick_process import QuickProcess
 
 from characterisation.atomic_io import FULL, write_json, write_netcdf
 from mitsim.campaign.plan import read_campaign
@@ -34,8 +35,8 @@ from mitsim.sensor.transforms import look_at
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
-KNOWN = [sys.executable, Path(__file__).with_name("known_command.py"), "characterise"]
-MITSIM = [sys.executable, "-m", "mitsim"]
+KNOWN = [Path(__file__).with_name("known_command.py"), "characterise"]
+MITSIM = ["-m", "mitsim"]
 
 _HOLD = (
     'mount -t tmpfs -o size=16k tmpfs "$0" && echo there && '
@@ -91,19 +92,19 @@ def campaign(tmp_path, scenes) -> Path:
     return file
 
 
-def run(command, code, **options):
+def run(command, code, limits=None):
     """Run a command; whatever happens, a traceback is a fault of ours."""
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False, **options)
-    assert done.returncode == code, (done.returncode, done.stderr)
-    assert "Traceback" not in done.stderr, done.stderr
-    assert "Exception ignored" not in done.stderr, done.stderr
-    return done.stderr
+    ended, said = QuickProcess(*command, limits=limits).wait()
+    assert ended == code, (ended, said)
+    assert "Traceback" not in said, said
+    assert "Exception ignored" not in said, said
+    return said
 
 
 def limit_files(size):
-    """For ``preexec_fn``: no file over ``size`` bytes, as ``ulimit -f``."""
+    """For ``limits``: no file over ``size`` bytes, as ``ulimit -f``."""
     resource = pytest.importorskip("resource", reason="no limits on this system")
-    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+    return partial(resource.setrlimit, resource.RLIMIT_FSIZE, (size, size))
 
 
 def whole_captures(plan, folder) -> dict[Path, int]:
@@ -150,7 +151,7 @@ def test_a_campaign_that_fills_the_disk_says_so_and_ends_in_the_same_map_once_th
 
 def test_a_map_over_the_limit_of_a_file_is_told_and_made_once_the_limit_is_gone(tmp_path, n10, campaign):
     plan, folder = read_campaign(campaign, n10), tmp_path / "map"
-    told = run([*KNOWN, campaign, "-o", folder], 3, preexec_fn=limit_files(100_000))
+    told = run([*KNOWN, campaign, "-o", folder], 3, limits=limit_files(100_000))
     assert f"{folder / 'samples.nc'}: cannot be written (File too large)" in told
     assert {path.name for path in folder.iterdir()} == {"coupons"}
     before = whole_captures(plan, folder)
@@ -201,7 +202,7 @@ def test_a_cloud_over_the_limit_of_a_file_leaves_what_was_there_before(captured,
     cloud = tmp_path / "clouds/cloud.ply"
     cloud.parent.mkdir()
     cloud.write_text("what was there before")
-    told = run([*MITSIM, "decode", captured[0], "-o", cloud], 3, preexec_fn=limit_files(16 * 1024))
+    told = run([*MITSIM, "decode", captured[0], "-o", cloud], 3, limits=limit_files(16 * 1024))
     assert f"{cloud}: cannot be written (File too large)" in told
     assert [path.name for path in cloud.parent.iterdir()] == ["cloud.ply"]
     assert cloud.read_text() == "what was there before"

@@ -1,8 +1,6 @@
 """A campaign from the command line with an emulated stage and an emulated camera, killed in the middle."""
 
 import json
-import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -12,6 +10,7 @@ import pytest
 import xarray as xr
 from emulated_rig import SCENE, SERIAL, known_fit
 from emulator_process import start_emulator
+from quick_process import QuickProcess
 
 from mitsim.campaign.stage_pose import write_stage_calibration
 from mitsim.capture.folder import read_capture
@@ -39,7 +38,8 @@ axes = [
 [stage.connection]
 kind = "ptu"
 port = "{port}"
-settle_s = 0.05
+settle_s = 0.02
+speed_deg_s = 140
 axes = [
     {{ name = "pan", channel = "P", limits_deg = [-60, 60] }},
     {{ name = "tilt", channel = "T", limits_deg = [-40, 30] }},
@@ -57,8 +57,7 @@ def rig(tmp_path):
     script = Path(__file__).with_name("emulated_rig.py")
 
     def start(folder):
-        command = [sys.executable, script, stage.journal_file, "characterise", file, "-o", tmp_path / folder]
-        return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        return QuickProcess(script, stage.journal_file, "characterise", file, "-o", tmp_path / folder)
 
     yield stage, start
     stage.end()
@@ -72,19 +71,17 @@ def test_a_live_campaign_that_is_killed_goes_on_and_ends_in_the_same_map(rig, tm
     stage, start = rig
     running = start("killed")
     deadline = time.monotonic() + 120
-    while len(kept(tmp_path / "killed")) < 2 and running.poll() is None and time.monotonic() < deadline:
+    while len(kept(tmp_path / "killed")) < 2 and running.running and time.monotonic() < deadline:
         time.sleep(0.02)
-    running.send_signal(signal.SIGKILL)
-    running.communicate()
+    running.kill()
     before = kept(tmp_path / "killed")
     assert before
     times = {shot: (shot / "shot.json").stat().st_mtime_ns for shot in before}
     homed = len(stage.journal("homed"))
     told = {}
     for folder in ("killed", "whole"):
-        running = start(folder)
-        told[folder] = running.communicate(timeout=300)[1]
-        assert running.returncode == 0, told[folder]
+        code, told[folder] = start(folder).wait()
+        assert code == 0, told[folder]
         assert "orientations are beyond the stage" in told[folder]
     assert len(stage.journal("homed")) == homed + 2
     assert stage.stands()

@@ -1,14 +1,11 @@
 """Many captures of a scene: the jobs of a plan, a start that goes on after kill -9, and the same bytes on a cluster."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
+from quick_process import QuickProcess
 from typer.testing import CliRunner
 
 from mitsim.campaign.many import CommonSettings, ManyFile, read_jobs
@@ -87,13 +84,11 @@ def test_a_plan_that_cannot_be_used_is_refused(plan, tmp_path, old, new, message
 
 
 def test_a_second_start_goes_on_after_kill_9(plan, tmp_path):
-    command = [sys.executable, "-m", "mitsim", "render", SCENE, "--many", plan, "-o", tmp_path / "killed", *OPTIONS]
-    process = subprocess.Popen([*map(str, command)], cwd=ROOT, stderr=subprocess.DEVNULL)
+    process = QuickProcess("-m", "mitsim", "render", SCENE, "--many", plan, "-o", tmp_path / "killed", *OPTIONS)
     deadline = time.monotonic() + 120
     while len(list((tmp_path / "killed").glob("*/view_*"))) < 2 and time.monotonic() < deadline:
         time.sleep(0.005)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+    process.kill()
     finished = sorted((tmp_path / "killed").glob("*/view_*"))
     assert 2 <= len(finished) < 5, "killed too late to show anything"
     for folder in finished:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 import re
-from functools import partial
 from pathlib import Path
 from unittest import mock
 
 import pytest
 import typer.main
+from plain_pages import without_pictures
 from shell import mitsim_here
 from small_study import small_study
 
 from mitsim.cli import app
-from mitsim.exposures import planned
+from mitsim.exposures import exposure_plan, planned
 
 #: ground aluminium of Ra 0.37: from the side the N10's own exposure, 1.15 ms, is too short
 STUDY = small_study("{ plane_Ra = 0.37, pillar_Ra = 0.37 }")
@@ -23,7 +23,9 @@ SAID = r"view {view}: expose (.* ms, at full power): every (other )?feature is a
 
 
 # a tolerance that does not fit ends with 1
-invoked = partial(mitsim_here, code=(0, 1))
+def invoked(*arguments):
+    with without_pictures():
+        return mitsim_here(*arguments, code=(0, 1))
 
 
 def asked(study, _, view, rules):
@@ -50,6 +52,14 @@ class Plans:
                 self.taken_again += 1
                 return plan
         return self.anew(*given)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_plans():
+    """Plans of few noise samples and of exposures an octave apart: all commands plan by the same rules."""
+    few = {exposure_plan.SEARCH: 1, exposure_plan.DECISION: 2, exposure_plan.REPORT: 2}
+    with mock.patch.multiple(exposure_plan, DRAWS=few, STEP=2.0):
+        yield
 
 
 @pytest.fixture(scope="module")

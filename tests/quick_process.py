@@ -1,0 +1,98 @@
+"""Processes that a test may kill or starve, forked from one that has imported the program: 2 s of imports saved each.
+
+The first process starts a server that imports :data:`PRELOADED` and renders nothing; every process is a fork of it.
+It has its own memory, files, limits and signals, as a command that a user starts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import runpy
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from multiprocessing.context import ForkServerProcess
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+
+#: folders that the scripts of tests import from
+FOLDERS = [HERE.parent, HERE, HERE / "campaign", HERE / "hardware"]
+
+#: what most commands and scripts import
+PRELOADED = ["known_clouds", "mitsim.cli", "mitsim.campaign.many", "trimesh.exchange.load", "pandas", "xarray"]
+
+_CONTEXT = multiprocessing.get_context("forkserver") if sys.platform != "win32" else None
+
+
+class QuickProcess:
+    """A script or module with arguments in a process of its own; what it says goes to a file."""
+
+    def __init__(self, *command: object, limits: Callable[[], object] | None = None) -> None:
+        assert _CONTEXT is not None
+        handle, name = tempfile.mkstemp(suffix=".stderr")
+        os.close(handle)
+        self._said = Path(name)
+        self._process: ForkServerProcess = _CONTEXT.Process(
+            target=_run, args=(list(map(str, command)), str(self._said), dict(os.environ), limits), daemon=True
+        )
+        with _path_for_the_server():
+            self._process.start()
+
+    @property
+    def running(self) -> bool:
+        return self._process.exitcode is None
+
+    def kill(self) -> None:
+        """As ``kill -9``; returns once it is gone."""
+        self._process.kill()
+        self._process.join()
+        self._said.unlink()
+
+    def wait(self, timeout: float = 300) -> tuple[int, str]:
+        """The exit code, and what was said to stderr."""
+        self._process.join(timeout)
+        code = self._process.exitcode
+        if code is None:
+            self._process.kill()
+            raise TimeoutError(f"not at its end after {timeout} s: {self._said.read_text()}")
+        said = self._said.read_text()
+        self._said.unlink()
+        return code, said
+
+
+@contextlib.contextmanager
+def _path_for_the_server() -> Iterator[None]:
+    """The server gets its modules by the environment: Python 3.11 does not hand it ``sys.path``."""
+    assert _CONTEXT is not None
+    _CONTEXT.set_forkserver_preload(PRELOADED)
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join([*map(str, FOLDERS), *([before] if before else [])])
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONPATH"]
+        else:
+            os.environ["PYTHONPATH"] = before
+
+
+def _run(command: list[str], said: str, environment: dict[str, str], limits: Any) -> None:
+    """What the fork does: the script as ``python script arguments``, or ``-m module arguments``."""
+    with Path(said).open("w", encoding="utf-8") as file:
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(file.fileno(), stream.fileno())
+    os.environ.clear()
+    os.environ.update(environment)
+    os.chdir(HERE.parent)
+    if limits is not None:
+        limits()
+    if command[0] == "-m":
+        sys.argv = ["mitsim", *command[2:]]
+        runpy.run_module(command[1], run_name="__main__", alter_sys=True)
+    else:
+        sys.argv = command
+        runpy.run_path(command[0], run_name="__main__")
