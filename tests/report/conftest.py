@@ -251,6 +251,7 @@ def statement_of(view):
         "interval_corrected": [None, None],
         "budget": [],
         "without_value": 1.0,
+        "losses": [{"reason": f"{HOSTILE}: 3 to 12 points, at least 100 are required", "count": 200}],
         "tolerance": 0.1,
         "verdict": "undecidable",
         "after_repeats": {},

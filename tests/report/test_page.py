@@ -130,6 +130,7 @@ def test_the_statement_is_told_first_with_its_budget_and_what_it_leaves_out(text
     for figure in ("−0.031 mm", "± 0.018 mm", "0.25 mm", "−0.52 to 0.47 mm", "−0.49 to 0.50 mm", "u = 0.23 mm", "13 %"):
         assert figure in cells, figure
     assert "undecidable" in said and "More virtual measurements would still change" in said
+    assert "200 of 200" in said and "3 to 12 points, at least 100 are required" in said
     widths = [float(width) for width in re.findall(r"width:([\d.]+)%", section)]
     assert widths == pytest.approx([80.0, 20.0])  # shares 0.64 and 0.16 of a bar that holds 0.8
     assert "0.20 mm" in cells and "64 %; 0.14 to 0.30" in cells
