@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 #: attribute of a netCDF file that holds its :func:`dataset_digest`
 DIGEST = "content_sha256"
 
-#: what stands behind a netCDF file of ours, before the SHA-256 of all before it in hexadecimal digits
+#: text that mitsim appends to a netCDF file; the SHA-256 of all bytes before it follows, in hexadecimal digits
 SEAL = b"mitsim sha256 "
 
 #: the largest single file that is read [bytes]
@@ -29,7 +29,7 @@ def read_bounded(file: Path, absent: str | None = None, hint: str = "", largest:
     Parameters
     ----------
     absent
-        What should have been there, said where the file is missing; without it a missing file cannot be read.
+        Name of the expected file, for the error about a missing one; without it a missing file cannot be read.
 
     Raises
     ------

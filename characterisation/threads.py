@@ -31,7 +31,7 @@ def thread_count() -> int:
 
 
 def in_threads(work: Callable[[Piece], Result], pieces: Iterable[Piece], most: int = MOST_THREADS) -> list[Result]:
-    """Return what ``work`` makes of every piece, in their order, computed in ``most`` threads or fewer.
+    """Return the result of ``work`` for every piece, in order, computed in at most ``most`` threads.
 
     The first exception of a piece is raised.
     """

@@ -141,12 +141,12 @@ class DataSheet:
 
 @dataclass(frozen=True)
 class Piece:
-    """One capture of a data sheet as plain values: method ``what`` of the bench, with the arguments ``given``."""
+    """One capture of a data sheet as plain values: ``method`` of the simulated targets, and its ``arguments``."""
 
     sensor: Sensor
     seed: int
-    what: str
-    given: tuple[Any, ...]
+    method: str
+    arguments: tuple[Any, ...]
 
 
 def measure_sensor(sensor: Sensor, seed: int = 1, workers: Executor | None = None) -> DataSheet:
@@ -178,7 +178,7 @@ def measure_piece(piece: Piece) -> Any:
         _prepared[key] = _SimulatedTargets(piece.sensor, piece.seed)
     targets = _prepared[key]
     targets.seed = piece.seed
-    return getattr(targets, piece.what)(*piece.given)
+    return getattr(targets, piece.method)(*piece.arguments)
 
 
 def gallery(sensor: Sensor, seed: int = 1) -> list[tuple[str, Capture, PointCloud]]:
@@ -189,12 +189,12 @@ def gallery(sensor: Sensor, seed: int = 1) -> list[tuple[str, Capture, PointClou
     target = np.array([0.0, 0.0, radius])
     eye = target + mid * np.array([0.0, -math.sin(angle), math.cos(angle)])
     pose = look_at(eye, target, (0.0, 0.0, 1.0)) @ sensor.rig.reference.sensor_from_camera.inverse()
-    seen = []
+    rendered = []
     for finish in track(list(FINISHES), f"{sensor.name}: gallery"):
         scene = ball_on_plate(radius, 0.6 * mid, finish, sensor.wavelength_nm)
         capture = targets.simulated.capture(scene, pose, seed=seed, rendering=Rendering(SAMPLES_PER_PIXEL))
-        seen.append((finish, capture, targets.decoded(capture)))
-    return seen
+        rendered.append((finish, capture, targets.decoded(capture)))
+    return rendered
 
 
 class _SimulatedTargets:

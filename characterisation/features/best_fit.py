@@ -50,7 +50,7 @@ _MIDDLES, _RINGS = 200, 60
 
 @dataclass(frozen=True)
 class _Part:
-    """Points (n, 3) of a shape from a view, each of which stands for ``thinning``."""
+    """Points (n, 3) of a shape from a view; each represents ``thinning`` points."""
 
     view: int
     shape: str
@@ -167,9 +167,9 @@ def _linearised(part: _Part, motion: Floats, shape: Surface, about: Floats) -> t
 def _choose(
     place: Floats, residual: Floats, by_pose: Floats, by_shape: Floats, part: _Part, rng: np.random.Generator
 ) -> _Chosen:
-    """Points within :data:`CLIP` robust standard deviations; their weight, by what is left about a shape of their own.
+    """Choose points within :data:`CLIP` robust standard deviations; weight them by residuals about their own shape.
 
-    A motion moves points as a change of the shape does; so what is left does not depend on the poses, to first order.
+    A motion moves points as a change of the shape does. So to first order these residuals do not depend on the poses.
     """
     near = np.abs(residual) <= CLIP * robust_std(residual)
     if near.sum() <= by_shape.shape[1]:

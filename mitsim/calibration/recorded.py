@@ -241,9 +241,9 @@ def _normal(
     off = (prior.values - prior.rows @ parameter_values(rig, prior.names)) / prior.sigma
     normal[:count, :count], gradient[:count] = weighted.T @ weighted, weighted.T @ off
     cost = float(off @ off)
-    for number, (place, seen, own_noise) in enumerate(zip(places, boards, noise, strict=True)):
-        jacobian, by_point, left = _residuals(rig, place, seen, board, prior.names)
-        whiten = _whitening(rig, place, seen, by_point, own_noise)
+    for number, (place, recorded, own_noise) in enumerate(zip(places, boards, noise, strict=True)):
+        jacobian, by_point, left = _residuals(rig, place, recorded, board, prior.names)
+        whiten = _whitening(rig, place, recorded, by_point, own_noise)
         flat = np.einsum("nij,njk->nik", whiten, jacobian.reshape(len(left), -1, count + 6)).reshape(-1, count + 6)
         white = np.einsum("nij,nj->ni", whiten, left).ravel()
         own = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]
@@ -254,28 +254,28 @@ def _normal(
 
 
 def _residuals(
-    rig: Rig, place: Transform, seen: RecordedBoard, board: Board, names: tuple[str, ...]
+    rig: Rig, place: Transform, recorded: RecordedBoard, board: Board, names: tuple[str, ...]
 ) -> tuple[Floats, Floats, Floats]:
     """Return derivatives of the pixels of one pose, (n, eyes, 2, p + 6), (n, eyes, 2, 3), residuals (n, 2 eyes)."""
-    optics, corners = all_eyes(rig), board.corners[seen.corners]
+    optics, corners = all_eyes(rig), board.corners[recorded.corners]
     jacobian, by_point = view_jacobian(optics, names, place, corners)
     at = place.points(corners)
-    left = np.concatenate([seen.pixels[name] - eye.project(at) for name, eye in optics.items()], axis=1)
+    left = np.concatenate([recorded.pixels[name] - eye.project(at) for name, eye in optics.items()], axis=1)
     return jacobian, by_point, left
 
 
-def _whitening(rig: Rig, place: Transform, seen: RecordedBoard, by_point: Floats, noise: Floats) -> Floats:
-    covariance = observation_covariance(all_eyes(rig), by_point, BoardView(place, seen.corners, *map(float, noise)))
+def _whitening(rig: Rig, place: Transform, recorded: RecordedBoard, by_point: Floats, noise: Floats) -> Floats:
+    covariance = observation_covariance(all_eyes(rig), by_point, BoardView(place, recorded.corners, *map(float, noise)))
     return np.linalg.inv(np.linalg.cholesky(covariance))
 
 
 def _noise(rig: Rig, places: list[Transform], boards: Sequence[RecordedBoard], board: Board, normal: Floats) -> Floats:
     """Return the noise of a camera's corner and the projector's part, (poses, 2), from residuals and freedom."""
     out, names, optics = [], parameter_names(rig), list(all_eyes(rig))
-    count = sum(2 * len(optics) * len(seen.corners) for seen in boards)
+    count = sum(2 * len(optics) * len(recorded.corners) for recorded in boards)
     lost = count / max(count - len(normal), 1)
-    for place, seen in zip(places, boards, strict=True):
-        _, by_point, left = _residuals(rig, place, seen, board, names)
+    for place, recorded in zip(places, boards, strict=True):
+        _, by_point, left = _residuals(rig, place, recorded, board, names)
         camera, own = [], [np.zeros(1)]
         for index, eye in enumerate(optics):
             part = left[:, 2 * index : 2 * index + 2]
@@ -298,10 +298,10 @@ def _covariance(
     if own_units:
         sigma = np.concatenate([[0.0], sigma[1:]])  # the first is the scale
     shared = np.zeros((len(normal), len(modes)))
-    for number, (place, seen, own_noise) in enumerate(zip(places, boards, noise, strict=True)):
-        jacobian, by_point, left = _residuals(rig, place, seen, board, names)
-        whiten = _whitening(rig, place, seen, by_point, own_noise)
-        shifts = np.einsum("ij,mnj->mni", place.rotation, modes[:, seen.corners])
+    for number, (place, recorded, own_noise) in enumerate(zip(places, boards, noise, strict=True)):
+        jacobian, by_point, left = _residuals(rig, place, recorded, board, names)
+        whiten = _whitening(rig, place, recorded, by_point, own_noise)
+        shifts = np.einsum("ij,mnj->mni", place.rotation, modes[:, recorded.corners])
         moves = np.einsum("neak,mnk->neam", by_point, shifts).reshape(len(left), -1, len(modes))
         flat = np.einsum("nij,njk->nik", whiten, jacobian.reshape(len(left), -1, count + 6))
         own = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]

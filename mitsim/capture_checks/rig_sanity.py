@@ -194,16 +194,16 @@ def pair_warnings(
         decode_coordinates(stack, code, size, settings, full_scale=full_scale, interpolate=True)
         for stack in (left, right)
     ]
-    seen = _Matches.of(found, geometry)
-    if seen.decoded < 0.005:
+    matches = _Matches.of(found, geometry)
+    if matches.decoded < 0.005:
         return [], float("nan"), ""
-    if seen.doubtful:
+    if matches.doubtful:
         names = " and ".join(list(rig.cameras)[:2])
         if geometry.raw_size[0] == geometry.raw_size[1] and not _Matches.of(found[::-1], geometry).doubtful:
             doubt = f"the images of {names} fit the calibration if they are exchanged"
             return [f"{doubt}: check whether left and right are exchanged"], float("nan"), ""
-        return [f"{seen}: check that the calibration belongs to these images"], float("nan"), ""
-    offset, source = seen.row_error, "by the code of the rows"
+        return [f"{matches}: check that the calibration belongs to these images"], float("nan"), ""
+    offset, source = matches.row_error, "by the code of the rows"
     if "rows" not in found[0]:
         image_roles = roles(code, *size)
         source = "by the texture of the surface"

@@ -132,7 +132,7 @@ def import_(
     imported = read_recording(path, given, kind)
     capture = imported.capture
     folder = output or Path(plain_name(path.resolve().stem) + "_capture")
-    say(f"{path}: {KINDS[imported.kind].what}, of {capture.sensor}, {capture.technology}, {capture.source}")
+    say(f"{path}: {KINDS[imported.kind].name}, of {capture.sensor}, {capture.technology}, {capture.source}")
     for name in SETTINGS_TO_CHECK:
         if name in capture.settings:
             say(f"  {name}: {capture.settings[name]}")

@@ -105,16 +105,20 @@ def predict(
     >>> cloud.source, cloud.points.shape
     ('predicted', (480, 752, 3))
     """
-    whose = str(performance_map.data.attrs.get("sensor"))
-    if whose != sensor.name:
+    map_sensor = str(performance_map.data.attrs.get("sensor"))
+    if map_sensor != sensor.name:
         raise InputError(
-            "predict", "performance_map", whose, sensor.name, "a map predicts only the sensor that it was measured with"
+            "predict",
+            "performance_map",
+            map_sensor,
+            sensor.name,
+            "a map predicts only the sensor that it was measured with",
         )
-    stands = as_pose(pose, "predict")
-    eye = (stands @ sensor.rig.reference.sensor_from_camera).translation
+    world_from_sensor = as_pose(pose, "predict")
+    eye = (world_from_sensor @ sensor.rig.reference.sensor_from_camera).translation
     predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor))
     radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
-    away = float(np.linalg.norm(np.subtract(eye, scene.centre)))
-    needed = NeededFinishes(sensor, scene.where, seen_finishes(scene), (max(away - radius, 1.0), away + radius))
+    distance = float(np.linalg.norm(np.subtract(eye, scene.centre)))
+    needed = NeededFinishes(sensor, scene.where, seen_finishes(scene), (max(distance - radius, 1.0), distance + radius))
     characterised = CharacterisedScene(scene, map_with_finishes(performance_map, needed, ask))
-    return predictor.predict(characterised, stands, np.random.default_rng(seed), correlated)
+    return predictor.predict(characterised, world_from_sensor, np.random.default_rng(seed), correlated)

@@ -22,11 +22,11 @@ from mitsim.sensor.light_code import LightCode, roles
 _STEPS = range(3, 17)
 
 #: largest number of suggested changes
-_TOLD = 3
+_LISTED = 3
 
 
 def advice(found: list[Path], camera: str, code: LightCode, size: tuple[int, int], count: int) -> str:
-    """Return advice on the images ``found`` of a camera, of which a ``code`` needs ``count``.
+    """Return advice on the images ``found`` of a camera; a ``code`` needs ``count`` images.
 
     ``size`` (width, height) of the projector [px]; ``count`` includes the ambient image.
     """
@@ -35,7 +35,7 @@ def advice(found: list[Path], camera: str, code: LightCode, size: tuple[int, int
     if reason:
         return reason
     changes = [words for words, table in _changes(code) if _count(code, table, size) == len(found) - more]
-    changes = [f"{each} in [pattern]" for each in changes[:_TOLD]]
+    changes = [f"{each} in [pattern]" for each in changes[:_LISTED]]
     if not more and len(found) == count + 1:
         changes.append("ambient_image = true, if the last image was taken without the projector")
     if changes:

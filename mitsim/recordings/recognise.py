@@ -94,11 +94,11 @@ class Imported:
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of recording: ``what`` it is, its function ``read`` and the options (``heeds``) that it uses."""
+    """One kind of recording: its ``name`` in words, its function ``read``, and the ``options`` that it uses."""
 
-    what: str
+    name: str
     read: Callable[[Path, Given], tuple[Capture, dict[str, bytes]]]
-    heeds: frozenset[str]
+    options: frozenset[str]
 
 
 def _read_ensenso(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
@@ -227,7 +227,7 @@ def kind_of(path: str | Path, given: Given | None = None) -> str:
     if path.suffix.lower() in known:
         return known[path.suffix.lower()]  # damaged; its reader reports the error
     raise InputError(
-        path, "", "a file of an unknown kind", "; ".join(kind.what for kind in KINDS.values()), "say which with --as"
+        path, "", "a file of an unknown kind", "; ".join(kind.name for kind in KINDS.values()), "say which with --as"
     )
 
 
@@ -244,9 +244,9 @@ def read_recording(path: str | Path, given: Given, kind: str | None = None) -> I
         raise InputError("--as", "", repr(kind), ", ".join(KINDS), nearest(kind, list(KINDS)))
     kind = kind or kind_of(path, given)
     for name in Given.__dataclass_fields__:
-        if getattr(given, name) is not None and name not in FOR_ALL and name not in KINDS[kind].heeds:
-            heeded = ", ".join(_option(each) for each in (*sorted(KINDS[kind].heeds), *FOR_ALL))
-            raise InputError(path, "", f"{_option(name)} for {KINDS[kind].what}", heeded)
+        if getattr(given, name) is not None and name not in FOR_ALL and name not in KINDS[kind].options:
+            used = ", ".join(_option(each) for each in (*sorted(KINDS[kind].options), *FOR_ALL))
+            raise InputError(path, "", f"{_option(name)} for {KINDS[kind].name}", used)
     settings_given = _settings_given(given)
     capture, originals = KINDS[kind].read(path, given)
     for name in (given.images or {}) if kind in ("images", "stereo-pair") else ():

@@ -84,7 +84,7 @@ class Agreement:
 
 
 def agreement(scores: xr.Dataset, checks: xr.Dataset, measurement: str) -> Agreement:
-    """Compare what is predicted for the checked views with the errors measured in them."""
+    """Compare the uncertainties predicted for the checked views with the errors measured in them."""
     here = scores.sel(measurement=measurement, view=checks["view"].values)
     errors = np.abs(checks["error"].sel(measurement=measurement).transpose("view", "repeat").values.astype(float))
     known = np.isfinite(errors)

@@ -71,16 +71,16 @@ def residual_figure(sheets: Sequence[DataSheet]) -> Figure:
     return figure
 
 
-def gallery_figure(sensor: str, seen: Sequence[tuple[str, Capture, PointCloud]]) -> Figure:
+def gallery_figure(sensor: str, gallery: Sequence[tuple[str, Capture, PointCloud]]) -> Figure:
     """Draw the reference camera's brightened image of each finish, and beside it the status of each pixel."""
     colours = ListedColormap([REASONS[status][1] for status in Status])
     steps = BoundaryNorm(np.arange(len(Status) + 1) - 0.5, len(Status))
     with drawing():
-        figure = Figure((3.3 * len(seen), 5.6), layout="constrained")
-        grid = np.asarray(figure.subplots(2, len(seen), squeeze=False))
+        figure = Figure((3.3 * len(gallery), 5.6), layout="constrained")
+        grid = np.asarray(figure.subplots(2, len(gallery), squeeze=False))
         present: set[int] = set()
-        cut = _window_around(seen[0][2])
-        for (finish, capture, cloud), (upper, lower) in zip(seen, grid.T, strict=True):
+        cut = _window_around(gallery[0][2])
+        for (finish, capture, cloud), (upper, lower) in zip(gallery, grid.T, strict=True):
             image = _brightest(capture)[_of_grid(cut, capture, cloud)]
             low, high = np.percentile(image, (5, 99.7))
             shown = np.clip((image - low) / max(high - low, 1e-9), 0, 1) ** STRETCH_EXPONENT
@@ -152,11 +152,11 @@ def _row(sheet: DataSheet) -> str:
 
 def _ratios(sheet: DataSheet) -> str:
     """Return the smallest to largest ratio of the published to the simulated spread, where both are known."""
-    seen = [point for point in sheet.noise if point.spread > 0]
-    if not seen:
+    recovered = [point for point in sheet.noise if point.spread > 0]
+    if not recovered:
         return "none in range"
-    distance = np.log([point.distance for point in seen])
-    spread = np.log([point.spread for point in seen])
+    distance = np.log([point.distance for point in recovered])
+    spread = np.log([point.spread for point in recovered])
     found: list[float] = []
     for known in sheet.sensor.published_noise:
         places = np.log(known.distance_mm)

@@ -146,8 +146,8 @@ def open_study(
     reach = characterised_range(path, file.views, sensor, standoffs, distances)
     candidates = candidate_views(file.views, sensor, standoffs, scene.centre, triangles(scene), reach, path)
     if performance_map is not None and mapped:
-        stood = [view.standoff for view in candidates.views]
-        depths = (min(stood) - radius, max(stood) + radius)
+        view_distances = [view.standoff for view in candidates.views]
+        depths = (min(view_distances) - radius, max(view_distances) + radius)
         wanted = NeededFinishes(sensor, scene.where, seen_finishes(scene), depths)
         performance_map = map_with_finishes(performance_map, wanted, ask)
     return Study(path, file, scene, task, sensor, candidates, campaign, performance_map)
@@ -159,7 +159,7 @@ def finishes_of_features(study: Study) -> dict[str, Finish | None]:
 
 
 def report_lays(study: Study) -> None:
-    """Say what the prediction leaves out of the direction of machining marks on the features of the study."""
+    """Report how the prediction simplifies the direction of machining marks on the features of the study."""
     finishes = finishes_of_features(study)
     for sentence in lays_in_words({name: (one.name, one.scatter) for name, one in finishes.items() if one is not None}):
         say(sentence)
@@ -183,8 +183,8 @@ def read_map(name: str | Path, sensor: Sensor, folder: str | Path = ".") -> Perf
     file = map_path(name, folder)
     performance_map = with_lights(PerformanceMap.load(file))
     attributes = performance_map.data.attrs
-    if (whose := str(attributes.get("sensor"))) != sensor.name:
-        raise InputError(file, "sensor", whose, sensor.name, "a map holds for one sensor only")
+    if (map_sensor := str(attributes.get("sensor"))) != sensor.name:
+        raise InputError(file, "sensor", map_sensor, sensor.name, "a map holds for one sensor only")
     if attributes.get("sensor_checksum", sensor_checksum(sensor)) != sensor_checksum(sensor):
         say(f"{file} was made with another version of {sensor.name}, whose parameters have changed since")
     return performance_map

@@ -1,4 +1,4 @@
-"""Say what a prediction leaves out of the direction of machining marks, the lay.
+"""Report how a prediction simplifies the direction of machining marks, the lay.
 
 Signal chain: scattering of a face, and its process -> whether the marks have a direction, and whether it is known.
 

@@ -260,7 +260,7 @@ class _Tiles:
         return float(np.sqrt((len(moved) - 1) * moved.var()))
 
     def _maps(self, knee: float, slope: float, numbers: Floats) -> Floats:
-        """What a and b are multiplied with in every used pixel (2, N)."""
+        """Return the factors (2, N) of a and b in every used pixel."""
         light, ratio = self.clean, np.ones(self.clean.shape)
         if slope < 1:
             top = knee + (float(self.clean.max()) + 5 - knee) / slope

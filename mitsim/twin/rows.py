@@ -71,7 +71,7 @@ def row_turns(capture: Capture, settings: Settings, place: Place, prior: tuple[f
 
 
 def _line(design: Floats, values: Floats, prior: Floats) -> tuple[Floats, Floats, Floats]:
-    """Numbers with a normal prior about 0, their covariance, and what is left of the values.
+    """Return numbers with a normal prior about 0, their covariance, and the residuals of the values.
 
     The variance of the values is that about the least-squares line, which knows no prior.
     """

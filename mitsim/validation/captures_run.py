@@ -163,7 +163,7 @@ def _preamble(real: Capture, simulated: Capture, place: Place, comparison: Compa
     return "\n\n".join(words) + "\n"
 
 
-def _shown(name: str, capture: Capture, place: Place, seen: SpecimenPatches) -> Shown:
+def _shown(name: str, capture: Capture, place: Place, patches: SpecimenPatches) -> Shown:
     mask = image_mask(place, capture.rig.reference)
     rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     image = reference_levels(capture)
@@ -171,14 +171,14 @@ def _shown(name: str, capture: Capture, place: Place, seen: SpecimenPatches) -> 
         slice(max(int(rows[0]) - _BORDER_PX, 0), int(rows[-1]) + _BORDER_PX),
         slice(max(int(columns[0]) - _BORDER_PX, 0), int(columns[-1]) + _BORDER_PX),
     )
-    roi = Roi.around(seen.on_grid) or Roi(0, 0, 1, 1)
-    totals = seen.status.sum(axis=0)
+    roi = Roi.around(patches.on_grid) or Roi(0, 0, 1, 1)
+    totals = patches.status.sum(axis=0)
     shares = {status: float(totals[status] / totals.sum()) for status in Status if totals[status] > 0}
     return Shown(
         f"{name}: {capture.sensor}",
         capture.source,
         image[cut],
-        seen.levels.sum(axis=0),
-        seen.residual[roi.slices],
+        patches.levels.sum(axis=0),
+        patches.residual[roi.slices],
         shares,
     )

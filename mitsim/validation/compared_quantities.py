@@ -59,32 +59,32 @@ def _sums(values: Floats, picked: Picked) -> Floats:
 
 
 def _median(name: str) -> Figure:
-    return lambda seen, picked: _quantile(getattr(seen, name)[picked], 0.5)
+    return lambda patches, picked: _quantile(getattr(patches, name)[picked], 0.5)
 
 
-def _level(seen: SpecimenPatches, picked: Picked) -> Floats:
-    return np.array([median_level(counts) for counts in _sums(seen.levels, picked)])
+def _level(patches: SpecimenPatches, picked: Picked) -> Floats:
+    return np.array([median_level(counts) for counts in _sums(patches.levels, picked)])
 
 
-def _spread(seen: SpecimenPatches, picked: Picked) -> Floats:
-    return _quantile(seen.sigma[picked], 0.75) - _quantile(seen.sigma[picked], 0.25)
+def _spread(patches: SpecimenPatches, picked: Picked) -> Floats:
+    return _quantile(patches.sigma[picked], 0.75) - _quantile(patches.sigma[picked], 0.25)
 
 
-def _run(seen: SpecimenPatches, picked: Picked) -> Floats:
-    changes = _sums(seen.crossings, picked)
-    return np.where(changes > 0, _sums(seen.pixels, picked) / np.maximum(changes, 1), np.nan)
+def _run(patches: SpecimenPatches, picked: Picked) -> Floats:
+    changes = _sums(patches.crossings, picked)
+    return np.where(changes > 0, _sums(patches.pixels, picked) / np.maximum(changes, 1), np.nan)
 
 
 def _share(status: Status) -> Figure:
-    def figure(seen: SpecimenPatches, picked: Picked) -> Floats:
-        counts = _sums(seen.status, picked)
+    def figure(patches: SpecimenPatches, picked: Picked) -> Floats:
+        counts = _sums(patches.status, picked)
         return np.asarray(counts[:, status] / counts.sum(axis=-1))
 
     return figure
 
 
-def _correlation_length(seen: SpecimenPatches, picked: Picked) -> Floats:
-    products, pairs = _sums(seen.products, picked), _sums(seen.pairs, picked)
+def _correlation_length(patches: SpecimenPatches, picked: Picked) -> Floats:
+    products, pairs = _sums(patches.products, picked), _sums(patches.pairs, picked)
     middle = products.shape[1] // 2
     lengths = np.full(len(picked), np.nan)
     for index in np.flatnonzero(pairs[:, middle, middle] > 0):

@@ -194,7 +194,7 @@ def test_the_command_imports_and_the_originals_are_untouched(tmp_path, monkeypat
     save(tmp_path / name, content)
     result = run("import", name, *options)
     folder = tmp_path / f"{Path(name).stem}_capture"
-    assert KINDS[kind_of(Path(name))].what in result.stderr and str(folder.name) in result.stderr
+    assert KINDS[kind_of(Path(name))].name in result.stderr and str(folder.name) in result.stderr
     assert result.stdout == ""
     assert (folder / "vendor" / name).read_bytes() == content
     if "--calibration" in options:
