@@ -37,6 +37,19 @@ def losses(reasons: Iterable[str]) -> tuple[Loss, ...]:
     return tuple(Loss(_spanned(parts, texts), len(texts)) for parts, texts in ordered)
 
 
+def common_losses(measurements: Iterable[tuple[str, int, Iterable[Loss]]]) -> list[tuple[list[str], int, int, str]]:
+    """Return names of measurements, count, number of trials and reason of each loss, in the order given.
+
+    Measurements with a feature in common are lost together, and have one entry. ``measurements`` are names, numbers of
+    trials and losses.
+    """
+    names: dict[tuple[int, int, str], list[str]] = {}
+    for name, trials, lost in measurements:
+        for loss in lost:
+            names.setdefault((loss.count, trials, loss.reason), []).append(name)
+    return [(some, *key) for key, some in names.items()]
+
+
 def _spanned(parts: Sequence[str], texts: Sequence[str]) -> str:
     """Return the parts of a text with the smallest and the largest of its numbers in every gap."""
     gaps = zip(*(_NUMBER.findall(text) for text in texts), strict=True)

@@ -15,6 +15,7 @@ from pydantic import ConfigDict, Field
 
 from characterisation.checked_files import read_json_object
 from characterisation.documents import Document, validate
+from characterisation.statements.losses import Loss, common_losses
 from mitsim.report.numbers import NONE, listed, percent, quantity, rounded, two_digits
 
 #: colour and name of a group of unknowns (Okabe and Ito, safe for colour-blind readers)
@@ -156,9 +157,11 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
         "included": [one.model_dump() for one in document.influences if one.included],
         "missing": [one.model_dump() for one in document.influences if not one.included],
         "losses": [
-            {"name": name, "count": loss.count, "trials": one.trials, "reason": loss.reason}
-            for name, one in document.measurements.items()
-            for loss in one.losses
+            {"names": names, "count": count, "trials": trials, "reason": reason}
+            for names, count, trials, reason in common_losses(
+                (name, one.trials, [Loss(lost.reason, lost.count) for lost in one.losses])
+                for name, one in document.measurements.items()
+            )
         ],
         "unsettled": [name for name, one in document.measurements.items() if not one.settled],
     }

@@ -90,7 +90,7 @@ def as_svg(figure: Figure, alt: str) -> str:
         canvas = FigureCanvasSVG(figure)
         _lay_out(figure)
         figure.dpi = _DPI
-        canvas.print_svg(buffer, metadata=nothing)
+        canvas.print_svg(buffer, metadata=nothing)  # type: ignore[no-untyped-call]
     text = buffer.getvalue()
     text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text[text.index("<svg") :], flags=re.DOTALL)
     text = re.sub(r'<g id="[^"]*"', "<g", text)  # ids of groups would not be unique on a page

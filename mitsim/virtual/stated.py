@@ -15,7 +15,7 @@ from typing import Any
 from characterisation.atomic_io import json_values, write_json
 from characterisation.statements.budget import budget
 from characterisation.statements.decision import tolerance_of
-from characterisation.statements.losses import losses
+from characterisation.statements.losses import common_losses, losses
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
 from mitsim.progress import track
@@ -149,12 +149,9 @@ def statement_table(stated: Sequence[Statement]) -> str:
                 one.verdict,
             )
         )
-    return "\n".join([*aligned(rows), *(f"  {line}" for one in stated for line in losses_in_lines(one))])
-
-
-def losses_in_lines(one: Statement) -> list[str]:
-    """Return a line for each kind of reason why a measurement had no value, most frequent first."""
-    return [f"{one.measurement}: no value in {loss.count} of {one.trials}: {loss.reason}" for loss in one.losses]
+    lost = common_losses((one.measurement, one.trials, one.losses) for one in stated)
+    lines = [f"no value in {count} of {trials}: {', '.join(names)}: {reason}" for names, count, trials, reason in lost]
+    return "\n".join([*aligned(rows), *lines])
 
 
 def judged(stated: Sequence[Statement]) -> list[Judged]:

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from characterisation.statements.losses import Loss, losses
+from characterisation.statements.losses import Loss, common_losses, losses
 
 
 def test_reasons_that_differ_in_numbers_are_one_kind_with_their_range():
@@ -32,3 +32,13 @@ def test_any_texts_are_counted_once_each(reasons):
     found = losses(reasons)
     assert sum(one.count for one in found) == sum(1 for reason in reasons if reason)
     assert [one.count for one in found] == sorted((one.count for one in found), reverse=True)
+
+
+def test_measurements_that_are_lost_together_have_one_entry():
+    pin, plane = Loss("pin: 3 points", 5), Loss("plane: 7 points", 5)
+    found = common_losses([("radius", 20, [pin]), ("angle", 20, [pin, plane]), ("height", 30, [plane])])
+    assert found == [
+        (["radius", "angle"], 5, 20, "pin: 3 points"),
+        (["angle"], 5, 20, "plane: 7 points"),
+        (["height"], 5, 30, "plane: 7 points"),
+    ]
