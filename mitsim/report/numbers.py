@@ -49,13 +49,15 @@ def quantity(value: float, unit: str) -> str:
 
 
 def percent(share: float) -> str:
-    """Write a share as a percentage, with one decimal below ten."""
+    """Write a share as a percentage, with one decimal below ten; 100 % is all of it."""
     if not math.isfinite(share):
         return NONE
     if share == 0:
         return f"0{SPACE}%"
     if 0 < share < 0.0005:
         return f"<{SPACE}0.1{SPACE}%"
+    if 0.995 < share < 1:
+        return f">{SPACE}99{SPACE}%"
     return f"{100 * share:.{1 if share < 0.0995 else 0}f}{SPACE}%"
 
 

@@ -97,6 +97,7 @@ def test_two_digits_are_within_half_of_the_last(value):
 def test_numbers_in_words():
     assert rounded(-0.2) == "0" and rounded(-12.6) == "−13" and rounded(math.nan) == "–"
     assert percent(0.0001) == "<\N{NO-BREAK SPACE}0.1\N{NO-BREAK SPACE}%"
+    assert percent(0.9951) == ">\N{NO-BREAK SPACE}99\N{NO-BREAK SPACE}%" and percent(1) == "100\N{NO-BREAK SPACE}%"
     assert percent(0.0996) == "10\N{NO-BREAK SPACE}%" and percent(0.054) == "5.4\N{NO-BREAK SPACE}%"
     assert count(16088) == "16\N{NARROW NO-BREAK SPACE}088"
     assert listed([]) == "" and listed(["a"]) == "a" and listed(["a", "b", "c"]) == "a, b and c"

@@ -365,7 +365,7 @@ def test_without_scripts_the_table_remains_and_says_so(browser, page):
 def test_script_writes_numbers_as_the_rest_of_the_page_does(opened):
     values = [0.0996, 0.1, 1.04, 9.96, 99.6, 123456.0, 0.000123, 0.0, -0.25, 1e-7, 3.0]
     source = (REPORT / "view_panel.js").read_text(encoding="utf-8")
-    shares, counts = [0.0, 0.0001, 0.05, 0.0994, 0.5, 0.97, 1.0], [0, 12, 1234, 1234567]
+    shares, counts = [0.0, 0.0001, 0.05, 0.0994, 0.5, 0.97, 0.9951, 1.0], [0, 12, 1234, 1234567]
 
     def written(values: list, how: str) -> list:
         return opened.tell(f"(() => {{ {source} return {values}.map((v) => {how}); }})()")
