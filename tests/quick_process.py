@@ -22,8 +22,15 @@ HERE = Path(__file__).resolve().parent
 #: folders that the scripts of tests import from
 FOLDERS = [HERE.parent, HERE, HERE / "campaign", HERE / "hardware"]
 
-#: what most commands and scripts import
-PRELOADED = ["known_clouds", "mitsim.cli", "mitsim.campaign.many", "trimesh.exchange.load", "pandas", "xarray"]
+#: what most commands and scripts import; Dr.Jit is not started, since a fork would lack its threads
+PRELOADED = [
+    "known_clouds",
+    "mitsim.cli",
+    "mitsim.campaign.many",
+    "mitsim.report.figures",
+    "trimesh.exchange.load",
+    "dask.array",  # xarray imports it
+]
 
 _CONTEXT = multiprocessing.get_context("forkserver") if sys.platform != "win32" else None
 

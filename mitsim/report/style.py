@@ -87,7 +87,7 @@ def as_svg(figure: Figure, alt: str) -> str:
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     with drawing():
-        canvas = FigureCanvasSVG(figure)
+        canvas: Any = FigureCanvasSVG(figure)
         _lay_out(figure)
         figure.dpi = _DPI
         canvas.print_svg(buffer, metadata=nothing)  # type: ignore[no-untyped-call]

@@ -12,6 +12,7 @@ from known_clouds import known_source, smooth
 from mitsim import cli
 from mitsim.campaign import acquire
 from mitsim.campaign.acquire import Source
+from mitsim.simulation import simulate
 
 
 def known_in_turn(*_: Any) -> Source:
@@ -22,4 +23,5 @@ def known_in_turn(*_: Any) -> Source:
 if __name__ == "__main__":
     acquire.in_turn = known_in_turn  # type: ignore[assignment]
     acquire.coupon_residuals = lambda *_: []
+    simulate.SimulatedSensor = lambda *_: None  # type: ignore[assignment,misc]
     cli.main()

@@ -70,8 +70,8 @@ def step_of(motion: np.ndarray) -> np.ndarray:
 
 RIGID = [rigid_derivatives(shape, ABOUT) for shape in SHAPES.values()]
 
-#: noise and bumps; both views from one side, or from opposite ones, which have only the plate's points in common
-CASES = [(SIGMA, 0.0, 0.0), (SIGMA, BUMP, 0.0), (SIGMA, 0.0, np.pi), (SIGMA, BUMP, np.pi)]
+#: noise and views from one side; bumps too and views from opposite sides, which share the plate's points alone
+CASES = [(SIGMA, 0.0, 0.0), (SIGMA, BUMP, np.pi)]
 
 
 @pytest.mark.parametrize(("sigma", "bump", "turn"), CASES)

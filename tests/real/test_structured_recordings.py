@@ -128,9 +128,10 @@ def test_two_ways_to_the_gamma_of_the_mugs_agree(mugs):
     level = gamma_from_white(phases.offset, white, black, 0.5, 0.5, used)
     tried = np.arange(1.0, 3.5, 0.05)
     spread = []
+    some = np.flatnonzero(used)[::5]  # of the pixels used, enough for a median
     for gamma in tried:
         first, second = (
-            correct_phase(phases.phase[k][used] - np.float32(shifts[k][0]), gamma, 3, 0.5, 0.5) + shifts[k][0]
+            correct_phase(phases.phase[k].ravel()[some] - np.float32(shifts[k][0]), gamma, 3, 0.5, 0.5) + shifts[k][0]
             for k in (0, 1)
         )
         # 200/3 and 100 px beat at 200 px, three fringes of the first

@@ -189,8 +189,8 @@ LAMPS = {
 }
 
 
-@pytest.mark.parametrize("depth", [1, 3])
-@pytest.mark.parametrize("lamps", [("sky",), ("bulb",), ("panel",), ("sky", "bulb", "panel")])
+# depth 3 has each lamp's direct light in it, and depth 1 how paths choose among lamps
+@pytest.mark.parametrize(("depth", "lamps"), [(3, ("sky",)), (3, ("bulb",)), (3, ("panel",)), (1, tuple(LAMPS))])
 def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
     """Sky, bulb and panel over a concave metal corner, with the projector on top; then the ambient image alone."""
     scene, chosen = _lit_corner(lamps, {"type": "machined_metal", "Ra": 0.4})
@@ -231,7 +231,10 @@ def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
 
 @pytest.mark.parametrize("lamp", ["sky", "bulb", "panel"])
 def test_indirect_light_of_emitters_is_all_of_it_less_its_direct_light(lamp):
-    """With the projector off; each is random by itself, so that means over blocks of pixels are held together."""
+    """With the projector off; each is random by itself, so that means over blocks of pixels are held together.
+
+    Eight images of 128 samples have means as precise as those of sixteen of 64, at half the launches.
+    """
     scene, _ = _lit_corner([lamp], {"type": "matt_white"})
     rays = CameraRays(pinhole(48, 32, 85.0))
     dark = LitPatterns(np.zeros((1, 140, 200)), Projector(pinhole(200, 140, 220.0, BESIDE), flux=1e-2))
@@ -244,7 +247,7 @@ def test_indirect_light_of_emitters_is_all_of_it_less_its_direct_light(lamp):
                     rays,
                     dark,
                     pose,
-                    LightPaths(samples=64, seed=s, depth=depth, with_ambient=True, indirect_only=only),
+                    LightPaths(samples=128, seed=s, depth=depth, with_ambient=True, indirect_only=only),
                 )[-1]
                 .reshape(4, 8, 6, 8)
                 .sum(axis=(1, 3))
@@ -252,10 +255,10 @@ def test_indirect_light_of_emitters_is_all_of_it_less_its_direct_light(lamp):
                 for s in seeds
             ]
         )
-        for depth, only, seeds in ((1, False, range(16)), (2, False, range(20, 36)), (2, True, range(40, 56)))
+        for depth, only, seeds in ((1, False, range(8)), (2, False, range(20, 28)), (2, True, range(40, 48)))
     )
     difference = direct.mean(0) + later.mean(0) - both.mean(0)
-    error = np.sqrt((direct.var(0, ddof=1) + later.var(0, ddof=1) + both.var(0, ddof=1)) / 16)
+    error = np.sqrt((direct.var(0, ddof=1) + later.var(0, ddof=1) + both.var(0, ddof=1)) / 8)
     seen = both.mean(0) > 1e-3 * both.mean()
     assert seen.sum() > 10 and later.mean() > 0.01 * direct.mean()
     z = difference[seen] / np.maximum(error[seen], 1e-5 * both.mean(0)[seen])
