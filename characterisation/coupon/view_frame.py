@@ -23,4 +23,9 @@ def view_frame(view: NDArray[np.floating], baseline: NDArray[np.floating]) -> Fl
 
 def in_view_frame(normals: Floats, view: Floats, baseline: Floats) -> Floats:
     """Return normals (..., 3) of the sensor frame in the view frame; the last component is the cosine of incidence."""
-    return np.asarray(np.einsum("...ij,...j->...i", view_frame(view, baseline), normals))
+    return in_frame(normals, view_frame(view, baseline))
+
+
+def in_frame(directions: Floats, frames: Floats) -> Floats:
+    """Return directions (..., 3) of the sensor frame in the frames (..., 3, 3) of :func:`view_frame`."""
+    return np.asarray(np.einsum("...ij,...j->...i", frames, directions))

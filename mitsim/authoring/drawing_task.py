@@ -21,9 +21,9 @@ from characterisation.tasks.definitions import (
     plane_distance,
     point_plane_distance,
 )
+from mitsim.authoring.drawn_characteristics import Dimension, GeometricTolerance, ProductInformation, Target
 from mitsim.authoring.drawn_zones import Side, zones
 from mitsim.authoring.face import Face
-from mitsim.authoring.product_information import Dimension, GeometricTolerance, ProductInformation, Target
 
 #: difference between the drawing and its own model above which it is reported [mm, deg]
 _AGREE = 0.005

@@ -14,8 +14,8 @@ import numpy as np
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.tasks.places import mid_plane
 from characterisation.tasks.zones import Datum, frame_fault
+from mitsim.authoring.drawn_characteristics import GeometricTolerance
 from mitsim.authoring.face import Face
-from mitsim.authoring.product_information import GeometricTolerance
 
 #: two sides belong to a slot or a web if their normals are opposite within this cosine
 _OPPOSITE = -0.9999

@@ -12,9 +12,10 @@ draw, and :mod:`~mitsim.prediction.perturbation` adds effects that flat coupons 
 Not included: clusters of lost points, since the map has only their share F, and the behaviour of a matcher at edges.
 """
 
+from mitsim.prediction.characterised_scene import CharacterisedScene
 from mitsim.prediction.perturbation import Effect, Perturbation, SceneView, together
 from mitsim.prediction.point_statistics import ViewPoints, expected_points, feature_statistics, performance
-from mitsim.prediction.predictor import EDGE_MARGIN_PX, CharacterisedScene, Ideal, Predicted, Predictor
+from mitsim.prediction.predictor import EDGE_MARGIN_PX, Ideal, Predicted, Predictor
 
 __all__ = [
     "EDGE_MARGIN_PX",

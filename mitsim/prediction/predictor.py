@@ -18,17 +18,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.coupon.view_frame import in_view_frame
-from characterisation.maps.performance_map import PerformanceMap
-from characterisation.maps.tables import Surface
+from characterisation.coupon.view_frame import in_frame, view_frame
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.threads import in_threads
-from mitsim.errors import InputError
+from mitsim.prediction.characterised_scene import CharacterisedScene
 from mitsim.prediction.noise_field import correlated_noise
 from mitsim.reconstruction.cloud import Geometry
 from mitsim.scene.load import Scene
-from mitsim.scene.materials import Finish
-from mitsim.scene.ray_casting.mapped_scene import MappedScene, MappedView, ViewRays
+from mitsim.scene.ray_casting.mapped_scene import MappedView, ViewRays
 from mitsim.scene.ray_casting.raycast import PixelRays, Surfaces, cast, shapes_met
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.matcher import MatcherSettings
@@ -67,29 +64,6 @@ class Predicted:
 
     seen: MappedView
     labels: NDArray[np.int16]
-
-
-class CharacterisedScene:
-    """A scene and the map of a sensor: F and sigma of its faces, copied to the device once.
-
-    ``finish`` replaces the finishes of the scene: matt white, to normalise the view score.
-    """
-
-    def __init__(self, scene: Scene, performance_map: PerformanceMap, finish: Finish | None = None) -> None:
-        self.scene, self.performance_map, self.finish = scene, performance_map, finish
-        self.unknown: dict[int, InputError] = {}
-        surfaces = [self._surface(index) for index in range(len(scene.names))]
-        self.mapped = MappedScene(scene, surfaces)
-
-    def _surface(self, index: int) -> Surface | None:
-        finish = self.finish or self.scene.finishes[index]
-        if finish is None:
-            return None
-        try:
-            return self.performance_map.surface(finish.name, finish.roughness, finish.light)
-        except InputError as error:  # raised only if a view shows the face
-            self.unknown[index] = error
-            return None
 
 
 class Predictor:
@@ -159,10 +133,11 @@ class Predictor:
             hidden = ~surfaces.seen[index].ravel()[pixel]
             status[hidden] = Status.SHADOWED if eye is self.rig.projector else Status.HIDDEN
         status[outside] = Status.NO_SURFACE
-        view = in_view_frame(normal, ray, self.rig.baseline_direction)
+        frames = view_frame(ray, self.rig.baseline_direction)
+        view = in_frame(normal, frames)
         along = None
         if surfaces.along is not None:
-            along = in_view_frame(surfaces.along.reshape(-1, 3)[pixel].astype(float), ray, self.rig.baseline_direction)
+            along = in_frame(surfaces.along.reshape(-1, 3)[pixel].astype(float), frames)
         return Ideal(pixel, point, ray, distance, view, surfaces.shape.ravel()[pixel], status, along)
 
     def labelled(self, cloud: PointCloud, scene: Scene, world_from_sensor: Transform) -> PointCloud:

@@ -1,0 +1,59 @@
+"""Dimensions, geometric tolerances and datums of a drawing, as a STEP file has them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Target:
+    """The object of a dimension, tolerance or datum: faces by number, and anything else by its type."""
+
+    faces: tuple[int, ...] = ()
+    others: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """A size or location: its ``kind`` as in the file, values in mm or deg, limits about the nominal value.
+
+    ``second``: the other end of a location; ``angular``: whether values are angles; ``notes``: further data of the
+    file, such as a fit.
+    """
+
+    number: int
+    kind: str
+    first: Target
+    second: Target | None
+    nominal: float | None
+    limits: tuple[float, float] | None
+    angular: bool
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class GeometricTolerance:
+    """A geometric tolerance: width or diameter of its ``zone`` [mm], letters of its datums in order."""
+
+    number: int
+    name: str
+    kind: str
+    zone: float | None
+    target: Target
+    datums: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ProductInformation:
+    """All product information, in the file's order; ``unread``: sentences about information that is not read."""
+
+    dimensions: list[Dimension] = field(default_factory=list)
+    tolerances: list[GeometricTolerance] = field(default_factory=list)
+    datums: dict[str, Target] = field(default_factory=dict)
+    unread: list[str] = field(default_factory=list)
+
+    @property
+    def found(self) -> bool:
+        """Return whether the file has any product information."""
+        return bool(self.dimensions or self.tolerances or self.datums or self.unread)
