@@ -134,7 +134,7 @@ def _read(file: Path) -> dict[str, Any]:
             raise
         except Exception as error:
             raise InputError(file, "", f"a file that NumPy cannot read ({error})", _KINDS) from None
-    _check_nesting(file, data)
+    _check_layout(file, data)
     storage = _opened(file)
     try:
         return {name: _plain(storage.root().getNode(name)) for name in storage.root().keys()}  # noqa: SIM118 not a dict
@@ -145,8 +145,8 @@ def _read(file: Path) -> dict[str, Any]:
         storage.release()
 
 
-def _check_nesting(file: Path, data: bytes) -> None:
-    """Reject text nested so deeply that OpenCV's recursive parsers would crash the process."""
+def _check_layout(file: Path, data: bytes) -> None:
+    """Reject text on which OpenCV's parsers would crash the process or never return."""
     if data[:2] == b"\x1f\x8b":  # OpenCV unpacks gzip files itself
         try:
             unpack = zlib.decompressobj(31)
@@ -164,8 +164,27 @@ def _check_nesting(file: Path, data: bytes) -> None:
         depth = max(depth, 0)
         deepest = max(deepest, depth)
     indented = max((len(mark.group(1)) for mark in _INDENT.finditer(data)), default=0)
+    if _is_outdented(data):
+        raise InputError(file, "", "a line that is indented less than the first", _KINDS)
     if deepest > _DEEPEST or indented > 4 * _DEEPEST or _DASHES.search(data):
         raise InputError(file, "", f"values nested over {_DEEPEST} deep", _KINDS)
+
+
+def _is_outdented(data: bytes) -> bool:
+    """Return whether a line of a YAML document is left of its first key: OpenCV would read it over and over."""
+    if data.lstrip()[:1] in (b"<", b"{"):  # XML or JSON
+        return False
+    first: int | None = None
+    for line in data.splitlines():
+        text = line.lstrip(b" ")
+        if line.startswith((b"---", b"...")):
+            first = None  # of the next document
+        elif text.strip() and not text.startswith((b"#", b"%")):
+            indent = len(line) - len(text)
+            first = indent if first is None else first
+            if indent < first:
+                return True
+    return False
 
 
 def _opened(file: Path) -> Any:

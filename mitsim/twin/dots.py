@@ -179,21 +179,28 @@ def fit_dots(
         excess = float(np.mean(off[spatial] ** 2 - np.diag(covariance)[spatial]))
         uneven = float(np.sqrt(max(excess, 0.0)))
         covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
-    kept = np.array([_is_determined(found, index, parameter) for index, parameter in enumerate(own)])
-    undetermined = tuple(parameter for parameter, is_kept in zip(own, kept, strict=True) if not is_kept)
-    # without it no parameter explains the variation of sharpness
-    if any(parameter is CORNER_BLUR for parameter in undetermined):
-        names, spatial = names[:count], spatial[:count]
-        wanted, covariance = real.of(names)
-        covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
-    if uneven > 0 or undetermined:
+    undetermined: list[Parameter] = []
+    settled = uneven == 0
+    while True:
+        kept = np.array([_is_determined(found, index, parameter) for index, parameter in enumerate(own)])
+        dropped = [parameter for parameter, is_kept in zip(own, kept, strict=True) if not is_kept]
+        if settled and not dropped:
+            break
+        # without it no parameter explains the variation of sharpness
+        if any(parameter is CORNER_BLUR for parameter in dropped):
+            names, spatial = names[:count], spatial[:count]
+            wanted, covariance = real.of(names)
+            covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
+        undetermined += dropped
         own = [parameter for parameter, is_kept in zip(own, kept, strict=True) if is_kept]
-        again = _prior(own, start[kept], found.values[kept])
+        start = start[kept]
+        again = _prior(own, start, found.values[kept])
         found = match_moments(wanted, covariance, simulate, again, draws.number, f"{where}, once more")
+        settled = True
     if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)):
         wider = found.covariance * found.chi_square / max(found.freedom, 1)
         found = replace(found, covariance=wider)
-    return DotsFit(sensor, tuple(own), found, len(field.corners), uneven, undetermined)
+    return DotsFit(sensor, tuple(own), found, len(field.corners), uneven, tuple(undetermined))
 
 
 def _is_determined(found: MomentFit, index: int, parameter: Parameter) -> bool:

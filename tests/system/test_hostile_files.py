@@ -135,6 +135,16 @@ def test_calibrations_nested_deep(tmp_path, name, text):
     refused(read_tree, [tmp_path / name], match="nested over")
 
 
+@pytest.mark.timeout(60)
+def test_a_calibration_with_a_line_left_of_its_first_key_ends(tmp_path):
+    """OpenCV would read such a line without end."""
+    path = tmp_path / "a.yml"
+    path.write_text("%YAML:1.0\n---\n   rows: 3\n   cols: 3\nD1:-matrix\n   rows: 3\n", encoding="utf-8")
+    refused(read_tree, [path], match="indented less than the first")
+    path.write_text("%YAML:1.0\n# optics\n---\n   rows: 3\n\n   cols: 4\n...\n", encoding="utf-8")
+    assert read_tree([path]).find("cols")[1] == 4
+
+
 def test_a_packed_calibration_does_not_unpack_to_gigabytes(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as packed:
         for number in range(3):
