@@ -39,7 +39,7 @@ def test_a_corner_is_as_bright_as_many_light_paths_make_it_and_less_noisy():
     scene = load_scene(ROOT / "scenes/two_pillars/matt_white.xml", sensor.wavelength_nm)
     pose = look_at([120, -180, 480], scene.centre, [0, 1, 0])
     simulated = SimulatedSensor(sensor)
-    around = pose.inverse().points(scene.centre + np.array([[x, y, 0] for x in (-14, 14) for y in (-14, 14)]))
+    around = pose.inverse().points(scene.centre + np.array([[x, y, 0] for x in (-20, 20) for y in (-20, 20)]))
 
     def light(seed, samples, depth=2, indirect=None):
         rendering, noise = Rendering(samples, depth, indirect), Noise(speckle=False)
