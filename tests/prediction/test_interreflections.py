@@ -146,8 +146,7 @@ def white_corner(sensor):
     )
 
 
-# a pattern, as of the ensenso-n10, is rendered so in the next test
-@pytest.mark.parametrize("name", ["david-sls-3", "kinect-v2"])
+@pytest.mark.parametrize("name", ["ensenso-n10", "david-sls-3", "kinect-v2"])
 def test_views_rendered_together_are_those_rendered_alone(name):
     """Every pose of a launch has its own frame, streams and pixels; the images agree to the last bit."""
     sensor = load_sensor(name)
