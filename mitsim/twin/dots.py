@@ -5,8 +5,9 @@ room light, dots, noise and corner losses by simulated moments (:mod:`mitsim.twi
 :mod:`mitsim.twin.parameters`) with the forward model (:mod:`mitsim.twin.specimen_simulator`).
 
 The six terms of room light may not explain the level and contrast over the field within chance. The mean square of the
-remainder is then added to the covariance of these terms, and the fit is repeated. If the misfit is still significant,
-the covariance is scaled by the reduced chi-square (Birge, Phys. Rev. 40 (1932) 207).
+remainder is then added to the covariance of these terms, and the fit is repeated. It is also repeated without the
+parameters that are not determined, until all are. If the misfit is still significant, the covariance is scaled by the
+reduced chi-square (Birge, Phys. Rev. 40 (1932) 207).
 """
 
 from __future__ import annotations
