@@ -1,4 +1,4 @@
-"""Processes that a test may kill or starve, forked from one that has imported the program: 2 s of imports saved each.
+"""Processes that a test may kill or starve, forked from one that has imported the program; each saves 2 s of imports.
 
 The first process starts a server that imports :data:`PRELOADED` and renders nothing; every process is a fork of it.
 It has its own memory, files, limits and signals, as a command that a user starts.
@@ -36,7 +36,7 @@ _CONTEXT = multiprocessing.get_context("forkserver") if sys.platform != "win32" 
 
 
 class QuickProcess:
-    """A script or module with arguments in a process of its own; what it says goes to a file."""
+    """A script or module with arguments in a process of its own; its output goes to a file."""
 
     def __init__(self, *command: object, limits: Callable[[], object] | None = None) -> None:
         assert _CONTEXT is not None
@@ -60,7 +60,7 @@ class QuickProcess:
         self._said.unlink()
 
     def wait(self, timeout: float = 300) -> tuple[int, str]:
-        """The exit code, and what was said to stderr."""
+        """Wait for the end; return the exit code and the text of stderr."""
         self._process.join(timeout)
         code = self._process.exitcode
         if code is None:
