@@ -107,10 +107,10 @@ def import_(
     """
     from mitsim.capture.folder import is_written, write_capture
     from mitsim.progress import say
-    from mitsim.recordings.recognise import KINDS, Given, read_recording
+    from mitsim.recordings.recognise import KINDS, ReadOptions, read_recording
     from mitsim.recordings.recording_files import plain_name
 
-    given = Given(
+    given = ReadOptions(
         sensor=sensor,
         calibration=None if calibration is None else str(calibration),
         camera=camera,

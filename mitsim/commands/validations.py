@@ -372,9 +372,9 @@ def _imported(recording: Path, folder: Path, frame: int | None, calibration: Pat
     """Import a recording into a capture folder."""
     from mitsim.capture.folder import write_capture
     from mitsim.progress import say
-    from mitsim.recordings.recognise import Given, read_recording
+    from mitsim.recordings.recognise import ReadOptions, read_recording
 
-    given = Given(frame=frame, calibration=None if calibration is None else str(calibration))
+    given = ReadOptions(frame=frame, calibration=None if calibration is None else str(calibration))
     imported = read_recording(recording, given)
     write_capture(imported.capture, folder, overwrite=True, vendor=imported.originals)
     say(f"{recording}: {imported.kind}, imported to {folder}")

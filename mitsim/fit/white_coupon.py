@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mitsim.capture.capture import Capture
 from mitsim.fit.place import Place
 from mitsim.scene.differentiable import lambertian_coupon
-from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.scene.light_transport.projector_light import ProjectedPatterns
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
@@ -43,7 +43,7 @@ class WhiteCouponRenderer:
         self.sensor, self.samples = sensor, samples
         # white() sets the image; a placeholder here keeps the patterns from being loaded on the device all at once
         self._simulated = SimulatedSensor(replace(sensor, pattern=RandomDots(kind="random_dots", run_length_px=10.0)))
-        self._lit: dict[Pattern, LitPatterns] = {}
+        self._lit: dict[Pattern, ProjectedPatterns] = {}
 
     def corner_loss(self, camera: str) -> NDArray[np.float32] | None:
         """Return the relative illumination of a camera's lens (H, W) [1], None if it is uniform."""
@@ -60,7 +60,7 @@ class WhiteCouponRenderer:
         )
         return np.asarray(radiance[0], np.float64) * self.sensor.electrons()
 
-    def _one(self, pattern: Pattern) -> LitPatterns:
+    def _one(self, pattern: Pattern) -> ProjectedPatterns:
         projector = self.sensor.projector
         frames = self.sensor.patterns()
         sent = projector.emit(frames[:1]) if pattern == "first" else _mean_sent(frames, projector)
@@ -68,7 +68,7 @@ class WhiteCouponRenderer:
             sent = np.full_like(sent, sent.mean())
         values = (sent - projector.black_level) / (1.0 - projector.black_level)
         values = np.clip(values, 0.0, 1.0) ** (1.0 / projector.gamma)
-        return LitPatterns(values.astype(np.float32), projector)
+        return ProjectedPatterns(values.astype(np.float32), projector)
 
 
 def _mean_sent(frames: NDArray[np.float32], projector: Projector) -> NDArray[np.float32]:

@@ -17,7 +17,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.reconstruction.cloud import Settings, capture_cloud, decoder_settings
 from mitsim.reconstruction.noise import known_noise
-from mitsim.recordings.recognise import Given, read_recording
+from mitsim.recordings.recognise import ReadOptions, read_recording
 from mitsim.sensor.matcher import MatcherSettings
 
 #: suffixes of cloud files that are found in a folder
@@ -78,7 +78,7 @@ def read_cloud(path: Path, sensor: str | None = None) -> InputCloud:
     if (path / "capture.json").exists():
         capture = read_capture(path)
     elif path.exists():
-        capture = read_recording(path, Given()).capture
+        capture = read_recording(path, ReadOptions()).capture
     else:
         raise InputError(
             path, "", "no such file or folder", "a cloud (.ply, .pcd), a capture folder, or folders of these"

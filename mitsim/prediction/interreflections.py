@@ -39,7 +39,7 @@ from mitsim.prediction.multipath_phase_bias import amplitude, finest_fringe, fri
 from mitsim.prediction.multipath_range_bias import path_amplitudes, path_bias, range_bias
 from mitsim.prediction.perturbation import Perturbation, SceneView
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import LitPatterns, ModulatedLight
+from mitsim.scene.light_transport.projector_light import ModulatedLight, ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace_poses
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
@@ -260,13 +260,13 @@ def _key(pose: Transform) -> bytes:
     return pose.matrix().tobytes()
 
 
-def _light(sensor: Sensor) -> LitPatterns | ModulatedLight:
+def _light(sensor: Sensor) -> ProjectedPatterns | ModulatedLight:
     """Return white light and the patterns from which a phase or a path is measured."""
     if isinstance(sensor.pattern, AmplitudeModulation):
         return ModulatedLight(sensor.projector, *sensor.pattern.images())
     optics = sensor.projector.optics
     white = np.ones((1, optics.height, optics.width), np.float32)
-    return LitPatterns(np.concatenate([white, fringes(sensor)]), sensor.projector)
+    return ProjectedPatterns(np.concatenate([white, fringes(sensor)]), sensor.projector)
 
 
 def _unbiased(nothing: Perturbation) -> tuple[Floats, Floats, Floats]:

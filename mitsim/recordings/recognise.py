@@ -38,7 +38,7 @@ FOR_ALL = ("range_mm", "exposure_s", "pose", "sample", "projector")
 
 
 @dataclass(frozen=True)
-class Given:
+class ReadOptions:
     """Options for reading a recording; None if not given.
 
     - ``sensor``: a preset or sensor file.
@@ -97,17 +97,17 @@ class Kind:
     """One kind of recording: its ``name`` in words, its function ``read``, and the ``options`` that it uses."""
 
     name: str
-    read: Callable[[Path, Given], tuple[Capture, dict[str, bytes]]]
+    read: Callable[[Path, ReadOptions], tuple[Capture, dict[str, bytes]]]
     options: frozenset[str]
 
 
-def _read_ensenso(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
-    frame = frame_of(given.frame, path, image_sets(path))
+def _read_ensenso(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    frame = frame_of(options.frame, path, image_sets(path))
     return read_ensenso(path, frame=frame), ensenso_originals(path, frame)
 
 
-def _read_images(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
-    if given.sensor is None:
+def _read_images(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    if options.sensor is None:
         raise InputError(
             path,
             "",
@@ -115,65 +115,74 @@ def _read_images(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
             "the rig that took them: --sensor my.toml",
             "for a plain stereo pair --calibration suffices",
         )
-    rig = load_recorded_rig(given.sensor, size_of_images(path))
-    if given.images:
-        rig = replace(rig, images={**(rig.images or {}), **given.images})
-    capture = read_image_folder(path, rig, channel_of(given.channel))
+    rig = load_recorded_rig(options.sensor, size_of_images(path))
+    if options.images:
+        rig = replace(rig, images={**(rig.images or {}), **options.images})
+    capture = read_image_folder(path, rig, channel_of(options.channel))
     warnings = [*rig.notes, *capture_warnings(capture, rig.settings)]
     return replace(capture, settings=capture.settings | ({"warnings": warnings} if warnings else {})), {}
 
 
-def _read_pair(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
-    source = _cameras(path, given, "a stereo pair")
+def _read_pair(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    source = _cameras(path, options, "a stereo pair")
     capture = read_stereo_pair(
-        path, source, frame=given.frame, sensor=given.named, images=given.images, channel=channel_of(given.channel)
+        path,
+        source,
+        frame=options.frame,
+        sensor=options.named,
+        images=options.images,
+        channel=channel_of(options.channel),
     )
     kept = [path / name for name in capture.settings["files"].values()]
     return capture, _originals([*kept, *_file_of(source)])
 
 
-def _read_depth(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
-    source = _cameras(path, given, "a depth image")
+def _read_depth(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    source = _cameras(path, options, "a depth image")
     capture = read_depth_image(
         path,
         source,
-        scale_mm=1.0 if given.scale_mm is None else given.scale_mm,
-        invalid=given.invalid or 0,
-        camera=given.camera,
-        sensor=given.named,
+        scale_mm=1.0 if options.scale_mm is None else options.scale_mm,
+        invalid=options.invalid or 0,
+        camera=options.camera,
+        sensor=options.named,
     )
     return capture, _originals([path, *_file_of(source)])
 
 
-def _read_cloud(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
-    axes = next((known for known in AXES if known == (given.axes or AXES[0])), None)
+def _read_cloud(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    axes = next((known for known in AXES if known == (options.axes or AXES[0])), None)
     if axes is None:
-        raise InputError("--axes", "", repr(given.axes), " | ".join(AXES))
-    if given.unit is not None and given.unit not in UNITS_MM:
-        raise InputError("--unit", "", repr(given.unit), " | ".join(UNITS_MM))
+        raise InputError("--axes", "", repr(options.axes), " | ".join(AXES))
+    if options.unit is not None and options.unit not in UNITS_MM:
+        raise InputError("--unit", "", repr(options.unit), " | ".join(UNITS_MM))
     capture = read_organised_cloud(
         path,
-        calibration=given.cameras,
-        unit=given.unit,
+        calibration=options.cameras,
+        unit=options.unit,
         axes=axes,
-        link=given.link,
-        camera=given.camera,
-        sensor=given.named,
+        link=options.link,
+        camera=options.camera,
+        sensor=options.named,
     )
-    beside = [*_file_of(given.cameras), *([] if given.link is None else [Path(given.link)])]
+    beside = [*_file_of(options.cameras), *([] if options.link is None else [Path(options.link)])]
     return capture, _originals([path, *beside])
 
 
-def _read_depthai(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
-    calibration = Path(given.calibration) if given.calibration else calibration_beside(path)
+def _read_depthai(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    calibration = Path(options.calibration) if options.calibration else calibration_beside(path)
     capture = read_depthai_recording(
-        path, calibration, frame=frame_of(given.frame, path), subpixel_bits=given.subpixel_bits, sensor=given.named
+        path,
+        calibration,
+        frame=frame_of(options.frame, path),
+        subpixel_bits=options.subpixel_bits,
+        sensor=options.named,
     )
     return capture, _originals([*recorded_streams(path).values(), calibration])
 
 
-def _read_robi(path: Path, given: Given) -> tuple[Capture, dict[str, bytes]]:
-    capture, files = read_robi(path, given.calibration, frame=frame_of(given.frame, path), sensor=given.named)
+def _read_robi(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    capture, files = read_robi(path, options.calibration, frame=frame_of(options.frame, path), sensor=options.named)
     return capture, _originals(files)
 
 
@@ -194,7 +203,7 @@ KINDS: dict[str, Kind] = {
 }
 
 
-def kind_of(path: str | Path, given: Given | None = None) -> str:
+def kind_of(path: str | Path, options: ReadOptions | None = None) -> str:
     """Return the kind of a recording: by its first bytes, or for a folder by the names in it and the options.
 
     Raises
@@ -202,9 +211,9 @@ def kind_of(path: str | Path, given: Given | None = None) -> str:
     InputError
         If the path does not exist, or its kind is unknown.
     """
-    path, given = Path(path), given or Given()
+    path, options = Path(path), options or ReadOptions()
     if path.is_dir():
-        return _kind_of_folder(path, given)
+        return _kind_of_folder(path, options)
     if not path.is_file():
         raise InputError(path, "", "no such file or folder", "a recording")
     with path.open("rb") as stream:
@@ -231,7 +240,7 @@ def kind_of(path: str | Path, given: Given | None = None) -> str:
     )
 
 
-def read_recording(path: str | Path, given: Given, kind: str | None = None) -> Imported:
+def read_recording(path: str | Path, options: ReadOptions, kind: str | None = None) -> Imported:
     """Read a recording of any kind.
 
     Raises
@@ -242,17 +251,17 @@ def read_recording(path: str | Path, given: Given, kind: str | None = None) -> I
     path = Path(path)
     if kind is not None and kind not in KINDS:
         raise InputError("--as", "", repr(kind), ", ".join(KINDS), nearest(kind, list(KINDS)))
-    kind = kind or kind_of(path, given)
-    for name in Given.__dataclass_fields__:
-        if getattr(given, name) is not None and name not in FOR_ALL and name not in KINDS[kind].options:
+    kind = kind or kind_of(path, options)
+    for name in ReadOptions.__dataclass_fields__:
+        if getattr(options, name) is not None and name not in FOR_ALL and name not in KINDS[kind].options:
             used = ", ".join(_option(each) for each in (*sorted(KINDS[kind].options), *FOR_ALL))
             raise InputError(path, "", f"{_option(name)} for {KINDS[kind].name}", used)
-    settings_given = _settings_given(given)
-    capture, originals = KINDS[kind].read(path, given)
-    for name in (given.images or {}) if kind in ("images", "stereo-pair") else ():
+    settings_given = _settings_given(options)
+    capture, originals = KINDS[kind].read(path, options)
+    for name in (options.images or {}) if kind in ("images", "stereo-pair") else ():
         if name not in capture.rig.cameras:
             raise InputError("--images", "", repr(name), ", ".join(capture.rig.cameras))
-    pose, covariance = (None, None) if given.pose is None else read_pose(given.pose)
+    pose, covariance = (None, None) if options.pose is None else read_pose(options.pose)
     capture = replace(
         capture,
         settings=capture.settings | settings_given,
@@ -266,28 +275,28 @@ def _option(name: str) -> str:
     return "--" + name.removesuffix("_mm").removesuffix("_s").replace("_", "-")
 
 
-def _settings_given(given: Given) -> dict[str, Any]:
+def _settings_given(options: ReadOptions) -> dict[str, Any]:
     """Return the settings from options that apply to every kind."""
     settings_given: dict[str, Any] = {}
-    if given.range_mm is not None:
-        near, far = given.range_mm
+    if options.range_mm is not None:
+        near, far = options.range_mm
         if not 0 < near < far <= 1e6:
             raise InputError("--range", "", f"{near:g} {far:g}", "near before far, over 0, in mm")
         settings_given |= {"near_mm": near, "far_mm": far, "range_mm": [near, far]}
-    if given.exposure_s is not None:
-        if not 0 < given.exposure_s <= 1e3:
-            raise InputError("--exposure", "", f"{given.exposure_s:g}", "seconds, over 0 to 1000")
-        settings_given["exposure_s"] = given.exposure_s
-    if given.sample is not None:
-        settings_given["coupon"] = {"sample": given.sample}
-    if given.projector is not None:
-        if given.projector not in ("on", "off"):
-            raise InputError("--projector", "", repr(given.projector), "on | off")
-        settings_given["projector_on"] = given.projector == "on"
+    if options.exposure_s is not None:
+        if not 0 < options.exposure_s <= 1e3:
+            raise InputError("--exposure", "", f"{options.exposure_s:g}", "seconds, over 0 to 1000")
+        settings_given["exposure_s"] = options.exposure_s
+    if options.sample is not None:
+        settings_given["coupon"] = {"sample": options.sample}
+    if options.projector is not None:
+        if options.projector not in ("on", "off"):
+            raise InputError("--projector", "", repr(options.projector), "on | off")
+        settings_given["projector_on"] = options.projector == "on"
     return settings_given
 
 
-def _kind_of_folder(path: Path, given: Given) -> str:
+def _kind_of_folder(path: Path, options: ReadOptions) -> str:
     if is_robi(path):
         return "robi"
     names = [file.relative_to(path).as_posix().lower() for file in _down_to(path, 3) if file.is_file()]
@@ -298,10 +307,10 @@ def _kind_of_folder(path: Path, given: Given) -> str:
     top = [name for name in names if "/" not in name]
     if any(name.endswith((".mcap", ".mp4", ".h264", ".h265")) for name in top):
         return "depthai"
-    if given.calibration is not None:
+    if options.calibration is not None:
         return "stereo-pair"
-    if given.sensor is not None:
-        return "images" if rig_named(given.sensor)[1] == "structured_light" else "stereo-pair"
+    if options.sensor is not None:
+        return "images" if rig_named(options.sensor)[1] == "structured_light" else "stereo-pair"
     if any(name == "capture.json" for name in top):
         raise InputError(path, "", "a capture folder", "a recording of another program", "it needs no import")
     alone = next((file.name for file in _down_to(path, 1) if file.suffix.lower() in _RECORDED_ALONE), None)
@@ -319,10 +328,10 @@ def _down_to(path: Path, levels: int) -> Iterable[Path]:
         yield from sorted(path.glob("/".join(["*"] * (level + 1))))
 
 
-def _cameras(path: Path, given: Given, what: str) -> str:
-    if given.cameras is None:
+def _cameras(path: Path, options: ReadOptions, what: str) -> str:
+    if options.cameras is None:
         raise InputError(path, "", f"{what} alone", "the camera that took it: --calibration FILE, or --sensor")
-    return given.cameras
+    return options.cameras
 
 
 def _file_of(source: Any) -> list[Path]:

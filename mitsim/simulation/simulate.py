@@ -27,7 +27,7 @@ from mitsim.capture.capture import Capture
 from mitsim.errors import InputError
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import Light, LitPatterns, ModulatedLight
+from mitsim.scene.light_transport.projector_light import Light, ModulatedLight, ProjectedPatterns
 from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import Scene
@@ -348,4 +348,4 @@ def _light(sensor: Sensor) -> Light:
     """Return the light whose code depends on the projector coordinate, or on time for time of flight."""
     if isinstance(sensor.pattern, AmplitudeModulation):
         return ModulatedLight(sensor.projector, *sensor.pattern.images())
-    return LitPatterns(sensor.patterns(), sensor.projector)
+    return ProjectedPatterns(sensor.patterns(), sensor.projector)

@@ -18,7 +18,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.scene.light_transport.projector_light import ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import PixelRays, cast
@@ -86,7 +86,7 @@ def true_image(
     axis = eye.sensor_from_camera.rotation[:, 2]
 
     size = (1, projector.optics.height, projector.optics.width)
-    white = LitPatterns(np.ones(size, np.float32), projector)
+    white = ProjectedPatterns(np.ones(size, np.float32), projector)
 
     def light(surfaces_on_path: int) -> NDArray[np.float32]:
         lit, ambient = trace(

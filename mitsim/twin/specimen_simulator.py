@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.fit.place import Place
-from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.scene.light_transport.projector_light import ProjectedPatterns
 from mitsim.scene.load import Scene
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.image_formation import expose, fixed_pattern
@@ -140,7 +140,7 @@ class SpecimenSimulator:
             return self._device
         other = copy.copy(self._device)
         other.sensor = one
-        other.patterns = LitPatterns(one.patterns(), one.projector)
+        other.patterns = ProjectedPatterns(one.patterns(), one.projector)
         return other
 
 

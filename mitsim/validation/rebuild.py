@@ -35,7 +35,7 @@ from mitsim.fit.electrons import chip_of, linearised
 from mitsim.fit.place import Place
 from mitsim.fit.specimen import MARGIN_PX, image_mask
 from mitsim.reconstruction.cloud import capture_pattern
-from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.scene.light_transport.projector_light import ProjectedPatterns
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import RandomDots
@@ -96,7 +96,7 @@ def rebuild(
     simulated = SimulatedSensor(own)
     if not projector_on:
         size = own.projector.optics.height, own.projector.optics.width
-        simulated.patterns = LitPatterns(np.ones((1, *size), np.float32), own.projector)
+        simulated.patterns = ProjectedPatterns(np.ones((1, *size), np.float32), own.projector)
     pose, around = place.world_from_sensor, place.corners()
     noise = Noise() if projector_on else Noise.without("speckle")  # room light has no speckle
 

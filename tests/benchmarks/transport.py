@@ -20,7 +20,7 @@ import numpy as np
 
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.scene.light_transport.projector_light import ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
@@ -41,7 +41,7 @@ def main() -> None:
     rng = np.random.default_rng(1)
     optics = sensor.projector.optics
     stack = rng.random((48, optics.height, optics.width), dtype=np.float32)
-    lit = {count: LitPatterns(stack[:count], sensor.projector) for count in (1, 24, 48)}
+    lit = {count: ProjectedPatterns(stack[:count], sensor.projector) for count in (1, 24, 48)}
     jobs = {"bare primary and shadow rays": lambda pose, seed: bare_rays(scene, rays, lit[1], pose, seed)}
     for depth in (1, 3):
         for count in (1, 24, 48):

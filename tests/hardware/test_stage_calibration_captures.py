@@ -11,7 +11,7 @@ from characterisation.stage.calibration import axis_deviations, calibrate_with_b
 from characterisation.stage.turning_axes import TurningAxes
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.scene.light_transport.projector_light import ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
@@ -38,7 +38,7 @@ def test_the_axes_come_back_from_rendered_captures_of_a_board(n10):
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250)
     board = cv2.aruco.CharucoBoard((COLUMNS, ROWS), SQUARE, MARKER, dictionary)
     detector, scene = cv2.aruco.CharucoDetector(board), board_scene(board)
-    white = LitPatterns(np.ones((1, n10.projector.optics.height, n10.projector.optics.width)), n10.projector)
+    white = ProjectedPatterns(np.ones((1, n10.projector.optics.height, n10.projector.optics.width)), n10.projector)
     rays = CameraRays(camera, 2.09, 600.0)
 
     zero = np.eye(4)

@@ -446,9 +446,9 @@ def _recording(name):
 
 
 def _read_recording(path):
-    from mitsim.recordings.recognise import Given, read_recording
+    from mitsim.recordings.recognise import ReadOptions, read_recording
 
-    read_recording(path.parent if path.suffix == ".json" else path, Given())
+    read_recording(path.parent if path.suffix == ".json" else path, ReadOptions())
 
 
 READERS: dict[str, Reader] = {

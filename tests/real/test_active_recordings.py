@@ -15,7 +15,7 @@ from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
 from mitsim.reconstruction.depth_range import surface_beyond
 from mitsim.recordings.ensenso import read_ensenso
-from mitsim.recordings.recognise import Given, read_recording
+from mitsim.recordings.recognise import ReadOptions, read_recording
 from mitsim.recordings.stereo_pair import read_stereo_pair
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
@@ -345,7 +345,7 @@ def test_a_wall_beyond_the_range_is_told(real_data):
     if not folder.exists():
         pytest.skip("no recording of the wall")
     calibration = str(folder / "calib_sensor_07_051923.json")
-    capture = read_recording(folder, Given(calibration=calibration, frame=0, range_mm=(700.0, 1200.0))).capture
+    capture = read_recording(folder, ReadOptions(calibration=calibration, frame=0, range_mm=(700.0, 1200.0))).capture
     settings, _ = decoder_settings(capture)
     found = surface_beyond(capture, capture_cloud(capture, settings), settings)
     assert found is not None and found.share > 0.3

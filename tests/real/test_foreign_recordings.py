@@ -18,7 +18,7 @@ from mitsim.capture_checks.sanity import cloud_warnings, pair_row_error
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.stereo import decode_stereo
 from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
-from mitsim.recordings.recognise import Given, read_recording
+from mitsim.recordings.recognise import ReadOptions, read_recording
 from mitsim.sensor.roi import Roi
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recordings"))
@@ -35,7 +35,7 @@ def imported(path: Path, folder: Path, **given):
     """Capture of a recording, by way of its folder, and its cloud."""
     if not path.exists():
         pytest.skip(f"no recording {path.name}")
-    found = read_recording(path, Given(**given))
+    found = read_recording(path, ReadOptions(**given))
     capture = read_capture(write_capture(found.capture, folder / "capture", vendor=found.originals))
     return capture, capture_cloud(capture, decoder_settings(capture)[0])
 
@@ -161,7 +161,7 @@ def test_an_imported_ensenso_is_the_recording(real_data, tmp_path):
     path = real_data / "ensenso" / "colorized_point_cloud" / "stereo.zip"
     if not path.is_file():
         pytest.skip(f"no recording {path.name}")
-    found = read_recording(path, Given())
+    found = read_recording(path, ReadOptions())
     capture = read_capture(write_capture(found.capture, tmp_path / "capture", vendor=found.originals))
     settings, _ = decoder_settings(capture)
     roi = Roi(500, 400, 60, 40)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.recordings.recognise import Given, read_recording
+from mitsim.recordings.recognise import ReadOptions, read_recording
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.roi import Roi
 from mitsim.twin.response import first_knee
@@ -26,7 +26,7 @@ def held_against(real_data, tmp_path, recording, sensor, window, projector=None)
     path = real_data / recording
     if not path.exists():
         pytest.skip(f"no recording {recording}")
-    write_capture(read_recording(str(path), Given(sensor=None)).capture, tmp_path / "real")
+    write_capture(read_recording(str(path), ReadOptions(sensor=None)).capture, tmp_path / "real")
     found = validate_captures(tmp_path / "real", None, tmp_path / "out", sensor, window and Roi(*window), projector, 1)
     return {row.quantity: row for row in found.comparison.rows}
 
@@ -66,7 +66,7 @@ def test_the_knee_of_a_recorded_n10_is_where_its_histograms_double(real_data):
     path = real_data / "ensenso/locate_multiple_patterns/camera.zip"
     if not path.exists():
         pytest.skip("no recording ensenso/locate_multiple_patterns/camera.zip")
-    capture = read_recording(str(path), Given(sensor=None)).capture
+    capture = read_recording(str(path), ReadOptions(sensor=None)).capture
     imager = load_sensor("ensenso-n10").imager
     for stack in capture.images.values():
         image = stack[0]
@@ -100,7 +100,7 @@ def test_a_recorded_gray_code_against_its_twin(real_data, tmp_path):
     for file in (rig, recording / "calibration.json"):
         shutil.copy(file, tmp_path)
     sensor = str(tmp_path / rig.name)
-    write_capture(read_recording(str(recording / "capture_0"), Given(sensor=sensor)).capture, tmp_path / "real")
+    write_capture(read_recording(str(recording / "capture_0"), ReadOptions(sensor=sensor)).capture, tmp_path / "real")
     found = validate_captures(tmp_path / "real", None, tmp_path / "out", sensor, Roi(320, 280, 560, 400), None, 1)
     rows = {row.quantity: row for row in found.comparison.rows}
     assert rows["distance"].real == pytest.approx(

@@ -532,8 +532,8 @@ def test_without_the_extra_other_recordings_load_and_these_say_what_to_install(r
         "import sys; sys.modules.update(dict.fromkeys(('mcap', 'mcap_protobuf', 'lz4', 'zstandard', 'google')))\n"
         "import mitsim.commands.import_recording, mitsim.measuring.clouds\n"
         "from mitsim.errors import MissingEnvironmentError\n"
-        "from mitsim.recordings.recognise import Given, read_recording\n"
-        "try: read_recording(sys.argv[1], Given(frame=0))\n"
+        "from mitsim.recordings.recognise import ReadOptions, read_recording\n"
+        "try: read_recording(sys.argv[1], ReadOptions(frame=0))\n"
         "except MissingEnvironmentError as error: print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", code, recorded[0]], capture_output=True, text=True, check=False)

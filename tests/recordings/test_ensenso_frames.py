@@ -25,7 +25,7 @@ from mitsim.cli import app
 from mitsim.decode.device_maps import camera_map_geometry, decode_depth_map
 from mitsim.recordings.calibration_file import read_calibration
 from mitsim.recordings.ensenso import read_ensenso
-from mitsim.recordings.recognise import Given, read_recording
+from mitsim.recordings.recognise import ReadOptions, read_recording
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, F, CX, CY = 80, 60, 66.0, 37.0, 31.0
@@ -87,7 +87,7 @@ def test_a_cloud_of_nxlib_comes_to_the_frame_of_the_raw_left_camera(tmp_path, sc
         points = RECTIFIED_FROM_WORKSPACE.inverse().points(points)
     path = tmp_path / "cloud.pcd"
     path.write_bytes(pcd(points.astype(np.float32), "binary"))
-    found = read_recording(path, Given(link=str(calib) if linked else None, calibration=given, unit="mm")).capture
+    found = read_recording(path, ReadOptions(link=str(calib) if linked else None, calibration=given, unit="mm")).capture
     assert off_plane(found.derived["points"]) < 2e-3  # single precision of 700 mm, moved twice
     assert off_plane(rectified_map()) > 10  # as it was imported before
     assert ("sensor_from_workspace" in found.settings) == linked
@@ -109,7 +109,7 @@ def test_a_calibration_of_another_unit_is_refused(tmp_path):
     path = tmp_path / "cloud.pcd"
     path.write_bytes(pcd(rectified_map().astype(np.float32), "binary"))
     with pytest.raises(InputError, match=r"px from the view rays of their pixels"):
-        read_recording(path, Given(calibration=str(calib), unit="mm"))
+        read_recording(path, ReadOptions(calibration=str(calib), unit="mm"))
 
 
 def test_a_recording_keeps_the_way_from_its_workspace(tmp_path):

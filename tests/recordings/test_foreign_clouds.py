@@ -27,7 +27,7 @@ from mitsim.reconstruction.cloud import capture_cloud, capture_geometry, decoder
 from mitsim.recordings.depth_image import read_depth_image
 from mitsim.recordings.organised_cloud import read_organised_cloud
 from mitsim.recordings.pinhole_fit import fit_pinhole
-from mitsim.recordings.recognise import Given, read_recording
+from mitsim.recordings.recognise import ReadOptions, read_recording
 from mitsim.recordings.stereo_pair import read_stereo_pair
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.preset import Sensor
@@ -184,7 +184,9 @@ def test_a_damaged_file_ends_in_words_or_in_a_capture_that_can_be_kept(name, dat
     with tempfile.TemporaryDirectory() as place:
         path = save(Path(place) / name, bytes(content))
         try:
-            found = read_recording(path, Given(calibration=str(pinhole(Path(place))) if name == "d.png" else None))
+            found = read_recording(
+                path, ReadOptions(calibration=str(pinhole(Path(place))) if name == "d.png" else None)
+            )
         except InputError:
             return
         capture = read_capture(write_capture(found.capture, Path(place) / "c", vendor=found.originals))

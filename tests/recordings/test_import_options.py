@@ -15,7 +15,7 @@ from mitsim.capture.folder import read_capture
 from mitsim.cli import app
 from mitsim.errors import InputError
 from mitsim.recordings.pose_file import read_pose
-from mitsim.recordings.recognise import Given, read_recording
+from mitsim.recordings.recognise import ReadOptions, read_recording
 from mitsim.recordings.recording_files import frame_of
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.light_code import GrayCode
@@ -214,7 +214,7 @@ exposure_s = 0.04
     beamer = Camera(np.array([[70.0, 0, 31.5], [0, 70, 23.5], [0, 0, 1]]), np.zeros(5), 64, 48)
     for name, eye in (("a", LEFT), ("b", RIGHT)):
         save_images(tmp_path / "images", images_seen(GrayCode(), eye, beamer, surface_seen(eye)), f"{name}{{:02d}}.png")
-    given = Given(sensor=str(tmp_path / "rig.toml"), images={"left": "a*.png", "right": "b*.png"})
+    given = ReadOptions(sensor=str(tmp_path / "rig.toml"), images={"left": "a*.png", "right": "b*.png"})
     capture = read_recording(tmp_path / "images", given).capture
     assert set(capture.images) == {"left", "right"}
     assert capture.settings["exposure_s"] == 0.04

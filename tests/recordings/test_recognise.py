@@ -26,7 +26,7 @@ from mitsim.capture.calibration import calibration_table
 from mitsim.capture.folder import read_capture
 from mitsim.cli import app
 from mitsim.recordings.calibration_file import read_calibration
-from mitsim.recordings.recognise import KINDS, Given, kind_of, read_recording
+from mitsim.recordings.recognise import KINDS, ReadOptions, kind_of, read_recording
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.preset import load_sensor
 
@@ -94,8 +94,8 @@ def test_folders_are_told_by_the_names_in_them(tmp_path):
     assert kind_of(tmp_path / "d") == "depthai"
     (tmp_path / "i").mkdir()
     save(tmp_path / "i" / "left.png", b"")
-    assert kind_of(tmp_path / "i", Given(calibration="c.yml")) == "stereo-pair"
-    assert kind_of(tmp_path / "i", Given(sensor="ensenso-n10")) == "stereo-pair"
+    assert kind_of(tmp_path / "i", ReadOptions(calibration="c.yml")) == "stereo-pair"
+    assert kind_of(tmp_path / "i", ReadOptions(sensor="ensenso-n10")) == "stereo-pair"
     with pytest.raises(InputError, match=r"left\.png.*with --sensor or --calibration"):
         kind_of(tmp_path / "i")
     with pytest.raises(InputError, match="no such file or folder"):
@@ -107,12 +107,12 @@ def test_folders_are_told_by_the_names_in_them(tmp_path):
 def test_what_a_kind_does_not_heed_is_refused(tmp_path):
     path = save(tmp_path / "a.pcd", pcd(CLOUD, "binary"))
     with pytest.raises(InputError, match="--scale for a PCD cloud; allowed: --axes, --calibration"):
-        read_recording(path, Given(scale_mm=2.0))
+        read_recording(path, ReadOptions(scale_mm=2.0))
     with pytest.raises(InputError, match="did you mean 'ply'"):
-        read_recording(path, Given(), "pyl")
+        read_recording(path, ReadOptions(), "pyl")
     for wrong, told in (({"axes": "z-up"}, "--axes"), ({"unit": "inch"}, "--unit"), ({"range_mm": (5, 4)}, "--range")):
         with pytest.raises(InputError, match=told):
-            read_recording(path, Given(**wrong))
+            read_recording(path, ReadOptions(**wrong))
 
 
 CALIBRATIONS = {

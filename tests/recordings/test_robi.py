@@ -15,7 +15,7 @@ from mitsim.capture.folder import read_capture
 from mitsim.cli import app
 from mitsim.errors import InputError
 from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
-from mitsim.recordings.recognise import Given, kind_of, read_recording
+from mitsim.recordings.recognise import ReadOptions, kind_of, read_recording
 from mitsim.recordings.robi import read_robi
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.camera import Rig
@@ -97,7 +97,7 @@ def test_disparities_are_those_of_the_toolkits_own_formula(tmp_path):
 
 def test_a_view_is_recognised_and_decodes_to_the_depth_beside_it(scene):
     assert kind_of(scene) == "robi"
-    imported = read_recording(scene, Given(frame=0))
+    imported = read_recording(scene, ReadOptions(frame=0))
     capture = imported.capture
     assert {"LEFT_view_0.bmp", f"{scene.name}_LEFT.yml", "DEPTH_view_0.json"} <= set(imported.originals)
     assert capture.settings["near_mm"] == pytest.approx(0.85 * DISTANCE, rel=1e-3)

@@ -10,7 +10,7 @@ import pytest
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.light_tracing import Photons, add_photons
-from mitsim.scene.light_transport.projector_light import LitPatterns, ModulatedLight
+from mitsim.scene.light_transport.projector_light import ModulatedLight, ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
@@ -63,7 +63,7 @@ def sharp_eyes():
     dots = np.kron(rng.integers(0, 2, (1, 7, 10)), np.ones((1, 20, 20)))
     ramp = np.broadcast_to(np.arange(200) / 200.0, (1, 140, 200))
     projector = Projector(optics, flux=1.0, black_level=0.1)
-    return CameraRays(pinhole(96, 64, 170.0)), LitPatterns(np.concatenate([dots, ramp]), projector)
+    return CameraRays(pinhole(96, 64, 170.0)), ProjectedPatterns(np.concatenate([dots, ramp]), projector)
 
 
 def real_eyes():
@@ -143,7 +143,7 @@ def test_photons_are_the_same_whatever_is_looked_at(corner):
 def test_photons_calm_interreflections_on_metal(n10, scenes):
     """The two-pillar part, root mean square: one photon a pixel brings it down to 0.47 of what four paths leave."""
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
-    rays, light = CameraRays(n10.rig.reference), LitPatterns(n10.patterns(), n10.projector)
+    rays, light = CameraRays(n10.rig.reference), ProjectedPatterns(n10.patterns(), n10.projector)
     pose = look_at([0, -400, 300], [0, 0, 30], [0, 0, 1])
 
     def noise(photons):

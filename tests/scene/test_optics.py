@@ -12,7 +12,7 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport import transport
 from mitsim.scene.light_transport.aperture_samples import aperture_samples
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import LIGHT_MM_S, LitPatterns, ModulatedLight, ProjectorLight
+from mitsim.scene.light_transport.projector_light import LIGHT_MM_S, ModulatedLight, ProjectedPatterns, ProjectorLight
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
@@ -71,7 +71,7 @@ def test_the_camera_sees_as_opencv_does(kind):
     camera = replace(pinhole(160, 120, 180.0), distortion=np.array(coefficients), model=model)
     optics = pinhole(800, 600, 500.0, Transform.from_degrees([0, -4, 0], [60, 5, -3]))
     columns, rows = np.meshgrid(np.arange(800) / 800.0, np.arange(600) / 600.0)
-    ramps = LitPatterns(np.stack([columns, rows, np.ones_like(rows)]), Projector(optics, 1.0))
+    ramps = ProjectedPatterns(np.stack([columns, rows, np.ones_like(rows)]), Projector(optics, 1.0))
     pose = look_at([100, -80, 500], [0, 0, 0], [0, 1, 0])
     u, v, white = trace(plate(), CameraRays(camera), ramps, pose, LightPaths(samples=64, seed=1))
     rays = camera.rays(camera.pixel_grid())
@@ -93,7 +93,7 @@ def test_beyond_its_image_a_projector_sends_nothing():
     image = trace(
         plate(),
         CameraRays(camera),
-        LitPatterns(np.ones((1, 200, 300)), Projector(optics, 1.0)),
+        ProjectedPatterns(np.ones((1, 200, 300)), Projector(optics, 1.0)),
         facing(300.0),
         LightPaths(samples=1, seed=1),
     )[0]
@@ -154,7 +154,7 @@ def test_camera_defocus_is_that_of_a_thin_lens():
         trace(
             plate(),
             CameraRays(camera, aperture, focus),
-            LitPatterns(pattern, Projector(optics, 1.0)),
+            ProjectedPatterns(pattern, Projector(optics, 1.0)),
             facing(distance),
             LightPaths(samples=1024, seed=1),
         )[0, 15]
@@ -184,7 +184,9 @@ def test_camera_defocus_equals_stock_thinlens():
     rays = CameraRays(camera, diameter, focus)
     ours = np.stack(
         [
-            trace(scene, rays, LitPatterns(pattern, projector), pose, LightPaths(samples=64, seed=s, jitter=True))[0]
+            trace(
+                scene, rays, ProjectedPatterns(pattern, projector), pose, LightPaths(samples=64, seed=s, jitter=True)
+            )[0]
             for s in range(8)
         ]
     )
@@ -239,8 +241,8 @@ def test_projector_defocus_grows_with_the_distance_from_its_focus():
     camera = pinhole(401, 21, 1200.0)
     edge = np.zeros((1, 300, 400), np.float32)
     edge[:, :, 200:] = 1.0
-    pattern = LitPatterns(edge, Projector(optics, 1.0, aperture_mm=aperture, focus_mm=focus))
-    point = LitPatterns(edge, Projector(optics, 1.0))
+    pattern = ProjectedPatterns(edge, Projector(optics, 1.0, aperture_mm=aperture, focus_mm=focus))
+    point = ProjectedPatterns(edge, Projector(optics, 1.0))
 
     def spread(lit, distance):
         profile = np.diff(
@@ -273,7 +275,7 @@ def test_an_aperture_makes_a_penumbra():
     scene = scene_from_dict({"floor": floor, "screen": screen}, 850)
     optics = pinhole(300, 200, 150.0)
     camera = pinhole(201, 41, 500.0, Transform.from_degrees([0, 0, 0], [60, 0, 0]))
-    lit = LitPatterns(np.ones((1, 200, 300)), Projector(optics, 1.0, aperture_mm=20.0, focus_mm=500.0))
+    lit = ProjectedPatterns(np.ones((1, 200, 300)), Projector(optics, 1.0, aperture_mm=20.0, focus_mm=500.0))
     image = trace(scene, CameraRays(camera), lit, facing(500.0), LightPaths(samples=256, seed=1))[0, 20]
     white = trace(plate(), CameraRays(camera), lit, facing(500.0), LightPaths(samples=256, seed=1))[0, 20]
     # the screen ends at x = 0, half way down: light from the lens place x' reaches floor points x > -x'
@@ -292,7 +294,7 @@ def test_vignetting_is_the_cosine_law_where_it_is_told_so():
         trace(
             plate(),
             CameraRays(camera),
-            LitPatterns(np.ones((1, 200, 300)), Projector(optics, 1.0, corner_illumination=c)),
+            ProjectedPatterns(np.ones((1, 200, 300)), Projector(optics, 1.0, corner_illumination=c)),
             facing(500.0),
             LightPaths(samples=1, seed=1),
         )[0]
@@ -310,7 +312,7 @@ def test_a_pixel_gap_is_dark_and_keeps_the_flux():
         trace(
             plate(),
             CameraRays(camera),
-            LitPatterns(np.ones((1, 20, 30)), Projector(optics, 1.0, pixel_gap=gap)),
+            ProjectedPatterns(np.ones((1, 20, 30)), Projector(optics, 1.0, pixel_gap=gap)),
             facing(500.0),
             LightPaths(samples=4, seed=1),
         )[0]
@@ -328,7 +330,7 @@ def test_the_response_curve_is_a_power_above_the_black_level():
     images = trace(
         plate(),
         CameraRays(pinhole(12, 8, 12.0)),
-        LitPatterns(steps, projector),
+        ProjectedPatterns(steps, projector),
         facing(500.0),
         LightPaths(samples=1, seed=1),
     )
@@ -395,7 +397,7 @@ def test_speckle_reads_the_code_beside_the_point():
     """A constant shift of 1 mrad moves a ramp as 0.5 mm on a plate at 500 mm does, on the axis."""
     optics, camera = pinhole(400, 300, 300.0), pinhole(60, 40, 60.0)
     ramp = np.broadcast_to(np.arange(400) / 400.0, (1, 300, 400))
-    lit, scene = LitPatterns(ramp, Projector(optics, 1.0)), plate()
+    lit, scene = ProjectedPatterns(ramp, Projector(optics, 1.0)), plate()
     shift = np.zeros((2, 40, 60))
     shift[0] = 1e-3
     still, moved = (
@@ -405,7 +407,7 @@ def test_speckle_reads_the_code_beside_the_point():
     white = trace(
         scene,
         CameraRays(camera),
-        LitPatterns(np.ones((1, 300, 400)), Projector(optics, 1.0)),
+        ProjectedPatterns(np.ones((1, 300, 400)), Projector(optics, 1.0)),
         facing(500.0),
         LightPaths(samples=1, seed=1),
     )[0]
@@ -417,7 +419,7 @@ def test_speckle_reads_the_code_beside_the_point():
 def test_bands_and_windows_change_nothing(n10, scenes, monkeypatch, depth):
     """Every pixel has a random stream of its own, whatever else is traced with it."""
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
-    rays, patterns = CameraRays(n10.rig.cameras["left"], 2.0, 500.0), LitPatterns(n10.patterns(), n10.projector)
+    rays, patterns = CameraRays(n10.rig.cameras["left"], 2.0, 500.0), ProjectedPatterns(n10.patterns(), n10.projector)
     pose = look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
     window = Roi(300, 200, 80, 60)
 
@@ -435,7 +437,7 @@ def test_bands_and_windows_change_nothing(n10, scenes, monkeypatch, depth):
 
 def test_from_pose_to_pose_nothing_recompiles(n10, scenes):
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
-    rays, patterns = CameraRays(n10.rig.cameras["left"], 2.0, 500.0), LitPatterns(n10.patterns(), n10.projector)
+    rays, patterns = CameraRays(n10.rig.cameras["left"], 2.0, 500.0), ProjectedPatterns(n10.patterns(), n10.projector)
 
     def look(turn):
         pose = look_at([100 + turn, -350, 250], [0, 0, 30], [0, 0, 1])

@@ -14,7 +14,7 @@ from mitsim.scene.backend import mi
 from mitsim.scene.light_transport import path_loop
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.plain_scene import single_bsdf, single_plane
-from mitsim.scene.light_transport.projector_light import LitPatterns, independent
+from mitsim.scene.light_transport.projector_light import ProjectedPatterns, independent
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
@@ -37,7 +37,7 @@ def pinhole(width, height, focal, place=None):
 def light():
     optics = pinhole(200, 140, 220.0, Transform.from_degrees([0, 0, 0], [80.0, 0, 0]))
     ramps = np.stack([np.linspace(0, 1, 200)[None].repeat(140, 0), np.linspace(0, 1, 140)[:, None].repeat(200, 1)])
-    return LitPatterns(ramps, Projector(optics, 1.0, aperture_mm=6.0, focus_mm=450.0))
+    return ProjectedPatterns(ramps, Projector(optics, 1.0, aperture_mm=6.0, focus_mm=450.0))
 
 
 def metal(**more):
@@ -108,11 +108,13 @@ def test_the_steps_of_sinusoids_are_sums_of_a_few(steps):
 def test_an_image_of_many_does_not_differ_from_the_same_image_alone(axis, along_row, light):
     scene, rays = scene_from_dict(SCENES["rectangle"](), 460), CameraRays(pinhole(96, 64, 240.0))
     stack = patterns(PhaseShift(periods_px=[140, 15], steps=4, axis=axis), 200, 140)
-    lit = LitPatterns(stack, light.projector)
+    lit = ProjectedPatterns(stack, light.projector)
     assert (lit.count, lit.codes, lit.along_row) == (8, 5, along_row)
     together = trace(scene, rays, lit, POSE, LightPaths(samples=16, seed=1))
     for image, pattern in zip(together, stack, strict=True):
-        alone = trace(scene, rays, LitPatterns(pattern[None], light.projector), POSE, LightPaths(samples=16, seed=1))[0]
+        alone = trace(
+            scene, rays, ProjectedPatterns(pattern[None], light.projector), POSE, LightPaths(samples=16, seed=1)
+        )[0]
         np.testing.assert_allclose(image, alone, rtol=1e-5, atol=2e-6 * together.max())
 
 
@@ -123,7 +125,7 @@ def test_a_lookup_along_the_row_is_that_in_both_directions(light):
     speck[0, -1, -1] += 1e-3  # beside the plate
     for gap in (0.0, 0.2):
         projector = replace(light.projector, pixel_gap=gap)
-        one, two = LitPatterns(row, projector), LitPatterns(speck, projector)
+        one, two = ProjectedPatterns(row, projector), ProjectedPatterns(speck, projector)
         assert (one.along_row, two.along_row) == (True, False)
         images = [trace(scene, rays, lit, POSE, LightPaths(samples=16, seed=1)) for lit in (one, two)]
         np.testing.assert_allclose(*images, rtol=1e-5, atol=1e-6 * images[0].max())

@@ -9,7 +9,7 @@ from characterisation.features.fits import fit_sphere
 from mitsim.decode.triangulate import triangulate
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.scene.light_transport.projector_light import ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
@@ -39,7 +39,7 @@ def test_lambertian_plate_has_its_closed_form_radiance(distance):
     image = trace(
         plate(),
         CameraRays(pinhole(60, 40, 60.0)),
-        LitPatterns(np.ones((1, 200, 300)), projector),
+        ProjectedPatterns(np.ones((1, 200, 300)), projector),
         look_at([0, 0, distance], [0, 0, 0], [0, 1, 0]),
         LightPaths(samples=4, seed=1),
     )[0]
@@ -54,7 +54,7 @@ def test_flux_of_a_white_frame_is_the_flux():
     image = trace(
         plate(),
         CameraRays(camera),
-        LitPatterns(np.ones((1, 200, 300)), projector),
+        ProjectedPatterns(np.ones((1, 200, 300)), projector),
         look_at([0, 0, 500], [0, 0, 0], [0, 1, 0]),
         LightPaths(samples=64, seed=1),
     )[0]
@@ -68,7 +68,7 @@ def test_black_level_and_patterns_are_linear():
     images = trace(
         plate(),
         CameraRays(pinhole(12, 8, 12.0)),
-        LitPatterns(half, projector),
+        ProjectedPatterns(half, projector),
         look_at([0, 0, 500], [0, 0, 0], [0, 1, 0]),
         LightPaths(samples=1, seed=1),
     )
@@ -78,7 +78,7 @@ def test_black_level_and_patterns_are_linear():
 
 def test_a_window_shows_what_the_whole_image_shows_there(n10, scenes):
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
-    rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
+    rays, patterns = CameraRays(n10.rig.cameras["left"]), ProjectedPatterns(n10.patterns(), n10.projector)
     pose = look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
     whole = trace(scene, rays, patterns, pose, LightPaths(samples=256, seed=1))[0]
     window = Roi(300, 200, 120, 80)
@@ -93,7 +93,7 @@ def test_a_window_shows_what_the_whole_image_shows_there(n10, scenes):
 @pytest.mark.parametrize(("depth", "jitter"), [(1, True), (3, False)])
 def test_same_seed_same_bytes_and_other_seed_other_noise(n10, scenes, depth, jitter):
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
-    rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
+    rays, patterns = CameraRays(n10.rig.cameras["left"]), ProjectedPatterns(n10.patterns(), n10.projector)
     pose = look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
     one, again, other = (
         trace(
@@ -113,7 +113,7 @@ def test_same_seed_same_bytes_and_other_seed_other_noise(n10, scenes, depth, jit
 def test_direct_light_has_no_noise_and_a_small_quadrature_error(n10, scenes):
     """Sixteen midpoints against 1024 random places, on the N10's own pattern; the seed changes nothing."""
     scene = load_scene(scenes / "coupon/matt_white.xml", 850)
-    rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
+    rays, patterns = CameraRays(n10.rig.cameras["left"]), ProjectedPatterns(n10.patterns(), n10.projector)
     pose = look_at([100, -350, 450], [0, 0, 0], [0, 0, 1])
     window = Roi(340, 210, 60, 50)
     one, two = (trace(scene, rays, patterns, pose, LightPaths(samples=16, seed=s), roi=window)[0] for s in (1, 2))
@@ -125,7 +125,7 @@ def test_direct_light_has_no_noise_and_a_small_quadrature_error(n10, scenes):
 
 def test_indirect_light_is_all_light_less_direct_light(n10, scenes):
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
-    rays, patterns = CameraRays(n10.rig.cameras["left"]), LitPatterns(n10.patterns(), n10.projector)
+    rays, patterns = CameraRays(n10.rig.cameras["left"]), ProjectedPatterns(n10.patterns(), n10.projector)
     given = scene, rays, patterns, look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
     roi = Roi(300, 200, 120, 80)
     direct, both, later = (
@@ -151,7 +151,7 @@ def test_equal_to_stock_mitsuba(scenes, depth):
     pattern = np.kron(rng.integers(0, 2, (1, 14, 20)), np.ones((1, 10, 10)))
     pose = look_at([120, -330, 240], [0, 0, 25], [0, 0, 1])
     repeats, samples = 12, 64
-    rays, lit = CameraRays(camera), LitPatterns(pattern, projector)
+    rays, lit = CameraRays(camera), ProjectedPatterns(pattern, projector)
     ours = np.stack(
         [
             trace(scene, rays, lit, pose, LightPaths(samples=samples, seed=s, depth=depth, jitter=True))[0]
@@ -198,7 +198,7 @@ def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
     projector = Projector(optics, flux=1e-2)
     pose = look_at([60, -330, 240], [0, 20, 25], [0, 0, 1])
     repeats, samples = 12, 64
-    rays, lit = CameraRays(camera), LitPatterns(np.ones((1, 140, 200)), projector)
+    rays, lit = CameraRays(camera), ProjectedPatterns(np.ones((1, 140, 200)), projector)
     ours = np.stack(
         [
             trace(
@@ -223,7 +223,7 @@ def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
     assert len(z) > 20
     assert abs(z.mean()) < 4 * np.sqrt(1.22 / len(z))
     assert np.sqrt((z**2).mean()) < np.sqrt(1.22) * (1 + 4 / np.sqrt(2 * len(z)))
-    dark = LitPatterns(np.zeros((1, 140, 200)), projector)
+    dark = ProjectedPatterns(np.zeros((1, 140, 200)), projector)
     alone = trace(scene, rays, dark, pose, LightPaths(samples=samples, seed=3, depth=depth, with_ambient=True))
     assert np.array_equal(alone[0], alone[1])
     assert 0 < alone[1].mean() < ours[0, 0].mean()
@@ -237,7 +237,7 @@ def test_indirect_light_of_emitters_is_all_of_it_less_its_direct_light(lamp):
     """
     scene, _ = _lit_corner([lamp], {"type": "matt_white"})
     rays = CameraRays(pinhole(48, 32, 85.0))
-    dark = LitPatterns(np.zeros((1, 140, 200)), Projector(pinhole(200, 140, 220.0, BESIDE), flux=1e-2))
+    dark = ProjectedPatterns(np.zeros((1, 140, 200)), Projector(pinhole(200, 140, 220.0, BESIDE), flux=1e-2))
     pose = look_at([60, -330, 240], [0, 20, 25], [0, 0, 1])
     direct, both, later = (
         np.stack(
@@ -328,7 +328,9 @@ def test_sphere_through_an_ideal_code(n10):
     projector = Projector(optics, n10.projector.flux)  # no black level
     camera = n10.rig.cameras["left"]
     pose = look_at([40, -590, 100], [0, 0, 0], [0, 0, 1])
-    u, v, white = trace(scene, CameraRays(camera), LitPatterns(ramps, projector), pose, LightPaths(samples=64, seed=1))
+    u, v, white = trace(
+        scene, CameraRays(camera), ProjectedPatterns(ramps, projector), pose, LightPaths(samples=64, seed=1)
+    )
     facing = white > 0.5 * white.max()  # away from the limb, where a pixel averages over a steep slope
     with np.errstate(invalid="ignore", divide="ignore"):
         projector_pixels = np.stack([u / white * optics.width, v / white * optics.height], axis=-1)[facing]

@@ -19,7 +19,7 @@ from mitsim.calibration.corner_noise import corner_noise
 from mitsim.calibration.simulated import SimulatedCorners, estimate
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_paths import LightPaths
-from mitsim.scene.light_transport.projector_light import LitPatterns
+from mitsim.scene.light_transport.projector_light import ProjectedPatterns
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
@@ -63,7 +63,7 @@ def corners(n10):
     detector = cv2.aruco.CharucoDetector(board)
     scene = board_scene(board)
     optics = n10.projector.optics
-    white = LitPatterns(np.ones((1, optics.height, optics.width)), n10.projector)
+    white = ProjectedPatterns(np.ones((1, optics.height, optics.width)), n10.projector)
     rays = {name: CameraRays(camera, 2.09, 600.0) for name, camera in n10.rig.cameras.items()}
     rng = np.random.default_rng(7)
     found = {name: [] for name in rays}

@@ -4,9 +4,9 @@ Signal chain: surface point -> position in the projector's aperture, if nothing 
 plane of focus -> distortion (:mod:`mitsim.scene.ray_casting.distortion`) -> projector coordinate (u, v) and irradiance
 -> value of the code of each image.
 
-The code of patterns is a function of (u, v): :class:`LitPatterns`. The code of a time-of-flight sensor is a function of
-L, the optical length from the projector over the scene to the camera: :class:`ModulatedLight`. The same loop evaluates
-both on the same paths. The radiometry is that of :mod:`mitsim.sensor.projector`.
+The code of patterns is a function of (u, v): :class:`ProjectedPatterns`. The code of a time-of-flight sensor is a
+function of L, the optical length from the projector over the scene to the camera: :class:`ModulatedLight`. The same
+loop evaluates both on the same paths. The radiometry is that of :mod:`mitsim.sensor.projector`.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Light(Protocol):
         """Return a quantity of each image from that of each code, numbers or arrays."""
 
 
-class LitPatterns:
+class ProjectedPatterns:
     """Patterns (P, H, W) of values 0..1, relative to white, on the device.
 
     The light is interpolated between the centres of projector pixels. With a pixel gap each pixel is a square with dark

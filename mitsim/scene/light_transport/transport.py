@@ -50,7 +50,7 @@ def trace(
     scene, rays, world_from_sensor
         The scene, the camera's rays, and the pose of the sensor.
     light
-        The projector with its codes: :class:`~mitsim.scene.light_transport.projector_light.LitPatterns` or
+        The projector with its codes: :class:`~mitsim.scene.light_transport.projector_light.ProjectedPatterns` or
         :class:`~mitsim.scene.light_transport.projector_light.ModulatedLight`.
     paths
         The light paths.
