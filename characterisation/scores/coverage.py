@@ -28,9 +28,9 @@ def coverage_interval(z: Floats, confidence: float = 0.95) -> tuple[float, float
     """Return the share of |z| up to 2, and its Clopper-Pearson interval.
 
     Repeats of one view have systematic errors in common, so they count as fewer trials. The effective number is p (1 -
-    p) over the variance of p between views (Korn and Graubard, Survey Methodology 24 (1998) 193-201), at least one for
-    each view and at most all trials. Where all errors or none lie within 2 u, this variance is unknown, and each view
-    counts as one trial.
+    p) over the variance of p between views (Korn and Graubard, Survey Methodology 24 (1998) 193-201), but at least the
+    number of views and at most that of all trials. Where all errors or none lie within 2 u, this variance is unknown,
+    and each view counts as one trial.
 
     Parameters
     ----------

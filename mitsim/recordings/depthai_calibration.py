@@ -8,8 +8,8 @@ extrinsics from one socket to the next, in centimetres -> rig in the frame of th
 - The lens model is OpenCV's: 14 coefficients in its order, or for ``cameraType`` 1 the first four of its fisheye model.
 - ``specTranslation`` is the design value, ``translation`` the calibrated one, which mitsim uses. A device that converts
   disparity to depth with the design value is wrong by their ratio, 2.6 % on one unit.
-- For an image of w x h from a camera calibrated at W x H, K is multiplied by w / W, and (h - H w / W) / 2 is added to
-  cy, as DepthAI does.
+- An image of w x h may come from a camera calibrated at W x H. As in DepthAI, K is then multiplied by w / W, and
+  (h - H w / W) / 2 is added to cy.
 """
 
 from __future__ import annotations

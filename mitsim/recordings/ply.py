@@ -2,9 +2,9 @@
 
 Signal chain: header -> elements and their properties -> x, y, z of every vertex -> rows and columns, if stated.
 
-PLY has no grid of its own. A file may state one by ``obj_info num_cols`` and ``num_rows`` (the range grids of
-Stanford's scans, whose ``range_grid`` lists give the filled places), or by ``viewportx`` and ``viewporty`` of an
-element ``camera`` (PCL).
+PLY has no grid of its own. Two kinds of file state one. Range grids of Stanford's scans have ``obj_info num_cols`` and
+``num_rows``, and lists ``range_grid`` for the filled places. PCL has ``viewportx`` and ``viewporty`` of an element
+``camera``.
 """
 
 from __future__ import annotations

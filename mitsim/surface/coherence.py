@@ -1,8 +1,8 @@
 """Divide light between the specular part and the diffuse lobe of a face, at every angle and without energy loss.
 
-The coherent share of a pair of directions i and o is A = exp(-g m^2) with m = (cos i + cos o) / 2 and g the phase
-variance at normal incidence (Beckmann and Spizzichino, "The Scattering of Electromagnetic Waves from Rough Surfaces",
-1963, chapter 5). In the specular direction this is exp(-g cos^2 i). The BRDF
+The coherent share of a pair of directions i and o is A = exp(-g m^2) with m = (cos i + cos o) / 2. Here g is the phase
+variance at normal incidence. The source is Beckmann and Spizzichino, "The Scattering of Electromagnetic Waves from
+Rough Surfaces", 1963, chapter 5. In the specular direction A is exp(-g cos^2 i). The BRDF
 
     f(i, o) = A f_mirror(i, o) + (1 - A) h(m) f_lobe(i, o)
 

@@ -4,9 +4,9 @@
     [exp(-g (1 - rho(tau*))) - A] / (1 - A) = 1/e        alpha = lambda / (2 pi tau*)       at normal incidence
 
 A at normal incidence is that of Bennett and Porteus (JOSA 51, 123, 1961). At the angle of incidence theta it is that of
-Beckmann and Spizzichino ("The Scattering of Electromagnetic Waves from Rough Surfaces", 1963, chapter 5), whose phase
-variance of a pair of directions uses the mean of their cosines. It holds while facets do not shadow one another, up to
-about 75 deg. The width holds near normal incidence.
+Beckmann and Spizzichino ("The Scattering of Electromagnetic Waves from Rough Surfaces", 1963, chapter 5). Their phase
+variance of a pair of directions uses the mean of the two cosines. It holds while facets do not shadow one another, up
+to about 75 deg. The width holds near normal incidence.
 
 The incoherent far field is the Fourier transform of exp(-g (1 - rho)) - A (Beckmann-Kirchhoff), so its width follows
 from the lag tau* at which the coherence has fallen to 1/e. The median facet slope of the full transform is 0.833 alpha

@@ -50,10 +50,14 @@ class PartCasesFile(Document):
     """Cases for the validation of statements and scores; paths are relative to the file.
 
     A part NAME has its scene and its task in ``NAME/NAME.xml`` and ``NAME/task.toml``. ``candidates`` are drawn from
-    the ``views`` of the study. The truth consists of errors in random worlds: ``worlds`` for every candidate,
-    ``raced_worlds`` for the first ``raced_candidates`` of a raced case, once with finishes of a pool, once with their
-    own, and ``stated_worlds`` for the ``stated`` views
-    whose statements are judged. ``measured`` is a folder with files of an earlier run, whose measurements are reused.
+    the ``views`` of the study. The truth consists of errors in random worlds:
+
+    - ``worlds`` for every candidate,
+    - ``raced_worlds`` for the first ``raced_candidates`` of a raced case, once with finishes of a pool, once with their
+      own,
+    - ``stated_worlds`` for the ``stated`` views whose statements are judged.
+
+    ``measured`` is a folder with files of an earlier run, whose measurements are reused.
     """
 
     sealed: list[str]

@@ -1,9 +1,13 @@
 """How long a bracket takes from its STEP file to a statement, without an editor: ``python -m tests.authoring.journey``.
 
-The clock starts with ``mitsim part --edit``. On the page, in headless Chromium, a face is renamed, two faces get a
-finish of their own, and a distance, a size with two limits, a perpendicularity and an angle are measured, by the
-keyboard and the mouse as a person would; a person reads and thinks for longer, so seconds are printed by step. Then the
-study that the page wrote is run, with ``--minutes`` for its race.
+The clock starts with ``mitsim part --edit``. A headless Chromium then works on the page by keyboard and mouse, as a
+person would:
+
+- it renames a face, and gives two faces a finish of their own,
+- it defines a distance, a size with two limits, a perpendicularity and an angle.
+
+A person reads and thinks for longer, so seconds are printed by step. At the end the study that the page wrote is run,
+with ``--minutes`` for its race.
 """
 
 from __future__ import annotations

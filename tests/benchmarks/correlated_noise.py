@@ -1,12 +1,15 @@
-"""Whether predicted errors hang together as those of a decoded render do: residuals of the plate of two pillars.
+"""Compare the correlation of predicted errors with that of a decoded render: residuals of the plate of two pillars.
 
     python tests/benchmarks/correlated_noise.py [map.nc] [repeats]
 
-A view of the two-pillar part by an Ensenso N10 is rendered and decoded, and predicted from the map with independent and
-with correlated noise, each several times with fresh noise. A plane is fitted to the plate's points by least squares
-along their rays, and the residuals' standard deviation, their autocorrelation rho on the pixel grid, the length at
-which it falls under 1/e, and the noise area by sums over it are means over the repeats. The last column is how far the
-fitted plane lies from the plate at its points, root mean square: what averages out badly.
+A view of the two-pillar part by an Ensenso N10 is rendered and decoded. It is also predicted from the map, once with
+independent and once with correlated noise. Each is repeated several times with fresh noise. A plane is fitted to the
+plate's points by least squares along their rays. The columns are means over the repeats:
+
+- the standard deviation of the residuals,
+- their autocorrelation rho on the pixel grid, and the length at which it falls under 1/e,
+- the noise area, a sum over rho,
+- the distance of the fitted plane from the plate at its points, root mean square: the error that does not average out.
 """
 
 from __future__ import annotations

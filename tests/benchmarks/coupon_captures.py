@@ -2,13 +2,15 @@
 
     python tests/benchmarks/coupon_captures.py [--sensors NAME ...] [--poses N] [--samples N] [--profile FILE]
 
-Each row is one sensor that is shown the coupon of scenes/coupon (ground aluminium, Ra 0.4) at poses up to 45 deg from
-its axis, in the middle of its working range: a capture around the coupon, its cloud and its patches, as a campaign
-makes them, and besides the capture written to a folder. Two rows are a sensor of 752 x 480 pixels and 24 images, made
-of the David SLS-3, so near that the coupon fills the image or a quarter of it. The first two poses, which compile, are
-left out. Captures per second and CPU time (of all cores) are without the disk: first as a campaign takes them, where
-one is decoded and measured while the next is rendered, then one after the other, which the rest of the table is of.
-The shares are of the time with the disk. On a machine that others use too, compare CPU times.
+Each row is one sensor before the coupon of scenes/coupon (ground aluminium, Ra 0.4), at poses up to 45 deg from its
+axis, in the middle of its working range. A capture around the coupon, its cloud and its patches are made as in a
+campaign, and the capture is written to a folder. Two rows are a sensor of 752 x 480 pixels and 24 images, made from the
+David SLS-3, so near that the coupon fills the image or a quarter of it. The first two poses, which compile, are left
+out.
+
+Captures per second and CPU time (of all cores) are without the disk. The first rate is that of a campaign, where one
+capture is decoded and measured while the next is rendered. The rest of the table is of captures one after the other.
+The shares are of the time with the disk. On a machine with other users, compare CPU times.
 """
 
 from __future__ import annotations

@@ -2,15 +2,15 @@
 
     python tests/benchmarks/kills.py [kills]
 
-The campaign is of a sensor that is known (tests/campaign/known_clouds.py); a run in two is slowed down, so that it is
-killed between captures, too, and the others write nearly all the time. Each run is killed by SIGKILL: one in five at a
-random moment of its start, where it reads what is kept; the others a random number of captures later, or, once all are
-kept, at a random moment until the map is made. Only a run that was still there counts as killed. The last one is left
-to end.
+The campaign uses a known sensor (tests/campaign/known_clouds.py). Every second run is slowed down, so that some kills
+fall between captures; the others write nearly all the time. Each run is killed by SIGKILL. One in five is killed at a
+random moment of its start, while it reads what is kept. The others are killed a random number of captures later or,
+once all captures are kept, at a random moment until the map is made. Only a run that was still alive counts as killed.
+The last run is left to end.
 
-Printed: how many captures were kept at each kill, how many kills left something half-written, how many captures were
-lost or taken twice in the end, and whether map.nc and samples.nc are byte for byte those of a campaign that nobody
-disturbed.
+Printed are the number of captures kept at each kill, the number of kills that left something half-written, and the
+number of captures lost or taken twice in the end. The last line says whether map.nc and samples.nc are byte for byte
+those of a campaign without kills.
 """
 
 from __future__ import annotations

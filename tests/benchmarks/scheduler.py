@@ -1,13 +1,14 @@
-"""What a cluster of many workers asks of Dask's scheduler and of the command that hands out work: captures that sleep.
+"""Measure the load of many workers on Dask's scheduler and on the command that hands out work: captures that sleep.
 
     python tests/benchmarks/scheduler.py [--tasks N] [--workers N] [--threads N] [--seconds S] [--bytes N]
 
-A scheduler in a process of its own, workers in another (all in one event loop; with ``--threads`` fewer of them sleep
-in several threads each, which a machine of two cores bears better), and this process as the command, which hands out
-orders as campaigns do (:class:`mitsim.campaign.cluster.Cluster`) and gets as many bytes back as a campaign keeps of a
-capture. Told are captures a second, the share of the workers' time that was slept, and the processor time of scheduler
-and command for each capture: its inverse is what each can do on a core of its own, whatever else the machine does.
-Memory is that at the end.
+There are three processes: the scheduler, all workers in one event loop, and this one as the command. With
+``--threads``, fewer workers sleep in several threads each, which costs less on two cores. The command hands out orders
+as campaigns do (:class:`mitsim.campaign.cluster.Cluster`), and gets back the bytes that a campaign keeps of a capture.
+
+Printed are captures per second, the share of the workers' time that was slept, and the processor time of scheduler and
+command for each capture. The inverse of a processor time is what that process can do on a core of its own. Memory is
+that at the end.
 """
 
 from __future__ import annotations

@@ -481,8 +481,8 @@ def test_alpha_is_looked_for_where_a_lobe_can_be():
 def test_the_recorded_sheet_and_what_is_left_of_it(scenes, tmp_path):
     """The N35-604's sheet: block means within 15 % of the model, dots as sharp as the preset's, power by both alike.
 
-    Bounds are what was measured (0.47 +- 0.11 by the means, 0.62 and 0.67 by the dots, residual 12 % of the mean)
-    with room for another machine's matcher, not for another result.
+    Measured were 0.47 +- 0.11 by the means, 0.62 and 0.67 by the dots, and a residual of 12 % of the mean. The bounds
+    leave room for another machine's matcher, not for another result.
     """
     from mitsim.recordings.ensenso import read_ensenso
 
