@@ -27,12 +27,13 @@ LOST_SHARE = 0.1
 _TOGETHER = 1 << 16
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
     """Intrinsics and pose of one camera or projector.
 
     ``matrix`` is K (3, 3) [px]; ``distortion`` (n,) [1]; ``width`` x ``height`` [px]; ``sensor_from_camera`` takes
-    camera coordinates to the sensor frame [mm]; ``model`` is ``perspective`` or ``fisheye``.
+    camera coordinates to the sensor frame [mm]; ``model`` is ``perspective`` or ``fisheye``. Cameras with equal values
+    are equal, so tables of pixels can be kept by camera.
     """
 
     matrix: NDArray[np.float64]
@@ -45,6 +46,17 @@ class Camera:
     def __post_init__(self) -> None:
         if self.model not in ("perspective", "fisheye"):
             raise ValueError(f"camera model {self.model!r}: allowed are perspective, fisheye")
+
+    def _values(self) -> tuple[object, ...]:
+        place = self.sensor_from_camera
+        arrays = (self.matrix, self.distortion, place.rotation, place.translation)
+        return (self.model, self.width, self.height, *(np.asarray(each, float).tobytes() for each in arrays))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Camera) and self._values() == other._values()
+
+    def __hash__(self) -> int:
+        return hash(self._values())
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -60,8 +72,8 @@ class Camera:
             ideal = cv2.fisheye.undistortPoints(flat, self.matrix, self.distortion.reshape(-1, 1), criteria=_EXACT)
         else:
             ideal = cv2.undistortPointsIter(flat, self.matrix, self.distortion, np.eye(3), np.eye(3), _EXACT)
-        rays = np.concatenate([ideal.reshape(-1, 2), np.ones((len(flat), 1))], axis=1)
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        x, y = ideal.reshape(-1, 2).T
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1) / np.sqrt(x * x + y * y + 1)[:, None]
         return np.asarray(rays.reshape(*pixels.shape[:-1], 3))
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:

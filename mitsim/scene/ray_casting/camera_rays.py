@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -58,13 +58,10 @@ class CameraRays:
     def __init__(self, camera: Camera, aperture_mm: float = 0.0, focus_mm: float = np.inf) -> None:
         if aperture_mm < 0 or not focus_mm > 0:
             raise InputError("camera", "aperture_mm, focus_mm", (aperture_mm, focus_mm), "0 or more; over 0")
-        columns, rows = np.meshgrid(np.arange(camera.width + 1) - 0.5, np.arange(camera.height + 1) - 0.5)
-        rays = camera.rays(np.stack([columns, rows], axis=-1))
         self.camera = camera
         self.distortion = Distortion(camera)
         self.aperture_mm, self.focus_mm = float(aperture_mm), float(focus_mm)
-        self.x = mi.Float(np.ravel(rays[..., 0] / rays[..., 2]).astype(np.float32))
-        self.y = mi.Float(np.ravel(rays[..., 1] / rays[..., 2]).astype(np.float32))
+        self.x, self.y = _ideal_corners(camera)
 
     def recalibrated(self, camera: Camera) -> CameraRays:
         """Return the rays of a camera of the same size whose calibration differs a little from this one's.
@@ -103,6 +100,14 @@ class CameraRays:
         below = corner + self.camera.width + 1
         indices = [corner, corner + 1, below, below + 1]
         return [dr.gather(mi.Float, self.x, i) for i in indices], [dr.gather(mi.Float, self.y, i) for i in indices]
+
+
+@lru_cache(maxsize=4)  # to undistort all pixels of a camera takes up to 0.6 s
+def _ideal_corners(camera: Camera) -> tuple[Any, Any]:
+    """Return the ideal image coordinates x/z and y/z at the pixel corners, row by row."""
+    columns, rows = np.meshgrid(np.arange(camera.width + 1) - 0.5, np.arange(camera.height + 1) - 0.5)
+    rays = camera.rays(np.stack([columns, rows], axis=-1))
+    return tuple(mi.Float(np.ravel(rays[..., i] / rays[..., 2]).astype(np.float32)) for i in (0, 1))
 
 
 def bilinear(corners: list[Any], a: Any, b: Any) -> Any:

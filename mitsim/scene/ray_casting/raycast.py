@@ -9,6 +9,7 @@ There is one ray per pixel and no filter, because an average of labels is no lab
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,7 @@ class PixelRays:
         return PixelRays(grid.origin, grid.rays())
 
     @staticmethod
+    @lru_cache(maxsize=4)  # to undistort all pixels of a camera takes up to 0.6 s
     def of_camera(camera: Camera) -> PixelRays:
         """Return the rays of a camera's pixel centres, with its distortion."""
         rays = camera.rays(camera.pixel_grid())
