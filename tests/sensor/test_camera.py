@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
+from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform
 
 K = np.array([[626.18, 0, 372.16], [0, 626.13, 240.86], [0, 0, 1.0]])
@@ -50,6 +51,22 @@ def test_a_pinhole_is_the_textbook_one():
 def test_a_point_behind_the_camera_has_no_image():
     camera = Camera(K, ENSENSO, 752, 480)
     assert np.isnan(camera.project(np.array([[0.0, 0.0, -100.0]]))).all()
+
+
+def test_cameras_with_equal_values_are_equal_and_others_are_not():
+    """Tables of pixels are kept by camera: a change of any field must give another camera."""
+    camera, same = (load_sensor("ensenso-n10").rig.cameras["right"] for _ in range(2))
+    assert camera == same and hash(camera) == hash(same)
+    moved = Transform(camera.sensor_from_camera.rotation, camera.sensor_from_camera.translation + 1e-9)
+    others = [
+        replace(camera, matrix=camera.matrix * [[1, 1, 1 + 1e-12]] * 3),
+        replace(camera, distortion=-camera.distortion),
+        replace(camera, width=camera.width + 1),
+        replace(camera, height=camera.height + 1),
+        replace(camera, model="fisheye"),
+        replace(camera, sensor_from_camera=moved),
+    ]
+    assert len({camera, *others}) == len(others) + 1
 
 
 def test_an_unknown_model_is_refused():

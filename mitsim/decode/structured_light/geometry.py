@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,8 +115,15 @@ def structured_light_geometry(
     offset = projector.sensor_from_camera.inverse().directions(camera.centre - projector.centre)
     code_axes = axes(code)
     axis = code_axes[0] if len(code_axes) == 1 or abs(offset[0]) >= abs(offset[1]) else code_axes[1]
-    component = 0 if axis == "columns" else 1
+    return _prepared(camera_name, camera, projector, axis, near_mm, far_mm)
 
+
+@lru_cache(maxsize=1)  # 1 to 2 s for two megapixels, and one study asks several times
+def _prepared(
+    camera_name: str, camera: Camera, projector: Camera, axis: Axis, near_mm: float, far_mm: float
+) -> StructuredLightGeometry:
+    """Return the geometry of a camera and a projector for coordinates along ``axis``."""
+    component = 0 if axis == "columns" else 1
     rays = camera.rays(camera.pixel_grid())
     with np.errstate(divide="ignore", invalid="ignore"):
         local = rays / rays[..., 2:]
