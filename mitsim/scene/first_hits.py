@@ -98,13 +98,12 @@ def visible_surfaces(scene: Scene, rig: Rig, world_from_sensor: Transform) -> Vi
     """Return the surfaces that the pixels of a rig's reference camera see from one pose."""
     camera = rig.reference
     eyes = [*list(rig.cameras.values())[1:], *([rig.projector] if rig.projector else [])]
-    directions = camera.sensor_from_camera.directions(camera.rays(camera.pixel_grid()))
+    directions = camera.pixel_directions()
     shape = directions.shape[:2]
     origin = world_from_sensor.points(camera.centre)
     world = world_from_sensor.directions(directions.reshape(-1, 3))
     hits = trace(scene, np.broadcast_to(origin, world.shape), world)
-    rays = PixelRays(camera.centre, directions)  # PixelRays.of_camera would undistort all pixels again
-    seen = cast(scene, rays, world_from_sensor, np.array([eye.centre for eye in eyes])).seen
+    seen = cast(scene, PixelRays.of_camera(camera), world_from_sensor, np.array([eye.centre for eye in eyes])).seen
     normal = world_from_sensor.inverse().directions(hits.normal).reshape(*shape, 3)
     point = camera.centre + directions * hits.distance.reshape(*shape, 1)
     seen_by_all = np.asarray(hits.front.reshape(shape) & seen.all(axis=0))

@@ -10,6 +10,7 @@ of its fisheye model. Pixel centres lie at integers.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -107,6 +108,17 @@ class Camera:
         """Return the pixel centres, (height, width, 2), as (column, row)."""
         columns, rows = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float))
         return np.stack([columns, rows], axis=-1)
+
+    def pixel_directions(self) -> NDArray[np.float64]:
+        """Return the unit view direction of each pixel in the *sensor* frame, (height, width, 3), read-only."""
+        return _pixel_directions(self)
+
+
+@lru_cache(maxsize=2)  # to undistort all pixels of a camera takes up to 0.6 s
+def _pixel_directions(camera: Camera) -> NDArray[np.float64]:
+    directions = camera.sensor_from_camera.directions(camera.rays(camera.pixel_grid()))
+    directions.flags.writeable = False
+    return directions
 
 
 @dataclass(frozen=True)

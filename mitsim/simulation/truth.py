@@ -75,7 +75,7 @@ def true_image(
     """
     eye, projector = simulated.sensor.rig.cameras[camera], simulated.sensor.projector
     surfaces = cast(scene, PixelRays.of_camera(eye), world_from_sensor, projector.optics.centre[None])
-    directions = eye.sensor_from_camera.directions(eye.rays(eye.pixel_grid()))
+    directions = eye.pixel_directions()
     points = eye.centre + directions * surfaces.distance[..., None].astype(float)
     projected = np.full((*surfaces.distance.shape, 2), np.nan)
     valid = np.isfinite(surfaces.distance)

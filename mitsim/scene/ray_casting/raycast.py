@@ -71,11 +71,10 @@ class PixelRays:
         return PixelRays(grid.origin, grid.rays())
 
     @staticmethod
-    @lru_cache(maxsize=4)  # to undistort all pixels of a camera takes up to 0.6 s
+    @lru_cache(maxsize=4)
     def of_camera(camera: Camera) -> PixelRays:
         """Return the rays of a camera's pixel centres, with its distortion."""
-        rays = camera.rays(camera.pixel_grid())
-        return PixelRays(camera.centre, camera.sensor_from_camera.directions(rays))
+        return PixelRays(camera.centre, camera.pixel_directions())
 
 
 def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDArray[np.floating]) -> Surfaces:
