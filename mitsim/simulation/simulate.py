@@ -63,8 +63,8 @@ class SimulatedSensor:
     ----------
     sensor
         The sensor.
-    rays, pixel_rays
-        Of each camera: rays for light paths, and rays of the pixel centres, both with the true calibration.
+    rays
+        Of each camera: rays for light paths, with the true calibration.
     patterns
         The projector and its codes.
     units
@@ -77,11 +77,15 @@ class SimulatedSensor:
         self.sensor = sensor
         cameras = sensor.true_rig.cameras
         self.rays = {name: _camera_rays(sensor, camera) for name, camera in cameras.items()}
-        self.pixel_rays = {name: PixelRays.of_camera(camera) for name, camera in cameras.items()}
+        self._cameras = cameras
         self.patterns = _light(sensor)
         self.units = {name: UnitPatterns.of(sensor, index, name) for index, name in enumerate(cameras)}
         corner = sensor.imager.corner_illumination
         self.corner_loss = {name: camera_illumination(corner, camera) for name, camera in cameras.items()}
+
+    def pixel_rays(self, camera: str) -> PixelRays:
+        """Return the rays of a camera's pixel centres, with the calibration that this sensor was made with."""
+        return PixelRays.of_camera(self._cameras[camera])
 
     def recalibrated(self, rig: Rig, unit: int | None = None) -> SimulatedSensor:
         """Return a sensor of the same type with a calibration close to this one's.
@@ -132,7 +136,7 @@ class SimulatedSensor:
         ambient = self.sensor.ambient_image or has_emitters(scene)
         paths = LightPaths(indirect.samples, seed, depth, indirect_only=True, with_ambient=ambient)
         images = trace(scene, rays, self.patterns, world_from_sensor, paths, roi)
-        shape = shapes_met(scene, self.pixel_rays[camera], world_from_sensor)[roi.slices]
+        shape = shapes_met(scene, self.pixel_rays(camera), world_from_sensor)[roi.slices]
         return smoothed(images, shape, indirect.smoothing_px)
 
     def radiance(
@@ -195,7 +199,7 @@ class SimulatedSensor:
 
         Its gradient is along the axes of the sensor frame at the middle of the working range, the same for all cameras.
         """
-        relative = room_radiance(scene, directional_albedos(scene), self.pixel_rays[camera], world_from_sensor)[
+        relative = room_radiance(scene, directional_albedos(scene), self.pixel_rays(camera), world_from_sensor)[
             roi.slices
         ]
         eye, depth = self.sensor.rig.cameras[camera], float(np.mean(self.sensor.working_range_mm))
@@ -249,7 +253,7 @@ class SimulatedSensor:
             speckle = None
             if noise.speckle:
                 rng = np.random.default_rng(speckle_stream)
-                speckle = draw_speckle(scene, sensor, camera, self.pixel_rays[name], world_from_sensor, roi, rng)
+                speckle = draw_speckle(scene, sensor, camera, self.pixel_rays(name), world_from_sensor, roi, rng)
             light[name] = self.radiance(
                 scene,
                 world_from_sensor,

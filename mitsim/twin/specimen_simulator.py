@@ -117,7 +117,7 @@ class SpecimenSimulator:
             simulated = self._of(one)
             pose = self.place.world_from_sensor
             rng = np.random.default_rng(np.random.SeedSequence([seed, 2]))
-            speckle = draw_speckle(self._scene, one, self.camera, simulated.pixel_rays[self.name], pose, self.roi, rng)
+            speckle = draw_speckle(self._scene, one, self.camera, simulated.pixel_rays(self.name), pose, self.roi, rng)
             still = None if speckle is None else replace(speckle, gain=np.ones_like(speckle.gain))
             radiance = simulated.radiance(
                 self._scene,

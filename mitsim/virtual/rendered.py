@@ -256,7 +256,7 @@ class RenderedMeasurements:
                 )
             else:
                 images[name] = np.zeros((0, roi.height, roi.width), np.float32)
-            lit = room_radiance(scene, albedos, simulated.pixel_rays[name], pose)[roi.slices]
+            lit = room_radiance(scene, albedos, simulated.pixel_rays(name), pose)[roi.slices]
             rois[name], room[name] = roi, simulated.apply_lens(lit, name, roi)
         indirect = IndirectImages(images, rois, how, self.rendering.depth)
         return _SharedLight(view.number, finish, indirect, room)
