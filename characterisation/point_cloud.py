@@ -103,8 +103,7 @@ class ViewGrid:
             x, y = (columns - self.cx) / self.fx, (rows - self.cy) / self.fy
         else:
             x, y = np.moveaxis(self.normalised[rows, columns].astype(np.float64), -1, 0)
-        local = np.stack([x, y, np.ones(x.shape)], axis=-1)
-        local /= np.linalg.norm(local, axis=-1, keepdims=True)
+        local = np.stack([x, y, np.ones(x.shape)], axis=-1) / np.sqrt(x * x + y * y + 1)[..., None]
         return np.asarray(local @ self.rotation.T)
 
     def project(self, points: Floats) -> NDArray[np.float64]:
