@@ -80,14 +80,13 @@ def test_a_window_shows_what_the_whole_image_shows_there(n10, scenes):
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
     rays, patterns = CameraRays(n10.rig.cameras["left"]), ProjectedPatterns(n10.patterns(), n10.projector)
     pose = look_at([100, -350, 250], [0, 0, 30], [0, 0, 1])
-    whole = trace(scene, rays, patterns, pose, LightPaths(samples=256, seed=1))[0]
+    whole = trace(scene, rays, patterns, pose, LightPaths(samples=16, seed=1))[0]
     window = Roi(300, 200, 120, 80)
-    part = trace(scene, rays, patterns, pose, LightPaths(samples=256, seed=2), roi=window)[0]
+    part = trace(scene, rays, patterns, pose, LightPaths(samples=16, seed=2), roi=window)[0]
     same = whole[200:280, 300:420]
     assert part.shape == (80, 120)
-    # other random numbers, the same places: the difference is sub-pixel jitter at 256 samples
-    assert np.abs(part - same).mean() < 0.02 * same.mean()
-    assert np.corrcoef(part.ravel(), same.ravel())[0, 1] > 0.999
+    # direct light has no noise, so that another seed changes nothing
+    np.testing.assert_array_equal(part, same)
 
 
 @pytest.mark.parametrize(("depth", "jitter"), [(1, True), (3, False)])
@@ -150,7 +149,7 @@ def test_equal_to_stock_mitsuba(scenes, depth):
     rng = np.random.default_rng(5)
     pattern = np.kron(rng.integers(0, 2, (1, 14, 20)), np.ones((1, 10, 10)))
     pose = look_at([120, -330, 240], [0, 0, 25], [0, 0, 1])
-    repeats, samples = 12, 64
+    repeats, samples = 12, 36
     rays, lit = CameraRays(camera), ProjectedPatterns(pattern, projector)
     ours = np.stack(
         [
@@ -178,26 +177,26 @@ def test_equal_to_stock_mitsuba(scenes, depth):
     assert np.isclose(a.mean(), b.mean(), rtol=0.01)
 
 
+#: each is a tenth or more of the light of its corner
 LAMPS = {
     "sky": {"type": "constant", "radiance": {"type": "uniform", "value": 2e-7}},
-    "bulb": {"type": "point", "position": [150.0, -200.0, 300.0], "intensity": {"type": "uniform", "value": 0.05}},
+    "bulb": {"type": "point", "position": [150.0, -200.0, 300.0], "intensity": {"type": "uniform", "value": 0.2}},
     "panel": {
         "type": "rectangle",
         "to_world": ("panel",),
-        "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 3e-6}},
+        "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 4e-5}},
     },
 }
 
 
-# depth 3 has each lamp's direct light in it, and depth 1 how paths choose among lamps
-@pytest.mark.parametrize(("depth", "lamps"), [(3, ("sky",)), (3, ("bulb",)), (3, ("panel",)), (1, tuple(LAMPS))])
-def test_light_of_the_scene_is_that_of_stock_mitsuba(depth, lamps):
+@pytest.mark.parametrize("depth", [1, 3])
+def test_light_of_the_scene_is_that_of_stock_mitsuba(depth):
     """Sky, bulb and panel over a concave metal corner, with the projector on top; then the ambient image alone."""
-    scene, chosen = _lit_corner(lamps, {"type": "machined_metal", "Ra": 0.4})
+    scene, chosen = _lit_corner(LAMPS, {"type": "machined_metal", "Ra": 0.4})
     camera, optics = pinhole(96, 64, 170.0), pinhole(200, 140, 220.0, BESIDE)
     projector = Projector(optics, flux=1e-2)
     pose = look_at([60, -330, 240], [0, 20, 25], [0, 0, 1])
-    repeats, samples = 12, 64
+    repeats, samples = 12, 36
     rays, lit = CameraRays(camera), ProjectedPatterns(np.ones((1, 140, 200)), projector)
     ours = np.stack(
         [
