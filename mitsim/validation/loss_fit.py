@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from threadpoolctl import threadpool_limits
 
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, Status
 from mitsim.prediction import Predictor, performance
@@ -115,9 +116,10 @@ def fitted_loss(cases: Sequence[Sequence[SeenPoints]], seed: int = 0, resamples:
     views = [view for case in cases for view in case]
     if not any((view.rho > _LEAST_RHO).any() for view in views):
         raise ValueError("no points with interreflections")
-    best = _most_likely(views, np.ones(len(views)))
-    rng = np.random.default_rng(seed)
-    drawn = np.array([_most_likely(views, _drawn_again([len(case) for case in cases], rng)) for _ in range(resamples)])
+    rng, sizes = np.random.default_rng(seed), [len(case) for case in cases]
+    with threadpool_limits(1, user_api="blas"):  # threads slow down fits of two parameters
+        best = _most_likely(views, np.ones(len(views)))
+        drawn = np.array([_most_likely(views, _drawn_again(sizes, rng)) for _ in range(resamples)])
     low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
     half, steepness = (round(float(value), 3) for value in best)
     return Loss(

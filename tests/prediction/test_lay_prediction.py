@@ -139,7 +139,7 @@ def test_turning_a_face_about_its_normal_swaps_what_the_score_sees_along_and_acr
 
 def test_rendered_coupons_along_and_across_are_as_the_score_predicts_them(n10, predictor, monkeypatch, tmp_path):
     """A small campaign up to 30 deg; then rendered coupons at an angle between its directions, and at one of them."""
-    monkeypatch.setattr(one_finish, "BANDS", ((30.0, 3),))
+    monkeypatch.setattr(one_finish, "BANDS", ((30.0, 2),))
     monkeypatch.setattr(one_finish, "REFINED", None)
     finish, simulated = finish_with_lay(n10), SimulatedSensor(n10)
     one = OneFinish(finish, n10, 30.0)
