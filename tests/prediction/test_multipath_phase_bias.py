@@ -28,6 +28,11 @@ def david():
     return load_sensor("david-sls-3")
 
 
+@pytest.fixture(scope="module")
+def geometry(david):
+    return sensor_geometry(david)
+
+
 @pytest.mark.parametrize("step", [1, 3])
 def test_light_in_a_steady_ratio_turns_the_phase_by_its_argument(step):
     rng = np.random.default_rng(1)
@@ -84,8 +89,8 @@ def test_faces_do_not_mix_and_without_direct_light_there_is_no_pull():
     assert not np.any(phase_bias(0 * direct, (other, other), shape, 1))
 
 
-def test_a_phase_becomes_the_depth_at_which_the_ray_meets_that_stripe(david):
-    predictor = Predictor.of_sensor(david, sensor_geometry(david)).thinned(40)
+def test_a_phase_becomes_the_depth_at_which_the_ray_meets_that_stripe(david, geometry):
+    predictor = Predictor.of_sensor(david, geometry).thinned(40)
     fringe = finest_fringe(david)
     rng = np.random.default_rng(3)
     ray = np.column_stack([rng.uniform(-0.3, 0.3, (50, 2)), np.ones(50)])
@@ -120,7 +125,7 @@ def test_a_sensor_without_fringes_has_none():
     assert InterreflectionEffect(n10).light.count == 1
 
 
-def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david):
+def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david, geometry):
     """A plate and a wall of Ra 0.37, stripes along their edge: what is predicted, and what is decoded without noise."""
     activate()
     from mitsim.scene.backend import mi
@@ -134,7 +139,7 @@ def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david):
         },
         david.wavelength_nm,
     )
-    pose, geometry = look_at([0, -420, 200], [0, 30, 5], [0, 0, 1]), sensor_geometry(david)
+    pose = look_at([0, -420, 200], [0, 30, 5], [0, 0, 1])
     predictor = Predictor.of_sensor(david, geometry)
     surfaces = predictor.surfaces(scene, pose)
     ideal = predictor.ideal(surfaces)
@@ -142,12 +147,12 @@ def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david):
     high = world[:, 2]
     strip = (ideal.shape == 1) & (np.abs(world[:, 0]) < 4) & (high > 1) & (high < 11)
 
-    light = InterreflectionEffect(david, paths=3_000_000, photons=6_000_000).render(scene, pose).at(ideal.point)
+    light = InterreflectionEffect(david, paths=1_500_000, photons=3_000_000).render(scene, pose).at(ideal.point)
     predicted = finest_fringe(david).range_bias(light.displaced, ideal)
     around = pose.inverse().points(np.array([[x, 30, z] for x in (-5.0, 5) for z in (0.0, 12)]))
     noise = Noise(**dict.fromkeys(Noise.__dataclass_fields__, False))
     capture = SimulatedSensor(david).capture(
-        scene, pose, rendering=Rendering(samples=64, depth=2), seed=1, around=around, noise=noise
+        scene, pose, rendering=Rendering(samples=36, depth=2), seed=1, around=around, noise=noise
     )
     cloud = capture_cloud(capture, david.settings, geometry, imager=david.imager)
     decoded = ((cloud.points.reshape(-1, 3)[ideal.pixel] - ideal.point) * ideal.ray).sum(axis=1)
