@@ -92,7 +92,16 @@ def test_a_perfect_sensor_finds_the_nominal_values(parts, part, perfect_sensor):
         ),
     )
     least = dict.fromkeys(study.task.measurements, np.inf)
+    pixel = perfect_sensor.grid.angular_pitch * study.views[0].standoff
+
+    def missed():
+        rims = {name for name, one in study.task.measurements.items() if one.kind == "diameter"}
+        # a hole is known by the pixels around it
+        return {name: error for name, error in least.items() if not error < (0.2 * pixel if name in rims else 0.02)}
+
     for view in study.views:
+        if not missed():
+            break
         surfaces = perfect_sensor.surfaces(study.scene, view.world_from_sensor)
         ideal = perfect_sensor.ideal(surfaces)
         size = (perfect_sensor.grid.height, perfect_sensor.grid.width)
@@ -110,10 +119,7 @@ def test_a_perfect_sensor_finds_the_nominal_values(parts, part, perfect_sensor):
         )
         for name, one in measure(cloud, study.task, view.world_from_sensor.inverse().matrix(), 30, False).items():
             least[name] = min(least[name], abs(one.error) if one.possible else np.inf)
-    pixel = perfect_sensor.grid.angular_pitch * study.views[0].standoff
-    for name, error in least.items():
-        rim = study.task.measurements[name].kind == "diameter"  # of a hole: known by the pixels around it
-        assert error < (0.2 * pixel if rim else 0.02), name
+    assert not missed(), missed()
 
 
 @pytest.mark.parametrize("part", ["bent_sheet", "casting", "balls_on_plate"])
