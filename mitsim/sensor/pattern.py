@@ -14,6 +14,7 @@ selection is not published; one spot in each cell keeps spots apart and their de
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Annotated, Literal
 
 import numpy as np
@@ -103,12 +104,17 @@ def random_blobs(
     ``run_length_px``: mean length of a bright or dark run along a row, in projector pixels, before the blur.
     ``blur_px``: standard deviation of the lens's point spread function, in projector pixels.
     """
-    noise = np.random.default_rng(seed).standard_normal((height, width)).astype(np.float32)
-    smooth = gaussian_filter(noise, run_length_px / RUN_LENGTH_PER_SIGMA, mode="wrap")
-    binary = (smooth > np.quantile(smooth, 1.0 - bright_share)).astype(np.float32)
+    binary = _sharp_blobs(width, height, run_length_px, bright_share, seed)
     for axis in (0, 1) if blur_px > 0 else ():
         binary = correlate1d(binary, point_spread(blur_px), axis, mode="wrap")
-    return np.asarray(binary, np.float32)
+    return np.array(binary, np.float32)
+
+
+@lru_cache(maxsize=1)  # a fit of a blur asks for the same mask a hundred times
+def _sharp_blobs(width: int, height: int, run_length_px: float, bright_share: float, seed: int) -> NDArray[np.float32]:
+    noise = np.random.default_rng(seed).standard_normal((height, width)).astype(np.float32)
+    smooth = gaussian_filter(noise, run_length_px / RUN_LENGTH_PER_SIGMA, mode="wrap")
+    return np.asarray(smooth > np.quantile(smooth, 1.0 - bright_share), np.float32)
 
 
 def diffraction_spots(
