@@ -205,6 +205,16 @@ class _Tiles:
         """Median level [DN]."""
         return float(np.median(self.clean))
 
+    @cached_property
+    def rising_levels(self) -> Floats:
+        """Levels of all pixels [DN], rising."""
+        return self.clean.reshape(-1)[self.rising]
+
+    @cached_property
+    def used(self) -> NDArray[np.intp]:
+        """Indices of the pixels that are used, among all pixels of the tiles."""
+        return np.flatnonzero(self.inside)
+
     def away_from(self, level: float) -> _Tiles:
         """The tiles without pixels near a level: a curve that is flat there only is no knee."""
         far = np.abs(self.clean - level) > _NEAR_DN
@@ -231,7 +241,7 @@ class _Tiles:
         """-2 log likelihood (n,) of the tiles."""
         variance = np.maximum(numbers @ self._maps(knee, slope, numbers), 1e-3) + 1 / 12 + self.own
         each = np.log(variance) + np.minimum(self.square / variance, _LARGEST**2)
-        total = np.bincount(np.nonzero(self.inside)[0], each, minlength=len(self.clean))
+        total = np.bincount(self.used // self.inside[0].size, each, minlength=len(self.clean))
         return np.asarray(independent_share() * total, float)
 
     def uncertainty(self, knee: float, slope: float) -> float:
@@ -263,18 +273,18 @@ class _Tiles:
         """Return the factors (2, N) of a and b in every used pixel."""
         light, ratio = self.clean, np.ones(self.clean.shape)
         if slope < 1:
-            top = knee + (float(self.clean.max()) + 5 - knee) / slope
+            top = knee + (float(self.rising_levels[-1]) + 5 - knee) / slope
             every = np.linspace(0.0, top, 1500)
             mean, share = _through(every, knee, slope, self.spread(every, numbers))
             light, ratio = self._interpolated(mean, every), self._interpolated(mean, share)
         both = ratio, ratio * np.maximum(light - self.black, 0.0)
-        return np.stack([_of_neighbours(one)[self.inside] for one in both])
+        return np.stack([_of_neighbours(one).take(self.used) for one in both])
 
     def _interpolated(self, levels: Floats, values: Floats) -> Floats:
         """Return values known at rising ``levels`` in every pixel (n, 36, 36)."""
         # in the order of the pixels' levels, which finds the neighbours five times as fast
         found = np.empty(self.clean.size)
-        found[self.rising] = np.interp(self.clean.reshape(-1)[self.rising], levels, values)
+        found[self.rising] = np.interp(self.rising_levels, levels, values)
         return found.reshape(self.clean.shape)
 
     def spread(self, level: Floats, numbers: Floats) -> Floats:
