@@ -110,7 +110,7 @@ def import_(
     from mitsim.recordings.recognise import KINDS, ReadOptions, read_recording
     from mitsim.recordings.recording_files import plain_name
 
-    given = ReadOptions(
+    options = ReadOptions(
         sensor=sensor,
         calibration=None if calibration is None else str(calibration),
         camera=camera,
@@ -129,7 +129,7 @@ def import_(
         sample=sample,
         projector=projector,
     )
-    imported = read_recording(path, given, kind)
+    imported = read_recording(path, options, kind)
     capture = imported.capture
     folder = output or Path(plain_name(path.resolve().stem) + "_capture")
     say(f"{path}: {KINDS[imported.kind].name}, of {capture.sensor}, {capture.technology}, {capture.source}")

@@ -374,8 +374,8 @@ def _imported(recording: Path, folder: Path, frame: int | None, calibration: Pat
     from mitsim.progress import say
     from mitsim.recordings.recognise import ReadOptions, read_recording
 
-    given = ReadOptions(frame=frame, calibration=None if calibration is None else str(calibration))
-    imported = read_recording(recording, given)
+    options = ReadOptions(frame=frame, calibration=None if calibration is None else str(calibration))
+    imported = read_recording(recording, options)
     write_capture(imported.capture, folder, overwrite=True, vendor=imported.originals)
     say(f"{recording}: {imported.kind}, imported to {folder}")
     return folder

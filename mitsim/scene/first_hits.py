@@ -103,7 +103,8 @@ def visible_surfaces(scene: Scene, rig: Rig, world_from_sensor: Transform) -> Vi
     origin = world_from_sensor.points(camera.centre)
     world = world_from_sensor.directions(directions.reshape(-1, 3))
     hits = trace(scene, np.broadcast_to(origin, world.shape), world)
-    seen = cast(scene, PixelRays.of_camera(camera), world_from_sensor, np.array([eye.centre for eye in eyes])).seen
+    rays = PixelRays(camera.centre, directions)  # PixelRays.of_camera would undistort all pixels again
+    seen = cast(scene, rays, world_from_sensor, np.array([eye.centre for eye in eyes])).seen
     normal = world_from_sensor.inverse().directions(hits.normal).reshape(*shape, 3)
     point = camera.centre + directions * hits.distance.reshape(*shape, 1)
     seen_by_all = np.asarray(hits.front.reshape(shape) & seen.all(axis=0))

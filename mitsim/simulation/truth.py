@@ -74,8 +74,8 @@ def true_image(
     ``samples``, ``depth`` and ``seed`` apply to the share of indirect light.
     """
     eye, projector = simulated.sensor.rig.cameras[camera], simulated.sensor.projector
-    surfaces = cast(scene, PixelRays.of_camera(eye), world_from_sensor, projector.optics.centre[None])
     directions = eye.pixel_directions()
+    surfaces = cast(scene, PixelRays(eye.centre, directions), world_from_sensor, projector.optics.centre[None])
     points = eye.centre + directions * surfaces.distance[..., None].astype(float)
     projected = np.full((*surfaces.distance.shape, 2), np.nan)
     valid = np.isfinite(surfaces.distance)

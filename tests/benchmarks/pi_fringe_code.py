@@ -11,8 +11,8 @@ images are a mixture of two shown ones, and the exposure follows the brightness.
 
 A the mean of all images (the print), D_j the shown pattern, c by least squares for each image, each linear along the
 rows. The three coarsest bits are even over most of a board, so that only the exposure would tell them: they are left
-out, and the fourth may come out inverted. The order of the code, multiples of 256 px, is therefore taken from the
-nearest pose whose coarse bits are clear. The epipolar geometry of all poses corrects it (:func:`in_order`).
+out, and the fourth may come out inverted. The order of the code is a multiple of 256 px. The order nearest to that
+of poses with clear coarse bits is taken, unless the epipolar geometry of all poses requires another (:func:`in_order`).
 """
 
 from __future__ import annotations

@@ -28,11 +28,6 @@ def david():
     return load_sensor("david-sls-3")
 
 
-@pytest.fixture(scope="module")
-def geometry(david):
-    return sensor_geometry(david)
-
-
 @pytest.mark.parametrize("step", [1, 3])
 def test_light_in_a_steady_ratio_turns_the_phase_by_its_argument(step):
     rng = np.random.default_rng(1)
@@ -89,8 +84,8 @@ def test_faces_do_not_mix_and_without_direct_light_there_is_no_pull():
     assert not np.any(phase_bias(0 * direct, (other, other), shape, 1))
 
 
-def test_a_phase_becomes_the_depth_at_which_the_ray_meets_that_stripe(david, geometry):
-    predictor = Predictor.of_sensor(david, geometry).thinned(40)
+def test_a_phase_becomes_the_depth_at_which_the_ray_meets_that_stripe(david):
+    predictor = Predictor.of_sensor(david, sensor_geometry(david)).thinned(40)
     fringe = finest_fringe(david)
     rng = np.random.default_rng(3)
     ray = np.column_stack([rng.uniform(-0.3, 0.3, (50, 2)), np.ones(50)])
@@ -125,7 +120,7 @@ def test_a_sensor_without_fringes_has_none():
     assert InterreflectionEffect(n10).light.count == 1
 
 
-def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david, geometry):
+def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david):
     """A plate and a wall of Ra 0.37, stripes along their edge: what is predicted, and what is decoded without noise."""
     activate()
     from mitsim.scene.backend import mi
@@ -139,7 +134,7 @@ def test_a_corner_of_metal_is_pulled_as_the_full_render_is(david, geometry):
         },
         david.wavelength_nm,
     )
-    pose = look_at([0, -420, 200], [0, 30, 5], [0, 0, 1])
+    pose, geometry = look_at([0, -420, 200], [0, 30, 5], [0, 0, 1]), sensor_geometry(david)
     predictor = Predictor.of_sensor(david, geometry)
     surfaces = predictor.surfaces(scene, pose)
     ideal = predictor.ideal(surfaces)
