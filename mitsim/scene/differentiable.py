@@ -93,7 +93,7 @@ class SpecularLobe:
         incoherent = {"type": "blendbsdf", "weight": 0.5, "first": lobe("ggx"), "second": lobe("beckmann")}
         numbers = dict.fromkeys(NUMBERS, 0.0)
         tree = {"type": NAME, "phase_variance": 1.0, **numbers, "mirror": lobe("beckmann"), "lobe": incoherent}
-        self._bsdf = mi.load_dict(tree, optimize=False)  # equal textures must not be merged
+        self._bsdf = mi.load_dict(tree, parallel=False, optimize=False)  # equal textures must not be merged
         self._parameters = mi.traverse(self._bsdf)
 
     def reflectance(self, scatter: Scatter, directions: Directions) -> NDArray[np.float64]:

@@ -4,6 +4,9 @@ Signal chain: scene XML, checked (:mod:`mitsim.scene.xml_check`) -> Mitsuba's pa
 (:mod:`mitsim.scene.materials`) -> shapes with their names, finishes and bounds.
 
 The ``id`` of a shape in the XML is the name of a feature, and its BSDF is the finish. Lengths are in mm.
+
+Everything is loaded in one thread, so that the values of a scene on the device are made, and waited for, in the order
+of the program. Scenes are too small to gain from more threads.
 """
 
 from __future__ import annotations
@@ -69,7 +72,9 @@ class Scene:
     def only(self, *names: str) -> Scene:
         """Return a scene with these shapes alone, in the order given."""
         chosen, shapes = [self.names.index(name) for name in names], self.shapes
-        part = backend.mi.load_dict({"type": "scene", **{f"shape_{i}": shapes[i] for i in chosen}}, optimize=False)
+        part = backend.mi.load_dict(
+            {"type": "scene", **{f"shape_{i}": shapes[i] for i in chosen}}, parallel=False, optimize=False
+        )
         return Scene(part, names, tuple(self.finishes[i] for i in chosen), bounds_of(part), self.where)
 
 
@@ -128,7 +133,7 @@ def scene_from_dict(description: dict[str, Any], wavelength_nm: float, where: st
     """
     _prepare()
     with loading(wavelength_nm, where) as state:
-        scene = backend.mi.load_dict({"type": "scene", **description}, optimize=False)
+        scene = backend.mi.load_dict({"type": "scene", **description}, parallel=False, optimize=False)
     return _wrap(scene, state.finishes, where)
 
 
@@ -142,7 +147,7 @@ def flat_coupon(finish: Finish, half_size: float, turn_deg: float = 0.0) -> Scen
     _prepare()
     to_world = backend.mi.ScalarTransform4f().rotate([0, 0, 1], turn_deg).scale([half_size, half_size, 1])
     coupon = {"type": "rectangle", "to_world": to_world, "bsdf": finish.description}
-    loaded = backend.mi.load_dict({"type": "scene", "coupon": coupon}, optimize=False)
+    loaded = backend.mi.load_dict({"type": "scene", "coupon": coupon}, parallel=False, optimize=False)
     return Scene(loaded, ("coupon",), (finish,), bounds_of(loaded), f"a coupon of {finish}")
 
 

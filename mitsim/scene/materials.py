@@ -218,11 +218,15 @@ def _finish(kind: str, reflectance: float, scatter: Scatter, name: str, roughnes
 
 
 def _make_bsdf(props: Any, description: dict[str, Any], finish: Finish) -> Any:
-    """Make the BSDF of a description and store its finish under the id of the BSDF."""
+    """Make the BSDF of a description and store its finish under the id of the BSDF.
+
+    BSDFs inside shapes of a dictionary may all have the id ``bsdf``; those after the first get a number.
+    """
     from mitsim.scene.backend import mi
 
-    bsdf = mi.load_dict(description)
-    bsdf.set_id(props.id() or f"finish_{next(_anonymous)}")
+    bsdf = mi.load_dict(description, parallel=False)
+    name = props.id() or "finish"
+    bsdf.set_id(name if props.id() and name not in _current.finishes else f"{name}_{next(_anonymous)}")
     _current.finishes[bsdf.id()] = replace(finish, description=description)
     return bsdf
 

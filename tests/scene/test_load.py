@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mitsim.errors import InputError
-from mitsim.scene.load import load_scene
+from mitsim.scene.load import load_scene, scene_from_dict
 
 TWO = "two_pillars/two_pillars.xml"
 
@@ -29,6 +29,15 @@ def test_matt_white_has_no_roughness(scenes):
     finish = load_scene(scenes / "coupon/matt_white.xml", 850).finishes[0]
     assert finish.name == "matt_white"
     assert math.isnan(finish.roughness)
+
+
+def test_shapes_of_a_dictionary_keep_their_own_finish():
+    """Mitsuba gives all BSDFs under the key ``bsdf`` that id: finishes must not be those of the one made last."""
+    turned = {"type": "machined_metal", "process": "turned", "Ra": 0.8}
+    finishes = {"a": turned, "b": {"type": "matt_white"}, "c": {**turned, "Ra": 0.4}, "d": {"type": "matt_white"}}
+    scene = scene_from_dict({name: {"type": "rectangle", "bsdf": one} for name, one in finishes.items()}, 850)
+    assert [finish.name for finish in scene.finishes] == ["aluminium/turned", "matt_white"] * 2
+    assert [scene.finishes[i].roughness for i in (0, 2)] == [0.8, 0.4]
 
 
 def test_a_scene_loads_with_plain_mitsuba_once_ours_is_there(scenes):

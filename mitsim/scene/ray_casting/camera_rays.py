@@ -102,7 +102,7 @@ class CameraRays:
         return [dr.gather(mi.Float, self.x, i) for i in indices], [dr.gather(mi.Float, self.y, i) for i in indices]
 
 
-@lru_cache(maxsize=4)  # to undistort all pixels of a camera takes up to 0.6 s
+@lru_cache(maxsize=16)  # up to 0.6 s for all pixels of a camera, and 26 MB; a choice of sensors asks for many
 def _ideal_corners(camera: Camera) -> tuple[Any, Any]:
     """Return the ideal image coordinates x/z and y/z at the pixel corners, row by row."""
     columns, rows = np.meshgrid(np.arange(camera.width + 1) - 0.5, np.arange(camera.height + 1) - 0.5)
