@@ -42,10 +42,10 @@ _SWAPPED_GROUPS = ("", *GROUPS)
 def write_trials(path: Path, folders: Mapping[str, TrialFolder], views: list[int]) -> None:
     """Write all finished trials of some views, by kind, completely or not at all."""
     rows = [
-        (kind, view, trial, [errors[name] for name in folder.measurements])
+        (kind, view, trial, [one.errors[name] for name in folder.measurements])
         for kind, folder in folders.items()
         for view in views
-        for trial, errors in sorted(folder.known(view).items(), key=lambda item: _place(item[0]))
+        for trial, one in sorted(folder.known(view).items(), key=lambda item: _place(item[0]))
     ]
     if not rows:
         return

@@ -197,7 +197,7 @@ def standings(
         known = trials.known(number)
         for k, trial in enumerate(_first_trials(most)):
             if trial in known and k < counts[number]:
-                errors[:, v, k] = [known[trial][name] for name in names]
+                errors[:, v, k] = [known[trial].errors[name] for name in names]
     u = scores["predicted_uncertainty"].sel(measurement=names).transpose("measurement", "view").values
     chance = scores["chance"].sel(measurement=names).transpose("measurement", "view").values
     tolerances = scores["tolerance"].sel(measurement=names).values

@@ -51,22 +51,19 @@ class TrialFolder:
 
     def __init__(self, folder: str | Path, digest: str, measurements: Sequence[str]) -> None:
         self.folder, self.digest, self.measurements = Path(folder), digest, tuple(measurements)
-        self._known: dict[int, dict[Trial, dict[str, float]]] = {}
-        self._reasons: dict[int, dict[Trial, dict[str, str]]] = {}
+        self._known: dict[int, dict[Trial, Outcome]] = {}
 
-    def known(self, view: int) -> dict[Trial, dict[str, float]]:
-        """Return the finished trials of a view and their errors, NaN without a value; the file is read once."""
+    def known(self, view: int) -> dict[Trial, Outcome]:
+        """Return the finished trials of a view; the file is read once."""
         if view not in self._known:
-            outcomes = self._read(view)
-            self._known[view] = {trial: dict(one.errors) for trial, one in outcomes.items()}
-            self._reasons[view] = {trial: dict(one.reasons) for trial, one in outcomes.items() if one.reasons}
+            self._known[view] = self._read(view)
         return self._known[view]
 
     def take_up(self, view: int, trials: Mapping[Trial, Mapping[str, float]]) -> None:
-        """Add trials that are kept elsewhere; they are not written again."""
+        """Add trials whose errors are kept elsewhere; they are not written again."""
         known = self.known(view)
         for trial, errors in trials.items():
-            known.setdefault(trial, dict(errors))
+            known.setdefault(trial, Outcome(dict(errors)))
 
     def add(self, view: int, trial: Trial, outcome: Outcome) -> None:
         """Keep a finished trial; it is on the disk when this function returns."""
@@ -92,19 +89,18 @@ class TrialFolder:
                 os.fsync(stream.fileno())
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(path)) from None
-        known[trial] = values
-        if outcome.reasons:
-            self._reasons[view][trial] = dict(outcome.reasons)
+        known[trial] = Outcome(values, dict(outcome.reasons))
 
     def errors(self, view: int, trials: Sequence[Trial]) -> NDArray[np.float64]:
         """Return the errors (measurements, trials) of finished trials of a view."""
         known = self.known(view)
-        return np.array([[known[trial][name] for trial in trials] for name in self.measurements], float)
+        return np.array([[known[trial].errors[name] for trial in trials] for name in self.measurements], float)
 
     def reasons(self, view: int, trials: Sequence[Trial], measurement: str) -> list[str]:
         """Return the known reasons why a measurement has no value in finished trials of a view."""
-        self.known(view)
-        return [one[measurement] for trial in trials if measurement in (one := self._reasons[view].get(trial, {}))]
+        known = self.known(view)
+        reasons = [known[trial].reasons for trial in trials if trial in known]
+        return [one[measurement] for one in reasons if measurement in one]
 
     def _head(self) -> dict[str, Any]:
         return {"schema_version": 1, "digest": self.digest, "measurements": list(self.measurements)}

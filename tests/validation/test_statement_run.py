@@ -101,8 +101,8 @@ def test_a_file_of_other_trials_is_not_taken_up(tmp_path):
     same, other = (TrialFolder(tmp_path / digest, digest * 16, ["one"]) for digest in ("a", "b"))
     assert take_up_trials(tmp_path / "case.nc", {"tool": same, "apart": other}) == {"tool": 2, "apart": 0}
     assert take_up_trials(tmp_path / "case.nc", {"tool": other}) == {"tool": 0}
-    assert same.known(3)[Trial(5, 1, "pose")] == {"one": 0.25}
-    assert np.isnan(same.known(3)[Trial(1 << 20)]["one"])
+    assert same.known(3)[Trial(5, 1, "pose")].errors == {"one": 0.25}
+    assert np.isnan(same.known(3)[Trial(1 << 20)].errors["one"])
 
 
 @pytest.mark.parametrize("content", [b"", b"no netCDF", b"CDF\x01" + bytes(200)])

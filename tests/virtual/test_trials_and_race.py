@@ -166,7 +166,7 @@ def test_trials_come_back_to_the_last_bit(tmp_path):
     again = TrialFolder(tmp_path, "d", NAMES).known(3)
     assert list(again) == list(known)
     for trial in known:
-        np.testing.assert_array_equal(list(again[trial].values()), list(known[trial].values()))
+        np.testing.assert_array_equal(list(again[trial].errors.values()), list(known[trial].errors.values()))
 
 
 @pytest.mark.parametrize("cut", [1, 20, 60])
