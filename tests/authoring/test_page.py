@@ -40,15 +40,19 @@ def _heed_interrupts():
 
 
 @pytest.fixture(scope="module")
-def served(folder):
+def step_file(folder):
+    return write_step([("bracket", bracket(), None)], folder / "bracket.step")
+
+
+@pytest.fixture(scope="module")
+def served(folder, step_file):
     """The command that serves the page of a bracket, and its address."""
-    write_step([("bracket", bracket(), None)], folder / "bracket.step")
     command = [
         sys.executable,
         "-m",
         "mitsim",
         "part",
-        folder / "bracket.step",
+        step_file,
         "-o",
         folder / "made",
         "--Ra",
@@ -192,10 +196,9 @@ def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browse
 @needs_step
 @pytest.mark.browser
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
-def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(folder, browser, tmp_path):
-    write_step([("bracket", bracket(), None)], tmp_path / "bracket.step")
+def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(step_file, step_here, browser, tmp_path):
     for arguments in (
-        ["part", tmp_path / "bracket.step", "-o", tmp_path / "made"],
+        ["part", step_file, "-o", tmp_path / "made"],
         ["check", tmp_path / "made/made.xml", "--task", tmp_path / "made/task.toml", "--html", tmp_path / "page.html"],
     ):
         mitsim_here(*arguments)
@@ -229,10 +232,9 @@ def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(folder, bro
 @needs_step
 @pytest.mark.browser
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
-def test_rules_and_features_that_the_page_does_not_show_are_kept(folder, browser, tmp_path):
-    write_step([("bracket", bracket(), None)], tmp_path / "bracket.step")
+def test_rules_and_features_that_the_page_does_not_show_are_kept(step_file, step_here, browser, tmp_path):
     made = tmp_path / "made"
-    mitsim_here("part", tmp_path / "bracket.step", "-o", made)
+    mitsim_here("part", step_file, "-o", made)
     own = (
         "[features.middle]\nkind = 'mid_plane'\nof = ['left', 'right']\n"
         "[decision]\nrule = 'simple_acceptance'\nuncertainty_ratio = 6\n"
