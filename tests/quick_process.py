@@ -48,20 +48,32 @@ _CONTEXT = multiprocessing.get_context("forkserver") if sys.platform != "win32" 
 class QuickProcess:
     """A script or module with arguments in a process of its own; its output goes to a file."""
 
-    def __init__(self, *command: object, limits: Callable[[], object] | None = None) -> None:
+    def __init__(
+        self, *command: object, limits: Callable[[], object] | None = None, folder: str | Path = HERE.parent
+    ) -> None:
         start_server()
         assert _CONTEXT is not None
         handle, name = tempfile.mkstemp(suffix=".stderr")
         os.close(handle)
         self._said = Path(name)
         self._process: ForkServerProcess = _CONTEXT.Process(
-            target=_run, args=(list(map(str, command)), str(self._said), dict(os.environ), limits), daemon=True
+            target=_run,
+            args=(list(map(str, command)), str(self._said), dict(os.environ), limits, str(folder)),
+            daemon=True,
         )
         self._process.start()
 
     @property
+    def pid(self) -> int:
+        return self._process.pid or 0
+
+    @property
+    def exitcode(self) -> int | None:
+        return self._process.exitcode
+
+    @property
     def running(self) -> bool:
-        return self._process.exitcode is None
+        return self.exitcode is None
 
     def kill(self) -> None:
         """As ``kill -9``; returns once it is gone."""
@@ -104,14 +116,14 @@ class QuickPool(Pool):
         return self._pool
 
 
-def _run(command: list[str], said: str, environment: dict[str, str], limits: Any) -> None:
+def _run(command: list[str], said: str, environment: dict[str, str], limits: Any, folder: str) -> None:
     """What the fork does: the script as ``python script arguments``, or ``-m module arguments``."""
     with Path(said).open("w", encoding="utf-8") as file:
         for stream in (sys.stdout, sys.stderr):
             os.dup2(file.fileno(), stream.fileno())
     os.environ.clear()
     os.environ.update(environment)
-    os.chdir(HERE.parent)
+    os.chdir(folder)
     if limits is not None:
         limits()
     if command[0] == "-m":
