@@ -1,4 +1,4 @@
-"""A kernel of IPython that is forked from a process that has imported the program: ``forked_kernel.py -f CONNECTION``."""
+"""A kernel of IPython, ``forked_kernel.py -f CONNECTION``, forked from a process that has imported the program."""
 
 from __future__ import annotations
 
