@@ -72,6 +72,11 @@ class QuickProcess:
         return self._process.exitcode
 
     @property
+    def said(self) -> str:
+        """What it has printed by now, on both streams."""
+        return self._said.read_text()
+
+    @property
     def running(self) -> bool:
         return self.exitcode is None
 
@@ -82,7 +87,7 @@ class QuickProcess:
         self._said.unlink()
 
     def wait(self, timeout: float = 300) -> tuple[int, str]:
-        """Wait for the end; return the exit code and the text of stderr."""
+        """Wait for the end; return the exit code and all that was printed."""
         self._process.join(timeout)
         code = self._process.exitcode
         if code is None:
