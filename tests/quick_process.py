@@ -35,6 +35,8 @@ PRELOADED = [
     "known_clouds",
     "mitsim.cli",
     "mitsim.campaign.many",
+    "mitsim.interface.studies",
+    "mitsim.virtual.spread_out",
     "mitsim.report.figures",
     "trimesh.exchange.load",
     "dask.array",  # xarray imports it
