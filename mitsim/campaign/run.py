@@ -223,7 +223,7 @@ def _finish(
 def joined(tables: Sequence[xr.Dataset]) -> xr.Dataset:
     """Return the patches of all captures of a series, each with the number of its ``orientation``."""
     names = [str(name) for name in tables[0].data_vars]
-    columns = {name: np.concatenate([table[name].values for table in tables]) for name in names}
+    columns = {name: np.concatenate([table.variables[name].values for table in tables]) for name in names}
     columns["orientation"] = np.repeat(np.arange(len(tables)), [table.sizes["patch"] for table in tables])
     return patch_table(**columns)
 

@@ -170,10 +170,10 @@ def _checked(folder: Path, path: str, entry: KeptFile) -> bytes:
 
 
 def _table_bytes(patches: xr.Dataset) -> bytes:
-    names = [str(name) for name in patches.data_vars]
-    table = np.empty(patches.sizes["patch"], [(name, patches[name].dtype) for name in names])
-    for name in names:
-        table[name] = patches[name].values
+    columns = {str(name): patches.variables[name].values for name in patches.data_vars}
+    table = np.empty(patches.sizes["patch"], [(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        table[name] = values
     stream = io.BytesIO()
     np.save(stream, table, allow_pickle=False)
     return stream.getvalue()

@@ -65,7 +65,7 @@ def drawn(tmp_path_factory):
 
 
 @needs_step
-def test_what_a_task_knows_becomes_measurements_and_the_rest_is_listed(drawn, tmp_path):
+def test_what_a_task_knows_becomes_measurements_and_the_rest_is_listed(drawn, tmp_path, step_here):
     part = write_part(drawn, tmp_path / "made")
     task = read_task(tmp_path / "made/task.toml")
     found = {name: (one.kind, one.features, one.nominal, one.tolerance) for name, one in task.measurements.items()}
@@ -155,7 +155,7 @@ def test_every_characteristic_of_nists_part_is_read_with_its_value_and_datums(ct
 
 @needs_step
 @pytest.mark.real
-def test_nists_part_becomes_a_task(ctc, tmp_path):
+def test_nists_part_becomes_a_task(ctc, tmp_path, step_here):
     part = write_part(ctc, tmp_path / "made")
     task = read_task(tmp_path / "made/task.toml")
     kinds = sorted(one.kind for one in task.measurements.values())

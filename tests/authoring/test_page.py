@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
-import subprocess
-import sys
+import time
 import tomllib
 import urllib.error
 import urllib.request
 import xml.etree.ElementTree as ElementTree
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import pytest
+from quick_process import QuickProcess
 from shell import mitsim_here
 
 from mitsim.authoring.read_step import step_installed
@@ -24,7 +25,6 @@ from tests.authoring.author import Author
 from tests.authoring.bracket import bracket, write_step
 from tests.report.chromium import BROWSER
 
-ROOT = Path(__file__).resolve().parents[2]
 needs_step = pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which reads STEP, is not installed")
 in_browser = [pytest.mark.browser, pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")]
 
@@ -34,42 +34,27 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("bracket")
 
 
-def _heed_interrupts():
-    # tests that a shell runs in its background ignore SIGINT, and so does what they start
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+@pytest.fixture(scope="module")
+def step_file(folder):
+    return write_step([("bracket", bracket(), None)], folder / "bracket.step")
 
 
 @pytest.fixture(scope="module")
-def served(folder):
+def served(folder, step_file):
     """The command that serves the page of a bracket, and its address."""
-    write_step([("bracket", bracket(), None)], folder / "bracket.step")
-    command = [
-        sys.executable,
-        "-m",
-        "mitsim",
-        "part",
-        folder / "bracket.step",
-        "-o",
-        folder / "made",
-        "--Ra",
-        "0.4",
-        "--edit",
-    ]
-    process = subprocess.Popen(
-        [str(c) for c in command],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-        preexec_fn=_heed_interrupts,
+    # what tests start ignores SIGINT where a shell runs them in its background
+    heed = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    process = QuickProcess(
+        "-m", "mitsim", "part", step_file, "-o", folder / "made", "--Ra", "0.4", "--edit", limits=heed
     )
-    for line in process.stdout:
-        if line.startswith("http://"):
-            break
-    yield process, line.strip()
-    if process.poll() is None:
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=30)
+    end = time.monotonic() + 300
+    while (told := re.search(r"(?m)^(http://\S+)\n", process.said)) is None:
+        assert process.running and time.monotonic() < end, process.said
+        time.sleep(0.05)
+    yield process, told[1]
+    if process.running:
+        os.kill(process.pid, signal.SIGINT)
+        process.wait(30)
 
 
 #: boxes of the texts in the picture, and lines, each with the number of its dimension
@@ -163,9 +148,9 @@ def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browse
     page.type("[aria-label^='Ra of finish_2']", "0.2")
     browser.tell("document.getElementById('author-done').click()")
     browser.until("document.getElementById('author-status').textContent.startsWith('Done')", 90)
-    _, err = process.communicate(timeout=30)
-    assert process.returncode == 0
-    assert "saved 1 times" in err
+    code, told = process.wait(30)
+    assert code == 0
+    assert "saved 1 times" in told
     assert browser.problems == []
     assert {url.split("/")[2] for url in browser.requests if url.startswith("http")} == {address.split("/")[2]}
     made = folder / "made"
@@ -192,10 +177,9 @@ def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browse
 @needs_step
 @pytest.mark.browser
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
-def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(folder, browser, tmp_path):
-    write_step([("bracket", bracket(), None)], tmp_path / "bracket.step")
+def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(step_file, step_here, browser, tmp_path):
     for arguments in (
-        ["part", tmp_path / "bracket.step", "-o", tmp_path / "made"],
+        ["part", step_file, "-o", tmp_path / "made"],
         ["check", tmp_path / "made/made.xml", "--task", tmp_path / "made/task.toml", "--html", tmp_path / "page.html"],
     ):
         mitsim_here(*arguments)
@@ -229,10 +213,9 @@ def test_a_page_by_itself_is_turned_and_clicked_and_needs_no_network(folder, bro
 @needs_step
 @pytest.mark.browser
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
-def test_rules_and_features_that_the_page_does_not_show_are_kept(folder, browser, tmp_path):
-    write_step([("bracket", bracket(), None)], tmp_path / "bracket.step")
+def test_rules_and_features_that_the_page_does_not_show_are_kept(step_file, step_here, browser, tmp_path):
     made = tmp_path / "made"
-    mitsim_here("part", tmp_path / "bracket.step", "-o", made)
+    mitsim_here("part", step_file, "-o", made)
     own = (
         "[features.middle]\nkind = 'mid_plane'\nof = ['left', 'right']\n"
         "[decision]\nrule = 'simple_acceptance'\nuncertainty_ratio = 6\n"

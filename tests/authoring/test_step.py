@@ -17,7 +17,10 @@ from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 from tests.authoring.bracket import bracket, write_step
 
-pytestmark = pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which reads STEP, is not installed")
+pytestmark = [
+    pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which reads STEP, is not installed"),
+    pytest.mark.usefixtures("step_here"),
+]
 
 NAMES = [
     "back",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,11 +17,17 @@ from mitsim.campaign import missing_finishes, one_finish
 from mitsim.campaign.plan import CampaignFile, plan_campaign
 
 
+@pytest.fixture(scope="session")
+def half_n10(n10):
+    """The N10 with pixels of twice the size: a quarter of the work, where the values do not matter."""
+    return replace(n10, rig=replace(n10.rig, cameras={name: eye.binned(2) for name, eye in n10.rig.cameras.items()}))
+
+
 @pytest.fixture
 def planned(scenes, n10):
     """Make a campaign of matt white and one metal; keywords change the file."""
 
-    def make(**changes):
+    def make(sensor=n10, **changes):
         table = {
             "distances_mm": [400, 600],
             "orientations": [{"up_to_deg": 60, "subdivisions": 1}],
@@ -28,7 +35,7 @@ def planned(scenes, n10):
             "samples_per_pixel": 1,
             **changes,
         }
-        return plan_campaign(scenes / "coupon/campaign.toml", CampaignFile.model_validate(table), n10)
+        return plan_campaign(scenes / "coupon/campaign.toml", CampaignFile.model_validate(table), sensor)
 
     return make
 

@@ -26,6 +26,7 @@ Known = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 #: coarser than the N10, so that a coupon is quick
 GRID = ViewGrid(fx=300.0, fy=300.0, cx=159.5, cy=119.5, width=320, height=240)
+RAYS = GRID.rays()
 
 
 def smooth(distance: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -43,20 +44,19 @@ def stepped(distance: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.n
 def cloud_of(shot: Shot, known: Known) -> PointCloud:
     """What the sensor sees of a coupon."""
     coupon = shot.series.sample.at(shot.sensor_from_coupon)
-    rays = GRID.rays()
     with np.errstate(divide="ignore"):
-        distance = (coupon.centre @ coupon.normal) / (rays @ coupon.normal)
-    points = rays * distance[..., None]
-    along = np.cross(coupon.normal, coupon.across)
-    local = points - coupon.centre
-    on = (np.abs(local @ coupon.across) < coupon.width / 2) & (np.abs(local @ along) < coupon.height / 2)
+        distance = (coupon.centre @ coupon.normal) / (RAYS @ coupon.normal)
+    across, along = coupon.across, np.cross(coupon.normal, coupon.across)
+    on = np.abs(distance * (RAYS @ across) - coupon.centre @ across) < coupon.width / 2
+    on &= np.abs(distance * (RAYS @ along) - coupon.centre @ along) < coupon.height / 2
     on &= distance > 0
     rng = np.random.default_rng(shot.seed)
+    chance, noise = rng.random(distance.shape)[on], rng.standard_normal(distance.shape)[on]
     # the coupon's normal in the view frame of its middle: near enough to that of each pixel for these tests
-    fraction, sigma = known(distance, np.broadcast_to(shot.normal, points.shape))
-    kept = on & (rng.random(distance.shape) < fraction)
-    points = points + (rng.standard_normal(distance.shape) * sigma)[..., None] * rays
-    points[~kept] = np.nan
+    fraction, sigma = known(distance[on], np.broadcast_to(shot.normal, (len(noise), 3)))
+    points, kept = np.full(RAYS.shape, np.nan), on.copy()
+    kept[on] = recovered = chance < fraction
+    points[kept] = ((distance[on] + noise * sigma)[:, None] * RAYS[on])[recovered]
     status = np.where(kept, Status.VALID, Status.LOW_MODULATION).astype(np.uint8)
     return PointCloud(points.astype(np.float32), status, GRID, "known", "simulated")
 

@@ -99,7 +99,7 @@ def test_it_is_characterised_once_and_kept(shipped, n10, quick, monkeypatch):
 
 
 def test_what_the_map_knew_before_it_answers_as_before(shipped, n10, quick):
-    joined = map_with_finishes(shipped, wanted_of(n10, finish_of(**MILLED)), lambda _: True)
+    joined = map_with_finishes(shipped, wanted_of(n10, finish_of(**MILLED), (504.0, 504.0)), lambda _: True)
     ground = finish_of(type="machined_metal", process="ground", Ra=0.4)
     for light in (None, ground.light):
         one, other = (m.query(ground.name, 0.4, [560.0], AHEAD, light) for m in (shipped, joined))

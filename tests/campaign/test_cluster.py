@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quick_process import start_server
 
 from mitsim.campaign.acquire import in_turn, simulated_source
 from mitsim.campaign.cluster import Cluster
@@ -29,15 +30,19 @@ pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.timeout(300)]
 
 @pytest.fixture(scope="module")
 def cluster():
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs="ERROR"
-    ) as made:
+    start_server()
+    with (
+        dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs="ERROR"
+        ) as made,
+    ):
         yield made
 
 
-def test_workers_give_the_same_map_though_one_is_killed(tmp_path, planned, n10, cluster):
-    plan = planned(distances_mm=[500], orientations=[{"up_to_deg": 40, "subdivisions": 1}])
-    run_campaign(plan, in_turn(simulated_source(SimulatedSensor(n10), 1), plan), tmp_path / "here")
+def test_workers_give_the_same_map_though_one_is_killed(tmp_path, planned, half_n10, cluster):
+    plan = planned(half_n10, distances_mm=[500], orientations=[{"up_to_deg": 40, "subdivisions": 1}])
+    run_campaign(plan, in_turn(simulated_source(SimulatedSensor(half_n10), 1), plan), tmp_path / "here")
     with distributed.Client(cluster, set_as_default=False) as client:
         workers = client.run(os.getpid)
         source, killed = worker_source(Cluster(cluster.scheduler_address), plan), []
@@ -221,6 +226,6 @@ def study_of(sensor):
         "task": "task.toml",
         "sensor": sensor,
         "views": {"subdivisions": 0, "rolls_deg": [0], "lowest_elevation_deg": 20},
-        "measure": {"light_path_depth": 1},
+        "measure": {"light_path_depth": 1, "samples_per_pixel": 1},
     }
     return open_study(SCENES / "study.toml", StudyFile.model_validate(table))

@@ -1,8 +1,8 @@
 """Recordings of DepthAI made here, by its own ``RecordMessage``, of frames that are known; no device is needed.
 
-Run as a program, ``python depthai_recordings.py PLAN.npz``, in a process apart: the plan holds the frames and the names
-of the files, and the package's threads end with the process. Beside NAME.mcap lies NAME.npz, which holds what DepthAI
-says of each frame: the images of ``getFrame``, the matrices of ``getIntrinsicMatrix``.
+Run as a program, ``python depthai_recordings.py PLAN.npz ...``, in a process apart: a plan holds the frames and the
+names of the files, and the package's threads end with the process. Beside NAME.mcap lies NAME.npz, which holds what
+DepthAI says of each frame: the images of ``getFrame``, the matrices of ``getIntrinsicMatrix``.
 
 ``rewritten`` writes a recording once more, changed or packed in another way, with whole checksums.
 """
@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
@@ -23,32 +24,42 @@ from mcap.writer import Writer
 EXPOSURE_US, ISO = 8000, 400
 
 
-def record(
-    folder: Path,
-    streams: dict[str, np.ndarray],
-    matrix: np.ndarray | None = None,
-    first: int = 0,
-    padding: int = 0,
-    cropped: bool = False,
-    grey: bool = False,
-) -> Path:
-    """Record stacks (n, H, W), uint8 or uint16, as NAME.mcap; frames are numbered from ``first`` on.
+@dataclass(frozen=True)
+class Recording:
+    """Stacks (n, H, W), uint8 or uint16, to record as NAME.mcap in a folder; frames are numbered from ``first`` on.
 
     ``padding`` bytes follow each row. Where ``cropped``, the frames were cut from larger ones, whose matrix is
     ``matrix``, and halved. Bytes are RAW8 or, where ``grey``, GRAY8.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    plan = folder / "plan.npz"
-    extra = {} if matrix is None else {"matrix": matrix}
-    stacks = {f"stream:{name}": stack for name, stack in streams.items()}
-    np.savez(plan, **stacks, **extra, options=[first, padding, cropped, grey])
+
+    folder: Path
+    streams: dict[str, np.ndarray]
+    matrix: np.ndarray | None = None
+    first: int = 0
+    padding: int = 0
+    cropped: bool = False
+    grey: bool = False
+
+    def plan(self) -> Path:
+        """Write what the program needs."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        extra = {} if self.matrix is None else {"matrix": self.matrix}
+        stacks = {f"stream:{name}": stack for name, stack in self.streams.items()}
+        options = [self.first, self.padding, self.cropped, self.grey]
+        np.savez(self.folder / "plan.npz", **stacks, **extra, options=options)
+        return self.folder / "plan.npz"
+
+
+def record(*recordings: Recording) -> None:
+    """Make recordings, all in one process, which takes half a second to import DepthAI."""
+    plans = [one.plan() for one in recordings]
     quiet = os.environ | {"DEPTHAI_LEVEL": "off"}
-    subprocess.run([sys.executable, __file__, str(plan)], check=True, env=quiet, timeout=300)
-    plan.unlink()
-    for name, stack in streams.items():
-        with (folder / f"{name}.mcap").open("rb") as stream:
-            assert make_reader(stream).get_summary().statistics.message_count == len(stack), "frames were lost"
-    return folder
+    subprocess.run([sys.executable, __file__, *map(str, plans)], check=True, env=quiet, timeout=300)
+    for one, plan in zip(recordings, plans, strict=True):
+        plan.unlink()
+        for name, stack in one.streams.items():
+            with (one.folder / f"{name}.mcap").open("rb") as stream:
+                assert make_reader(stream).get_summary().statistics.message_count == len(stack), "frames were lost"
 
 
 def rewritten(
@@ -121,8 +132,8 @@ def _record(folder: Path, name: str, stack: np.ndarray, matrix: np.ndarray | Non
 
 
 if __name__ == "__main__":
-    place = Path(sys.argv[1])
-    with np.load(place) as table:
-        for key in (key for key in table.files if key.startswith("stream:")):
-            known = table["matrix"] if "matrix" in table.files else None
-            _record(place.parent, key.removeprefix("stream:"), table[key], known, *map(int, table["options"]))
+    for place in map(Path, sys.argv[1:]):
+        with np.load(place) as table:
+            for key in (key for key in table.files if key.startswith("stream:")):
+                known = table["matrix"] if "matrix" in table.files else None
+                _record(place.parent, key.removeprefix("stream:"), table[key], known, *map(int, table["options"]))

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from depthai_recordings import EXPOSURE_US, ISO, record, rewritten
+from depthai_recordings import EXPOSURE_US, ISO, Recording, record, rewritten
 from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -216,7 +216,8 @@ def recorded(tmp_path_factory):
     with np.errstate(divide="ignore"):
         depth = np.where(disparity > 0, 55.0 * 75.0 * 8 / disparity, 0).astype(np.uint16)
     streams = {"left": pair[0], "right": pair[1], "disparity": disparity, "depth": depth}
-    folder = record(tmp_path_factory.mktemp("oak") / "recording", streams, MATRIX, first=40)
+    folder = tmp_path_factory.mktemp("oak") / "recording"
+    record(Recording(folder, streams, MATRIX, first=40))
     save(folder / "calibration.json", calibration())
     return folder, streams
 
@@ -290,13 +291,27 @@ def test_damage_is_refused(recorded, tmp_path):
         read_depthai_recording(folder, frame=0)
 
 
-@pytest.mark.parametrize(("dtype", "grey"), [(np.uint8, False), (np.uint8, True), (np.uint16, False)])
-def test_padded_rows_and_cropped_and_halved_frames_are_what_depthai_says(tmp_path, dtype, grey):
-    """Forty frames, more than its queues hold, and the last of them is read."""
+FRAMES = {"uint8": (np.uint8, False), "uint8, grey": (np.uint8, True), "uint16": (np.uint16, False)}
+
+
+@pytest.fixture(scope="module")
+def halved(tmp_path_factory):
+    """Recordings of forty frames, more than the queues hold, with padded rows, of frames that were cut and halved."""
     pytest.importorskip("depthai", reason="recordings are made by depthai: pip install 'mitsim[depthai]'")
-    stack = np.random.default_rng(3).integers(0, np.iinfo(dtype).max, (40, HEIGHT, WIDTH)).astype(dtype)
     matrix = np.array([[110.0, 0, 75.5], [0, 111.0, 51.0], [0, 0, 1]])
-    folder = record(tmp_path / "r", {"depth": stack}, matrix, 7, padding=6, cropped=True, grey=grey)
+    made = {}
+    for name, (dtype, grey) in FRAMES.items():
+        stack = np.random.default_rng(3).integers(0, np.iinfo(dtype).max, (40, HEIGHT, WIDTH)).astype(dtype)
+        folder = tmp_path_factory.mktemp("halved") / "r"
+        made[name] = Recording(folder, {"depth": stack}, matrix, 7, padding=6, cropped=True, grey=grey)
+    record(*made.values())
+    return made
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_padded_rows_and_cropped_and_halved_frames_are_what_depthai_says(halved, name):
+    """The last of the frames is read."""
+    folder, stack = halved[name].folder, halved[name].streams["depth"]
     read = read_frames({"depth": folder / "depth.mcap"}, 39)["depth"]
     with np.load(folder / "depth.npz") as said:
         np.testing.assert_array_equal(read.image, said["images"][39])
