@@ -49,8 +49,8 @@ def pool():
 
 
 @pytest.fixture(scope="module")
-def rendering_pool():
-    """Two processes for tests that render: forks that have imported the program."""
+def forked_pool():
+    """Two processes that have imported the program."""
     made = QuickPool(2)
     yield made
     made.close()
@@ -111,9 +111,8 @@ def test_processes_follow_cores_and_memory(monkeypatch):
 PLAN = "captures = 2\n[views]\nsubdivisions = 0\nstandoff_mm = 500\n"
 
 
-def test_commands_give_the_same_bytes_in_two_processes(tmp_path, rendering_pool, monkeypatch):
-    # what --processes 2 starts, started once for all
-    monkeypatch.setattr(executor, "Pool", {2: rendering_pool}.__getitem__)
+def test_commands_give_the_same_bytes_in_two_processes(tmp_path, pool, monkeypatch):
+    monkeypatch.setattr(executor, "Pool", {2: pool}.__getitem__)  # what --processes 2 starts, started once for all
     (tmp_path / "plan.toml").write_text(PLAN)
     white = (ROOT / "scenes/coupon/matt_white.xml").as_posix()
     (tmp_path / "campaign.toml").write_text(
@@ -144,12 +143,12 @@ def test_commands_give_the_same_bytes_in_two_processes(tmp_path, rendering_pool,
         assert [name for name in one if one[name] != two[name]] == []
 
 
-def test_a_data_sheet_is_the_same_in_two_processes(rendering_pool, half_n10, monkeypatch):
+def test_a_data_sheet_is_the_same_in_two_processes(forked_pool, half_n10, monkeypatch):
     from mitsim import data_sheet
 
     monkeypatch.setattr(data_sheet, "DISTANCES", 2)
     monkeypatch.setattr(data_sheet, "METALS", [])
-    one, two = (data_sheet.measure_sensor(half_n10, 3, workers) for workers in (None, rendering_pool))
+    one, two = (data_sheet.measure_sensor(half_n10, 3, workers) for workers in (None, forked_pool))
     assert len(one.residuals.values) > 1000
     np.testing.assert_equal(one.numbers(), two.numbers())
     np.testing.assert_array_equal(one.residuals.values, two.residuals.values)
