@@ -55,25 +55,23 @@ def lobe_numbers(
     The parameters of the lobe are those of :class:`~mitsim.surface.scatter.Scatter`. For an elongated lobe the energy
     is averaged over the azimuth of the light.
     """
-    returned, missing = [], []
     lobes: tuple[tuple[float, float, Distribution], ...] = (
         (beckmann * energy_factor[1], 1.0, "beckmann"),
         ((1 - beckmann) * energy_factor[0], GGX_PER_BECKMANN, "ggx"),
     )
-    for cosine in np.linspace(np.cos(LARGEST_INCIDENCE), EVEN_FROM, _ANGLES).tolist():
-        sums, lacking = np.zeros(3), 0.0
-        for share, width, distribution in lobes:
-            if share == 0:
-                continue
-            angle = float(np.arccos(cosine))
-            weight, out = facets(angle, width * alpha_u, width * alpha_v, distribution, _COUNTS)
-            mean = 0.5 * (cosine + out)
-            kept = share * weight * (1 - coherent_weight(phase_variance, mean))
-            u = np.maximum(1 - mean / EVEN_FROM, 0.0)
-            square = u * u
-            sums += [kept @ square, kept @ (square * u), kept @ (square * square)]
-            lacking += share * weight.sum() * (1 - float(coherent_weight(phase_variance, cosine))) - kept.sum()
-        returned.append(sums)
-        missing.append(lacking)
-    first, second, third = np.linalg.lstsq(np.array(returned), np.array(missing), rcond=1e-6)[0].tolist()
+    cosines = np.linspace(np.cos(LARGEST_INCIDENCE), EVEN_FROM, _ANGLES)
+    lost = 1 - coherent_weight(phase_variance, cosines)
+    returned, missing = np.zeros((_ANGLES, 3)), np.zeros(_ANGLES)
+    for share, width, distribution in lobes:
+        if share == 0:
+            continue
+        weight, out = facets(np.arccos(cosines), width * alpha_u, width * alpha_v, distribution, _COUNTS)
+        mean = 0.5 * (cosines[:, None] + out)
+        kept = share * weight * (1 - coherent_weight(phase_variance, mean))
+        u = np.maximum(1 - mean / EVEN_FROM, 0.0)
+        square = u * u
+        for number, term in enumerate((square, square * u, square * square)):
+            returned[:, number] += np.vecdot(kept, term)
+        missing += share * weight.sum(axis=-1) * lost - kept.sum(axis=-1)
+    first, second, third = np.linalg.lstsq(returned, missing, rcond=1e-6)[0].tolist()
     return first, second, third
