@@ -153,7 +153,7 @@ def test_views_rendered_together_are_those_rendered_alone(name):
     near = 1.2 * sensor.working_range_mm[0]
     scene = white_corner(sensor)
     poses = [look_at([x, -0.7 * near, 0.7 * near], [0, 0, 0], [0, 0, 1]) for x in (-200, 0, 150)]
-    effect = InterreflectionEffect(sensor, paths=20_000, photons=100_000)
+    effect = InterreflectionEffect(sensor, photons=100_000)
     alone = [effect.render(scene, pose).values for pose in poses]
     together = [image.values for image in effect.render_views(scene, poses)]
     assert not np.array_equal(alone[0], alone[1], equal_nan=True)
