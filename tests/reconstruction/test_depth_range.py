@@ -27,16 +27,24 @@ def middle_of(sensor):
     return float(np.sqrt(np.prod(sensor.working_range_mm)))
 
 
+def middle_part(camera, width, height):
+    column, row = (camera.width - width) // 2, (camera.height - height) // 2
+    matrix = camera.matrix - [[0, 0, column], [0, 0, row], [0, 0, 0]]
+    return replace(camera, matrix=matrix, width=width, height=height)
+
+
 @pytest.fixture(scope="module", params=NAMES)
 def taken(request):
-    """A preset, of one camera its middle 400 x 320 pixels, and its capture of a plate that fills most of the image."""
+    """A preset, and its capture of a plate that fills most of the image.
+
+    Of one camera its middle 400 x 320 pixels, of two their middle 200 rows.
+    """
     sensor = load_sensor(request.param)
     camera = sensor.rig.reference
-    if len(sensor.rig.cameras) == 1 and camera.width > 640:
-        column, row = (camera.width - 400) // 2, (camera.height - 320) // 2
-        matrix = camera.matrix - [[0, 0, column], [0, 0, row], [0, 0, 0]]
-        window = replace(camera, matrix=matrix, width=400, height=320)
-        sensor = replace(sensor, rig=Rig({"camera": window}, sensor.rig.projector))
+    width, height = (camera.width, 200) if len(sensor.rig.cameras) == 2 else (400, 320)
+    if camera.width > 640:
+        windows = {name: middle_part(eye, width, height) for name, eye in sensor.rig.cameras.items()}
+        sensor = replace(sensor, rig=Rig(windows, sensor.rig.projector))
     distance = middle_of(sensor)
     pose = coupon_pose(np.array([0.1, 0.0, 0.995]), distance, np.array([0, 0, 1.0]))
     scene = plate(0.6 * distance, "matt white", sensor.wavelength_nm)
