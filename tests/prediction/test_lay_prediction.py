@@ -142,6 +142,7 @@ def test_rendered_coupons_along_and_across_are_as_the_score_predicts_them(n10, p
     """A small campaign up to 30 deg; then rendered coupons at an angle between its directions, and at one of them."""
     monkeypatch.setattr(one_finish, "BANDS", ((30.0, 2),))
     monkeypatch.setattr(one_finish, "REFINED", None)
+    monkeypatch.setattr(one_finish, "SAMPLES_PER_PIXEL", 4)
     near = narrow_search(n10, DISTANCE - 50, DISTANCE + 55)
     finish, simulated = finish_with_lay(n10), SimulatedSensor(near)
     one = OneFinish(finish, near, 30.0)
