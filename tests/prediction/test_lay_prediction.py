@@ -23,7 +23,7 @@ from mitsim.scene.load import Scene, flat_coupon, scene_from_dict
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.simulate import SimulatedSensor
-from tests.narrow_search import narrow_search
+from tests.smaller_sensors import narrow_search
 
 DISTANCE = 504.0
 TURNED = {"type": "machined_metal", "metal": "aluminium", "process": "turned", "Ra": 0.8}

@@ -15,22 +15,17 @@ from mitsim.cli import app
 from mitsim.reconstruction.cloud import capture_cloud
 from mitsim.reconstruction.depth_range import _coarse_capture, depths_of, neighbour_agreement, surface_beyond
 from mitsim.scene.test_targets import plate
-from mitsim.sensor.camera import Rig, stereo_rectification
+from mitsim.sensor.camera import stereo_rectification
 from mitsim.sensor.preset import load_sensor
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
+from tests.smaller_sensors import middle_part
 
 NAMES = ["ensenso-n10", "david-sls-3", "kinect-v2"]
 
 
 def middle_of(sensor):
     return float(np.sqrt(np.prod(sensor.working_range_mm)))
-
-
-def middle_part(camera, width, height):
-    column, row = (camera.width - width) // 2, (camera.height - height) // 2
-    matrix = camera.matrix - [[0, 0, column], [0, 0, row], [0, 0, 0]]
-    return replace(camera, matrix=matrix, width=width, height=height)
 
 
 @pytest.fixture(scope="module", params=NAMES)
@@ -40,11 +35,8 @@ def taken(request):
     Of one camera its middle 400 x 320 pixels, of two their middle 200 rows.
     """
     sensor = load_sensor(request.param)
-    camera = sensor.rig.reference
-    width, height = (camera.width, 200) if len(sensor.rig.cameras) == 2 else (400, 320)
-    if camera.width > 640:
-        windows = {name: middle_part(eye, width, height) for name, eye in sensor.rig.cameras.items()}
-        sensor = replace(sensor, rig=Rig(windows, sensor.rig.projector))
+    if sensor.rig.reference.width > 640:
+        sensor = middle_part(sensor, *((752, 200) if len(sensor.rig.cameras) == 2 else (400, 320)))
     distance = middle_of(sensor)
     pose = coupon_pose(np.array([0.1, 0.0, 0.995]), distance, np.array([0, 0, 1.0]))
     scene = plate(0.6 * distance, "matt white", sensor.wavelength_nm)

@@ -167,6 +167,7 @@ def small(scenes, tmp_path_factory, n10, simulated):
     file = CampaignFile.model_validate(
         {
             "distances_mm": [400, 600],
+            "coupon_px": 90,
             "orientations": [{"up_to_deg": 70, "subdivisions": 0}],
             "samples_per_pixel": 4,
             "samples": [entry for entry in entries if entry.get("parameters", {}).get("Ra") != 0.09],
