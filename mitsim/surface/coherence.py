@@ -34,6 +34,9 @@ LARGEST_INCIDENCE = float(np.radians(75))
 
 _ANGLES, _COUNTS = 12, (96, 48, 4)
 
+#: angles of one step for a round lobe: larger arrays leave the cache. An elongated one has larger arrays for one angle
+_TOGETHER = 3
+
 
 def coherent_weight(phase_variance: float, mean_cosine: ArrayLike) -> NDArray[np.float64]:
     """Return A [1] of pairs of directions; ``mean_cosine`` is the mean of their cosines to the normal, any shape."""
@@ -60,18 +63,21 @@ def lobe_numbers(
         ((1 - beckmann) * energy_factor[0], GGX_PER_BECKMANN, "ggx"),
     )
     cosines = np.linspace(np.cos(LARGEST_INCIDENCE), EVEN_FROM, _ANGLES)
-    lost = 1 - coherent_weight(phase_variance, cosines)
+    angles, lost = np.arccos(cosines), 1 - coherent_weight(phase_variance, cosines)
     returned, missing = np.zeros((_ANGLES, 3)), np.zeros(_ANGLES)
+    together = _TOGETHER if alpha_u == alpha_v else 1
     for share, width, distribution in lobes:
         if share == 0:
             continue
-        weight, out = facets(np.arccos(cosines), width * alpha_u, width * alpha_v, distribution, _COUNTS)
-        mean = 0.5 * (cosines[:, None] + out)
-        kept = share * weight * (1 - coherent_weight(phase_variance, mean))
-        u = np.maximum(1 - mean / EVEN_FROM, 0.0)
-        square = u * u
-        for number, term in enumerate((square, square * u, square * square)):
-            returned[:, number] += np.vecdot(kept, term)
-        missing += share * weight.sum(axis=-1) * lost - kept.sum(axis=-1)
-    first, second, third = np.linalg.lstsq(returned, missing, rcond=1e-6)[0].tolist()
-    return first, second, third
+        for first in range(0, _ANGLES, together):
+            some = slice(first, first + together)
+            weight, out = facets(angles[some], width * alpha_u, width * alpha_v, distribution, _COUNTS)
+            mean = 0.5 * (cosines[some, None] + out)
+            kept = share * weight * (1 - coherent_weight(phase_variance, mean))
+            u = np.maximum(1 - mean / EVEN_FROM, 0.0)
+            square = u * u
+            for number, term in enumerate((square, square * u, square * square)):
+                returned[some, number] += np.vecdot(kept, term)
+            missing[some] += share * weight.sum(axis=-1) * lost[some] - kept.sum(axis=-1)
+    c_0, c_1, c_2 = np.linalg.lstsq(returned, missing, rcond=1e-6)[0].tolist()
+    return c_0, c_1, c_2
