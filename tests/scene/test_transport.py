@@ -18,7 +18,7 @@ from mitsim.sensor.projector import Projector
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import FILM_OFFSET_PX, Transform, look_at, mitsuba_to_world
 
-#: aperture and focus [mm] as in the other tests with this part and samples of 4: they share the kernels
+#: aperture and focus [mm] of all tests that trace four samples of the two pillars: they share the kernels
 LENS = (2.0, 500.0)
 
 BESIDE = Transform.from_degrees([0, -4.15, 0], [50.4, 0, 3.7])

@@ -163,7 +163,7 @@ def flat_white():
 def test_the_light_s_own_noise_is_none_at_depth_1_and_falls_with_samples_at_depth_3(simulated, scenes):
     """White floor and ball: no noise of direct light; that of interreflections falls as the root of the samples.
 
-    In the 6600 pixels around the ball's foot, where most of it is: the ratio is known to 2 % there.
+    In the 6600 pixels around the ball's foot, where most of it is: the ratio is known to 5 % there.
     """
     white = {"type": "matt_white"}
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([100, 100, 1]), "bsdf": white}
