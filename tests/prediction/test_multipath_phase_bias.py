@@ -86,7 +86,8 @@ def test_faces_do_not_mix_and_without_direct_light_there_is_no_pull():
 
 
 def test_a_phase_becomes_the_depth_at_which_the_ray_meets_that_stripe(david):
-    predictor = Predictor.of_sensor(david, sensor_geometry(david)).thinned(40)
+    small = middle_part(david, 160, 120)
+    predictor = Predictor.of_sensor(small, sensor_geometry(small)).thinned(40)
     fringe = finest_fringe(david)
     rng = np.random.default_rng(3)
     ray = np.column_stack([rng.uniform(-0.3, 0.3, (50, 2)), np.ones(50)])
