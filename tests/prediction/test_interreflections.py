@@ -109,10 +109,13 @@ def test_points_are_lost_as_the_ratio_grows_and_none_without():
 @pytest.mark.parametrize("name", ["ensenso-n10", "david-sls-3", "kinect-v2"])
 def test_beside_a_wall_points_are_noisier_and_fewer_and_codes_are_pulled(name):
     """A white plate and a wall on it: light from the wall fades along the plate, and with it all that it does."""
-    sensor = load_sensor(name)
+    sensor, thinned = load_sensor(name), 4
+    if name == "david-sls-3":  # of two megapixels
+        eye = sensor.rig.reference.binned(2)
+        sensor, thinned = replace(sensor, rig=replace(sensor.rig, cameras={"camera": eye})), 2
     near = 1.2 * sensor.working_range_mm[0]
     scene, pose = white_corner(sensor), look_at([0, -0.7 * near, 0.7 * near], [0, 0, 0], [0, 0, 1])
-    predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor)).thinned(4)
+    predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor)).thinned(thinned)
     surfaces = predictor.surfaces(scene, pose)
     ideal = predictor.ideal(surfaces)
     found = InterreflectionEffect(sensor)(SceneView(scene, pose, surfaces, ideal))
@@ -153,7 +156,7 @@ def test_views_rendered_together_are_those_rendered_alone(name):
     near = 1.2 * sensor.working_range_mm[0]
     scene = white_corner(sensor)
     poses = [look_at([x, -0.7 * near, 0.7 * near], [0, 0, 0], [0, 0, 1]) for x in (-200, 0, 150)]
-    effect = InterreflectionEffect(sensor, paths=20_000, photons=100_000)
+    effect = InterreflectionEffect(sensor, photons=100_000)
     alone = [effect.render(scene, pose).values for pose in poses]
     together = [image.values for image in effect.render_views(scene, poses)]
     assert not np.array_equal(alone[0], alone[1], equal_nan=True)

@@ -23,6 +23,7 @@ from mitsim.scene.load import Scene, flat_coupon, scene_from_dict
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.simulate import SimulatedSensor
+from tests.smaller_sensors import narrow_search
 
 DISTANCE = 504.0
 TURNED = {"type": "machined_metal", "metal": "aluminium", "process": "turned", "Ra": 0.8}
@@ -141,8 +142,10 @@ def test_rendered_coupons_along_and_across_are_as_the_score_predicts_them(n10, p
     """A small campaign up to 30 deg; then rendered coupons at an angle between its directions, and at one of them."""
     monkeypatch.setattr(one_finish, "BANDS", ((30.0, 2),))
     monkeypatch.setattr(one_finish, "REFINED", None)
-    finish, simulated = finish_with_lay(n10), SimulatedSensor(n10)
-    one = OneFinish(finish, n10, 30.0)
+    monkeypatch.setattr(one_finish, "SAMPLES_PER_PIXEL", 4)
+    near = narrow_search(n10, DISTANCE - 50, DISTANCE + 55)
+    finish, simulated = finish_with_lay(n10), SimulatedSensor(near)
+    one = OneFinish(finish, near, 30.0)
     known = characterise_finish(one, simulated, DISTANCE, tmp_path)
     file, normal = plan_of(30.0), np.array([math.sin(0.35), 0.0, math.cos(0.35)])
     seen, predicted = [], []

@@ -21,6 +21,7 @@ from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
+from tests.smaller_sensors import middle_part
 
 ROOT = Path(__file__).parents[2]
 FRINGES = (ROOT / "tests/data/fringes.toml").read_text(encoding="utf-8")
@@ -51,12 +52,12 @@ _FRAMES = [(0.0, 0.0), (9.0, 4.0), (18.0, 8.0), (27.0, 12.0)]
 
 
 def sensor_of(kind: str, folder: Path):
-    n10 = load_sensor("ensenso-n10")
+    n10 = middle_part(load_sensor("ensenso-n10"), 560, 300)
     match kind:
         case "time of flight":
             return load_sensor("kinect-v2")
         case "reference":
-            return load_sensor("primesense-carmine-1.09")
+            return middle_part(load_sensor("primesense-carmine-1.09"), 480, 300)
         case "sgbm":
             return n10
         case "correlation of 4 frames" | "correlation of 1 frame":

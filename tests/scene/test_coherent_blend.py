@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -27,7 +29,12 @@ def mirror(roughness, wavelength, process="lapped"):
     scatter = machined(Face(process=process, Ra=roughness, wide_angle=0.0), wavelength)
     scatter = dataclasses.replace(scatter, energy_factor=energy_factors(scatter.alpha_u, scatter.alpha_v, 1.0))
     register_coherent_blend()
-    return scatter, mi.load_dict(metal_bsdf((0.0, 1.0), scatter))
+    bsdf = mi.load_dict(metal_bsdf((0.0, 1.0), scatter))
+    parameters = mi.traverse(bsdf)
+    for name in parameters.keys():  # noqa: SIM118 it is no mapping
+        dr.make_opaque(parameters[name])  # faces of any roughness share their kernels
+    parameters.update()
+    return scatter, bsdf
 
 
 def closed_form(roughness, wavelength, angle):
@@ -46,33 +53,43 @@ def surface_seen_at(angle, count):
     return surface
 
 
-def sampled(bsdf, angle, side=512):
-    """Weights (n,) and half-way slopes (n,) of stratified samples of a BSDF seen at an angle [rad]."""
+@cache
+def stratified(side):
+    """Three numbers (side^2,) in the unit interval for each of as many samples."""
     count = side**2
     rng = np.random.default_rng(7)
     cells = np.stack(np.meshgrid(np.arange(side), np.arange(side))).reshape(2, -1)
     first, second = (cells + rng.random((2, count))) / side
     pick = rng.permutation((np.arange(count) + rng.random(count)) / count)
-    surface = surface_seen_at(angle, count)
-    pick, first, second = (mi.Float(np.minimum(v, 1 - 1e-7).astype(np.float32)) for v in (pick, first, second))
+    return [np.minimum(v, 1 - 1e-7).astype(np.float32) for v in (pick, first, second)]
+
+
+def sampled(bsdf, angle, side=512):
+    """Weights (n,) and half-way slopes (n,) of stratified samples of a BSDF seen at an angle [rad]."""
+    surface = surface_seen_at(angle, side**2)
+    pick, first, second = (mi.Float(values) for values in stratified(side))
     found, weight = bsdf.sample(mi.BSDFContext(), surface, pick, mi.Point2f(first, second))
     half = np.array(surface.wi + found.wo, float)
     return np.ravel(np.array(weight, float)), np.hypot(half[0], half[1]) / half[2]
 
 
-@pytest.mark.parametrize("wavelength", [550, 850])
-@pytest.mark.parametrize("roughness", [0.05, 0.09, 0.2, 0.4])
-def test_the_mirror_like_share_is_that_of_beckmann_and_spizzichino(roughness, wavelength):
+@pytest.fixture(scope="module", params=itertools.product([0.05, 0.09, 0.2, 0.4], [550, 850]), ids=str)
+def face(request):
+    """Roughness [um], wavelength [nm], scatter, and weights and slopes of the samples at each of the angles."""
+    scatter, bsdf = mirror(*request.param)
+    return *request.param, scatter, [sampled(bsdf, angle) for angle in np.radians(ANGLES_DEG)]
+
+
+def test_the_mirror_like_share_is_that_of_beckmann_and_spizzichino(face):
     """Share of the light that facets of a slope under 0.015 send, against the closed forms of both distributions."""
-    scatter, bsdf = mirror(roughness, wavelength)
+    roughness, wavelength, scatter, samples = face
     q = (NARROW / scatter.alpha_u) ** 2
     q_ggx = (NARROW / scatter.ggx_alpha[0]) ** 2
     factor_ggx, factor_beckmann = scatter.energy_factor
     of_rest = scatter.beckmann * factor_beckmann * -math.expm1(-q)
     of_rest += (1 - scatter.beckmann) * factor_ggx * q_ggx / (1 + q_ggx)
     of_mirror = -math.expm1(-((NARROW / 0.005) ** 2))
-    for angle in np.radians(ANGLES_DEG):
-        weight, slope = sampled(bsdf, angle)
+    for angle, (weight, slope) in zip(np.radians(ANGLES_DEG), samples, strict=True):
         found = weight[slope < NARROW].sum() / len(weight)
         share = closed_form(roughness, wavelength, angle)
         assert (found - of_rest) / (of_mirror - of_rest) == pytest.approx(share, abs=0.01)
@@ -85,17 +102,15 @@ def test_a_fine_face_at_60_deg_is_half_a_mirror():
     assert scatter.coherent_at(np.radians(60)) == pytest.approx(0.499, abs=0.001)
 
 
-@pytest.mark.parametrize("wavelength", [550, 850])
-@pytest.mark.parametrize("roughness", [0.05, 0.09, 0.2, 0.4])
-def test_what_the_mirror_gains_the_rest_loses(roughness, wavelength):
+def test_what_the_mirror_gains_the_rest_loses(face):
     """White furnace: what comes back is what the two lobes return, shared at that angle, to 1 %, and not over 1.
 
     The lobes alone return up to 1.0025, as their energy factor is that of 30 deg.
     """
-    scatter, bsdf = mirror(roughness, wavelength)
+    roughness, wavelength, scatter, samples = face
     factor_ggx, factor_beckmann = scatter.energy_factor
-    for angle in np.radians(ANGLES_DEG):
-        found = sampled(bsdf, angle)[0].mean()
+    for angle, (weight, _) in zip(np.radians(ANGLES_DEG), samples, strict=True):
+        found = weight.mean()
         rest = scatter.beckmann * factor_beckmann * directional_albedo(angle, *[scatter.alpha_u] * 2, "beckmann")
         rest += (1 - scatter.beckmann) * factor_ggx * directional_albedo(angle, *scatter.ggx_alpha, "ggx")
         share = closed_form(roughness, wavelength, angle)

@@ -43,6 +43,15 @@ def test_many_points_are_projected_as_all_at_once(distortion, model):
     assert camera.project(points).tobytes() == whole.tobytes()
 
 
+@pytest.mark.parametrize("distortion", [np.zeros(0), ENSENSO[:4], ENSENSO, FOURTEEN[:8], FOURTEEN[:12]])
+def test_points_are_projected_as_by_opencv(distortion):
+    """To the last bits: a compiler may fuse a product and a sum."""
+    camera = Camera(K, distortion, 752, 480)
+    points = np.random.default_rng(1).uniform([-200, -200, 300], [200, 200, 900], (20_000, 3))
+    other = cv2.projectPoints(points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), K, distortion)[0].reshape(-1, 2)
+    np.testing.assert_allclose(camera.project(points), other, rtol=0, atol=1e-11)
+
+
 def test_a_pinhole_is_the_textbook_one():
     camera = Camera(K, np.zeros(5), 752, 480)
     assert np.allclose(camera.project(np.array([30.0, -20.0, 600.0])), [626.18 * 0.05 + 372.16, 240.86 - 626.13 / 30])

@@ -31,7 +31,7 @@ def median_slope(rho, sigma, wavelength_um, guess):
     v = 4 pi s / lambda for facets of slope s.
     """
     g = (4 * np.pi * sigma / wavelength_um) ** 2
-    lags = np.concatenate([[0], np.geomspace(1e-4, 2e3, 400000)])
+    lags = np.concatenate([[0], np.geomspace(1e-4, 2e3, 100_000)])
     coherence = np.exp(-g * (1 - rho(lags))) * np.expm1(-g * rho(lags)) / np.expm1(-g)
     last = np.searchsorted(-coherence, -1e-9)
     lags, coherence = lags[:last], coherence[:last]

@@ -20,6 +20,7 @@ from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.simulate import SimulatedSensor
+from tests.smaller_sensors import middle_part
 
 CARMINE, N35, D435, OAK = "primesense-carmine-1.09", "ensenso-n35", "realsense-d435", "oak-d-pro"
 
@@ -27,6 +28,8 @@ CARMINE, N35, D435, OAK = "primesense-carmine-1.09", "ensenso-n35", "realsense-d
 @cache
 def prepared(name):
     sensor = load_sensor(name)
+    if len(sensor.rig.cameras) == 2:
+        sensor = middle_part(sensor, sensor.rig.reference.width, 320)  # all plates are in these rows
     return sensor, SimulatedSensor(sensor), sensor_geometry(sensor)
 
 

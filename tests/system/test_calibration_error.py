@@ -18,13 +18,16 @@ from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
+from tests.smaller_sensors import middle_part
 
 
-@pytest.mark.parametrize(("name", "floor_mm"), [("david-sls-3", 0.005), ("ensenso-n35", 0.03)])
-def test_rendered_plates_come_out_where_drawn_rigs_put_them(name, floor_mm):
+@pytest.mark.parametrize(
+    ("name", "part", "floor_mm"), [("david-sls-3", (560, 560), 0.005), ("ensenso-n35", (1280, 400), 0.03)]
+)
+def test_rendered_plates_come_out_where_drawn_rigs_put_them(name, part, floor_mm):
     """Without noise; ``floor_mm`` is what code and decoder leave on such a plate with the right rig."""
-    sensor = load_sensor(name)
-    covariance = preset_covariance(sensor)
+    covariance = preset_covariance(load_sensor(name))  # of deviations, which a part of the image shares
+    sensor = middle_part(load_sensor(name), *part)
     true = moved(sensor.rig, covariance.names, covariance.draw(np.random.default_rng(5)))
     assert true.projector is not None
     rendered = replace(sensor, rig=true, projector=replace(sensor.projector, optics=true.projector))

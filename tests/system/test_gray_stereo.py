@@ -46,7 +46,7 @@ def cloud_of(sensor, shape, pose):
 POSE = look_at([0, 0, 600], [0, 0, 0], [0, 1, 0])
 
 
-@pytest.mark.parametrize("stripe", [2, 4, 8, 16])
+@pytest.mark.parametrize("stripe", [2, 16])
 def test_a_plane_has_no_bias(stripe, tmp_path):
     sensor = sensor_of(stripe, tmp_path)
     cloud = cloud_of(sensor, {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([1000, 1000, 1])}, POSE)
@@ -79,7 +79,7 @@ def test_the_faces_of_a_corner_are_flat_and_square(stripe, tmp_path):
         assert off.std() < STAIRCASE[stripe] / 5
 
 
-@pytest.mark.parametrize("stripe", [2, 4, 8, 16])
+@pytest.mark.parametrize("stripe", [2, 16])
 def test_a_ball_has_no_bias(stripe, tmp_path):
     sensor = sensor_of(stripe, tmp_path)
     cloud = cloud_of(sensor, {"type": "sphere", "radius": 60.0}, POSE)

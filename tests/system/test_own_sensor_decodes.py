@@ -7,6 +7,7 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from characterisation.cloud_files import read_ply
@@ -65,9 +66,11 @@ class Taken:
         assert self.sensor.name not in presets()
         scene = load_scene(ROOT / "scenes/coupon/matt_white.xml", self.sensor.wavelength_nm)
         pose = look_at([150, -100, 560], [0, 0, 0], [0, 1, 0])
-        write_capture(
-            SimulatedSensor(self.sensor).capture(scene, pose, rendering=Rendering(samples=1), seed=4), self.folder
+        coupon = pose.inverse().points(60.0 * np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)]))
+        capture = SimulatedSensor(self.sensor).capture(
+            scene, pose, rendering=Rendering(samples=1), seed=4, around=coupon
         )
+        write_capture(capture, self.folder)
 
     def cloud(self, name: str, sensor: str | None = None):
         decode(self.folder, self.folder.parent / name, sensor)

@@ -167,6 +167,7 @@ def small(scenes, tmp_path_factory, n10, simulated):
     file = CampaignFile.model_validate(
         {
             "distances_mm": [400, 600],
+            "coupon_px": 90,
             "orientations": [{"up_to_deg": 70, "subdivisions": 0}],
             "samples_per_pixel": 4,
             "samples": [entry for entry in entries if entry.get("parameters", {}).get("Ra") != 0.09],
@@ -240,9 +241,9 @@ def test_variants_of_a_sample_have_folders_of_their_own(tmp_path, scenes, n10):
 def test_the_noise_of_interreflections_that_are_rendered_apart_falls_with_their_own_samples(scenes, simulated):
     """Four times the paths halve it; with the samples of direct light it does not change.
 
-    In the 4700 pixels between the pillars, where most of it is: a ratio is known to 3 % there.
+    In the 4700 pixels between the white pillars, where most of it is: a ratio is known to 5 % there.
     """
-    scene = load_scene(scenes / "two_pillars/two_pillars.xml", simulated.sensor.wavelength_nm)
+    scene = load_scene(scenes / "two_pillars/matt_white.xml", simulated.sensor.wavelength_nm)
     pose = look_at([0, -400, 300], [0, 0, 30], [0, 0, 1])
 
     around = pose.inverse().points(np.array([[x, y, 0.0] for x in (-30, 30) for y in (-50, 20)]))
@@ -251,9 +252,9 @@ def test_the_noise_of_interreflections_that_are_rendered_apart_falls_with_their_
         rendering = Rendering(samples, 2, IndirectLight(paths, 1.5))
         return render_residual(simulated, scene, pose, "left", rendering, seed=1, around=around).noise
 
-    few = noise(4, 4)
-    assert noise(4, 16) == pytest.approx(few / 2, rel=0.15)
-    assert noise(8, 4) == pytest.approx(few, rel=0.15)
+    few = noise(1, 1)
+    assert noise(1, 4) == pytest.approx(few / 2, rel=0.15)
+    assert noise(4, 1) == pytest.approx(few, rel=0.15)
 
 
 @pytest.fixture(scope="module")
