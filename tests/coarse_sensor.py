@@ -24,21 +24,25 @@ def coarse_sensor(name: str, step: int, folder: Path) -> Path:
     """
     preset = (files("mitsim.sensor") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
     parts = re.split(r"(?m)^(?=\[)", preset)
-    calibration = '[unknowns.calibration]\ncovariance = "calibration.toml"\n'
+    calibration = folder / f"{name}-calibration.toml"
+    if not any(part.startswith("[unknowns.calibration]") for part in parts):
+        parts.append("[unknowns.calibration]\n")
     sensor = folder / f"{name}.toml"
-    sensor.write_text("\n".join([*(_coarse(part, step) for part in parts), calibration]), encoding="utf-8")
+    sensor.write_text("\n".join(_coarse(part, step, calibration) for part in parts), encoding="utf-8")
     known = preset_covariance(load_sensor(name), Drift.none())
     cameras = load_sensor(sensor).rig.cameras
     eye_and_kind = [one.split(".", 1) for one in known.names]
     in_pixels = [eye in cameras and kind.startswith(("focal", "principal")) for eye, kind in eye_and_kind]
     scale = np.where(in_pixels, 1 / step, 1.0)
     coarse = replace(known, covariance=known.covariance * np.outer(scale, scale))
-    write_rig_covariance(folder / "calibration.toml", coarse, load_sensor(sensor).rig)
+    write_rig_covariance(calibration, coarse, load_sensor(sensor).rig)
     return sensor
 
 
-def _coarse(part: str, step: int) -> str:
+def _coarse(part: str, step: int, calibration: Path) -> str:
     """Return a table of a sensor file with lengths in pixels of the cameras divided by ``step``."""
+    if part.startswith("[unknowns.calibration]"):
+        return f'{part}covariance = "{calibration.name}"\n'
     if part.startswith("[pattern]"):
         return re.sub(r"(?m)^(run_length_px = )([\d.]+)", lambda found: found[1] + str(step * float(found[2])), part)
     if not part.startswith("[cameras."):
