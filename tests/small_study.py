@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 from shell import ROOT
 
@@ -12,13 +13,13 @@ MEASUREMENTS = ("point1_point2_distance", "pillar1_radius", "pillar2_radius")
 SCENES = ROOT / "scenes" / "two_pillars"
 
 
-def small_study(parameters: str) -> str:
+def small_study(parameters: str, sensor: str | Path = "ensenso-n10", task: str | Path = SCENES / "task.toml") -> str:
     """The text of the study with these ``parameters`` of its scene, an inline table of TOML."""
     return f"""
 scene = "{SCENES / "two_pillars.xml"}"
 parameters = {parameters}
-task = "{SCENES / "task.toml"}"
-sensor = "ensenso-n10"
+task = "{task}"
+sensor = "{sensor}"
 [views]
 subdivisions = 0
 lowest_elevation_deg = 20

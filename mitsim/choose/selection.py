@@ -84,6 +84,7 @@ class SensorResult:
     """
 
     candidate: CandidateSensor
+    unknowns: Unknowns
     scores: xr.Dataset
     screened: Floats
     screened_u: Floats
@@ -195,7 +196,7 @@ def _screened(candidate: CandidateSensor, folder: Path) -> SensorResult:
         assert study.performance_map is not None
         predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
         say(f"choose: {candidate.name}, {len(study.views)} views")
-        scores, _ = screen(study, predictor, study.performance_map)
+        scores, _ = screen(study, predictor, study.performance_map, unknowns)
         scores.attrs["digest"] = digest
         write_netcdf(scores, path)
         gc.collect()
@@ -207,7 +208,8 @@ def _screened(candidate: CandidateSensor, folder: Path) -> SensorResult:
         _screened_demand(study.task, name, float(size))
         for name, size in zip(study.task.measurements, least, strict=True)
     ]
-    return SensorResult(candidate, scores, np.array(demands), least, scores["view"].values[best].astype(np.int64))
+    screened_view = scores["view"].values[best].astype(np.int64)
+    return SensorResult(candidate, unknowns, scores, np.array(demands), least, screened_view)
 
 
 _OF_A_VIEW = ("measurement", "view")
@@ -268,8 +270,8 @@ class _Workspace:
         return state_view(study, chosen, exposed.runner, trials, self.unknowns, StatementTable(trials=count, pairs=0))
 
 
-def _prepared(candidate: CandidateSensor, folder: Path, workers: Executor | None) -> _Workspace:
-    study, unknowns = candidate.study, study_unknowns(candidate.study)
+def _prepared(one: SensorResult, folder: Path, workers: Executor | None) -> _Workspace:
+    candidate, study, unknowns = one.candidate, one.candidate.study, one.unknowns
     virtual_measurements = measurements_of(study, unknowns)
     runner = spread_over(workers, study, unknowns, virtual_measurements)
     digest = trial_digest(study, unknowns, runner.source)
@@ -280,7 +282,7 @@ def _prepared(candidate: CandidateSensor, folder: Path, workers: Executor | None
 def _measure_sensor(one: SensorResult, folder: Path, seconds: float, workers: Executor | None) -> None:
     """Race and state one sensor in approximately ``seconds``."""
     began = time.monotonic()
-    study, workspace = one.candidate.study, _prepared(one.candidate, folder, workers)
+    study, workspace = one.candidate.study, _prepared(one, folder, workers)
     table = study.file.race
     rules = RaceRules(
         min(SHORTLIST, table.shortlist), min(RACE_TRIALS, table.trials), table.margin, 0.9, _RACE_SHARE * seconds
@@ -340,7 +342,7 @@ def _own_views(one: SensorResult, names: list[str], view: int) -> list[int]:
 
 def _refine_leader(leader: SensorResult, folder: Path, end: float, workers: Executor | None) -> None:
     """Add trials of the leader up to the number in the study, as long as there is time."""
-    workspace = _prepared(leader.candidate, folder, workers)
+    workspace = _prepared(leader, folder, workers)
     most = leader.candidate.study.file.statement.trials
     used = {row[0] for row in leader.best() if row is not None}
     while time.monotonic() < end:

@@ -101,7 +101,7 @@ def run_study(
     clock.lap("characterise")
 
     predictor = virtual_measurements.predictor
-    scores, chosen, search = score_study(study, predictor, performance_map, folder)
+    scores, chosen, search = score_study(study, predictor, performance_map, folder, unknowns)
     clock.lap("score")
     trials = TrialFolder(folder / "trials", digest, list(study.task.measurements))
     raced = run_race(study.views, scores, runner, trials, race_rules(study.file.race, minutes))

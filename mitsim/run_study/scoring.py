@@ -31,17 +31,23 @@ from mitsim.study import Study
 from mitsim.view_sets.confirmed_set import Search, joining_in_words
 from mitsim.views import write_views
 from mitsim.virtual.screening import screen
+from mitsim.virtual.world import Unknowns
 
 
 def score_study(
-    study: Study, predictor: Predictor, performance_map: PerformanceMap, folder: Path
+    study: Study,
+    predictor: Predictor,
+    performance_map: PerformanceMap,
+    folder: Path,
+    unknowns: Unknowns | None = None,
 ) -> tuple[xr.Dataset, ViewSet | None, Search]:
     """Score all views, choose a set if the study asks for one, and write ``scores``, ``poses`` and ``part.ply``.
 
-    Returns the scores, the set, and the function that finds a set for other limits.
+    ``unknowns``: see :func:`~mitsim.virtual.screening.screen`. Returns the scores, the set, and the function that finds
+    a set for other limits.
     """
     write_views(folder / "poses", study.candidates, study.file.views, study.sensor.name)
-    scores, inputs = screen(study, predictor, performance_map)
+    scores, inputs = screen(study, predictor, performance_map, unknowns)
     search = partial(_set_within, study, inputs)
     chosen = _chosen_set(study, search)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")

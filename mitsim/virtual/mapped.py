@@ -105,7 +105,7 @@ class MappedMeasurements:
         if not new:
             return
         study = replace(self.study, candidates=replace(self.study.candidates, views=new))
-        scores, _ = screen(study, self.predictor, self.performance_map)
+        scores, _ = screen(study, self.predictor, self.performance_map, self.unknowns)
         predicted = scores["predicted_uncertainty"].transpose("view", "measurement").values
         for view, row in zip(new, predicted.tolist(), strict=True):
             self._predicted[view.number] = dict(zip(scores["measurement"].values.tolist(), row, strict=True))

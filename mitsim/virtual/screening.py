@@ -38,17 +38,19 @@ _FOUND_AGAIN_MM = 1e-3
 
 
 def screen(
-    study: Study, predictor: Predictor, performance_map: PerformanceMap
+    study: Study, predictor: Predictor, performance_map: PerformanceMap, unknowns: Unknowns | None = None
 ) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:
-    """Score all views of a study; see :func:`mitsim.view_scores.score_candidates`."""
-    return score_candidates(
-        study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS, effects_of(study)
-    )
+    """Score all views of a study; see :func:`mitsim.view_scores.score_candidates`.
+
+    ``unknowns`` are those of the study, if the caller has prepared them: a calibration may take seconds to simulate.
+    """
+    effects = effects_of(study, study_unknowns(study) if unknowns is None else unknowns)
+    return score_candidates(study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS, effects)
 
 
-def effects_of(study: Study) -> list[Effect]:
+def effects_of(study: Study, unknowns: Unknowns) -> list[Effect]:
     """Return the effects that screening includes beyond the map."""
-    effects: list[Effect] = [shared_errors(study, study_unknowns(study))]
+    effects: list[Effect] = [shared_errors(study, unknowns)]
     depth = study.file.score.light_path_depth
     if depth > 1 and sees_itself(study.scene):
         poses = [view.world_from_sensor for view in study.views]

@@ -9,15 +9,16 @@ from unittest import mock
 
 import pytest
 import typer.main
+from coarse_sensor import coarse_sensor
 from plain_pages import without_pictures
 from shell import mitsim_here
-from small_study import small_study
+from small_study import few_measurements, small_study
 
 from mitsim.cli import app
 from mitsim.exposures import exposure_plan, planned
 
 #: ground aluminium of Ra 0.37: from the side the N10's own exposure, 1.15 ms, is too short
-STUDY = small_study("{ plane_Ra = 0.37, pillar_Ra = 0.37 }")
+FINISHES = "{ plane_Ra = 0.37, pillar_Ra = 0.37 }"
 OWN_S = 0.00115
 SAID = r"view {view}: expose (.* ms, at full power): every (other )?feature is at its limit with 1 exposure"
 
@@ -71,7 +72,8 @@ def plans():
 def chosen(tmp_path_factory, plans):
     """What `run --plan-exposures` left and said, and the number of the view that it stated."""
     folder = tmp_path_factory.mktemp("planned")
-    (folder / "study.toml").write_text(STUDY)
+    (folder / "task.toml").write_text(few_measurements())
+    (folder / "study.toml").write_text(small_study(FINISHES, coarse_sensor("ensenso-n10", 2, folder), "task.toml"))
     with mock.patch.object(planned, "plan_view", plans.anew):
         done = invoked("run", folder / "study.toml", "--plan-exposures", "-o", folder / "run")
     return folder, done, json.loads((folder / "run/statement.json").read_text())["view"]
@@ -98,7 +100,7 @@ def test_budget_and_choose_plan_as_run_does(chosen, plans, command):
     `budget` makes its plan anew. `choose` has to ask for the very plan that `run` made, and gets that.
     """
     folder, done, view = chosen
-    more = ["--view", view] if command == "budget" else ["--sensors", "ensenso-n10"]
+    more = ["--view", view] if command == "budget" else ["--sensors", folder / "ensenso-n10.toml"]
     with mock.patch.object(planned, "plan_view", plans.anew if command == "budget" else plans.kept):
         other = invoked(command, folder / "study.toml", *more, "--plan-exposures", "-o", folder / command)
     assert plans.taken_again == (command == "choose")
@@ -123,7 +125,7 @@ def test_without_the_option_the_sensors_own_exposure_holds(chosen):
 
 def test_exposures_that_the_study_gives_are_not_planned_again(chosen):
     folder, _, view = chosen
-    (folder / "given.toml").write_text(STUDY + "[exposure]\nexposures_s = [0.003]\n")
+    (folder / "given.toml").write_text((folder / "study.toml").read_text() + "[exposure]\nexposures_s = [0.003]\n")
     done = invoked("budget", folder / "given.toml", "--view", view, "--plan-exposures", "-o", folder / "given")
     assert "expose" not in done.stderr
     assert statement_in(folder / "given")["exposure"] == {"exposures_s": [0.003], "power": 1.0}

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray as xr
+from coarse_sensor import coarse_sensor
 from typer.testing import CliRunner
 
 import mitsim as ms
@@ -85,15 +86,25 @@ def test_score_has_the_figures_of_the_command(workplace):
             assert np.array_equal(scores[name].values, theirs[name].values, equal_nan=True)
 
 
-def test_statement_has_the_figures_of_the_command(workplace):
-    text = (workplace / "study.toml").read_text() + "\n[statement]\ntrials = 3\npairs = 0\n"
-    (workplace / "short.toml").write_text(text)
+@pytest.fixture
+def coarse_workplace(workplace):
+    """The folder, with a study of a sensor that has a quarter of the pixels."""
+    sensor = coarse_sensor("ensenso-n10", 2, workplace)
+    text = (workplace / "study.toml").read_text().replace('"ensenso-n10"', f'"{sensor.name}"')
+    (workplace / "study.toml").unlink()  # it is a link to the file of all tests
+    (workplace / "study.toml").write_text(text)
+    return workplace
+
+
+def test_statement_has_the_figures_of_the_command(coarse_workplace):
+    text = (coarse_workplace / "study.toml").read_text() + "\n[statement]\ntrials = 3\npairs = 0\n"
+    (coarse_workplace / "short.toml").write_text(text)
     CliRunner().invoke(app, ["budget", "short.toml", "--view", "4", "-o", "budget"], catch_exceptions=False)
-    theirs = json.loads((workplace / "budget/statement.json").read_text())["measurements"]
+    theirs = json.loads((coarse_workplace / "budget/statement.json").read_text())["measurements"]
     for one in ms.statement(ms.open_study("study.toml"), 4, trials=3, pairs=0, folder="mine"):
         assert one.trials == 3
         assert one.standard_uncertainty == pytest.approx(theirs[one.measurement]["standard_uncertainty"], nan_ok=True)
-    kept, mine = (workplace / one / "trials/view_0004.jsonl" for one in ("budget", "mine"))
+    kept, mine = (coarse_workplace / one / "trials/view_0004.jsonl" for one in ("budget", "mine"))
     assert kept.read_bytes() == mine.read_bytes()
 
 

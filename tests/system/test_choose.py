@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import shell
+from coarse_sensor import coarse_sensor
 from small_study import MEASUREMENTS, few_measurements
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
@@ -45,7 +46,8 @@ def chosen(tmp_path_factory):
     task = re.sub(r"(nominal = 20.0)", rf"\1\ntolerance = {RADIUS}", few_measurements())
     task = re.sub(r"(nominal = 70.0)", rf"\1\ntolerance = {DISTANCE}", task)
     (folder / "task.toml").write_text(task)
-    arguments = ("choose", folder / "study.toml", "--sensors", "kinect-v2,zivid-2-m70", "-o")
+    david = coarse_sensor("david-sls-3", 3, folder)
+    arguments = ("choose", folder / "study.toml", "--sensors", f"kinect-v2,{david}", "-o")
     return folder, arguments, mitsim_here(*arguments, folder / "out")
 
 
@@ -54,7 +56,7 @@ def test_sensors_are_listed_best_first_with_what_they_fit(chosen):
     assert done.returncode == 0, done.stderr
     choice = json.loads((folder / "out" / "choice.json").read_text())
     names = [one["name"] for one in choice["sensors"]]
-    assert names == ["zivid-2-m70", "kinect-v2"]
+    assert names == ["david-sls-3", "kinect-v2"]
     assert [line.split()[0] for line in done.stdout.splitlines()[1:3]] == names
     best, last = choice["sensors"][0], choice["sensors"][-1]
     assert best["status"] == "stated" and best["fits"] == len(MEASUREMENTS) and best["ratio"] <= 1
@@ -72,7 +74,7 @@ def test_progress_names_the_leader_and_the_last_line_is_the_result(chosen):
     lines = done.stderr.splitlines()
     assert any(re.match(r"choose: 2 of 2 screened; \S+ leads by the screening, at worst", line) for line in lines)
     assert any("leads measured" in line for line in lines)
-    assert lines[-1] == "zivid-2-m70: fits 3 of 3 tolerances"
+    assert lines[-1] == "david-sls-3: fits 3 of 3 tolerances"
 
 
 def test_a_finished_comparison_is_kept_and_overwritten_on_request_from_its_own_trials(chosen):
@@ -86,7 +88,7 @@ def test_a_finished_comparison_is_kept_and_overwritten_on_request_from_its_own_t
     again = mitsim_here(*arguments, folder / "out", "--overwrite")
     assert again.returncode == 0 and again.stdout == first.stdout
     assert trials and {path: path.read_bytes() for path in (folder / "out").rglob("view_*.jsonl")} == trials
-    assert "choose: kinect-v2," in again.stderr and "choose: zivid-2-m70," not in again.stderr
+    assert "choose: kinect-v2," in again.stderr and "choose: david-sls-3," not in again.stderr
 
 
 def test_page_and_sheet(chosen):

@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from coarse_sensor import coarse_sensor
 from shell import ROOT, mitsim, mitsim_here
 
 from characterisation.atomic_io import HOST
@@ -113,7 +114,7 @@ def test_the_same_render_again_is_finished_and_another_is_refused_before_it_is_r
 
 
 def test_a_deviation_is_told_and_kept_with_the_capture(tmp_path):
-    coupon = ("render", "scenes/coupon/coupon.xml", "--position", 0, 0, 500, "--samples", 1)
+    coupon = ("render", "scenes/coupon/coupon.xml", "--position", 0, 0, 500, "--samples", 1, "--depth", 1)
     done = mitsim_here(*coupon, "--deviation", "alpha=1,wide_angle=-1", "-o", tmp_path / "moved")
     assert "aluminium/ground Ra 0.4 um: prior of ground metal" in done.stderr
     assert "alpha +1 and wide angle -1 sigma" in done.stderr
@@ -133,7 +134,8 @@ def test_characterise_says_what_is_not_known_of_a_finish(tmp_path):
         scene = "{coupon}"
         spread = true
     """)
-    done = mitsim_here("characterise", tmp_path / "campaign.toml", "-o", tmp_path / "out")
+    sensor = coarse_sensor("ensenso-n10", 2, tmp_path)
+    done = mitsim_here("characterise", tmp_path / "campaign.toml", "--sensor", sensor, "-o", tmp_path / "out")
     assert "aluminium/ground, Ra 0.4 µm: unknown properties of the finish change F by up to 0." in done.stderr
 
 
@@ -231,7 +233,7 @@ def test_bad_arguments_are_told_with_code_2(tmp_path, arguments):
 
 def test_a_broken_png_is_named(tmp_path):
     plate = "scenes/coupon/matt_white.xml"
-    mitsim_here("render", plate, "--position", 0, 0, 500, "-o", tmp_path / "capture", "--samples", 1)
+    mitsim_here("render", plate, "--position", 0, 0, 500, "-o", tmp_path / "capture", "--samples", 1, "--depth", 1)
     image = tmp_path / "capture/images/left_000.png"
     image.write_bytes(image.read_bytes()[:5000])
     done = mitsim_here("decode", tmp_path / "capture", "-o", tmp_path / "cloud.ply", code=2)

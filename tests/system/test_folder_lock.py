@@ -1,6 +1,5 @@
 """Two commands do not write to one folder; one that was killed keeps nothing, and what it left is swept."""
 
-import contextlib
 import json
 import os
 import signal
@@ -8,14 +7,17 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import pytest
-from shell import ROOT, mitsim_here
+from coarse_sensor import coarse_sensor
+from shell import mitsim_here
 from small_study import small_study
 
 from characterisation.atomic_io import HOST, atomic_write, atomic_write_named, write_folder
 from mitsim.commands.folder_lock import LOCK, lock_folder, remove_partial, remove_partial_beside
 from mitsim.errors import InputError
+from mitsim.run_study import score_study
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
 
@@ -117,19 +119,20 @@ def test_signals_end_a_command_as_ctrl_c_does(tmp_path, number):
 @pytest.mark.timeout(120)
 def test_commands_hold_their_folders_and_let_them_go(tmp_path, tmp_path_factory, holder):
     study, into = str(tmp_path_factory.mktemp("study") / "study.toml"), ("-o", str(tmp_path))
-    Path(study).write_text(small_study("{ plane_Ra = 0.37, pillar_Ra = 0.37 }"), encoding="utf-8")
+    sensor = coarse_sensor("ensenso-n10", 2, Path(study).parent)
+    Path(study).write_text(small_study("{ plane_Ra = 0.37, pillar_Ra = 0.37 }", sensor), encoding="utf-8")
     for call in (("score", study, *into), ("run", study, *into), ("budget", study, "--view", "1", *into)):
         assert f"process {holder.pid}" in mitsim_here(*call, code=2).stderr
     assert {path.name for path in tmp_path.iterdir()} == {LOCK, f".scores.csv.{holder.pid}.partial"}
     os.kill(holder.pid, signal.SIGKILL)
     holder.wait()
     seen = []
-    score = [sys.executable, "-m", "mitsim", "score", study, *into]
-    with subprocess.Popen(score, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as running:
-        while running.poll() is None:
-            with contextlib.suppress(OSError, ValueError):
-                seen.append(json.loads((tmp_path / LOCK).read_text())["pid"])
-            time.sleep(0.05)
-        assert running.returncode == 0, running.stderr.read()
-    assert running.pid in seen
+
+    def scored(*given):
+        seen.append(json.loads((tmp_path / LOCK).read_text())["pid"])
+        return score_study(*given)
+
+    with mock.patch("mitsim.run_study.score_study", scored):
+        mitsim_here("score", study, *into)
+    assert seen == [os.getpid()]
     assert (tmp_path / "scores.csv").exists() and not (tmp_path / LOCK).exists()

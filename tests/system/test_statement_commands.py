@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import shell
+from coarse_sensor import coarse_sensor
 from small_study import MEASUREMENTS, few_measurements
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
@@ -13,7 +14,7 @@ SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
 STUDY = f"""
 scene = "{SCENES / "matt_white.xml"}"
 task = "task.toml"
-sensor = "ensenso-n10"
+sensor = "ensenso-n10.toml"
 [views]
 subdivisions = 0
 lowest_elevation_deg = 20
@@ -32,6 +33,7 @@ mitsim_here = partial(shell.mitsim_here, code=None)
 def stated(tmp_path_factory):
     folder = tmp_path_factory.mktemp("statement")
     (folder / "study.toml").write_text(STUDY)
+    coarse_sensor("ensenso-n10", 2, folder)
     task = few_measurements()
     place = task.index("[measurements.pillar1_radius]")
     (folder / "task.toml").write_text(

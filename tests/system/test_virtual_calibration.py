@@ -70,7 +70,7 @@ def corners(n10):
     for pose in poses():
         for name in rays:
             light = gaussian_blur(
-                trace(scene, rays[name], white, pose, LightPaths(samples=36, seed=1))[0], n10.imager.blur_px
+                trace(scene, rays[name], white, pose, LightPaths(samples=16, seed=1))[0], n10.imager.blur_px
             )
             electrons = light / np.percentile(light, 99.9) * 0.9 * n10.imager.full_well
             noisy = [

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coarse_sensor import coarse_sensor
 
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
@@ -32,15 +33,18 @@ def study_of(sensor, **more):
         "task": "task.toml",
         "sensor": sensor,
         "measure": {"by": "map"},
+        "score": {"light_path_depth": 1},
         "views": {"subdivisions": 0, "rolls_deg": [0], "lowest_elevation_deg": 20},
         **more,
     }
     return open_study(SCENES / "study.toml", StudyFile.model_validate(table))
 
 
-@pytest.fixture(scope="module", params=["ensenso-n10", "david-sls-3", "kinect-v2"])
-def drawn(request):
-    study = study_of(request.param)
+@pytest.fixture(
+    scope="module", params=[("ensenso-n10", 2), ("david-sls-3", 3), ("kinect-v2", 1)], ids=lambda one: one[0]
+)
+def drawn(request, tmp_path_factory):
+    study = study_of(str(coarse_sensor(*request.param, tmp_path_factory.mktemp("sensor"))))
     maker = measurements_of(study, study_unknowns(study, ("noise",)))
     view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
     return study, maker, view
@@ -112,7 +116,7 @@ def plain_map(known, sigma):
     return PerformanceMap(data)
 
 
-def test_the_linear_uncertainty_is_that_of_the_trials_where_nothing_but_noise_is_unknown():
+def test_the_linear_uncertainty_is_that_of_the_trials_where_nothing_but_noise_is_unknown(tmp_path, monkeypatch):
     """Of a map without losses, correlation and bias, a hundred trials: seven per cent, one sigma, for each ratio.
 
     An angle whose nominal value is 0 is the length of two normal errors, so sizes are compared, bias included.

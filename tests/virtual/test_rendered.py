@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coarse_sensor import coarse_sensor
 
 from characterisation.documents import read_toml
 from characterisation.point_cloud import PointCloud, Status
@@ -46,9 +47,21 @@ def study_of(sensor, **more):
 
 
 @pytest.fixture(scope="module")
-def fringes():
+def david(tmp_path_factory):
+    """The file of a fringe projector whose camera has a ninth of the pixels."""
+    return str(coarse_sensor("david-sls-3", 3, tmp_path_factory.mktemp("david")))
+
+
+@pytest.fixture(scope="module")
+def coarse_n10(tmp_path_factory):
+    """The file of an N10 with a quarter of the pixels."""
+    return str(coarse_sensor("ensenso-n10", 2, tmp_path_factory.mktemp("n10")))
+
+
+@pytest.fixture(scope="module")
+def fringes(david):
     """A fringe projector before the white pillars: what is measured from the first view with everything nominal."""
-    study = study_of("david-sls-3")
+    study = study_of(david)
     maker = measurements_of(study, study_unknowns(study, ()))
     world = maker.unknowns.draw(Trial(0))
     view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
@@ -146,9 +159,9 @@ def test_sharing_kernels_changes_no_image():
     np.testing.assert_allclose(images[1], images[0], rtol=2e-3, atol=1e-3 * images[0].max())
 
 
-def test_light_that_was_rendered_before_is_the_same_light():
-    sensor = SimulatedSensor(load_sensor("ensenso-n10"))
-    scene = load_scene(SCENES / "two_pillars.xml", 850.0, {"plane_Ra": "0.37", "pillar_Ra": "0.37"})
+def test_light_that_was_rendered_before_is_the_same_light(coarse_n10):
+    sensor = SimulatedSensor(load_sensor(coarse_n10))
+    scene = load_scene(SCENES / "matt_white.xml", 850.0)
     pose = look_at((0.0, -300.0, 450.0), (0.0, 0.0, 20.0), (0.0, 0.0, 1.0))
     how = IndirectLight(4, 1.5)
     at_once = sensor.light(scene, pose, rendering=Rendering(samples=4, depth=2, indirect=how), seed=5)
@@ -201,8 +214,8 @@ def test_a_path_that_is_read_too_long_moves_points_along_their_rays(fringes):
     assert np.isnan(out[:3]).all()
 
 
-def test_form_moves_points_by_what_was_asked():
-    study = study_of("david-sls-3", unknowns={"form": {"features": {"plane": 0.05}}})
+def test_form_moves_points_by_what_was_asked(david):
+    study = study_of(david, unknowns={"form": {"features": {"plane": 0.05}}})
     unknowns = study_unknowns(study, ("form",))
     maker = measurements_of(study, unknowns)
     view = min(study.views, key=lambda one: abs(one.elevation_deg - 60))
@@ -234,8 +247,8 @@ def test_parts_whose_faces_face_one_another(tmp_path):
         assert sees_itself(load_scene(path, 850.0)) is answer
 
 
-def test_a_statement_from_a_few_trials(tmp_path):
-    study = study_of("ensenso-n10", statement={"trials": 6, "pairs": 2}, unknowns={"pose": {"told_mm": 0.1}})
+def test_a_statement_from_a_few_trials(coarse_n10, tmp_path):
+    study = study_of(coarse_n10, statement={"trials": 6, "pairs": 2}, unknowns={"pose": {"told_mm": 0.1}})
     unknowns = study_unknowns(study)
     maker = measurements_of(study, unknowns)
     trials = TrialFolder(tmp_path, trial_digest(study, unknowns, "render"), list(study.task.measurements))
@@ -260,7 +273,7 @@ def test_a_statement_from_a_few_trials(tmp_path):
     document = statement_document(study, view, stated, unknowns, "render")
     missing = [one["name"] for one in document["influences"] if not one["included"]]
     assert "form of the part" in missing and "interreflections" in missing
-    other = study_of("ensenso-n10", unknowns={"pose": {"told_mm": 0.2}})
+    other = study_of(coarse_n10, unknowns={"pose": {"told_mm": 0.2}})
     assert trial_digest(other, study_unknowns(other), "render") != trial_digest(study, unknowns, "render")
 
 
