@@ -44,6 +44,7 @@ def pytest_configure(config: pytest.Config) -> None:
     for name, value in KEEP_MEMORY.items():
         os.environ.setdefault(name, value)
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, usable_cores() // workers)))
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or every process that a test starts would compile the program
     config.option.loadscopereorder = False  # files in the order of pytest_collection_modifyitems
 
 

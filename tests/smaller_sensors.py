@@ -1,4 +1,4 @@
-"""Sensors that search or show a part of what a preset does, for tests that need no more: a matcher takes its time."""
+"""Sensors that search or show less than a preset does, for tests that need no more."""
 
 from __future__ import annotations
 
@@ -12,6 +12,12 @@ def narrow_search(sensor: Sensor, near_mm: float, far_mm: float) -> Sensor:
     """Return a sensor with a matcher that searches another range of depths."""
     assert sensor.matcher is not None
     return replace(sensor, matcher=sensor.matcher.model_copy(update={"near_mm": near_mm, "far_mm": far_mm}))
+
+
+def binned(sensor: Sensor, step: int) -> Sensor:
+    """Return a sensor whose cameras have their pixels binned ``step`` x ``step``."""
+    cameras = {name: camera.binned(step) for name, camera in sensor.rig.cameras.items()}
+    return replace(sensor, rig=replace(sensor.rig, cameras=cameras))
 
 
 def middle_part(sensor: Sensor, width: int, height: int) -> Sensor:

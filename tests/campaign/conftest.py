@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,12 +14,13 @@ from known_clouds import known_source, smooth
 
 from mitsim.campaign import missing_finishes, one_finish
 from mitsim.campaign.plan import CampaignFile, plan_campaign
+from tests.smaller_sensors import binned
 
 
 @pytest.fixture(scope="session")
 def half_n10(n10):
     """The N10 with pixels of twice the size: a quarter of the work, where the values do not matter."""
-    return replace(n10, rig=replace(n10.rig, cameras={name: eye.binned(2) for name, eye in n10.rig.cameras.items()}))
+    return binned(n10, 2)
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
+from tests.smaller_sensors import binned
 
 REFLECTANCE = 0.6
 
@@ -111,8 +112,7 @@ def test_beside_a_wall_points_are_noisier_and_fewer_and_codes_are_pulled(name):
     """A white plate and a wall on it: light from the wall fades along the plate, and with it all that it does."""
     sensor, thinned = load_sensor(name), 4
     if name == "david-sls-3":  # of two megapixels
-        eye = sensor.rig.reference.binned(2)
-        sensor, thinned = replace(sensor, rig=replace(sensor.rig, cameras={"camera": eye})), 2
+        sensor, thinned = binned(sensor, 2), 2
     near = 1.2 * sensor.working_range_mm[0]
     scene, pose = white_corner(sensor), look_at([0, -0.7 * near, 0.7 * near], [0, 0, 0], [0, 0, 1])
     predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor)).thinned(thinned)

@@ -3,7 +3,6 @@
 import runpy
 import sys
 import tomllib
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from mitsim.scene.load import load_scene, share_kernels
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.preset import load_sensor
 from mitsim.study import StudyFile, open_study
+from tests.smaller_sensors import binned
 
 PARTS = (
     "balls_on_plate",
@@ -40,8 +40,7 @@ NEAR_MM = 2e-3
 @pytest.fixture(scope="module")
 def perfect_sensor():
     """Every fourth pixel of a Zivid, in both directions."""
-    sensor = load_sensor("zivid-2-m70")
-    sensor = replace(sensor, rig=replace(sensor.rig, cameras={"camera": sensor.rig.reference.binned(4)}))
+    sensor = binned(load_sensor("zivid-2-m70"), 4)
     return Predictor.of_sensor(sensor, sensor_geometry(sensor))
 
 

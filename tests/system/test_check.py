@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from mitsim.scene.first_hits import visible_surfaces
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 from mitsim.sensor.working_volume import common_view, field_of_view, in_image, in_working_volume, pose_at, usual_place
+from tests.smaller_sensors import binned
 
 METAL = """<bsdf type="machined_metal"><string name="metal" value="aluminium"/>
     <string name="process" value="ground"/><float name="Ra" value="0.4"/></bsdf>"""
@@ -49,7 +49,7 @@ class Checked:
 @pytest.fixture(scope="module")
 def coarse(n10):
     """The sensor with a quarter of its pixels, which is enough to see what stands before it."""
-    return replace(n10, rig=replace(n10.rig, cameras={name: eye.binned(2) for name, eye in n10.rig.cameras.items()}))
+    return binned(n10, 2)
 
 
 @pytest.fixture
