@@ -49,8 +49,8 @@ def _ranks(values: Floats) -> Floats:
     rising = values[order]
     if len(values) and np.isnan(rising[-1]):
         return np.full(len(values), np.nan)
-    first = np.flatnonzero(np.concatenate([np.ones(min(len(values), 1), bool), rising[1:] != rising[:-1]]))
-    count = np.diff(first, append=len(values))
+    ends = np.append(np.flatnonzero(rising[1:] != rising[:-1]) + 1, len(values))  # of runs of equal values
+    starts = np.concatenate([[0], ends[:-1]])
     ranks = np.empty(len(values))
-    ranks[order] = np.repeat(first + (count + 1) / 2, count)
+    ranks[order] = np.repeat((starts + 1 + ends) / 2, ends - starts)
     return ranks
