@@ -164,15 +164,20 @@ def _exp(values: Floats) -> Floats:
 
 def _polynomial(place: Floats) -> Floats:
     """Return the regressors (n, 7) of displacements (n, 3): 1, a, b, x, a^2, a b, b^2."""
-    a, b, x = place.T
-    return np.column_stack([np.ones(len(a)), a, b, x, a * a, a * b, b * b])
+    out = np.empty((len(place), 7))
+    a, b = place[:, 0], place[:, 1]
+    out[:, 0], out[:, 1:4] = 1.0, place
+    out[:, 4], out[:, 5], out[:, 6] = a * a, a * b, b * b
+    return out
 
 
 class _Part:
     """The places of one tile and the rows about them, arranged for matrix products."""
 
     def __init__(self, data: Observations, at: Floats, radius: Floats, slopes: Slopes, link: str) -> None:
-        self.log, self.slopes = link == "log", slopes
+        self.log = link == "log"
+        self.away = np.array([0.0, *slopes.mean, 0.0, 0.0, 0.0])
+        self.precision = np.array([0.0, *slopes.precision, *[slopes.curvature] * 3])
         low, high = at[:, :2].min(0) - radius.max(), at[:, :2].max(0) + radius.max()
         a, b = data.place.T[:2]
         near = np.flatnonzero((a > low[0]) & (a < high[0]) & (b > low[1]) & (b < high[1]))
@@ -180,7 +185,7 @@ class _Part:
         self.offset, self.design = _polynomial(at - middle), _polynomial(data.place[near] - middle)
         self.value, self.base, self.share = data.value[near], data.weight[near], data.share[near]
         self.cluster, self.within = data.cluster[near], data.within[near]
-        self.starts = np.flatnonzero(np.diff(self.cluster, prepend=-1))
+        self.starts = np.flatnonzero(np.concatenate([[True], self.cluster[1:] != self.cluster[:-1]]))
 
     def fit(self, radius: Floats, own: NDArray[np.int64] | None, keep: str) -> LocalFit:
         """Fit every place of the tile, see :func:`local_fit`."""
@@ -193,21 +198,19 @@ class _Part:
             weight[(self.cluster == own[:, None]) == (keep == "others")] = 0.0
         total: Floats = weight.sum(1)
         known = total > 0
-        away = np.array([0.0, *self.slopes.mean, 0.0, 0.0, 0.0])
-        prior = np.diag([0.0, *self.slopes.precision, *[self.slopes.curvature] * 3])
         products = (x[:, :, None] * x[:, None, :]).reshape(len(x), -1)
-        matrix = (weight @ products).reshape(-1, x.shape[1], x.shape[1]) + prior
+        matrix = (weight @ products).reshape(-1, x.shape[1], x.shape[1]) + np.diag(self.precision)
         matrix[~known] = np.eye(x.shape[1])
         inverse = np.linalg.inv(matrix)
         with np.errstate(divide="ignore", invalid="ignore"):
             leverage = weight * (np.einsum("qij,qj->qi", inverse, here) @ x.T)
             fitted = leverage @ self.value
             if self.log:
-                line = self._scored(weight, total, np.asarray(inverse, float), away, prior)
+                line = self._scored(weight, total, np.asarray(inverse, float))
                 inverse_mean = _exp(-(line @ x.T))
                 squared = (self.value[:, 0] * inverse_mean - 1.0) ** 2 + self.within * inverse_mean**2
             else:
-                line = np.einsum("qij,qj->qi", inverse, weight @ (x * self.value[:, :1]) + prior @ away)
+                line = np.einsum("qij,qj->qi", inverse, weight @ (x * self.value[:, :1]) + self.precision * self.away)
                 squared = (self.value[:, 0] - line @ x.T) ** 2 + self.within
             fitted[:, 0] = np.einsum("qi,qi->q", line, here)
             rows = total**2 / (weight**2 / self.share).sum(1)
@@ -217,10 +220,11 @@ class _Part:
         out = (independent, clustered, spread, rows, total)
         return LocalFit(np.where(known[:, None], fitted, np.nan), *(np.where(known, values, np.nan) for values in out))
 
-    def _scored(self, weight: Floats, total: Floats, inverse: Floats, away: Floats, prior: Floats) -> Floats:
+    def _scored(self, weight: Floats, total: Floats, inverse: Floats) -> Floats:
         """Return the coefficients (q, 7) of the log-linear fit, by Fisher scoring from the mean."""
-        x, y, precision = self.design, self.value[:, 0], np.diag(prior)
-        line = np.tile(away, (len(weight), 1))
+        x, y, precision, away = self.design, self.value[:, 0], self.precision, self.away
+        line = np.empty((len(weight), len(away)))
+        line[:] = away
         line[:, 0] = np.log(np.maximum(weight @ y / np.where(total > 0, total, 1.0), 1e-300))
         for _ in range(SCORING_STEPS):
             excess = y * _exp(-(line @ x.T)) - 1.0

@@ -10,7 +10,6 @@ The risk of a view is its root mean square error over the square root of the sha
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +22,9 @@ _HALVES = 200
 
 #: number of resamples of a bootstrap
 _RESAMPLES = 1000
+
+#: errors that are summed at once, so that they fit the memory near the processor
+_AT_ONCE = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -92,11 +94,15 @@ def true_risk(errors: ArrayLike) -> Floats:
     """Return the risk (v,) of views from errors (v, w), NaN for missing values; infinite without any value."""
     found = np.asarray(errors, float)
     known = np.isfinite(found)
-    share_known = known.mean(axis=1)
-    square = np.where(known, found, 0.0) ** 2
+    return _risk(np.where(known, found, 0.0) ** 2, known)
+
+
+def _risk(square: Floats, known: NDArray[np.bool_]) -> Floats:
+    """Return the risk (...) of squared errors (..., w), 0 where no value is known."""
+    count = known.sum(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        risk = np.sqrt(square.sum(axis=1) / known.sum(axis=1) / share_known)
-    return np.where(known.any(axis=1), risk, np.inf)
+        risk = np.sqrt(square.sum(axis=-1) / count / (count / known.shape[-1]))
+    return np.where(count > 0, risk, np.inf)
 
 
 @dataclass(frozen=True)
@@ -131,8 +137,8 @@ def regret(errors: ArrayLike, chosen: int, seed: int = 0, block: int = 1) -> Reg
     rng = np.random.default_rng(seed)
     places = np.arange(found.shape[1]).reshape(-1, block)
     count = len(places)
-    drawn = np.array([_halved(found, chosen, places[rng.permutation(count)]) for _ in range(_HALVES)])
-    again = np.array([_halved(found, chosen, places[rng.integers(count, size=count)]) for _ in range(_RESAMPLES)])
+    drawn = _halved(found, chosen, np.array([places[rng.permutation(count)] for _ in range(_HALVES)]))
+    again = _halved(found, chosen, np.array([places[rng.integers(count, size=count)] for _ in range(_RESAMPLES)]))
     best = int(np.argmin(risks))
     ratio = float(risks[chosen] / risks[best]) if np.isfinite(risks[best]) else float("nan")
     low, high = np.quantile(again, [0.025, 0.975], method="nearest") if np.isfinite(again).any() else (np.inf, np.inf)
@@ -148,15 +154,21 @@ def regret(errors: ArrayLike, chosen: int, seed: int = 0, block: int = 1) -> Reg
     )
 
 
-def _halved(errors: Floats, chosen: int, order: NDArray[Any]) -> float:
-    """Return the logarithm of the regret in one half of the blocks, against the best view of the other half.
+def _halved(errors: Floats, chosen: int, orders: NDArray[np.int64]) -> Floats:
+    """Return the logarithms (n,) of the regret in one half of the blocks, against the best view of the other half.
 
-    ``order`` (block, world) are the places of the worlds.
+    ``orders`` (n, block, world) are the places of the worlds.
     """
-    middle = len(order) // 2
-    best = int(np.argmin(true_risk(errors[:, order[:middle].ravel()])))
-    risks = true_risk(errors[[chosen, best]][:, order[middle:].ravel()])
-    if np.isinf(risks).all():
-        return 0.0
-    with np.errstate(divide="ignore"):
-        return float(np.log(risks[0]) - np.log(risks[1]))
+    known = np.isfinite(errors)
+    square = np.where(known, errors, 0.0) ** 2
+    out, parts = [], min(len(orders), len(orders) * errors.size // _AT_ONCE + 1)
+    for some in np.array_split(orders, parts):
+        first, second = (half.reshape(len(some), -1) for half in np.split(some, [orders.shape[1] // 2], axis=1))
+        best = np.argmin(_risk(square.take(first, axis=1), known.take(first, axis=1)), axis=0)
+        risks = [
+            _risk(square[view[:, None], second], known[view[:, None], second])
+            for view in (np.full_like(best, chosen), best)
+        ]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            out.append(np.where(np.isinf(risks).all(axis=0), 0.0, np.log(risks[0]) - np.log(risks[1])))
+    return np.concatenate(out)

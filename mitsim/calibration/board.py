@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,9 +71,9 @@ class Board:
         """Return its manufacturing quality."""
         return GRADES[self.grade]
 
-    @property
+    @cached_property
     def corners(self) -> Floats:
-        """Return the inner corners in the board's frame, with its centre as origin, (n, 3) [mm]."""
+        """The inner corners in the board's frame, with its centre as origin, (n, 3) [mm]."""
         x, y = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
         places = np.stack([x - self.columns / 2, y - self.rows / 2, np.zeros_like(x, float)], axis=-1)
         return np.asarray(places.reshape(-1, 3) * self.square_mm)

@@ -110,7 +110,7 @@ def random_blobs(
     return np.array(binary, np.float32)
 
 
-@lru_cache(maxsize=1)  # a fit of a blur asks for the same mask a hundred times
+@lru_cache(maxsize=8)  # a fit of a blur asks for the same masks, one for each draw, a hundred times
 def _sharp_blobs(width: int, height: int, run_length_px: float, bright_share: float, seed: int) -> NDArray[np.float32]:
     noise = np.random.default_rng(seed).standard_normal((height, width)).astype(np.float32)
     smooth = gaussian_filter(noise, run_length_px / RUN_LENGTH_PER_SIGMA, mode="wrap")

@@ -12,8 +12,10 @@ multivariate linear model (Mardia, Kent & Bibby, Multivariate Analysis, 1979, se
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
@@ -88,6 +90,11 @@ class Field:
             column, row, window_mask, patch_px, corners, _basis(camera, corners + np.array([row, column]), patch_px)
         )
 
+    def patches(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the values (P, patch_px^2) of an image's window (h, w) in every patch."""
+        windows = sliding_window_view(values, (self.patch_px, self.patch_px))
+        return windows[self.corners[:, 0], self.corners[:, 1]].reshape(len(self.corners), -1)
+
 
 def _basis(camera: Camera, corners: NDArray[np.int64], patch_px: int) -> Floats:
     middles = corners[:, ::-1] + (patch_px - 1) / 2
@@ -131,23 +138,28 @@ def patch_figures(image: Floats, field: Field, window_px: int) -> Floats:
     grain = np.zeros(image.shape)
     grain[:, 1:] += fine[:, 1:] * fine[:, :-1]
     grain[1:] += fine[1:] * fine[:-1]
-    size = field.patch_px
-    out = np.empty((len(field.corners), len(FIGURES)))
-    for index, (row, column) in enumerate(field.corners):
-        part = np.s_[row : row + size, column : column + size]
-        inside = field.mask[part]
-        level, spread = mean[part][inside].mean(), deviation[part][inside]
-        bright = near[part] > np.median(near[part][inside])
-        amounts = np.abs(fine[part])
-        energy = float((fine[part][inside] ** 2).mean())
-        out[index] = (
-            level,
-            (spread / np.maximum(mean[part][inside], 1.0)).mean(),
-            crossing[part][inside].mean(),
-            (along[part] + down[part])[inside].mean() / max(2 * float((spread**2).mean()), _LEAST),
-            amounts[inside & ~bright].mean(),
-            amounts[inside & bright].mean(),
+    inside = field.patches(field.mask)
+    count = inside.sum(axis=1)
+
+    def mean_of(values: Floats, where: NDArray[np.bool_] = inside) -> Floats:
+        return np.asarray(np.where(where, values, 0.0).sum(axis=1) / where.sum(axis=1))
+
+    level, spread, near, fine = (field.patches(one) for one in (mean, deviation, near, fine))
+    rising = np.sort(np.where(inside, near, np.inf), axis=1)
+    middles = np.stack([(count - 1) // 2, count // 2], axis=1)
+    bright = near > np.take_along_axis(rising, middles, axis=1).mean(axis=1, keepdims=True)
+    amounts = np.abs(fine)
+    out = np.stack(
+        [
+            mean_of(level),
+            mean_of(spread / np.maximum(level, 1.0)),
+            mean_of(field.patches(crossing)),
+            mean_of(field.patches(along + down)) / np.maximum(2 * mean_of(spread**2), _LEAST),
+            mean_of(amounts, inside & ~bright),
+            mean_of(amounts, inside & bright),
             # 1 plus the correlation of neighbours; it is -0.8 for white noise after these weights
-            1.0 + float(grain[part][inside].mean()) / (2 * max(energy, _LEAST)),
-        )
+            1.0 + mean_of(field.patches(grain)) / (2 * np.maximum(mean_of(fine**2), _LEAST)),
+        ],
+        axis=1,
+    )
     return np.asarray(np.log(np.maximum(out, _LEAST)))

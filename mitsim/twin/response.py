@@ -24,6 +24,7 @@ others are not looked for. Levels beyond the brightest pixel are unknown; the cu
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -31,8 +32,7 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from mitsim.fit.fine_detail import FINEST, finest_detail, noise_of_levels
 from mitsim.sensor.imager import Imager
@@ -45,8 +45,9 @@ Mask = NDArray[np.bool_]
 #: side of a tile and its rim, which the weights reach [px]; largest number of tiles, least number with quiet pixels
 _TILE_PX, _RIM_PX, _TILES, _FEWEST = 32, 2, 120, 8
 
-#: slope beyond a knee; steps of its level [DN], coarse and fine; fine steps to either side, and as many at most
-_SLOPE, _COARSE_DN, _STEP_DN, _AROUND, _FARTHEST = 0.5, 3.0, 0.5, 4, 20
+#: slope beyond a knee; steps of its level [DN], coarse and fine; fine steps to either side of a coarse level, and of a
+#: level that is known, and as many at most
+_SLOPE, _COARSE_DN, _STEP_DN, _AROUND, _BESIDE_IT, _FARTHEST = 0.5, 3.0, 0.5, 4, 1, 20
 
 #: how far a level's own share of the light begins under the knee of the file [DN]
 _ROUNDED_DOWN_DN = 0.5
@@ -65,6 +66,9 @@ _GAIN, _SURE = 18.4, 3.0
 
 #: the print's own finest detail that a pixel may have, and the largest finest detail, in standard deviations of noise
 _QUIET, _LARGEST = 0.5, 4.0
+
+#: squares of the weights of finest detail along an axis (32, 36): of the pixels of a tile and its rim, for those within
+_WEIGHTS = sum(np.eye(_TILE_PX, _TILE_PX + 2 * _RIM_PX, at) * weight for at, weight in enumerate(FINEST**2))
 
 #: median of chi-square with one degree of freedom
 _MEDIAN_SQUARE = 0.45493642311957283
@@ -92,8 +96,12 @@ def quiet_pixels(image: Floats, clean: Floats, mask: Mask) -> Mask:
 
     ``clean`` is the image without its noise.
     """
-    own = finest_detail(clean) ** 2
-    return mask & (own < _QUIET**2 * np.maximum(noise_of_levels(image, mask)(clean), 1e-12))
+    return _quiet(noise_of_levels(image, mask), clean, mask)
+
+
+def _quiet(variance: Callable[[Floats], Floats], clean: Floats, mask: Mask) -> Mask:
+    """Pixels ``mask`` whose finest detail is noise of a variance that is known by level."""
+    return mask & (finest_detail(clean) ** 2 < _QUIET**2 * np.maximum(variance(clean), 1e-12))
 
 
 def first_knee(image: Floats, mask: Mask, imager: Imager) -> Knee | None:
@@ -107,7 +115,7 @@ def first_knee(image: Floats, mask: Mask, imager: Imager) -> Knee | None:
     if not len(coarse):
         return None
     _, middle = min((tiles.best(k, _SLOPE).sum(), k) for k in coarse)
-    slope, level = _SLOPE, _least(tiles, middle, _SLOPE)
+    slope, level = _SLOPE, _least(tiles, middle, _SLOPE, _AROUND)
     away = tiles.away_from(level)
     gain = away.best(np.inf, 1.0) - away.best(level, slope)
     if gain.sum() < max(_GAIN, _SURE * float(gain.std()) * np.sqrt(len(gain))) or not low < level < high:
@@ -131,18 +139,22 @@ def _bias(clean: Floats, mask: Mask, tiles: _Tiles, knee: Knee) -> tuple[float, 
     for stream in np.random.default_rng(0).spawn(_DRAWS):
         drawn = light + np.interp(light, every, spread) * stream.normal(size=light.shape)
         drawn = np.rint(np.minimum(drawn, k) + knee.slope * np.maximum(drawn - k, 0.0))
+        variance = noise_of_levels(drawn, mask)
         both = [
-            _Tiles.of(drawn, levels, quiet_pixels(drawn, levels, mask), tiles.black)
+            _Tiles.of(drawn, levels, _quiet(variance, levels, mask), tiles.black)
             for levels in (denoised(drawn, mask), clean)
         ]
-        found.append([np.nan if one is None else _least(one, knee.level, knee.slope) for one in both])
+        found.append([np.nan if one is None else _least(one, knee.level, knee.slope, _BESIDE_IT) for one in both])
     off = np.array(found) @ [1.0, -1.0]
     off = off[np.isfinite(off)]
     return (float(off.mean()), float(off.std(ddof=1) / np.sqrt(len(off)))) if len(off) > 1 else (0.0, float("inf"))
 
 
-def _least(tiles: _Tiles, middle: float, slope: float) -> float:
-    """The level whose curve is most likely, by a parabola through three levels; from ``middle`` on, downhill."""
+def _least(tiles: _Tiles, middle: float, slope: float, around: int) -> float:
+    """The level whose curve is most likely, by a parabola through three levels.
+
+    The best of ``middle`` and ``around`` levels to either side is the start; from there on, downhill.
+    """
     total: dict[int, float] = {}
 
     def at(step: int) -> float:
@@ -150,7 +162,7 @@ def _least(tiles: _Tiles, middle: float, slope: float) -> float:
             total[step] = float(tiles.best(middle + step * _STEP_DN, slope).sum())
         return total[step]
 
-    best = min(range(-_AROUND, _AROUND + 1), key=at)
+    best = min(range(-around, around + 1), key=at)
     while abs(best) < _FARTHEST and at(beside := min(best - 1, best + 1, key=at)) < at(best):
         best = beside
     before, least, after = at(best - 1), at(best), at(best + 1)
@@ -201,6 +213,11 @@ class _Tiles:
         return float(np.median(self.square))
 
     @cached_property
+    def excess(self) -> Floats:
+        """Squared detail less that of rounding and of the print."""
+        return self.square - 1 / 12 - self.own
+
+    @cached_property
     def median_level(self) -> float:
         """Median level [DN]."""
         return float(np.median(self.clean))
@@ -212,8 +229,8 @@ class _Tiles:
 
     @cached_property
     def used(self) -> NDArray[np.intp]:
-        """Indices of the pixels that are used, among all pixels of the tiles."""
-        return np.flatnonzero(self.inside)
+        """Indices of the pixels that are used, among all pixels of the tiles without their rims."""
+        return np.flatnonzero(self.inside[:, _RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX])
 
     def away_from(self, level: float) -> _Tiles:
         """The tiles without pixels near a level: a curve that is flat there only is no knee."""
@@ -233,7 +250,7 @@ class _Tiles:
             maps = self._maps(knee, slope, numbers)
             for _ in range(2):
                 weight = (self.square < _LARGEST**2 * variance) / variance**2
-                numbers = _two(maps, self.square - 1 / 12 - self.own, weight)
+                numbers = _two(maps, self.excess, weight)
                 variance = np.maximum(numbers @ maps, 1e-3) + 1 / 12 + self.own
         return numbers
 
@@ -241,7 +258,7 @@ class _Tiles:
         """-2 log likelihood (n,) of the tiles."""
         variance = np.maximum(numbers @ self._maps(knee, slope, numbers), 1e-3) + 1 / 12 + self.own
         each = np.log(variance) + np.minimum(self.square / variance, _LARGEST**2)
-        total = np.bincount(self.used // self.inside[0].size, each, minlength=len(self.clean))
+        total = np.bincount(self.used // _TILE_PX**2, each, minlength=len(self.clean))
         return np.asarray(independent_share() * total, float)
 
     def uncertainty(self, knee: float, slope: float) -> float:
@@ -301,7 +318,7 @@ def _cut(values: NDArray[Any], side: int) -> Floats:
 def _through(level: Floats, knee: float, slope: float, spread: Floats) -> tuple[Floats, Floats]:
     """Mean (n,) behind the curve of levels with normal noise, and the share of the noise's variance there."""
     t, flat = (level - (knee - _ROUNDED_DOWN_DN)) / spread, 1 - slope
-    above, density = norm.cdf(t), norm.pdf(t)
+    above, density = ndtr(t), np.exp(-(t**2) / 2.0) / np.sqrt(2 * np.pi)
     first, second = density + t * above, (1 + t**2) * above + t * density
     return level - flat * spread * first, 1 - 2 * flat * above + flat**2 * (second - first**2)
 
@@ -319,5 +336,5 @@ def _two(design: Floats, values: Floats, weight: Floats) -> Floats:
 
 
 def _of_neighbours(values: Floats) -> Floats:
-    """Mean (n, H, W) of the pixels about each by the squares of their weights in finest detail."""
-    return np.asarray(correlate1d(correlate1d(values, FINEST**2, axis=1), FINEST**2, axis=2))
+    """Mean (n, 32, 32) of the pixels about each of a tile (n, 36, 36) by the squares of their weights in detail."""
+    return np.asarray(_WEIGHTS @ values @ _WEIGHTS.T)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,7 @@ class SpecimenSimulator:
         self._room: NDArray[np.float32] | None = None
         self._device: SimulatedSensor | None = None
         self._slopes = _slopes(self.camera, self.roi)
+        self._loss = lru_cache(maxsize=1)(self._corner_loss)  # of the light of the room and that of the projector
 
     def levels(self, sensor: Sensor, seed: int, *, projector_on: bool = True) -> NDArray[Any]:
         """Return the grey levels (h, w) of the part in the first image of a capture by a sensor."""
@@ -61,11 +63,12 @@ class SpecimenSimulator:
             lit, gain = self._lit(sensor, seed)
             light = light + self._through(sensor, lit * np.float32(sensor.projector.flux)) * gain
         assert sensor.exposure.base_s is not None
-        seconds = sensor.exposure.base_s
-        scale = electrons_per_radiance(sensor.imager, sensor.wavelength_nm, seconds)
+        chip, seconds = sensor.imager, sensor.exposure.base_s
+        scale = electrons_per_radiance(chip, sensor.wavelength_nm, seconds)
         noise, device = np.random.SeedSequence([seed, 1]).spawn(2)
-        fixed = fixed_pattern(sensor.imager, light.shape, np.random.default_rng(device))
-        seen = expose(light * np.float32(scale), sensor.imager, fixed, Noise(), np.random.default_rng(noise), seconds)
+        varies = chip.dsnu or chip.prnu or chip.column_pattern
+        fixed = fixed_pattern(chip, light.shape, np.random.default_rng(device)) if varies else None
+        seen = expose(light * np.float32(scale), chip, fixed, Noise(), np.random.default_rng(noise), seconds)
         return np.asarray(seen[self.inner])
 
     def projector_irradiance(self, sensor: Sensor, seed: int) -> float:
@@ -82,9 +85,13 @@ class SpecimenSimulator:
         return self._through(sensor, np.asarray(self._room * irradiance, np.float32))
 
     def _through(self, sensor: Sensor, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        loss = camera_illumination(sensor.imager.corner_illumination, self.camera)
+        loss = self._loss(sensor.imager.corner_illumination)
         out = blur_by_lens(image, sensor.imager, self.camera, self.roi)
-        return out if loss is None else np.asarray(out * loss[self.roi.slices], np.float32)
+        return out if loss is None else np.asarray(out * loss, np.float32)
+
+    def _corner_loss(self, corner: float | None) -> NDArray[np.float32] | None:
+        loss = camera_illumination(corner, self.camera)
+        return None if loss is None else loss[self.roi.slices]
 
     def _lit(self, sensor: Sensor, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the light of the projector at 1 W before the lens, and the gain of speckle behind it."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.fft import dctn, idctn
+from scipy.fft import dct
 
 from mitsim.fit.fine_detail import noise_of_levels
 
@@ -22,6 +22,9 @@ Floats = NDArray[np.float64]
 
 #: side of a window [px]; standard deviations of the noise under which a coefficient is noise
 _SIDE_PX, _THRESHOLD = 8, 3.0
+
+#: the cosine transform of a column: a row for each coefficient
+_COSINES = dct(np.eye(_SIDE_PX), axis=0, norm="ortho")
 
 
 def denoised(image: Floats, mask: NDArray[np.bool_]) -> Floats:
@@ -31,18 +34,25 @@ def denoised(image: Floats, mask: NDArray[np.bool_]) -> Floats:
     wide = np.pad(np.asarray(image, float), margin, mode="symmetric")
     total, weight = np.zeros(wide.shape), np.zeros(wide.shape)
     count = wide.shape[1] - margin
+    band, shares = np.empty((_SIDE_PX, wide.shape[1])), np.empty(wide.shape[1])
+    windows = sliding_window_view(band, count, axis=1)  # (row, column, window) of the windows beside each other
     for top in range(wide.shape[0] - margin):
         rows = np.s_[top : top + _SIDE_PX]
-        tiles = sliding_window_view(wide[rows], (_SIDE_PX, _SIDE_PX))[0]
-        coefficients = dctn(tiles, axes=(1, 2), norm="ortho")
-        spread = np.sqrt(variance(tiles.mean(axis=(1, 2))))
-        kept = np.abs(coefficients) >= _THRESHOLD * spread[:, None, None]
-        kept[:, 0, 0] = True  # the mean of the window
-        share = 1.0 / kept.sum(axis=(1, 2))
-        back = idctn(coefficients * kept, axes=(1, 2), norm="ortho") * share[:, None, None]
+        np.matmul(_COSINES, wide[rows], out=band)  # of each column, which eight windows share
+        coefficients = _COSINES @ windows
+        spread = np.sqrt(variance(coefficients[0, 0] / _SIDE_PX))
+        kept = np.abs(coefficients) >= _THRESHOLD * spread
+        kept[0, 0] = True  # the mean of the window
+        share = 1.0 / kept.sum(axis=(0, 1))
+        coefficients *= kept
+        coefficients *= share
+        back = _COSINES.T @ coefficients
+        band[:], shares[:] = 0.0, 0.0
         for offset in range(_SIDE_PX):
             columns = np.s_[offset : offset + count]
-            total[rows, columns] += back[:, :, offset].T
-            weight[rows, columns] += share
+            band[:, columns] += back[:, offset]
+            shares[columns] += share
+        total[rows] += _COSINES.T @ band
+        weight[rows] += shares
     inside = np.s_[margin : margin + image.shape[0], margin : margin + image.shape[1]]
     return np.asarray(total[inside] / weight[inside])

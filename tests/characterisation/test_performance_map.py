@@ -168,7 +168,7 @@ def with_spread(finish, roughness, distances=(400.0, 600.0)):
 def test_spread_is_the_root_sum_of_squares_of_half_differences():
     plain = [table for table in with_spread("metal", 0.4) if table.variant is None]
     tables = with_spread("metal", 0.1) + plain
-    performance_map = build_map(tables, {"name": "known"}, LARGEST, nodes=33)
+    performance_map = build_map(tables, {"name": "known"}, LARGEST, nodes=17)
     normals = node_normals(performance_map, math.radians(50))
     here = np.full(len(normals), 500.0)
     found = performance_map.query("metal", 0.1, here, normals)
@@ -183,8 +183,8 @@ def test_spread_is_the_root_sum_of_squares_of_half_differences():
 
 def test_variants_leave_the_rest_of_the_map_as_it_is():
     tables = with_spread("metal", 0.1)
-    whole = build_map(tables, {}, LARGEST, nodes=33).data
-    plain = build_map([table for table in tables if table.variant is None], {}, LARGEST, nodes=33).data
+    whole = build_map(tables, {}, LARGEST, nodes=17).data
+    plain = build_map([table for table in tables if table.variant is None], {}, LARGEST, nodes=17).data
     for name in plain.data_vars:
         assert np.array_equal(plain[name], whole[name], equal_nan=True) == ("spread" not in str(name)), name
 
@@ -230,7 +230,7 @@ def test_a_neighbour_that_recovered_nothing_does_not_silence_the_sample_that_was
         sigma = np.where(count > 10, 0.3 / normals[:, 2], np.nan)
         patches = table.patches.assign(points=("patch", count), ray_noise_inliers=("patch", sigma))
         tables += [SampleTable("metal", roughness, d, patches) for d in (400.0, 600.0)]
-    performance_map = build_map(tables, {"name": "known"}, LARGEST, nodes=33)
+    performance_map = build_map(tables, {"name": "known"}, LARGEST, nodes=17)
     inside = node_normals(performance_map, math.radians(50))
     at = np.full(len(inside), 600.0)
     own = performance_map.query("metal", 0.4, at, inside)

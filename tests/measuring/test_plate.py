@@ -93,10 +93,11 @@ def test_dots_of_any_size_are_found_to_a_fiftieth_of_a_pixel(diameter, rng):
     pitch = int(2 * diameter)
     true = np.stack(np.meshgrid(np.arange(1, 5), np.arange(1, 4)), -1).reshape(-1, 2) * pitch + rng.random((12, 2))
     size = (4 * pitch, 5 * pitch)
-    row, column = np.mgrid[: size[0] * 8, : size[1] * 8] / 8 - 7 / 16
-    ink = np.zeros(row.shape)
+    ink = np.zeros((size[0] * 8, size[1] * 8))
     for x, y in true:
-        ink[np.hypot(column - x, row - y) < diameter / 2] = 180
+        top, left = (int(8 * (at - diameter / 2)) for at in (y, x))
+        row, column = np.ogrid[top : top + 8 * diameter + 16, left : left + 8 * diameter + 16]
+        ink[row, column] = 180 * (np.hypot(column / 8 - 7 / 16 - x, row / 8 - 7 / 16 - y) < diameter / 2)
     image = (220 - cv2.resize(ink, size[::-1], interpolation=cv2.INTER_AREA)).astype(np.uint8)
     for shown, dark in ((image, True), (255 - image, False)):
         found = dot_centres(shown, dark)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,8 @@ from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
+from mitsim.twin import run
 from mitsim.twin.input_captures import read_input_captures, repeats
-from mitsim.twin.run import sensor_path
 from mitsim.twin.sensor_text import Entry, moved_paths, with_cameras, with_entries, with_exposure
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -27,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 @pytest.mark.parametrize("name", [name for name in presets() if name != "kinect-v2"])
 def test_every_preset_takes_fitted_numbers_and_is_a_sensor_again(name, tmp_path):
-    sensor, path = load_sensor(name), sensor_path(name)
+    sensor, path = load_sensor(name), run.sensor_path(name)
     text = moved_paths(path.read_text(encoding="utf-8"), path.parent, tmp_path)
     entries = {
         "projector.flux_w": "0.5",
@@ -61,7 +62,7 @@ def recorded(tmp_path_factory):
     backend.activate()
     chip = replace(preset.imager, full_well=15000, read_noise=50.0, dsnu=0.0, prnu=0.0, row_noise=0.0)
     lit = replace(preset, imager=chip)
-    size = backend.mi.ScalarTransform4f().scale([150, 110, 1])
+    size = backend.mi.ScalarTransform4f().scale([110, 80, 1])  # 24 patches, just enough for terms over the field
     sheet = {"type": "rectangle", "to_world": size, "bsdf": {"type": "matt_white"}}
     scene = scene_from_dict({"sheet": sheet}, preset.wavelength_nm)
     pose = look_at((0.0, 0.0, 500.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 0.0)
@@ -83,7 +84,9 @@ def test_repeats_are_found_and_the_dark_is_told_by_the_settings(recorded):
     assert groups == {("dark", 2), ("on", 3)}
 
 
-def test_a_file_of_ones_own_camera(recorded, tmp_path):
+def test_a_file_of_ones_own_camera(recorded, tmp_path, monkeypatch):
+    # one draw of the dots: how well three of them determine the numbers of dots is for test_dots.py
+    monkeypatch.setattr(run, "fit_sensor", partial(run.fit_sensor, draws=1))
     output = tmp_path / "my-camera.toml"
     folders = [str(folder) for folder in sorted(recorded.iterdir())]
     result = CliRunner().invoke(

@@ -113,6 +113,8 @@ def independent(patterns: NDArray[np.float32]) -> tuple[list[int], NDArray[np.fl
     The error is at most ``_LOOKUP_ERROR`` of white. QR decomposition of the Gram matrix with column pivoting sorts the
     patterns by their contribution (Golub and Van Loan, Matrix Computations, 4th ed., section 5.4.2).
     """
+    if len(patterns) == 1:
+        return [0], np.eye(1)
     count, parts = len(patterns), np.array_split(patterns, -(-patterns.size // _VALUES_AT_ONCE), axis=1)
 
     def double_parts() -> Iterator[NDArray[np.float64]]:
@@ -216,7 +218,9 @@ class ProjectorLight(Eye):
         low, high = rectangles[:, 0], rectangles[:, 1]
         self.extents = [(of_lane(a, lane), of_lane(b - a, lane)) for a, b in zip(low.T, high.T, strict=True)]
         self.area = of_lane(np.prod(high - low, axis=1), lane)
-        self.vignetting = float(projector.corner_illumination) ** -0.5 - 1.0
+        self.has_corner_loss = projector.corner_illumination < 1
+        # not a literal: a fit that varies it would compile a kernel for each value
+        self.corner_loss = dr.opaque(mi.Float, float(projector.corner_illumination) ** -0.5 - 1.0)
         cx, cy = optics.matrix[0, 2], optics.matrix[1, 2]
         self.principal = (float(cx), float(cy))
         self.farthest = float(np.hypot(max(cx, optics.width - 1 - cx), max(cy, optics.height - 1 - cy)))
@@ -271,7 +275,7 @@ class ProjectorLight(Eye):
             facing &= ~scene.ray_test(shadow_ray(surface, toward, distance), facing)
         cosine = z / distance
         arriving = self.irradiance / (dr.square(cosine) * cosine * dr.square(distance))
-        if self.vignetting > 0:
+        if self.has_corner_loss:
             arriving *= self._corner_loss(u, v)
         return toward, dr.select(facing, arriving, 0.0), self._texture(u, v), distance
 
@@ -298,7 +302,7 @@ class ProjectorLight(Eye):
         x, y = (low + p * extent for p, (low, extent) in zip((position.x, position.y), self.extents, strict=True))
         u, v, inside = self.distortion.image(x, y, True)
         flux = self.irradiance * self.area
-        if self.vignetting > 0:
+        if self.has_corner_loss:
             flux *= self._corner_loss(u, v)
         local, origin = mi.Vector3f(x, y, 1.0), self.position
         if self.radius > 0:
@@ -316,7 +320,7 @@ class ProjectorLight(Eye):
 
     def _corner_loss(self, u: Any, v: Any) -> Any:
         off = (dr.square(u - self.principal[0]) + dr.square(v - self.principal[1])) / self.farthest**2
-        return 1.0 / dr.square(1.0 + self.vignetting * off)
+        return 1.0 / dr.square(1.0 + self.corner_loss * off)
 
     def _texture(self, u: Any, v: Any) -> Any:
         return mi.Point2f((u + 0.5) / self.size[0], (v + 0.5) / self.size[1])
