@@ -30,7 +30,8 @@ Floats = NDArray[np.float64]
 #: data. Up to the first radius, rows are not joined
 CELLS = ((0.1, 0.0), (0.2, 0.03), (0.4, 0.06), (np.inf, 0.12))
 
-#: side of the squares whose places share their rows, over the smallest radius; it affects only the computing time
+#: side of the squares whose places share their rows, over the smallest radius. The prior is about the middle of the
+#: square, so that the side also moves, by up to some percent, the estimates that few data determine
 TILE = 1.2
 
 #: Fisher scoring takes at most ``SCORING_STEPS`` steps of at most ``LARGEST_STEP`` in the logarithm. It ends when all

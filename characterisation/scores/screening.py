@@ -133,9 +133,8 @@ def interval(
         for cells in groups:
             places = rng.integers(len(cells[0].cost), size=len(cells[0].cost))
             values += [figure(cell.of(places)) for cell in cells]
-        known = [value for value in values if not math.isnan(value)]
-        if known:
-            found.append(sum(known) / len(known))
+        if np.isfinite(values).any():
+            found.append(float(np.nanmean(values)))
     if not found:
         return math.nan, math.nan
     low, high = np.quantile(found, [0.025, 0.975])
