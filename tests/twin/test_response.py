@@ -4,6 +4,7 @@ import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from mitsim.fit.electrons import linearised
 from mitsim.sensor.image_formation import expose
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise
+from mitsim.twin import response
 from mitsim.twin.photon_transfer import TransferLine, one_image_line
 from mitsim.twin.response import Knee, first_knee, quiet_pixels
 from mitsim.validation.denoise import denoised
@@ -39,17 +41,28 @@ def capture(seed: int, slope: float | None, size: tuple[int, int] = (200, 232)) 
     return expose(electrons, chip, None, Noise(), np.random.default_rng(100 + seed)).astype(float), level
 
 
+simulated_bias = response._bias
+
+
 @cache
-def bent(seed: int) -> tuple[np.ndarray, float, Knee | None]:
-    """A capture with a knee of slope 0.5, its level, and the knee that is found."""
+def bent(seed: int) -> tuple[np.ndarray, float, Knee | None, float]:
+    """A capture with a knee of slope 0.5, its level, the knee that is found, and by how much it was moved for bias."""
     image, level = capture(seed, 0.5)
-    return image, level, first_knee(image, np.ones(image.shape, bool), STRAIGHT)
+    found = [np.nan]
+
+    def kept(*given):
+        both = simulated_bias(*given)
+        found.append(both[0])
+        return both
+
+    with mock.patch.object(response, "_bias", kept):
+        return image, level, first_knee(image, np.ones(image.shape, bool), STRAIGHT), found[-1]
 
 
 def test_the_interval_of_a_knee_holds_it():
     errors = []
     for seed in range(SEEDS):
-        _, level, knee = bent(seed)
+        _, level, knee, _ = bent(seed)
         if knee is not None:  # in few of them, little is brighter than the knee
             assert knee.slope == 0.5, seed
             errors.append((knee.level - level) / knee.uncertainty)
@@ -60,10 +73,21 @@ def test_the_interval_of_a_knee_holds_it():
     assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.25
 
 
+def test_the_error_of_a_knee_does_not_grow_with_its_bias():
+    """The slope of the error on the bias that was subtracted is 0; it would be 1 without the subtraction."""
+    found = [(level, knee, bias) for _, level, knee, bias in map(bent, range(SEEDS)) if knee is not None]
+    off, bias, u = np.array([(knee.level - level, bias, knee.uncertainty) for level, knee, bias in found]).T
+    weight = 1 / u**2
+    off, bias = (each - np.average(each, weights=weight) for each in (off, bias))
+    known_to = 1 / np.sqrt(np.sum(weight * bias**2))
+    assert known_to < 0.25
+    assert abs(np.sum(weight * bias * off) * known_to**2) < 2 * known_to
+
+
 def test_behind_a_knee_the_full_well_is_right():
     wells = []
     for seed in range(3):
-        image, level, knee = bent(seed)
+        image, level, knee, _ = bent(seed)
         there = np.ones(image.shape, bool)
         assert knee is not None and knee.slope == 0.5 and abs(knee.level - level) < 3 * knee.uncertainty
         chip = replace(STRAIGHT, companding=knee.companding(8))
