@@ -27,6 +27,7 @@ from mitsim.capture.capture import Capture
 from mitsim.errors import InputError
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.scene.light_transport.light_paths import LightPaths
+from mitsim.scene.light_transport.plain_scene import single_plane
 from mitsim.scene.light_transport.projector_light import Light, ModulatedLight, ProjectedPatterns
 from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
 from mitsim.scene.light_transport.transport import trace
@@ -134,6 +135,8 @@ class SimulatedSensor:
         rays = self.rays[camera]
         roi = roi or rays.whole
         ambient = self.sensor.ambient_image or has_emitters(scene)
+        if single_plane(scene) is not None:  # a flat coupon does not light itself
+            return np.zeros((self.patterns.count + ambient, roi.height, roi.width), np.float32)
         paths = LightPaths(indirect.samples, seed, depth, indirect_only=True, with_ambient=ambient)
         images = trace(scene, rays, self.patterns, world_from_sensor, paths, roi)
         shape = shapes_met(scene, self.pixel_rays(camera), world_from_sensor)[roi.slices]

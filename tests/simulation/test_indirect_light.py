@@ -8,10 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mitsim.scene.load import load_scene
+from mitsim.scene.backend import mi
+from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation import simulate
 from mitsim.simulation.indirect_light import IndirectLight, smoothed
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
@@ -70,3 +73,26 @@ def test_direct_light_alone_is_not_touched():
     for name, images in kept.images.items():
         np.testing.assert_array_equal(images, with_rule.images[name])
     assert with_rule.settings["indirect_light"] == {"samples": 4, "smoothing_px": 2.0}
+
+
+def test_a_flat_coupon_is_not_traced_and_two_of_them_do_not_light_each_other(monkeypatch):
+    """Two squares of one plane are traced, and are as dark as the one that is not."""
+    sensor = replace(load_sensor("ensenso-n10"), ambient_image=True)
+    square = {"type": "rectangle", "bsdf": {"type": "matt_white"}}
+    at = mi.ScalarTransform4f()
+    halves = {
+        name: {**square, "to_world": at.translate([x, 0, 0]).scale([10, 20, 1])} for name, x in (("a", -10), ("b", 10))
+    }
+    pose, simulated = look_at([0, 0, 500], [0, 0, 0], [0, 1, 0]), SimulatedSensor(sensor)
+    roi = Roi.between(340, 200, 400, 240)
+
+    def dark(shapes):
+        scene = scene_from_dict(shapes, sensor.wavelength_nm)
+        return simulated.indirect_radiance(scene, pose, "left", IndirectLight(1, 1.5), seed=1, depth=2, roi=roi)
+
+    two = dark(halves)
+    monkeypatch.setattr(simulate, "trace", None)
+    one = dark({"both": {**square, "to_world": at.scale([20, 20, 1])}})
+    assert not two.any()
+    assert one.dtype == two.dtype
+    np.testing.assert_array_equal(one, two)
