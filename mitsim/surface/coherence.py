@@ -34,9 +34,6 @@ LARGEST_INCIDENCE = float(np.radians(75))
 
 _ANGLES, _COUNTS = 12, (96, 48, 4)
 
-#: angles of one step for a round lobe: larger arrays leave the cache. An elongated one has larger arrays for one angle
-_TOGETHER = 3
-
 
 def coherent_weight(phase_variance: float, mean_cosine: ArrayLike) -> NDArray[np.float64]:
     """Return A [1] of pairs of directions; ``mean_cosine`` is the mean of their cosines to the normal, any shape."""
@@ -58,26 +55,25 @@ def lobe_numbers(
     The parameters of the lobe are those of :class:`~mitsim.surface.scatter.Scatter`. For an elongated lobe the energy
     is averaged over the azimuth of the light.
     """
+    returned, missing = [], []
     lobes: tuple[tuple[float, float, Distribution], ...] = (
         (beckmann * energy_factor[1], 1.0, "beckmann"),
         ((1 - beckmann) * energy_factor[0], GGX_PER_BECKMANN, "ggx"),
     )
-    cosines = np.linspace(np.cos(LARGEST_INCIDENCE), EVEN_FROM, _ANGLES)
-    angles, lost = np.arccos(cosines), 1 - coherent_weight(phase_variance, cosines)
-    returned, missing = np.zeros((_ANGLES, 3)), np.zeros(_ANGLES)
-    together = _TOGETHER if alpha_u == alpha_v else 1
-    for share, width, distribution in lobes:
-        if share == 0:
-            continue
-        for first in range(0, _ANGLES, together):
-            some = slice(first, first + together)
-            weight, out = facets(angles[some], width * alpha_u, width * alpha_v, distribution, _COUNTS)
-            mean = 0.5 * (cosines[some, None] + out)
+    for cosine in np.linspace(np.cos(LARGEST_INCIDENCE), EVEN_FROM, _ANGLES).tolist():
+        sums, lacking = np.zeros(3), 0.0
+        for share, width, distribution in lobes:
+            if share == 0:
+                continue
+            angle = float(np.arccos(cosine))
+            weight, out = facets(angle, width * alpha_u, width * alpha_v, distribution, _COUNTS)
+            mean = 0.5 * (cosine + out)
             kept = share * weight * (1 - coherent_weight(phase_variance, mean))
             u = np.maximum(1 - mean / EVEN_FROM, 0.0)
             square = u * u
-            for number, term in enumerate((square, square * u, square * square)):
-                returned[some, number] += np.vecdot(kept, term)
-            missing[some] += share * weight.sum(axis=-1) * lost[some] - kept.sum(axis=-1)
-    c_0, c_1, c_2 = np.linalg.lstsq(returned, missing, rcond=1e-6)[0].tolist()
-    return c_0, c_1, c_2
+            sums += [kept @ square, kept @ (square * u), kept @ (square * square)]
+            lacking += share * weight.sum() * (1 - float(coherent_weight(phase_variance, cosine))) - kept.sum()
+        returned.append(sums)
+        missing.append(lacking)
+    first, second, third = np.linalg.lstsq(np.array(returned), np.array(missing), rcond=1e-6)[0].tolist()
+    return first, second, third

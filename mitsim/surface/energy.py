@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mitsim.surface.microfacet import GGX_PER_BECKMANN, Distribution, fresnel, shadowing
 
@@ -43,30 +43,29 @@ def directional_albedo(
 
 
 def facets(
-    incidence: ArrayLike,
+    incidence: float,
     alpha_u: float,
     alpha_v: float,
     distribution: Distribution,
     counts: tuple[int, int, int],
     index: tuple[float, float] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return each facet's share [1] of light at ``incidence`` (...) [rad], and the cosine of its exit angle.
+    """Return each facet's share [1] of light at ``incidence`` [rad], and the cosine of its exit angle; (n,) each.
 
-    Both have the shape (..., n). ``counts``: numbers of the facets' radii and azimuths, and of azimuths of the light
-    for an elongated lobe. The sum of the shares is the directional albedo.
+    ``counts``: numbers of the facets' radii and azimuths, and of azimuths of the light for an elongated lobe. The sum
+    of the shares is the directional albedo.
     """
     radii, azimuths, several = counts
     # an isotropic lobe needs one azimuth, and half of the facets, as the others are their mirror images; an elongated
     # one is symmetric in both its axes
     isotropic = alpha_u == alpha_v
     slope_u, slope_v = _unit_slopes(radii, azimuths, isotropic and azimuths % 2 == 0, distribution)
-    sx, sy = (alpha_u * slope_u).ravel(), (alpha_v * slope_v).ravel()
+    sx, sy = alpha_u * slope_u, alpha_v * slope_v
     views = [0.0] if isotropic else np.pi / 2 * (np.arange(several) + 0.5) / several
     lobe = _Lobe(alpha_u, alpha_v, distribution, index)
-    angle = np.asarray(incidence, float)[..., None]
-    seen = [_facets_from(angle, view, sx, sy, lobe) for view in views]
-    weights, cosines = (one[0] if len(one) == 1 else np.concatenate(one, axis=-1) for one in zip(*seen, strict=True))
-    return weights / weights.shape[-1], cosines
+    seen = [_facets_from(incidence, view, sx, sy, lobe) for view in views]
+    weights, cosines = (np.concatenate([one[k].ravel() for one in seen]) for k in (0, 1))
+    return weights / weights.size, cosines
 
 
 @lru_cache(maxsize=16)
@@ -94,7 +93,7 @@ class _Lobe:
 
 
 def _facets_from(
-    incidence: NDArray[np.float64], azimuth: float, sx: NDArray[np.float64], sy: NDArray[np.float64], lobe: _Lobe
+    incidence: float, azimuth: float, sx: NDArray[np.float64], sy: NDArray[np.float64], lobe: _Lobe
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     x, y = np.sin(incidence) * np.cos(azimuth), np.sin(incidence) * np.sin(azimuth)
     z = np.cos(incidence)

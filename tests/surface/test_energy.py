@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mitsim.surface.energy import NOMINAL_INCIDENCE, compensation, directional_albedo, energy_factors, facets
+from mitsim.surface.energy import NOMINAL_INCIDENCE, compensation, directional_albedo, energy_factors
 
 ANGLES = np.radians([0.1, 30, 45, 60, 75, 85])
 TABLE = {
@@ -38,15 +38,6 @@ def test_an_elongated_lobe_loses_less_than_its_wide_side_alone():
     narrow = directional_albedo(NOMINAL_INCIDENCE, 0.1, 0.1, "ggx")
     assert wide < elongated < narrow
     assert np.isclose(elongated, directional_albedo(NOMINAL_INCIDENCE, 0.4, 0.1, "ggx"), atol=1e-6)
-
-
-@pytest.mark.parametrize("alphas", [(0.3, 0.3), (0.1, 0.4)])
-@pytest.mark.parametrize("distribution", ["beckmann", "ggx"])
-def test_several_angles_at_once_are_those_one_by_one(alphas, distribution):
-    together = facets(ANGLES, *alphas, distribution, (20, 16, 3))
-    for number, angle in enumerate(ANGLES):
-        for of_all, of_one in zip(together, facets(angle, *alphas, distribution, (20, 16, 3)), strict=True):
-            np.testing.assert_array_equal(of_all[number], of_one)
 
 
 @given(st.floats(0.005, 0.5), st.sampled_from(["beckmann", "ggx"]))
