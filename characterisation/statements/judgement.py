@@ -23,9 +23,6 @@ _HALVES = 200
 #: number of resamples of a bootstrap
 _RESAMPLES = 1000
 
-#: errors that are summed at once, so that they fit the memory near the processor
-_AT_ONCE = 1 << 18
-
 
 @dataclass(frozen=True)
 class Share:
@@ -161,14 +158,11 @@ def _halved(errors: Floats, chosen: int, orders: NDArray[np.int64]) -> Floats:
     """
     known = np.isfinite(errors)
     square = np.where(known, errors, 0.0) ** 2
-    out, parts = [], min(len(orders), len(orders) * errors.size // _AT_ONCE + 1)
-    for some in np.array_split(orders, parts):
-        first, second = (half.reshape(len(some), -1) for half in np.split(some, [orders.shape[1] // 2], axis=1))
-        best = np.argmin(_risk(square.take(first, axis=1), known.take(first, axis=1)), axis=0)
-        risks = [
-            _risk(square[view[:, None], second], known[view[:, None], second])
-            for view in (np.full_like(best, chosen), best)
-        ]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            out.append(np.where(np.isinf(risks).all(axis=0), 0.0, np.log(risks[0]) - np.log(risks[1])))
-    return np.concatenate(out)
+    first, second = (half.reshape(len(orders), -1) for half in np.split(orders, [orders.shape[1] // 2], axis=1))
+    best = np.argmin(_risk(square[:, first], known[:, first]), axis=0)
+    risks = [
+        _risk(square[view[:, None], second], known[view[:, None], second])
+        for view in (np.full_like(best, chosen), best)
+    ]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(np.isinf(risks).all(axis=0), 0.0, np.log(risks[0]) - np.log(risks[1]))

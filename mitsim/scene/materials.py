@@ -95,7 +95,7 @@ class Loading:
     fault: InputError | None = None
 
 
-# Mitsuba makes BSDFs in its own threads, where a context variable would not be set
+# not a context variable: where a program loads a scene by Mitsuba itself, BSDFs are made in Mitsuba's threads
 _current = Loading()
 _lock = threading.Lock()
 _anonymous = itertools.count()
@@ -225,9 +225,11 @@ def _make_bsdf(props: Any, description: dict[str, Any], finish: Finish) -> Any:
     from mitsim.scene.backend import mi
 
     bsdf = mi.load_dict(description, parallel=False)
-    name = props.id() or "finish"
-    bsdf.set_id(name if props.id() and name not in _current.finishes else f"{name}_{next(_anonymous)}")
-    _current.finishes[bsdf.id()] = replace(finish, description=description)
+    name = props.id()
+    while not name or name in _current.finishes:
+        name = f"{props.id() or 'finish'}_{next(_anonymous)}"
+    bsdf.set_id(name)
+    _current.finishes[name] = replace(finish, description=description)
     return bsdf
 
 

@@ -24,8 +24,8 @@ _EXACT = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 #: largest error of OpenCV's centre of a rectified image that is accepted, as a share of the image width
 LOST_SHARE = 0.1
 
-#: points projected at once: OpenCV also computes derivatives, 400 bytes per point; the others stay in the cache
-_TOGETHER, _TOGETHER_DIRECT = 1 << 16, 1 << 14
+#: points projected at once, to stay in the processor's cache: OpenCV also computes derivatives, 400 bytes per point
+_TOGETHER = 1 << 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,42 +86,42 @@ class Camera:
         flat = np.ascontiguousarray(local, np.float64).reshape(-1, 1, 3)
         if flat.size == 0:
             return np.empty((*points.shape[:-1], 2))
-        out = self._by_opencv(flat) if self.model == "fisheye" or self.distortion[12:].any() else self._direct(flat)
+        out = np.empty((len(flat), 2))
+        tilted = self.distortion[12:].any()
+        project = self._by_opencv if self.model == "fisheye" or tilted else self._without_derivatives
+        for start in range(0, len(flat), _TOGETHER):
+            out[start : start + _TOGETHER] = project(flat[start : start + _TOGETHER])
         out[flat[:, 0, 2] <= 0] = np.nan
         return out.reshape(*points.shape[:-1], 2)
 
     def _by_opencv(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return pixel positions (n, 2) of points (n, 1, 3) in the camera frame."""
-        zero, out = np.zeros(3), np.empty((len(local), 2))
-        for start in range(0, len(local), _TOGETHER):
-            some = local[start : start + _TOGETHER]
-            if self.model == "fisheye":
-                pixels, _ = cv2.fisheye.projectPoints(some, zero, zero, self.matrix, self.distortion.reshape(-1, 1))
-            else:
-                pixels, _ = cv2.projectPoints(some, zero, zero, self.matrix, self.distortion)
-            out[start : start + _TOGETHER] = pixels.reshape(-1, 2)
-        return out
+        zero = np.zeros(3)
+        if self.model == "fisheye":
+            pixels, _ = cv2.fisheye.projectPoints(local, zero, zero, self.matrix, self.distortion.reshape(-1, 1))
+        else:
+            pixels, _ = cv2.projectPoints(local, zero, zero, self.matrix, self.distortion)
+        return np.asarray(pixels.reshape(-1, 2))
 
-    def _direct(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what OpenCV does for an imager without tilt, by its operations in its order, without derivatives."""
+    def _without_derivatives(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what :meth:`_by_opencv` does for an imager without tilt, by OpenCV's operations in its order.
+
+        OpenCV also computes the derivatives by all parameters, which takes ten times as long.
+        """
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = np.concatenate([self.distortion.ravel(), np.zeros(12)])[:12]
-        out = np.empty((len(local), 2))
         with np.errstate(all="ignore"):  # points behind the camera
-            for start in range(0, len(local), _TOGETHER_DIRECT):
-                x, y, z = local[start : start + _TOGETHER_DIRECT, 0].T
-                scale = 1.0 / z
-                x, y = x * scale, y * scale
-                r2 = x * x + y * y
-                r4 = r2 * r2
-                r6 = r4 * r2
-                radial, inverse = 1 + k1 * r2 + k2 * r4 + k3 * r6, 1.0 / (1 + k4 * r2 + k5 * r4 + k6 * r6)
-                xy, xx, yy = 2 * x * y, r2 + 2 * x * x, r2 + 2 * y * y
-                u = x * radial * inverse + p1 * xy + p2 * xx + s1 * r2 + s2 * r4
-                v = y * radial * inverse + p1 * yy + p2 * xy + s3 * r2 + s4 * r4
-                some = out[start : start + _TOGETHER_DIRECT]
-                some[:, 0] = u * self.matrix[0, 0] + self.matrix[0, 2]
-                some[:, 1] = v * self.matrix[1, 1] + self.matrix[1, 2]
-        return out
+            x, y, z = local[:, 0].T
+            scale = 1.0 / z
+            x, y = x * scale, y * scale
+            r2 = x * x + y * y
+            r4 = r2 * r2
+            r6 = r4 * r2
+            radial, inverse = 1 + k1 * r2 + k2 * r4 + k3 * r6, 1.0 / (1 + k4 * r2 + k5 * r4 + k6 * r6)
+            xy, xx, yy = 2 * x * y, r2 + 2 * x * x, r2 + 2 * y * y
+            u = x * radial * inverse + p1 * xy + p2 * xx + s1 * r2 + s2 * r4
+            v = y * radial * inverse + p1 * yy + p2 * xy + s3 * r2 + s4 * r4
+            (fx, _, cx), (_, fy, cy), _ = self.matrix
+            return np.stack([u * fx + cx, v * fy + cy], axis=1)
 
     def binned(self, step: int) -> Camera:
         """Return the camera with pixels binned ``step`` x ``step``; incomplete bins at the edges are cut off."""

@@ -88,9 +88,9 @@ def parameter_values(rig: Rig, names: Sequence[str]) -> NDArray[np.float64]:
         If the rig lacks one of the parameters.
     """
     check_names(rig, names)
-    poses: dict[str, NDArray[np.float64]] = {}
     optics = eyes(rig)
-    return np.array([0.0 if name in PATH_NAMES else _value(optics, name, poses) for name in names])
+    poses = {name: _pose_values(camera) for name, camera in optics.items()}
+    return np.array([0.0 if name in PATH_NAMES else _value(optics, poses, name) for name in names])
 
 
 def parameter_differences(nominal: Rig, other: Rig, names: Sequence[str]) -> NDArray[np.float64]:
@@ -151,16 +151,18 @@ def check_names(rig: Rig, names: Sequence[str], where: str = "parameters") -> No
         raise InputError(where, ", ".join(twice[:8]), "a parameter named twice", "each parameter once")
 
 
-def _value(optics: dict[str, Camera], name: str, poses: dict[str, NDArray[np.float64]]) -> float:
-    """Return a parameter's value; ``poses`` keeps the six numbers of each eye's pose for the next one."""
+def _pose_values(camera: Camera) -> NDArray[np.float64]:
+    """Return the six numbers of a camera's pose, in the order of :data:`POSE_NAMES`."""
+    rotation = Rotation.from_matrix(camera.sensor_from_camera.rotation).as_rotvec()
+    return np.concatenate([rotation, camera.centre])
+
+
+def _value(optics: dict[str, Camera], poses: dict[str, NDArray[np.float64]], name: str) -> float:
     eye, _, parameter = name.rpartition(".")
     camera = optics[eye]
     if parameter in _MATRIX_PLACES:
         return float(camera.matrix[_MATRIX_PLACES[parameter]])
     if parameter in POSE_NAMES:
-        if eye not in poses:
-            rotation = Rotation.from_matrix(camera.sensor_from_camera.rotation).as_rotvec()
-            poses[eye] = np.concatenate([rotation, camera.centre])
         return float(poses[eye][POSE_NAMES.index(parameter)])
     return float(camera.distortion[_distortion_order(camera).index(parameter)])
 

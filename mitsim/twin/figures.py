@@ -139,15 +139,12 @@ def patch_figures(image: Floats, field: Field, window_px: int) -> Floats:
     grain[:, 1:] += fine[:, 1:] * fine[:, :-1]
     grain[1:] += fine[1:] * fine[:-1]
     inside = field.patches(field.mask)
-    count = inside.sum(axis=1)
 
     def mean_of(values: Floats, where: NDArray[np.bool_] = inside) -> Floats:
         return np.asarray(np.where(where, values, 0.0).sum(axis=1) / where.sum(axis=1))
 
     level, spread, near, fine = (field.patches(one) for one in (mean, deviation, near, fine))
-    rising = np.sort(np.where(inside, near, np.inf), axis=1)
-    middles = np.stack([(count - 1) // 2, count // 2], axis=1)
-    bright = near > np.take_along_axis(rising, middles, axis=1).mean(axis=1, keepdims=True)
+    bright = near > np.nanmedian(np.where(inside, near, np.nan), axis=1, keepdims=True)
     amounts = np.abs(fine)
     out = np.stack(
         [

@@ -116,7 +116,7 @@ def plain_map(known, sigma):
     return PerformanceMap(data)
 
 
-def test_the_linear_uncertainty_is_that_of_the_trials_where_nothing_but_noise_is_unknown(tmp_path, monkeypatch):
+def test_the_linear_uncertainty_is_that_of_the_trials_where_nothing_but_noise_is_unknown():
     """Of a map without losses, correlation and bias, a hundred trials: seven per cent, one sigma, for each ratio.
 
     An angle whose nominal value is 0 is the length of two normal errors, so sizes are compared, bias included.

@@ -113,8 +113,6 @@ def independent(patterns: NDArray[np.float32]) -> tuple[list[int], NDArray[np.fl
     The error is at most ``_LOOKUP_ERROR`` of white. QR decomposition of the Gram matrix with column pivoting sorts the
     patterns by their contribution (Golub and Van Loan, Matrix Computations, 4th ed., section 5.4.2).
     """
-    if len(patterns) == 1:
-        return [0], np.eye(1)
     count, parts = len(patterns), np.array_split(patterns, -(-patterns.size // _VALUES_AT_ONCE), axis=1)
 
     def double_parts() -> Iterator[NDArray[np.float64]]:
