@@ -95,8 +95,11 @@ class Loading:
     fault: InputError | None = None
 
 
-# not a context variable: where a program loads a scene by Mitsuba itself, BSDFs are made in Mitsuba's threads
-_current = Loading()
+# state of scenes that a program loads by Mitsuba itself: nobody asks for their finishes
+_OUTSIDE = Loading()
+
+# not a context variable: Mitsuba itself makes BSDFs in threads of its own
+_current = _OUTSIDE
 _lock = threading.Lock()
 _anonymous = itertools.count()
 
@@ -229,7 +232,8 @@ def _make_bsdf(props: Any, description: dict[str, Any], finish: Finish) -> Any:
     while not name or name in _current.finishes:
         name = f"{props.id() or 'finish'}_{next(_anonymous)}"
     bsdf.set_id(name)
-    _current.finishes[name] = replace(finish, description=description)
+    if _current is not _OUTSIDE:
+        _current.finishes[name] = replace(finish, description=description)
     return bsdf
 
 

@@ -42,11 +42,15 @@ def test_shapes_of_a_dictionary_keep_their_own_finish():
 
 def test_a_scene_loads_with_plain_mitsuba_once_ours_is_there(scenes):
     code = (
-        "from mitsim.scene import load, backend; load._prepare(); mi = backend.mi;"
-        f"print(len(mi.load_file({str(scenes / TWO)!r}, optimize=False).shapes()))"
+        "from mitsim.scene import load, backend; load._prepare(); mi = backend.mi\n"
+        "for _ in range(2):\n"
+        f"    shapes = mi.load_file({str(scenes / TWO)!r}, optimize=False).shapes()\n"
+        "    print(len(shapes), *sorted({shape.bsdf().id() for shape in shapes}))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "5"
+    first, second = done.stdout.splitlines()
+    assert first.split()[0] == "5"
+    assert second == first  # ids too: nothing is left of what was loaded before
 
 
 @pytest.mark.parametrize(
