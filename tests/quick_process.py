@@ -1,8 +1,7 @@
 """Processes that a test may kill or starve, forked from one that has imported the program; each saves 2 s of imports.
 
 The first process starts a server that imports :data:`PRELOADED` and renders nothing; every process is a fork of it.
-It has its own memory, files, limits and signals, as a command that a user starts. Workers of a pool or of a cluster
-can come from the same server: :class:`QuickPool`, :func:`start_server`.
+It has its own memory, files, limits and signals, as a command that a user starts.
 """
 
 from __future__ import annotations
@@ -13,17 +12,11 @@ import runpy
 import sys
 import tempfile
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import forkserver
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 from unittest import mock
-
-from characterisation.threads import usable_cores
-from mitsim.campaign import executor
-from mitsim.campaign.executor import Pool
-from mitsim.scene import backend
 
 HERE = Path(__file__).resolve().parent
 
@@ -35,13 +28,9 @@ PRELOADED = [
     "known_clouds",
     "mitsim.cli",
     "mitsim.campaign.many",
-    "mitsim.interface.studies",
-    "mitsim.virtual.spread_out",
     "mitsim.report.figures",
     "trimesh.exchange.load",
     "dask.array",  # xarray imports it
-    "distributed",
-    "ipykernel.kernelapp",
 ]
 
 _CONTEXT = multiprocessing.get_context("forkserver") if sys.platform != "win32" else None
@@ -50,18 +39,14 @@ _CONTEXT = multiprocessing.get_context("forkserver") if sys.platform != "win32" 
 class QuickProcess:
     """A script or module with arguments in a process of its own; its output goes to a file."""
 
-    def __init__(
-        self, *command: object, limits: Callable[[], object] | None = None, folder: str | Path = HERE.parent
-    ) -> None:
-        start_server()
+    def __init__(self, *command: object, limits: Callable[[], object] | None = None) -> None:
+        _start_server()
         assert _CONTEXT is not None
         handle, name = tempfile.mkstemp(suffix=".stderr")
         os.close(handle)
         self._said = Path(name)
         self._process: ForkServerProcess = _CONTEXT.Process(
-            target=_run,
-            args=(list(map(str, command)), str(self._said), dict(os.environ), limits, str(folder)),
-            daemon=True,
+            target=_run, args=(list(map(str, command)), str(self._said), dict(os.environ), limits), daemon=True
         )
         self._process.start()
 
@@ -70,17 +55,13 @@ class QuickProcess:
         return self._process.pid or 0
 
     @property
-    def exitcode(self) -> int | None:
-        return self._process.exitcode
-
-    @property
     def said(self) -> str:
         """What it has printed by now, on both streams."""
         return self._said.read_text()
 
     @property
     def running(self) -> bool:
-        return self.exitcode is None
+        return self._process.exitcode is None
 
     def kill(self) -> None:
         """As ``kill -9``; returns once it is gone."""
@@ -100,7 +81,7 @@ class QuickProcess:
         return code, said
 
 
-def start_server() -> None:
+def _start_server() -> None:
     """Start the server that every process is a fork of, unless it runs already."""
     assert _CONTEXT is not None
     _CONTEXT.set_forkserver_preload(PRELOADED)
@@ -110,27 +91,14 @@ def start_server() -> None:
         forkserver.ensure_running()
 
 
-class QuickPool(Pool):
-    """A pool of the program whose processes are forks of the server, in place of new interpreters."""
-
-    def _ready(self) -> ProcessPoolExecutor:
-        if self._pool is None:
-            start_server()
-            parent = forkserver._forkserver._forkserver_pid
-            threads = max(1, usable_cores() // self.processes)
-            arguments = (threads, parent, backend.active())
-            self._pool = ProcessPoolExecutor(self.processes, _CONTEXT, executor._start_worker, arguments)
-        return self._pool
-
-
-def _run(command: list[str], said: str, environment: dict[str, str], limits: Any, folder: str) -> None:
+def _run(command: list[str], said: str, environment: dict[str, str], limits: Any) -> None:
     """What the fork does: the script as ``python script arguments``, or ``-m module arguments``."""
     with Path(said).open("w", encoding="utf-8") as file:
         for stream in (sys.stdout, sys.stderr):
             os.dup2(file.fileno(), stream.fileno())
     os.environ.clear()
     os.environ.update(environment)
-    os.chdir(folder)
+    os.chdir(HERE.parent)
     if limits is not None:
         limits()
     if command[0] == "-m":

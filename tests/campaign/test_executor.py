@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quick_process import QuickPool
 from typer.testing import CliRunner
 
 from mitsim.campaign import executor
@@ -44,14 +43,6 @@ def die(order):
 def pool():
     """Two processes as the program starts them: new interpreters."""
     made = Pool(2)
-    yield made
-    made.close()
-
-
-@pytest.fixture(scope="module")
-def forked_pool():
-    """Two processes that have imported the program."""
-    made = QuickPool(2)
     yield made
     made.close()
 
@@ -143,12 +134,12 @@ def test_commands_give_the_same_bytes_in_two_processes(tmp_path, pool, monkeypat
         assert [name for name in one if one[name] != two[name]] == []
 
 
-def test_a_data_sheet_is_the_same_in_two_processes(forked_pool, half_n10, monkeypatch):
+def test_a_data_sheet_is_the_same_in_two_processes(pool, half_n10, monkeypatch):
     from mitsim import data_sheet
 
     monkeypatch.setattr(data_sheet, "DISTANCES", 2)
     monkeypatch.setattr(data_sheet, "METALS", [])
-    one, two = (data_sheet.measure_sensor(half_n10, 3, workers) for workers in (None, forked_pool))
+    one, two = (data_sheet.measure_sensor(half_n10, 3, workers) for workers in (None, pool))
     assert len(one.residuals.values) > 1000
     np.testing.assert_equal(one.numbers(), two.numbers())
     np.testing.assert_array_equal(one.residuals.values, two.residuals.values)

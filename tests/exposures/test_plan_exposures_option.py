@@ -9,13 +9,13 @@ from unittest import mock
 
 import pytest
 import typer.main
-from coarse_sensor import coarse_sensor
 from plain_pages import without_pictures
 from shell import mitsim_here
 from small_study import few_measurements, small_study
 
 from mitsim.cli import app
 from mitsim.exposures import exposure_plan, planned
+from tests.smaller_sensors import coarse_sensor
 
 #: ground aluminium of Ra 0.37: from the side the N10's own exposure, 1.15 ms, is too short
 FINISHES = "{ plane_Ra = 0.37, pillar_Ra = 0.37 }"

@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray as xr
-from coarse_sensor import coarse_sensor
 from typer.testing import CliRunner
 
 import mitsim as ms
 from mitsim.cli import app
+from tests.smaller_sensors import coarse_sensor
 
 POSE = ms.look_at((0, -300, 400))
 

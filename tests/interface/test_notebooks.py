@@ -4,7 +4,6 @@ from pathlib import Path
 
 import nbformat
 import pytest
-from forked_kernel import forked_kernels
 from nbclient import NotebookClient
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "notebooks"
@@ -46,10 +45,7 @@ def test_the_notebook_is_kept_as_it_was_run(path):
 def test_the_notebook_runs(path):
     kept = nbformat.read(path, as_version=4)
     book = nbformat.read(path, as_version=4)
-    # the first book has a kernel of its own, as a reader starts it; the others save its imports
-    kernels = None if path.stem == "first_capture" else forked_kernels()
-    about = {"metadata": {"path": str(FOLDER)}}
-    NotebookClient(book, kernels, timeout=300, kernel_name="python3", resources=about).execute(cleanup_kc=True)
+    NotebookClient(book, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(FOLDER)}}).execute()
     for before, after in zip(code(kept), code(book), strict=True):
         # values change with the machine; how much is printed and drawn does not
         assert len(words(after).splitlines()) == len(words(before).splitlines()), after.source

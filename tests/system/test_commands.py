@@ -9,7 +9,6 @@ import sys
 
 import numpy as np
 import pytest
-from coarse_sensor import coarse_sensor
 from shell import ROOT, mitsim, mitsim_here
 
 from characterisation.atomic_io import HOST
@@ -17,6 +16,7 @@ from characterisation.cloud_files import read_ply
 from mitsim.capture.folder import read_capture
 from mitsim.progress import be_quiet, say, say_progress, track
 from mitsim.simulation.truth import read_exr
+from tests.smaller_sensors import coarse_sensor
 
 
 @pytest.mark.parametrize("module", ["import mitsim", "import mitsim.cli"])

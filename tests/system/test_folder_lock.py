@@ -10,7 +10,6 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from coarse_sensor import coarse_sensor
 from shell import mitsim_here
 from small_study import small_study
 
@@ -18,6 +17,7 @@ from characterisation.atomic_io import HOST, atomic_write, atomic_write_named, w
 from mitsim.commands.folder_lock import LOCK, lock_folder, remove_partial, remove_partial_beside
 from mitsim.errors import InputError
 from mitsim.run_study import score_study
+from tests.smaller_sensors import coarse_sensor
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
 

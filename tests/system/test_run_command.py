@@ -7,13 +7,13 @@ import json
 
 import numpy as np
 import pytest
-from coarse_sensor import coarse_sensor
 from plain_pages import without_pictures
 from shell import ROOT, mitsim_here
 from small_study import MEASUREMENTS, few_measurements
 
 from characterisation.cloud_files import read_ply
 from characterisation.maps.performance_map import PerformanceMap
+from tests.smaller_sensors import coarse_sensor
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 import shell
-from coarse_sensor import coarse_sensor
 from small_study import MEASUREMENTS, few_measurements
+
+from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from coarse_sensor import coarse_sensor
 
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
@@ -22,6 +21,7 @@ from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.stated import budget_groups
 from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.world import BEYOND, FINISHES, Trial
+from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
 DISTANCE = "pillar1_pillar2_distance"

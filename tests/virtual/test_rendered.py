@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from coarse_sensor import coarse_sensor
 
 from characterisation.documents import read_toml
 from characterisation.point_cloud import PointCloud, Status
@@ -29,6 +28,7 @@ from mitsim.virtual.stated import budget_groups, state_view, statement_document
 from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Trial, finish_deviation
+from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
 DISTANCE = "pillar1_pillar2_distance"
