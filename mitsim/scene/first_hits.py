@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.device import vectors_to_device, vectors_to_host
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.camera import Rig
@@ -72,8 +73,8 @@ def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.fl
 
     ``origins`` (n, 3) [mm] and unit ``directions`` (n, 3), world frame.
     """
-    start, along = (np.asarray(a, np.float32).reshape(-1, 3).T for a in (origins, directions))
-    ray = mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
+    start, along = (vectors_to_device(np.asarray(a).reshape(-1, 3)) for a in (origins, directions))
+    ray = mi.Ray3f(mi.Point3f(start), along)
     surface = scene.mitsuba.ray_intersect(ray)
     behind = dr.dot(surface.n, ray.d) > 0
     two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
@@ -90,7 +91,7 @@ def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.fl
             lookup[shape_id] = index
     lookup[0] = -1
     shape = lookup[ids]
-    vectors = np.where((shape >= 0)[:, None], np.array(normal, float).T, np.nan)
+    vectors = np.where((shape >= 0)[:, None], vectors_to_host(normal, float), np.nan)
     return Hits(shape, np.array(front, bool) & (shape >= 0), vectors, np.array(distance, float))
 
 

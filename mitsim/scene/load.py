@@ -148,22 +148,27 @@ def flat_coupon(finish: Finish, half_size: float, turn_deg: float = 0.0) -> Scen
     to_world = backend.mi.ScalarTransform4f().rotate([0, 0, 1], turn_deg).scale([half_size, half_size, 1])
     coupon = {"type": "rectangle", "to_world": to_world, "bsdf": finish.description}
     loaded = backend.mi.load_dict({"type": "scene", "coupon": coupon}, parallel=False, optimize=False)
+    _share_kernels(loaded)
     return Scene(loaded, ("coupon",), (finish,), bounds_of(loaded), f"a coupon of {finish}")
 
 
-def share_kernels(scene: Scene) -> Scene:
-    """Make the parameters of a scene's materials inputs of its kernels, not constants in them, and return the scene.
+def _share_kernels(scene: Any) -> None:
+    """Make the numbers of materials and the transforms of shapes inputs of a scene's kernels, not constants in them.
 
-    With constants, Mitsuba compiles a kernel for each finish, which takes seconds. Inputs are faster if several
-    finishes of one part are rendered.
+    With constants, Dr.Jit compiles a kernel for each finish and each size of a coupon, which takes seconds.
+
+    A shape computes the inverse of its transform anew. The inverse that Mitsuba 3.9.1 makes of a rotation about a
+    vector that is not a unit vector is wrong, and a rectangle that is called directly would lose a part.
     """
-    parameters = backend.mi.traverse(scene.mitsuba)
+    parameters = backend.mi.traverse(scene)
     for key in parameters.keys():  # noqa: SIM118 - not a dict
         value = parameters[key]
         if isinstance(value, backend.mi.Float) and len(value) == 1:  # a mesh's vertices have this type too
             parameters[key] = backend.dr.opaque(backend.mi.Float, float(value[0]))
+        elif isinstance(value, backend.mi.Transform4f):
+            backend.dr.make_opaque(value)
+            parameters[key] = value
     parameters.update()
-    return scene
 
 
 def _prepare() -> None:
@@ -189,6 +194,7 @@ def _wrap(scene: Any, finishes: dict[str, Finish], where: str) -> Scene:
     if not 1.0 <= size <= 1e5:
         hint = "lengths are in mm; a part modelled in metres needs <scale value='1000'/>"
         raise InputError(where, "shape", f"a scene {size:g} mm across", "1 mm to 100 m", hint)
+    _share_kernels(scene)
     names = tuple(shape.id() or f"shape_{i}" for i, shape in enumerate(shapes))
     return Scene(scene, names, tuple(finishes.get(s.bsdf().id()) for s in shapes), bounds, where)
 

@@ -30,7 +30,7 @@ from mitsim.capture.capture import Capture
 from mitsim.prediction import Predictor
 from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
-from mitsim.scene.load import Scene, load_scene, share_kernels
+from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.scene.ray_casting.triangles import hull_corners
 from mitsim.sensor.exposure import PlannedExposure
@@ -214,13 +214,11 @@ class RenderedMeasurements:
             file, scene = self.study.file, self.study.scene
             if finish >= 0:
                 parameters = {name: str(value) for name, value in file.parameters.items()}
-                scene = share_kernels(
-                    load_scene(
-                        scene.where,
-                        self.study.sensor.wavelength_nm,
-                        parameters,
-                        lambda name: finish_deviation(self.unknowns, finish, name),
-                    )
+                scene = load_scene(
+                    scene.where,
+                    self.study.sensor.wavelength_nm,
+                    parameters,
+                    lambda name: finish_deviation(self.unknowns, finish, name),
                 )
             self._scenes[finish] = scene, directional_albedos(scene)
         return self._scenes[finish]

@@ -52,6 +52,10 @@ def shape(kind: str, *, x: float = 0.0, **bsdf):
 SCENES = {
     "rectangle": lambda: {"a": shape("rectangle")},
     "seen from behind": lambda: {"a": shape("rectangle", type="twosided", b=metal()) | {"flip_normals": True}},
+    # the axis is no unit vector
+    "askew rectangle": lambda: {
+        "a": shape("rectangle") | {"to_world": mi.ScalarTransform4f().rotate([1, 1, 0], 25).scale([60, 40, 1])}
+    },
     "white rectangle": lambda: {"a": shape("rectangle", type="matt_white")},
     "two shapes of one metal": lambda: {
         "finish": metal(),
@@ -67,7 +71,13 @@ SCENES = {
 
 @pytest.mark.parametrize(
     ("kind", "depth"),
-    [("rectangle", 1), ("white rectangle", 1), ("seen from behind", 3), ("two shapes of one metal", 3)],
+    [
+        ("rectangle", 1),
+        ("askew rectangle", 1),
+        ("white rectangle", 1),
+        ("seen from behind", 3),
+        ("two shapes of one metal", 3),
+    ],
 )
 def test_the_short_way_finds_the_light_of_the_long_way(kind, depth, light, monkeypatch):
     scene = scene_from_dict(SCENES[kind](), 460)
@@ -89,10 +99,6 @@ def test_scenes_that_are_not_plain_take_the_long_way(scenes):
     lit = {"a": shape("rectangle"), "sky": {"type": "constant"}}
     assert single_plane(scene_from_dict(lit, 460)) is None
     assert single_plane(scene_from_dict({"a": shape("sphere")}, 460)) is None
-    askew = mi.ScalarTransform4f().rotate([1, 1, 0], 25)  # the axis is no unit vector
-    assert (
-        single_plane(scene_from_dict({"a": shape("rectangle") | {"to_world": askew.scale([60, 40, 1])}}, 460)) is None
-    )
     several = {"a": shape("rectangle"), "b": shape("rectangle", x=10.0, type="matt_white")}
     assert single_bsdf(scene_from_dict(several, 460)) is None
 

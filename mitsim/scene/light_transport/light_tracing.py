@@ -40,6 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.device import opaque, opaque_index
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
 from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
 from mitsim.scene.load import Scene
@@ -143,28 +144,30 @@ def _launch(
     first, count, depth, seed = batch.start, len(poses) * len(batch), photons.depth, photons.seed
     index, lane = dr.arange(mi.UInt32, count), None
     if len(poses) > 1:
-        per_pose = dr.opaque(mi.UInt32, len(batch))
+        per_pose = opaque_index(len(batch))
         lane, index = index // per_pose, index % per_pose
     camera = Eye([pose @ rays.camera.sensor_from_camera for pose in poses], lane)
     projector = ProjectorLight(poses, light.projector, scene.bounds, lane)
-    aperture, inverse_focus = 0.5 * rays.aperture_mm, 1.0 / rays.focus_mm
+    has_aperture = rays.aperture_mm > 0
+    aperture, inverse_focus = (opaque(one) for one in (0.5 * rays.aperture_mm, 1.0 / rays.focus_mm))
+    in_row, surfaces = (opaque_index(n) for n in (rays.camera.width, depth))
     # n_C / n_L; 0 if there are only photons
-    samples_per_photon = dr.opaque(mi.Float, 0.0 if photons.samples is None else photons.samples / photons.count)
+    samples_per_photon = opaque(0.0 if photons.samples is None else photons.samples / photons.count)
 
-    index += dr.opaque(mi.UInt32, first)
+    index += opaque_index(first)
     streams = mi.UInt64(index) + _FIRST_STREAM
     random = mi.PCG32(initstate=dr.opaque(mi.UInt64, seed), initseq=streams)
-    side = dr.opaque(mi.UInt32, round(np.sqrt(photons.count)))
-    sequence_seed, z_index = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), z_order(index % side, index // side)
+    side = opaque_index(round(np.sqrt(photons.count)))
+    sequence_seed, z_index = opaque_index(seed & 0xFFFFFFFF), z_order(index % side, index // side)
     image_point = mi.Point2f(index % side, index // side)
     image_point = (image_point + mi.Point2f(random.next_float32(), random.next_float32())) / mi.Float(side)
-    lens = _in_disc(random) if projector.radius > 0 else None
+    lens = _in_disc(random) if projector.has_aperture else None
     origin, direction, flux, uv = projector.emit_photon(image_point, lens)
 
     records = depth - 1
     pixels, radiances = dr.zeros(mi.UInt32, count * records), dr.zeros(mi.Float, count * records)
     lengths = dr.zeros(mi.Float, count * records)
-    slot = dr.arange(mi.UInt32, count) * records
+    slot = dr.arange(mi.UInt32, count) * opaque_index(records)
     initial = _PhotonState(
         active=flux > 0,
         bounce=mi.UInt32(dr.zeros(mi.UInt32, count)),
@@ -194,7 +197,7 @@ def _launch(
 
         # to the camera
         lens_point = camera.position
-        if aperture > 0:
+        if has_aperture:
             in_lens = _in_disc(random) * aperture
             lens_point = lens_point + camera.axes[0] * in_lens.x + camera.axes[1] * in_lens.y
         to_camera = lens_point - surface.p
@@ -204,7 +207,7 @@ def _launch(
         in_front = hit & ~at_first & (local.z > 0)
         cosine = dr.select(in_front, local.z, 1.0)
         x, y = local.x / cosine, local.y / cosine
-        if aperture > 0:
+        if has_aperture:
             x += in_lens.x * inverse_focus
             y += in_lens.y * inverse_focus
         column, row, seen = rays.distortion.image(x, y, in_front)
@@ -219,7 +222,7 @@ def _launch(
         radiance = weight * value * importance / cosine_in * heuristic
         lit = seen & (radiance > 0)
         target = slot + bounce - 1
-        dr.scatter(pixels, row * rays.camera.width + column, target, lit)
+        dr.scatter(pixels, row * in_row + column, target, lit)
         dr.scatter(radiances, radiance, target, lit)
         dr.scatter(lengths, length + distance, target, lit)
 
@@ -227,7 +230,7 @@ def _launch(
         sample1, sample2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
         even1, even2 = r3_point(z_index, sequence_seed, 1)
         sample1, sample2 = dr.select(at_first, even1, sample1), dr.select(at_first, even2, sample2)
-        continues = hit & (bounce + 1 < depth)
+        continues = hit & (bounce + 1 < surfaces)
         sampled, _ = bsdf.sample(context, surface, sample1, sample2, continues)
         continues &= (sampled.pdf > 0) & ~mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
         outgoing = surface.to_world(sampled.wo)
@@ -243,18 +246,18 @@ def _launch(
 
     dr.while_loop((initial,), running, step, labels=("photon",), label="photons")
     dr.eval(pixels, radiances, lengths, uv)
-    left, top, width, height = (dr.opaque(mi.UInt32, n) for n in (roi.left, roi.top, roi.width, roi.height))
-    column, row = pixels % rays.camera.width - left, pixels // rays.camera.width - top
+    left, top, width, height = (opaque_index(n) for n in (roi.left, roi.top, roi.width, roi.height))
+    column, row = pixels % in_row - left, pixels // in_row - top
     inside = (column < width) & (row < height)  # unsigned: differences below 0 become very large
     kept = dr.compress((radiances > 0) & inside)
     if not len(kept):
         return np.empty(0, np.int32), np.empty(0), uv, lengths
     pixel = row * width + column
     if len(poses) > 1:
-        pixel += dr.arange(mi.UInt32, count * records) // (per_pose * records) * (width * height)
+        pixel += dr.arange(mi.UInt32, count * records) // opaque_index(len(batch) * records) * (width * height)
     pixel = mi.Int32(dr.gather(mi.UInt32, pixel, kept))
     radiance, length = dr.gather(mi.Float, radiances, kept), dr.gather(mi.Float, lengths, kept)
-    uv = dr.gather(mi.Point2f, uv, kept // records)
+    uv = dr.gather(mi.Point2f, uv, kept // opaque_index(records))
     dr.eval(pixel, radiance, length, uv)
     return np.asarray(pixel), np.asarray(radiance, np.float64), uv, length
 

@@ -20,7 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.scene.backend import dr, mi
+from mitsim.scene.backend import mi
+from mitsim.scene.device import opaque_index
 
 _ROOT = 1.2207440846057596
 
@@ -40,7 +41,7 @@ def r3_point(index: Any, seed: Any, stream: int) -> tuple[Any, Any]:
     """
     values = []
     for axis, step in enumerate(_STEPS):
-        shift = mi.sample_tea_32(seed, dr.opaque(mi.UInt32, 3 * stream + axis), 6)[0]
+        shift = mi.sample_tea_32(seed, opaque_index(3 * stream + axis), 6)[0]
         bits = index * mi.UInt32(step) + shift
         values.append(mi.Float(bits >> 8) * np.float32(2**-24))
     return values[0], mi.Point2f(values[1], values[2])

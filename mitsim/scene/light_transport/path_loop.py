@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.device import opaque, opaque_index, to_device
 from mitsim.scene.light_transport.ambient import has_emitters, hit_emitter_light, sampled_emitter_light
 from mitsim.scene.light_transport.aperture_samples import aperture_samples
 from mitsim.scene.light_transport.light_paths import LightPaths
@@ -53,30 +54,34 @@ def launch(
     count = len(poses) * roi.width * roi.height
     index, lane = dr.arange(mi.UInt32, count), None
     if len(poses) > 1:
-        pixels = dr.opaque(mi.UInt32, roi.width * roi.height)
+        pixels = opaque_index(roi.width * roi.height)
         lane, index = index // pixels, index % pixels
     camera = Eye([pose @ rays.camera.sensor_from_camera for pose in poses], lane)
     projector = ProjectorLight(poses, light.projector, scene.bounds, lane)
 
-    width = dr.opaque(mi.UInt32, roi.width)
-    column = index % width + dr.opaque(mi.UInt32, roi.left)
-    row = index // width + dr.opaque(mi.UInt32, roi.top)
-    pixel = row * rays.camera.width + column
+    width = opaque_index(roi.width)
+    column = index % width + opaque_index(roi.left)
+    row = index // width + opaque_index(roi.top)
+    pixel = row * opaque_index(rays.camera.width) + column
     x, y = rays.corners(column, row)
     displacement = None if shift is None else _displacement(shift, camera, index)
 
     random = mi.PCG32(initstate=dr.opaque(mi.UInt64, seed), initseq=mi.UInt64(pixel))
-    sequence_seed, z_index = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), z_order(column, row)
-    total = dr.opaque(mi.UInt32, side * side)
+    sequence_seed, z_index = opaque_index(seed & 0xFFFFFFFF), z_order(column, row)
+    total = opaque_index(side * side)
     # the second moment of n midpoints in a row is too small by the factor 1 - 1/n^2. Stretched to the right moment they
     # integrate cubics exactly, and two of them are Gauss's rule
-    stretch = 1.0 if jitter or side == 1 else float(1.0 / np.sqrt(1.0 - side**-2))
+    stretch = opaque(1.0 if jitter or side == 1 else float(1.0 / np.sqrt(1.0 - side**-2)))
+    cells, per_cell = opaque_index(side), opaque(1.0 / side)
     has_aperture = rays.aperture_mm > 0
+    aperture, inverse_focus = (opaque(one) for one in (0.5 * rays.aperture_mm, 1.0 / rays.focus_mm))
     pupils = _Pupils(side * side, jitter)
     has_ambient = has_emitters(scene)
+    # the ray from the last surface may meet an emitter of the scene
+    surfaces, rays_at_most = (opaque_index(n) for n in (depth, depth + 1 if has_ambient else depth))
     plane, shared_bsdf = single_plane(scene), single_bsdf(scene)
     occluders = scene.mitsuba if plane is None else None
-    photons_per_sample = dr.opaque(mi.Float, photons / side**2)
+    photons_per_sample = opaque(photons / side**2)
     area = pixel_area(x, y)
     sums = [dr.zeros(mi.Float, count) for _ in range(light.codes + 1)]  # the last is ambient light
     initial = _PathState(
@@ -101,14 +106,16 @@ def launch(
         random, sums = path.random, path.sums
         # a lane at bounce 0 starts a path in the next cell of its pixel's raster of side x side
         at_first = bounce == 0
-        a = 0.5 + stretch * ((mi.Float(sample % side) + (random.next_float32() if jitter else 0.5)) / side - 0.5)
-        b = 0.5 + stretch * ((mi.Float(sample // side) + (random.next_float32() if jitter else 0.5)) / side - 0.5)
+        cell_row = mi.UInt32((mi.Float(sample) + 0.5) * per_cell)  # an integer division is slow, and this one is exact
+        cell_column = sample - cell_row * cells
+        a = 0.5 + stretch * ((mi.Float(cell_column) + (random.next_float32() if jitter else 0.5)) * per_cell - 0.5)
+        b = 0.5 + stretch * ((mi.Float(cell_row) + (random.next_float32() if jitter else 0.5)) * per_cell - 0.5)
         local = mi.Vector3f(bilinear(x, a, b), bilinear(y, a, b), 1.0)
         start = camera.position
         if has_aperture:
-            in_lens = pupils.camera(sample, random) * (0.5 * rays.aperture_mm)
+            in_lens = pupils.camera(sample, random) * aperture
             start = start + camera.axes[0] * in_lens.x + camera.axes[1] * in_lens.y
-            local -= mi.Vector3f(in_lens.x, in_lens.y, 0.0) * (1.0 / rays.focus_mm)
+            local -= mi.Vector3f(in_lens.x, in_lens.y, 0.0) * inverse_focus
         origin = dr.select(at_first, start, origin)
         direction = dr.select(at_first, camera.to_world(dr.normalize(local)), direction)
         weight = dr.select(at_first, 1.0, weight)
@@ -119,13 +126,13 @@ def launch(
             ambient = weight * hit_emitter_light(scene, surface, origin, pdf, at_first)
             if paths.indirect_only:  # an emitter behind the first surface is its direct light
                 ambient = dr.select(bounce > 1, ambient, 0.0)
-        hit = surface.is_valid() & (bounce < depth)
+        hit = surface.is_valid() & (bounce < surfaces)
         length = dr.select(at_first, 0.0, length) + dr.select(hit, surface.t, 0.0)
         context = mi.BSDFContext()
         bsdf = surface.bsdf() if shared_bsdf is None else shared_bsdf
         contributes = hit & ~at_first if paths.indirect_only else hit
 
-        lens = pupils.projector(sample, random) if projector.radius > 0 else None
+        lens = pupils.projector(sample, random) if projector.has_aperture else None
         shift_mm = None if displacement is None else displacement * dr.select(at_first, surface.t, 0.0)
         toward, irradiance, uv, distance = projector.light(occluders, surface, direction, lens, shift_mm, contributes)
         reflected = bsdf.eval(context, surface, surface.to_local(toward), contributes & (irradiance > 0))[0]
@@ -154,8 +161,7 @@ def launch(
         if not jitter:  # most of the remaining error is that of the first bounce
             even1, even2 = r3_point(z_index * total + sample, sequence_seed, 0)
             sample1, sample2 = dr.select(at_first, even1, sample1), dr.select(at_first, even2, sample2)
-        # the ray from the last surface may meet an emitter of the scene
-        continues = hit & (bounce + 1 < (depth + 1 if has_ambient else depth))
+        continues = hit & (bounce + 1 < rays_at_most)
         sampled, bsdf_weight = bsdf.sample(context, surface, sample1, sample2, continues)
         continues &= bsdf_weight[0] > 0
         next_ray = surface.spawn_ray(surface.to_world(sampled.wo))
@@ -182,7 +188,7 @@ def launch(
 
     (final,) = dr.while_loop((initial,), running, step, labels=("path",), label="transport")
     sums = final.sums
-    scale = dr.opaque(mi.Float, 1.0 / (side * side))
+    scale = opaque(1.0 / (side * side))
     *code_sums, ambient_sum = sums
     images = [(s + ambient_sum) * scale for s in light.images(code_sums)] + [ambient_sum * scale]
     dr.eval(images)  # all at once: one kernel for any number of images
@@ -263,7 +269,6 @@ def _displacement(shift: NDArray[np.floating], camera: Eye, index: Any) -> Any:
 
     It is per unit of distance from the camera [rad].
     """
-    # a gather, because a kernel that loads is compiled for each possible alignment of a NumPy array
-    along = mi.Float(np.ravel(shift).astype(np.float32))
-    below = index + dr.opaque(mi.UInt32, shift[0].size)
+    along = to_device(np.ravel(shift))
+    below = index + opaque_index(shift[0].size)
     return camera.axes[0] * dr.gather(mi.Float, along, index) + camera.axes[1] * dr.gather(mi.Float, along, below)

@@ -9,28 +9,17 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.scene.load import Scene
 
-#: tolerance for rounding of a rotation in single precision times its inverse
-_ROUNDINGS = 1e-5
-
 
 def single_plane(scene: Scene) -> Any | None:
-    """Return the shape of a scene that is one rectangle and has no emitters; None for any other scene.
-
-    None also if the rectangle's transform times its inverse is not the identity. Mitsuba 3.9.1 makes such a transform
-    from a rotation about a vector that is not a unit vector. Called directly, the rectangle would lose a part.
-    """
+    """Return the shape of a scene that is one rectangle and has no emitters; None for any other scene."""
     shapes = scene.shapes
     if len(shapes) > 1 or has_emitters(scene) or shapes[0].shape_type() != mi.ShapeType.Rectangle.value:
         return None
-    to_world = mi.traverse(shapes[0])["to_world"]
-    product = np.array((to_world @ to_world.inverse()).matrix, float).reshape(4, 4)[:3, :3]
-    return shapes[0] if np.allclose(product, np.eye(3), rtol=0, atol=_ROUNDINGS) else None
+    return shapes[0]
 
 
 def single_bsdf(scene: Scene) -> Any | None:

@@ -22,6 +22,7 @@ from scipy.linalg import qr
 
 from mitsim.errors import InputError
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.device import opaque
 from mitsim.scene.ray_casting.distortion import Distortion
 from mitsim.scene.ray_casting.eye import Eye, of_lane, shadow_ray
 from mitsim.sensor.modulation import LIGHT_MM_S
@@ -83,21 +84,22 @@ class ProjectedPatterns:
         self.codes = len(chosen)
         stack = np.ascontiguousarray(np.moveaxis(emitted[chosen], 0, -1))
         kind, stack = (mi.Texture1f, stack[0]) if self.along_row else (mi.Texture2f, stack)
-        filter_mode = dr.FilterMode.Nearest if projector.pixel_gap > 0 else dr.FilterMode.Linear
+        gap = float(projector.pixel_gap)
+        self.has_gap = gap > 0
+        self.size = [opaque(n) for n in (optics.width, optics.height)]
+        self.half_lit, self.lit_factor = (opaque(n) for n in (0.5 - 0.5 * gap, 1.0 / (1.0 - gap) ** 2))
+        filter_mode = dr.FilterMode.Nearest if self.has_gap else dr.FilterMode.Linear
         self.texture = kind(mi.TensorXf(stack), wrap_mode=dr.WrapMode.Clamp, filter_mode=filter_mode)
 
     def values(self, uv: Any, length: Any, active: Any) -> list[Any]:
         """Return the relative light of each independent pattern at texture coordinate ``uv``."""
-        gap = float(self.projector.pixel_gap)
         values = list(self.texture.eval(mi.Array1f(uv.x) if self.along_row else uv, active))
-        if gap > 0:
-            optics = self.projector.optics
-            across, down = uv.x * optics.width, uv.y * optics.height
-            edge = 0.5 * gap
-            lit = (dr.abs(across - dr.floor(across) - 0.5) < 0.5 - edge) & (
-                dr.abs(down - dr.floor(down) - 0.5) < 0.5 - edge
+        if self.has_gap:
+            across, down = uv.x * self.size[0], uv.y * self.size[1]
+            lit = (dr.abs(across - dr.floor(across) - 0.5) < self.half_lit) & (
+                dr.abs(down - dr.floor(down) - 0.5) < self.half_lit
             )
-            factor = dr.select(lit, 1.0 / (1.0 - gap) ** 2, 0.0)
+            factor = dr.select(lit, self.lit_factor, 0.0)
             values = [value * factor for value in values]
         return values
 
@@ -172,9 +174,9 @@ class ModulatedLight:
         self.projector = projector
         self.count = self.codes = len(frequencies)
         contrasts = np.broadcast_to(np.asarray(contrast, float), frequencies.shape)
-        self.contrasts = [dr.opaque(mi.Float, float(m)) for m in contrasts]
-        self.turns_per_mm = [dr.opaque(mi.Float, float(f / LIGHT_MM_S)) for f in frequencies]
-        self.deltas = [dr.opaque(mi.Float, float(d)) for d in deltas]
+        self.contrasts = [opaque(m) for m in contrasts]
+        self.turns_per_mm = [opaque(f / LIGHT_MM_S) for f in frequencies]
+        self.deltas = [opaque(d) for d in deltas]
 
     def values(self, uv: Any, length: Any, active: Any) -> list[Any]:
         """Return the relative correlation of each image for light of optical length ``length`` [mm]."""
@@ -207,21 +209,24 @@ class ProjectorLight(Eye):
         poses = [world_from_sensor] if isinstance(world_from_sensor, Transform) else world_from_sensor
         frames = [pose @ optics.sensor_from_camera for pose in poses]
         super().__init__(frames, lane)
-        self.size = (optics.width, optics.height)
+        # numbers of a projector are no literals of the kernel: a fit that varies one would compile a kernel for each
+        # value, and a comparison of sensors one for each sensor
+        self.per_size = [opaque(1.0 / n) for n in (optics.width, optics.height)]
         self.distortion = Distortion(optics)
-        self.irradiance = dr.opaque(mi.Float, projector.plane_irradiance)
-        self.radius = float(0.5 * projector.aperture_mm)
-        self.inverse_focus = float(1.0 / projector.focus_mm)
+        self.irradiance = opaque(projector.plane_irradiance)
+        self.has_aperture = projector.aperture_mm > 0
+        self.radius = opaque(0.5 * projector.aperture_mm)
+        self.radius_over_focus = opaque(0.5 * projector.aperture_mm / projector.focus_mm)
         rectangles = np.array([_photon_rectangle(self.distortion, projector, frame, bounds) for frame in frames])
         low, high = rectangles[:, 0], rectangles[:, 1]
         self.extents = [(of_lane(a, lane), of_lane(b - a, lane)) for a, b in zip(low.T, high.T, strict=True)]
         self.area = of_lane(np.prod(high - low, axis=1), lane)
         self.has_corner_loss = projector.corner_illumination < 1
-        # not a literal: a fit that varies it would compile a kernel for each value
-        self.corner_loss = dr.opaque(mi.Float, float(projector.corner_illumination) ** -0.5 - 1.0)
+        self.corner_loss = opaque(float(projector.corner_illumination) ** -0.5 - 1.0)
         cx, cy = optics.matrix[0, 2], optics.matrix[1, 2]
-        self.principal = (float(cx), float(cy))
-        self.farthest = float(np.hypot(max(cx, optics.width - 1 - cx), max(cy, optics.height - 1 - cy)))
+        self.principal = [opaque(c) for c in (cx, cy)]
+        farthest = np.hypot(max(cx, optics.width - 1 - cx), max(cy, optics.height - 1 - cy))
+        self.per_farthest_squared = opaque(farthest**-2)
 
     def light(
         self, scene: Any, surface: Any, ray_direction: Any, lens: Any, shift: Any, active: Any
@@ -254,7 +259,7 @@ class ProjectorLight(Eye):
             Distance to the position in the aperture [mm].
         """
         position = self.position
-        if self.radius > 0:
+        if self.has_aperture:
             position = position + self.axes[0] * (lens.x * self.radius) + self.axes[1] * (lens.y * self.radius)
         to_projector = position - surface.p
         distance = dr.norm(to_projector)
@@ -264,9 +269,9 @@ class ProjectorLight(Eye):
         z = dr.select(in_front, local.z, 1.0)
         code_point = local if shift is None else local + self.to_local(shift)
         x, y = code_point.x / z, code_point.y / z
-        if self.radius > 0:  # the point where the ray crosses the plane of focus, as seen from the centre of the lens
-            x += lens.x * (self.radius * self.inverse_focus)
-            y += lens.y * (self.radius * self.inverse_focus)
+        if self.has_aperture:  # the point where the ray crosses the plane of focus, as seen from the centre of the lens
+            x += lens.x * self.radius_over_focus
+            y += lens.y * self.radius_over_focus
         u, v, inside = self.distortion.image(x, y, in_front)
         facing = inside & (dr.dot(surface.n, toward) * dr.dot(surface.n, -ray_direction) > 0)
         if scene is not None:
@@ -303,9 +308,9 @@ class ProjectorLight(Eye):
         if self.has_corner_loss:
             flux *= self._corner_loss(u, v)
         local, origin = mi.Vector3f(x, y, 1.0), self.position
-        if self.radius > 0:
+        if self.has_aperture:
             origin = origin + self.axes[0] * (lens.x * self.radius) + self.axes[1] * (lens.y * self.radius)
-            local -= mi.Vector3f(lens.x, lens.y, 0.0) * (self.radius * self.inverse_focus)
+            local -= mi.Vector3f(lens.x, lens.y, 0.0) * self.radius_over_focus
         return origin, self.to_world(dr.normalize(local)), dr.select(inside, flux, 0.0), self._texture(u, v)
 
     def density(self, toward: Any, distance: Any) -> Any:
@@ -317,11 +322,11 @@ class ProjectorLight(Eye):
         return 1.0 / (self.area * dr.square(cosine) * cosine * dr.square(distance))
 
     def _corner_loss(self, u: Any, v: Any) -> Any:
-        off = (dr.square(u - self.principal[0]) + dr.square(v - self.principal[1])) / self.farthest**2
+        off = (dr.square(u - self.principal[0]) + dr.square(v - self.principal[1])) * self.per_farthest_squared
         return 1.0 / dr.square(1.0 + self.corner_loss * off)
 
     def _texture(self, u: Any, v: Any) -> Any:
-        return mi.Point2f((u + 0.5) / self.size[0], (v + 0.5) / self.size[1])
+        return mi.Point2f((u + 0.5) * self.per_size[0], (v + 0.5) * self.per_size[1])
 
 
 def _photon_rectangle(

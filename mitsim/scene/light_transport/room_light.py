@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.device import to_device, vectors_to_host
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.transforms import Transform
@@ -34,7 +35,7 @@ def room_radiance(
     surfaces = cast(scene, rays, world_from_sensor, np.empty((0, 3)))
     out = np.zeros(surfaces.shape.shape, np.float32)
     cosines = _cosines()
-    directions = np.array(rays.directions, np.float32).T.reshape(*rays.size, 3)
+    directions = vectors_to_host(rays.directions).reshape(*rays.size, 3)
     for index, albedo in enumerate(albedos):
         pixels = surfaces.shape == index
         cosine = np.abs((surfaces.normal[pixels] * directions[pixels]).sum(axis=-1))
@@ -61,7 +62,7 @@ def directional_albedo(bsdf: Any) -> NDArray[np.float64]:
     cosines = _cosines()
     count = len(cosines) * _SAMPLES
     random = mi.PCG32(size=count, initstate=7)
-    cosine = mi.Float(np.repeat(cosines, _SAMPLES).astype(np.float32))
+    cosine = to_device(np.repeat(cosines, _SAMPLES))
     azimuth = 2 * dr.pi * random.next_float32()
     sine = dr.sqrt(1 - dr.square(cosine))
     surface = dr.zeros(mi.SurfaceInteraction3f, count)

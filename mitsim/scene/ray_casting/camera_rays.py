@@ -25,6 +25,7 @@ from scipy.sparse import csr_array
 
 from mitsim.errors import InputError
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.device import opaque_index, to_device
 from mitsim.scene.ray_casting.distortion import Distortion
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.roi import Roi
@@ -62,6 +63,7 @@ class CameraRays:
         self.distortion = Distortion(camera)
         self.aperture_mm, self.focus_mm = float(aperture_mm), float(focus_mm)
         self.x, self.y = _ideal_corners(camera)
+        self._corners_in_row = opaque_index(camera.width + 1)
 
     def recalibrated(self, camera: Camera) -> CameraRays:
         """Return the rays of a camera of the same size whose calibration differs a little from this one's.
@@ -84,8 +86,8 @@ class CameraRays:
             down.coefficients @ component @ across.coefficients.T for component in np.moveaxis(after - before, -1, 0)
         ]
         dx, dy = (down.basis @ (across.basis @ difference.T).T for difference in differences)
-        other.x = self.x + mi.Float(np.ravel(dx).astype(np.float32))
-        other.y = self.y + mi.Float(np.ravel(dy).astype(np.float32))
+        other.x = self.x + to_device(np.ravel(dx))
+        other.y = self.y + to_device(np.ravel(dy))
         dr.eval(other.x, other.y)
         return other
 
@@ -96,8 +98,8 @@ class CameraRays:
 
     def corners(self, column: Any, row: Any) -> tuple[list[Any], list[Any]]:
         """Return x/z and y/z at the four corners of pixels: upper left, upper right, lower left, lower right."""
-        corner = row * (self.camera.width + 1) + column
-        below = corner + self.camera.width + 1
+        corner = row * self._corners_in_row + column
+        below = corner + self._corners_in_row
         indices = [corner, corner + 1, below, below + 1]
         return [dr.gather(mi.Float, self.x, i) for i in indices], [dr.gather(mi.Float, self.y, i) for i in indices]
 
@@ -107,7 +109,7 @@ def _ideal_corners(camera: Camera) -> tuple[Any, Any]:
     """Return the ideal image coordinates x/z and y/z at the pixel corners, row by row."""
     columns, rows = np.meshgrid(np.arange(camera.width + 1) - 0.5, np.arange(camera.height + 1) - 0.5)
     rays = camera.rays(np.stack([columns, rows], axis=-1))
-    return tuple(mi.Float(np.ravel(rays[..., i] / rays[..., 2]).astype(np.float32)) for i in (0, 1))
+    return tuple(to_device(np.ravel(rays[..., i] / rays[..., 2])) for i in (0, 1))
 
 
 def bilinear(corners: list[Any], a: Any, b: Any) -> Any:

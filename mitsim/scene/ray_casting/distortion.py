@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.scene.backend import dr
+from mitsim.scene.device import opaque
 from mitsim.sensor.camera import Camera
 
 #: largest radius that is projected, over the ideal radius of the farthest corner. Beyond it, a distortion polynomial
@@ -30,31 +31,33 @@ class Distortion:
 
     def __init__(self, optics: Camera) -> None:
         k = optics.matrix
-        self.focal = (float(k[0, 0]), float(k[1, 1]))
-        self.principal = (float(k[0, 2]), float(k[1, 2]))
-        self.fisheye = optics.model == "fisheye"
-        self.coefficients = np.concatenate([optics.distortion, np.zeros(14)])[:14].tolist()
-        self.tilt = _tilt(*self.coefficients[12:])
-        self.size = (optics.width, optics.height)
         self.border = ideal_border(optics)
         self.reach = float(np.linalg.norm(self.border, axis=1).max()) * _BEYOND
+        coefficients = np.concatenate([optics.distortion, np.zeros(14)])[:14]
+        homography = _tilt(*coefficients[12:])
+        self._fisheye, self._distorted = optics.model == "fisheye", bool(coefficients.any())
+        self._focal, self._principal = [opaque(k[i, i]) for i in (0, 1)], [opaque(c) for c in k[:2, 2]]
+        self._coefficients = [opaque(c) for c in coefficients[:12]]
+        self._tilt = None if homography is None else [[opaque(h) for h in row] for row in homography]
+        self._last = [opaque(n - 0.5) for n in (optics.width, optics.height)]
+        self._reach_squared = opaque(self.reach**2)
 
     def pixel(self, x: Any, y: Any) -> tuple[Any, Any]:
         """Return the pixel (column, row) of the ideal image point (x, y)."""
-        if self.fisheye:
-            x, y = self._fisheye(x, y)
-        elif any(self.coefficients):
+        if self._fisheye:
+            x, y = self._equidistant(x, y)
+        elif self._distorted:
             x, y = self._perspective(x, y)
-        return self.focal[0] * x + self.principal[0], self.focal[1] * y + self.principal[1]
+        return self._focal[0] * x + self._principal[0], self._focal[1] * y + self._principal[1]
 
     def image(self, x: Any, y: Any, active: Any) -> tuple[Any, Any, Any]:
         """Return the pixel (column, row) of the ideal image point (x, y), and whether it lies in the image."""
-        near = active & (dr.square(x) + dr.square(y) < self.reach**2)
+        near = active & (dr.square(x) + dr.square(y) < self._reach_squared)
         u, v = self.pixel(x, y)
-        return u, v, near & (u > -0.5) & (u < self.size[0] - 0.5) & (v > -0.5) & (v < self.size[1] - 0.5)
+        return u, v, near & (u > -0.5) & (u < self._last[0]) & (v > -0.5) & (v < self._last[1])
 
-    def _fisheye(self, x: Any, y: Any) -> tuple[Any, Any]:
-        k1, k2, k3, k4 = self.coefficients[:4]
+    def _equidistant(self, x: Any, y: Any) -> tuple[Any, Any]:
+        k1, k2, k3, k4 = self._coefficients[:4]
         radius = dr.sqrt(x * x + y * y)
         theta = dr.atan(radius)
         t2 = theta * theta
@@ -64,15 +67,15 @@ class Distortion:
         return x * scale, y * scale
 
     def _perspective(self, x: Any, y: Any) -> tuple[Any, Any]:
-        k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, *_ = self.coefficients
+        k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = self._coefficients
         r2 = x * x + y * y
         radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
         x, y = (
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * s2),
             y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + r2 * s4),
         )
-        if self.tilt is not None:
-            t = self.tilt
+        if self._tilt is not None:
+            t = self._tilt
             w = t[2][0] * x + t[2][1] * y + t[2][2]
             x, y = (t[0][0] * x + t[0][1] * y + t[0][2]) / w, (t[1][0] * x + t[1][1] * y + t[1][2]) / w
         return x, y

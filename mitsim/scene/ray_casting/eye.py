@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.device import opaque, to_device
 from mitsim.sensor.transforms import Transform
 
 #: share of its length by which a shadow ray ends before the eye. Mitsuba offsets its start from the surface
@@ -30,8 +31,8 @@ def of_lane(values: Sequence[float], lane: Any = None) -> Any:
     The numbers are opaque to Dr.Jit, so that all poses share one kernel.
     """
     if lane is None:
-        return dr.opaque(mi.Float, float(values[0]))
-    return dr.gather(mi.Float, mi.Float(np.asarray(values, np.float32)), lane)
+        return opaque(values[0])
+    return dr.gather(mi.Float, to_device(values), lane)
 
 
 class Eye:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from characterisation.maps.tables import AT_KNOT, PROBIT_MARGIN, ROUNDED, Surface
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.device import opaque
 
 #: tolerance for rounding at the outermost nodes, which lie on the limit itself [nodes]
 _BEYOND = 1e-4
@@ -50,7 +51,7 @@ class MapTables:
         self.numbers = np.cumsum([0] + [1 + len(surface.directions) for surface in surfaces])[:-1].tolist()
         self.directions = max(len(surface.directions) for surface in surfaces)
         directed = next((surface for surface in surfaces if surface.directions), first)
-        self.mirror = [dr.opaque(mi.Float, float(place)) for place in directed.mirror_mm]
+        self.mirror = [opaque(place) for place in directed.mirror_mm]
         self.has_lay = mi.Bool([bool(one.directions) for one in every])
         rows = np.concatenate([_rows(one, self.intervals) for one in every])
         self.table = mi.Float(rows.ravel())

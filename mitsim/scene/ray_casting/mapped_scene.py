@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from characterisation.maps.tables import Surface
 from characterisation.point_cloud import Status, ViewGrid
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.device import opaque, opaque_index, vectors_to_host
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.distortion import Distortion
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
@@ -126,9 +127,9 @@ class ViewRays:
 
     def pixels(self, roi: Roi) -> Any:
         """Return the flat indices of the pixels of a region."""
-        left, top, width = (dr.opaque(mi.UInt32, each) for each in (roi.left, roi.top, roi.width))
+        left, top, width = (opaque_index(each) for each in (roi.left, roi.top, roi.width))
         index = dr.arange(mi.UInt32, roi.width * roi.height)
-        return (index // width + top) * self.grid.width + index % width + left
+        return (index // width + top) * opaque_index(self.grid.width) + index % width + left
 
     def in_view_frame(self, normal: Any, ray: Any) -> Any:
         """Rotate a normal, or another vector, from the sensor frame to the view frame of a ray.
@@ -164,7 +165,7 @@ class MappedScene:
         for index, (number, shape) in enumerate(zip(ids, scene.shapes, strict=True)):
             two_sided = bool(int(shape.bsdf().flags()) & int(mi.BSDFFlags.BackSide))
             rows[number] = index, numbers[index], two_sided
-        self.shapes, self.count = mi.Int32(rows.ravel()), len(rows)
+        self.shapes, self.count = mi.Int32(rows.ravel()), opaque_index(len(rows))
         dr.eval(self.shapes)
 
     def cast(self, view: ViewRays, world_from_sensor: Transform, margin: int = 0, normals: bool = False) -> MappedView:
@@ -176,7 +177,7 @@ class MappedScene:
         size = (roi.height, roi.width)
         images = self._images(view, world_from_sensor, roi)
         dr.eval(images)
-        normal = np.array(images["normal"]).reshape(3, *size) if normals else None
+        normal = vectors_to_host(images["normal"]).T.reshape(3, *size) if normals else None
         status, shape, distance, fraction, sigma = (
             np.array(images[name]).reshape(size) for name in ("status", "shape", "distance", "fraction", "sigma")
         )
@@ -240,4 +241,4 @@ def _code(status: Status) -> Any:
 
 def _point(point: NDArray[np.floating]) -> Any:
     """Return a point on the device, opaque to Dr.Jit so that other values share the kernel."""
-    return mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in point])
+    return mi.Point3f(*[opaque(v) for v in point])

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import ViewGrid
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.device import opaque, vectors_to_device, vectors_to_host
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
 from mitsim.sensor.camera import Camera
@@ -57,9 +58,7 @@ class PixelRays:
     def __init__(self, origin: NDArray[np.floating], directions: NDArray[np.floating]) -> None:
         self.origin = np.asarray(origin, float)
         self.size = (directions.shape[0], directions.shape[1])
-        columns = np.ascontiguousarray(np.asarray(directions, np.float32).reshape(-1, 3).T)
-        # an array (3, n) would compile its size into the kernel
-        self.directions = mi.Vector3f(*[mi.Float(one) for one in columns])
+        self.directions = vectors_to_device(directions.reshape(-1, 3))
 
     def frame(self, world_from_sensor: Transform) -> Eye:
         """Return the origin of the rays and the axes of the sensor, in the world frame."""
@@ -98,7 +97,7 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
     distance = dr.select(hit, surface.t, dr.nan)
     seen = []
     for eye in world_from_sensor.points(np.asarray(eyes, float).reshape(-1, 3)):
-        to_eye = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in eye]) - surface.p
+        to_eye = mi.Point3f(*[opaque(v) for v in eye]) - surface.p
         length = dr.norm(to_eye)
         ray = shadow_ray(surface, to_eye / length, length)
         front = hit & (dr.dot(surface.n * facing, to_eye) > 0)
@@ -109,10 +108,10 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
     size = rays.size
     return Surfaces(
         distance=np.array(distance, np.float32).reshape(size),
-        normal=np.ascontiguousarray(np.array(normal, np.float32).T).reshape(*size, 3),
+        normal=vectors_to_host(normal).reshape(*size, 3),
         shape=_indices(scene, shape).reshape(size),
         seen=_stack(seen, size),
-        along=None if along is None else np.array(along, np.float32).T.reshape(*size, 3),
+        along=None if along is None else vectors_to_host(along).reshape(*size, 3),
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.device import vectors_to_device
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.triangles import triangles
 
@@ -39,6 +40,6 @@ def sees_itself(scene: Scene, seed: int = 0) -> bool:
     direction = normal + direction / np.linalg.norm(direction, axis=1, keepdims=True)  # Lambert's law, unnormalised
     size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
     start = a + u * (b - a) + v * (c - a) + _OFFSET * size * normal
-    rays = mi.Ray3f(mi.Point3f(*start.T.astype(np.float32)), dr.normalize(mi.Vector3f(*direction.T.astype(np.float32))))
+    rays = mi.Ray3f(mi.Point3f(vectors_to_device(start)), dr.normalize(vectors_to_device(direction)))
     blocked = np.array(scene.mitsuba.ray_test(rays), bool)
     return bool(blocked.mean() > 1e-3)
