@@ -37,9 +37,8 @@ def images_seen(code, camera, projector, points, *, full=255, noise=1.0, seed=1,
     for role in roles(code, projector.width, projector.height):
         axis = role.axis or "columns"
         at = place[..., 1 if axis == "rows" else 0]
-        shown = np.mean(
-            [value(code, role, at + step * spread[axis]) ** gamma for step in (-0.375, -0.125, 0.125, 0.375)], axis=0
-        )
+        steps = (-0.375, -0.125, 0.125, 0.375) if role.axis else (0.0,)  # white and black have no stripes to blur
+        shown = sum(value(code, role, at + step * spread[axis]) ** gamma for step in steps) / len(steps)
         level = 0.04 + 0.8 * albedo * np.where(lit, shown, 0)
         out.append(np.clip(full * level + draw.normal(0, noise * full / 255, level.shape), 0, full - 1))
     return np.rint(out).astype(np.uint8 if full < 256 else np.uint16)

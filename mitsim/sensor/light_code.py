@@ -197,9 +197,9 @@ def value(code: LightCode, role: Role, coordinate: NDArray[np.floating]) -> NDAr
             assert not isinstance(code, GrayCode)
             return np.asarray(code.mean + code.contrast * np.cos(2 * np.pi * place / role.period - role.shift))
         case _:
-            # bit i of s ^ (s >> 1) is bit i of s differing from bit i + 1; role.period is the stripe of bit i
-            bit, above = np.floor(place / role.period) % 2, np.floor(place / (2 * role.period)) % 2
-            lit = bit != above
+            # bit i of s ^ (s >> 1): of every four stripes of bit i, each role.period wide, the middle two are lit
+            quarters = (np.floor(place / role.period) + 1) / 4
+            lit = quarters - np.floor(quarters) >= 0.5
             return np.asarray(lit if role.kind == "gray" else ~lit, np.float64)
 
 
