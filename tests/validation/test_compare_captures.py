@@ -26,6 +26,7 @@ from mitsim.validation.compare_captures import compare_captures
 from mitsim.validation.compared_quantities import QUANTITIES
 from mitsim.validation.rebuild import projector_was_on, rebuild
 from mitsim.validation.specimen_patches import PATCH_PX, specimen_patches
+from tests.smaller_sensors import narrow_search
 
 SIZE, DISTANCE = 190.0, 480.0
 
@@ -60,10 +61,10 @@ def as_recorded(capture):
 
 @pytest.fixture(scope="module")
 def n10_module():
-    """The N10 with lenses that do not distort: setting them up takes most of the time otherwise."""
+    """The N10 with lenses that do not distort, and a search about the plate: both take most of the time otherwise."""
     from mitsim.sensor.preset import load_sensor
 
-    sensor = load_sensor("ensenso-n10")
+    sensor = narrow_search(load_sensor("ensenso-n10"), 400, 560)
     cameras = {name: replace(camera, distortion=np.zeros(5)) for name, camera in sensor.rig.cameras.items()}
     return replace(sensor, rig=replace(sensor.rig, cameras=cameras))
 
