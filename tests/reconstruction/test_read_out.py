@@ -21,7 +21,7 @@ from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
-from tests.smaller_sensors import middle_part
+from tests.smaller_sensors import middle_part, narrow_search
 
 ROOT = Path(__file__).parents[2]
 FRINGES = (ROOT / "tests/data/fringes.toml").read_text(encoding="utf-8")
@@ -52,12 +52,12 @@ _FRAMES = [(0.0, 0.0), (9.0, 4.0), (18.0, 8.0), (27.0, 12.0)]
 
 
 def sensor_of(kind: str, folder: Path):
-    n10 = middle_part(load_sensor("ensenso-n10"), 560, 300)
+    n10 = narrow_search(middle_part(load_sensor("ensenso-n10"), 560, 300), 450, 750)
     match kind:
         case "time of flight":
             return load_sensor("kinect-v2")
         case "reference":
-            return middle_part(load_sensor("primesense-carmine-1.09"), 480, 300)
+            return narrow_search(middle_part(load_sensor("primesense-carmine-1.09"), 480, 300), 450, 750)
         case "sgbm":
             return n10
         case "correlation of 4 frames" | "correlation of 1 frame":
@@ -74,7 +74,7 @@ def sensor_of(kind: str, folder: Path):
     }[kind]
     path = folder / "sensor.toml"
     path.write_text(text, encoding="utf-8")
-    return load_sensor(path)
+    return middle_part(load_sensor(path), 440, 320)
 
 
 class Shown:
@@ -223,9 +223,9 @@ def test_a_window_beside_what_was_read_out_shows_nothing(shown):
     ("read_out", "named"),
     [
         ({"eye": [0, 0, 10, 10]}, "eye"),
-        ({"camera": [600, 0, 100, 10]}, "640 x 480"),
-        ({"camera": [0, -1, 10, 10]}, "640 x 480"),
-        ({"camera": [0, 0, 0, 10]}, "640 x 480"),
+        ({"camera": [400, 0, 100, 10]}, "440 x 320"),
+        ({"camera": [0, -1, 10, 10]}, "440 x 320"),
+        ({"camera": [0, 0, 0, 10]}, "440 x 320"),
         ({"camera": [0, 0, 10]}, "read_out"),
         ({"camera": "all"}, "read_out"),
     ],
@@ -237,7 +237,7 @@ def test_a_region_that_cannot_be_is_refused(phase, read_out, named):
         phase.cloud(wrong)
 
 
-@pytest.mark.parametrize("roi", [Roi(0, 0, 641, 10), Roi(10, 0, 0, 10), Roi(-1, 0, 11, 10)])
+@pytest.mark.parametrize("roi", [Roi(0, 0, 441, 10), Roi(10, 0, 0, 10), Roi(-1, 0, 11, 10)])
 def test_a_window_outside_the_grid_is_refused(phase, roi):
     with pytest.raises(InputError, match="region of interest"):
         phase.cloud(phase.capture(True), roi)
