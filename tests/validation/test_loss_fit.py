@@ -1,5 +1,8 @@
 """Constants of lost points: given back from drawn points, with intervals that hold them, and from renders."""
 
+import shutil
+from functools import partial
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -7,7 +10,9 @@ from typer.testing import CliRunner
 from characterisation.documents import read_toml
 from mitsim.cli import app
 from mitsim.prediction.interreflections import Loss, Losses, losses
+from mitsim.validation import loss_fit
 from mitsim.validation.loss_fit import SeenPoints, fitted_loss, losses_document
+from tests.smaller_sensors import coarse_sensor
 
 HALF, STEEPNESS = 1.8, 1.5
 
@@ -47,10 +52,23 @@ def test_the_data_file_is_read_as_it_was_written(tmp_path):
     assert found == Losses(command="command", cases=["a", "b"], matched=loss, coded=loss)
 
 
-def test_the_command_gives_the_shipped_numbers_back_from_a_few_views(scenes, tmp_path):
-    """Two views of a matcher and two of a code, of those that the shipped numbers were read off: intervals overlap."""
+@pytest.fixture
+def coarse_cases(scenes, tmp_path):
+    """Two of the cases that the shipped numbers come from, a matcher and a code; the camera of the code is coarse."""
+    for part in ("pocket", "stepped_block"):
+        shutil.copytree(scenes / "parts" / part, tmp_path / part)
+    text = (scenes / "parts/validation.toml").read_text(encoding="utf-8")
+    text = text.replace('"david-sls-3"', f'"{coarse_sensor("david-sls-3", 3, tmp_path)}"')
+    file = tmp_path / "validation.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def test_the_command_gives_the_shipped_numbers_back_from_a_few_views(coarse_cases, tmp_path, monkeypatch):
+    """Two views of a matcher and two of a code: intervals overlap."""
+    monkeypatch.setattr(loss_fit, "fitted_loss", partial(fitted_loss, resamples=40))
     out = tmp_path / "losses.toml"
-    given = ["validate", "losses", str(scenes / "parts/validation.toml"), "-o", str(out), "--views", "2"]
+    given = ["validate", "losses", str(coarse_cases), "-o", str(out), "--views", "2"]
     ran = CliRunner().invoke(app, [*given, "--only", "pocket__ensenso-n10", "--only", "stepped_block__david"])
     assert ran.exit_code == 0, ran.output
     found, shipped = read_toml(out, Losses), losses()
