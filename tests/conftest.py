@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer.testing
 from hypothesis import HealthCheck, settings
 
 from characterisation.threads import usable_cores
@@ -38,6 +40,8 @@ def pytest_configure(config: pytest.Config) -> None:
     is there without it.
     """
     os.fsync = lambda handle: None
+    # typer would read the signatures of all commands again whenever a test calls one
+    typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)
     workers = getattr(config.option, "numprocesses", None)
     if not workers:
         return
