@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mitsim.campaign.plan import coupon_pose
+from mitsim.capture.capture import Capture
 from mitsim.capture.folder import write_capture
 from mitsim.cli import app
 from mitsim.reconstruction.cloud import capture_cloud
@@ -30,19 +31,17 @@ def middle_of(sensor):
 
 @pytest.fixture(scope="module")
 def strip():
-    """The N10's middle 200 rows: all of a row is searched."""
-    return middle_part(load_sensor("ensenso-n10"), 752, 200)
+    """The N10's middle 140 rows: all of a row is searched."""
+    return middle_part(load_sensor("ensenso-n10"), 752, 140)
 
 
 @pytest.fixture(scope="module", params=NAMES)
 def taken(request, strip):
     """A preset, and its capture of a plate that fills most of the image.
 
-    Of one camera its middle 400 x 320 pixels, of two their middle 200 rows.
+    Of one camera its middle 300 x 240 pixels, of two their middle 140 rows.
     """
-    sensor = load_sensor(request.param)
-    if sensor.rig.reference.width > 640:
-        sensor = strip if len(sensor.rig.cameras) == 2 else middle_part(sensor, 400, 320)
+    sensor = strip if request.param == strip.name else middle_part(load_sensor(request.param), 300, 240)
     distance = middle_of(sensor)
     pose = coupon_pose(np.array([0.1, 0.0, 0.995]), distance, np.array([0, 0, 1.0]))
     scene = plate(0.6 * distance, "matt white", sensor.wavelength_nm)
@@ -104,17 +103,13 @@ def test_fewer_pixels_look_along_the_same_rays(n10, binned):
     camera = n10.rig.reference
     stack = np.zeros((1, camera.height, camera.width), np.uint8)
     pair = stereo_rectification(*list(n10.rig.cameras.values())[:2])
-    capture = SimulatedSensor(n10).capture(
-        plate(100, "matt white", 850),
-        coupon_pose(np.array([0, 0, 1.0]), 500, np.array([0, 0, 1.0])).inverse(),
-        rendering=Rendering(samples=1),
-        seed=1,
-    )
-    capture = replace(
-        capture,
-        images=dict.fromkeys(n10.rig.cameras, stack),
-        rig=replace(n10.rig, rectification=pair),
-        settings=capture.settings | {"read_out": {"left": [10, 20, 300, 200]}},
+    capture = Capture(
+        n10.name,
+        n10.technology,
+        "simulated",
+        replace(n10.rig, rectification=pair),
+        dict.fromkeys(n10.rig.cameras, stack),
+        settings={"read_out": {"left": [10, 20, 300, 200]}},
     )
     few = _coarse_capture(capture, 3, binned=binned)
     eye = few.rig.reference

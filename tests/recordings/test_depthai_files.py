@@ -484,7 +484,7 @@ def fields_of(description: FileDescriptorSet) -> list[tuple[int, ...]]:
     ]
 
 
-@settings(max_examples=400)
+@settings(max_examples=200)
 @given(data=st.data())
 def test_any_description_and_any_message_are_read_or_refused_in_words(recorded, data):
     """Bytes of the message or of its description changed, or a field of another type, with whole checksums."""
