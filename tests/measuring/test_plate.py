@@ -11,7 +11,7 @@ from characterisation.point_cloud import ViewGrid
 from mitsim.decode.dot_centres import dot_centres
 from mitsim.measuring.plate import Plate, PlateDots, measure_plate, plate_dots, plate_scale
 
-GRID = ViewGrid(900.0, 900.0, 319.5, 239.5, 640, 480)
+GRID = ViewGrid(900.0, 900.0, 189.5, 179.5, 380, 360)
 PITCH, COUNT = 18.75, 7
 FINE = 4
 
