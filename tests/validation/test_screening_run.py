@@ -6,6 +6,7 @@ import xarray as xr
 from known_trials import NAMES, rows
 
 import mitsim.validation.screening_run as screening_run
+from characterisation.scores import screening
 from characterisation.statements.selection import chance_after
 from mitsim.validation.part_cases import read_part_cases
 from mitsim.validation.screening_page import cells_of, described_screening, write_screening_page
@@ -90,7 +91,8 @@ def test_views_called_impossible_are_behind_for_every_score_and_counted(screen):
         assert [one.recall for one in found] == [0.0] * len(NAMES)
 
 
-def test_the_page_has_all_cells_and_takes_the_kept_worlds(screen, cases, tmp_path):
+def test_the_page_has_all_cells_and_takes_the_kept_worlds(screen, cases, tmp_path, monkeypatch):
+    monkeypatch.setattr(screening, "_RESAMPLES", 20)
     chosen = read_part_cases(cases)
     judged = screen(np.arange(1.0, MORE + 1))
     page, tables = write_screening_page([judged], tmp_path / "run", described_screening(cases, chosen))
