@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import html
 import math
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 from characterisation.atomic_io import atomic_write
 from characterisation.point_cloud import Status
@@ -70,16 +71,21 @@ def write_report(folder: str | Path) -> Path:
         If a file of the run is missing or damaged; the message names the file.
     """
     run = read_run(folder)
+    text = _template().render(page_content(run))
+    path = run.folder / "report.html"
+    with atomic_write(path) as file:
+        file.write_text(text, encoding="utf-8")
+    return path
+
+
+@cache
+def _template() -> Template:
     loader = FileSystemLoader(Path(__file__).parent)
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters["breakable"] = breakable
-    text = environment.get_template("page.html.j2").render(page_content(run))
-    path = run.folder / "report.html"
-    with atomic_write(path) as file:
-        file.write_text(text, encoding="utf-8")
-    return path
+    return environment.get_template("page.html.j2")
 
 
 def page_content(run: Run) -> dict[str, Any]:

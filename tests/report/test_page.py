@@ -13,12 +13,10 @@ from markupsafe import escape
 
 from characterisation.atomic_io import write_netcdf
 from characterisation.errors import InputError
-from mitsim.report import page
 from mitsim.report.numbers import two_digits
 from mitsim.report.page import write_report
-from mitsim.report.style import Picture
 
-from .conftest import CHECKED, FEATURES, HOSTILE, MEASUREMENTS, write_run
+from .conftest import CHECKED, FEATURES, HOSTILE, MEASUREMENTS, no_pictures, plain_pictures, write_run
 
 
 class Tags(HTMLParser):
@@ -89,13 +87,10 @@ def answers(text: str) -> list[list[str]]:
 
 
 @pytest.fixture
-def written(monkeypatch):
-    """The page of a folder as text, its pictures left out for speed."""
-    for name in ("map_pictures", "measurement_pictures"):
-        monkeypatch.setattr(page, name, lambda *_: [])
-    monkeypatch.setattr(page, "cloud_picture", lambda *_: Picture("", ""))
-    monkeypatch.setattr(page, "camera_view", lambda *_: {"images": [], "caption": ""})
-    return lambda folder: write_report(folder).read_text(encoding="utf-8")
+def written():
+    """The page of a folder as text, without pictures."""
+    with no_pictures():
+        yield lambda folder: write_report(folder).read_text(encoding="utf-8")
 
 
 def plain(text: str) -> str:
@@ -185,7 +180,8 @@ def test_leaves_nothing_beside_it_and_stays_small(report):
 def test_a_run_without_checks_or_coupons_still_has_a_page(tmp_path):
     folder = write_run(tmp_path / "run", checked=[])
     (folder / "samples.nc").unlink()  # the study named a map that was made before
-    text = write_report(folder).read_text(encoding="utf-8")
+    with plain_pictures():
+        text = write_report(folder).read_text(encoding="utf-8")
     assert "so the prediction was not tested" in text
     assert len([a for a in Tags(text).all("svg") if a.get("role") == "img"]) == 2 + len(MEASUREMENTS)
 

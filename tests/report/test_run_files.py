@@ -10,7 +10,7 @@ from mitsim.report.page import write_report
 from mitsim.report.run_files import claim_folder, digests_of
 from mitsim.report.run_folder import read_run
 
-from .conftest import CHECKED, plain_pictures
+from .conftest import CHECKED, no_pictures
 
 NAMES = (
     "map.nc",
@@ -42,7 +42,7 @@ def read_all(folder):
 
 def test_a_run_of_named_files_is_read(folder):
     read_all(folder)
-    with plain_pictures():
+    with no_pictures():
         assert write_report(folder).stat().st_size > 0
 
 
