@@ -193,8 +193,15 @@ class _MatchingCosts:
         self.penalties = Penalties(penalties.block, p1, p2, cap, penalties.uniqueness)
         self.count, self.width, self.last = count, reference.shape[1] - count, len(reference) - 1
         self.reference = _channels(reference, cap)
-        # mirrored, so that the disparities of one column are adjacent
-        self.mirrored = [[np.ascontiguousarray(each[:, ::-1]) for each in channel] for channel in _channels(other, cap)]
+        # column x of the reference is compared with column x - d of the other image; the disparities of one column are
+        # adjacent in the mirrored image
+        self.compared = [
+            [
+                sliding_window_view(np.ascontiguousarray(each[:, ::-1]), self.count, axis=1)[:, : self.width][:, ::-1]
+                for each in channel
+            ]
+            for channel in _channels(other, cap)
+        ]
 
     def zero_paths(self) -> _Paths:
         """Return the paths before the first row and after the last."""
@@ -230,10 +237,7 @@ class _MatchingCosts:
         total = np.zeros((self.width, self.count), np.int16)
         for channel, shift in ((0, 0), (1, 2)):
             u, u0, u1 = (each[row, self.count :, None] for each in self.reference[channel])
-            # column x of the reference is compared with column x - d of the other image
-            v, v0, v1 = (
-                sliding_window_view(each[row], self.count)[: self.width][::-1] for each in self.mirrored[channel]
-            )
+            v, v0, v1 = (each[row] for each in self.compared[channel])
             forward = np.maximum(np.maximum(u, v1) - v1, np.maximum(v0, u) - u)
             backward = np.maximum(np.maximum(v, u1) - u1, np.maximum(u0, v) - v)
             total += np.minimum(forward, backward) >> shift
