@@ -61,6 +61,11 @@ def recorded(sensor, pattern, flux=1.0):
     return replace(capture, source="device", settings=kept, world_from_sensor=None)
 
 
+@pytest.fixture(scope="module")
+def gray(david):
+    return recorded(david, GRAY)
+
+
 @pytest.mark.parametrize(
     ("pattern", "words"),
     [
@@ -98,18 +103,18 @@ def test_the_power_is_that_of_the_device_and_rows_that_do_not_apply_say_so(david
         GrayCodePhaseShift(kind="gray_code_phase_shift", period_px=16, steps=4, white_black=True),
     ],
 )
-def test_the_plain_image_of_a_gray_code_is_lit_all_over(david, code):
+def test_the_plain_image_of_a_gray_code_is_lit_all_over(david, gray, code):
     """A bit and its inverse light every pixel once, and white lights all: their brightest is 1 everywhere."""
-    capture = replace(recorded(david, GRAY), settings={"pattern": code.model_dump(mode="json")})
+    capture = replace(gray, settings={"pattern": code.model_dump(mode="json")})
     shown = patterns(code, david.projector.optics.width, david.projector.optics.height)
     plain = plain_image(capture)
     np.testing.assert_array_equal(plain.of(shown), 1.0)
     assert not plain.has_dots
 
 
-def test_the_plain_image_of_fringes_is_near_their_crest(david):
+def test_the_plain_image_of_fringes_is_near_their_crest(david, gray):
     """Of N shifts one lies within pi / N of the crest: at least mean + contrast cos(pi / N)."""
-    capture = replace(recorded(david, GRAY), settings={"pattern": FRINGES.model_dump(mode="json")})
+    capture = replace(gray, settings={"pattern": FRINGES.model_dump(mode="json")})
     shown = patterns(FRINGES, david.projector.optics.width, david.projector.optics.height)
     level = plain_image(capture).of(shown)
     assert level.min() >= FRINGES.mean + FRINGES.contrast * np.cos(np.pi / 4) - 1e-6
@@ -117,8 +122,8 @@ def test_the_plain_image_of_fringes_is_near_their_crest(david):
 
 
 @pytest.fixture(scope="module")
-def folder(david, tmp_path_factory):
-    return write_capture(recorded(david, GRAY), tmp_path_factory.mktemp("captures") / "real")
+def folder(gray, tmp_path_factory):
+    return write_capture(gray, tmp_path_factory.mktemp("captures") / "real")
 
 
 def test_structured_light_without_its_projector_is_refused(folder, tmp_path):
@@ -126,11 +131,10 @@ def test_structured_light_without_its_projector_is_refused(folder, tmp_path):
         validate_captures(folder, None, tmp_path, None, None, "off", 1)
 
 
-def test_a_saturated_specimen_is_refused(david, tmp_path):
-    capture = recorded(david, GRAY)
-    white = plain_image(capture).images[0]
-    capture.images["camera"][white][capture.images["camera"][white] > 40] = 255
-    real = write_capture(capture, tmp_path / "real")
+def test_a_saturated_specimen_is_refused(gray, tmp_path):
+    white, stack = plain_image(gray).images[0], gray.images["camera"].copy()
+    stack[white][stack[white] > 40] = 255
+    real = write_capture(replace(gray, images={"camera": stack}), tmp_path / "real")
     with pytest.raises(InputError, match=r"a median grey level of 255 .* in the white image; allowed: under 255"):
         validate_captures(real, None, tmp_path / "out", None, None, None, 1)
 
