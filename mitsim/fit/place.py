@@ -70,7 +70,7 @@ class Place:
         """
 
         def cells(values: NDArray[np.floating], axis: int) -> NDArray[np.intp]:
-            return np.floor((values - self.low[axis]) / self.cell[axis]).astype(int)
+            return np.asarray(np.floor((values - self.low[axis]) / self.cell[axis]), int)
 
         (x, y), (rows, columns) = points.T, self.occupied.shape
         own_column, own_row = cells(x, 0), cells(y, 1)
