@@ -16,12 +16,17 @@ SEEDS = range(4)
 
 
 def plate(seed: int, blur: float = BLUR_PX, size: tuple[int, int] = (150, 160)) -> np.ndarray:
-    """Grey levels [DN] of dark dots on paper, 53 on 92, at random places, drawn at an eighth of a pixel."""
-    fine, rng = 8, np.random.default_rng(seed)
-    # distance along either axis from the nearest centre of a dot
-    y, x = (np.abs((np.arange(n * fine) / fine - rng.uniform(0, 24)) % 24 - 12) for n in size)
-    dots = (np.hypot(y[:, None], x) < 5.5).astype(float)
-    dots = gaussian_filter(dots, blur * fine).reshape(size[0], fine, size[1], fine).mean(axis=(1, 3))
+    """Grey levels [DN] of dark dots on paper, 53 on 92, at random places, drawn at an eighth of a pixel.
+
+    One dot is drawn, and repeated every 24 pixels.
+    """
+    fine, period, rng = 8, 24, np.random.default_rng(seed)
+    # distance along either axis from the centre of the dot
+    places = np.arange(period * fine) / fine
+    y, x = (np.abs((places - rng.uniform(0, period)) % period - 12) for _ in size)
+    dot = gaussian_filter((np.hypot(y[:, None], x) < 5.5).astype(float), blur * fine, mode="wrap")
+    dot = dot.reshape(period, fine, period, fine).mean(axis=(1, 3))
+    dots = dot[np.ix_(*(np.arange(n) % period for n in size))]
     return 92 * (1 - 0.42 * dots)
 
 
