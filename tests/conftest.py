@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -90,6 +91,18 @@ def browser(started_browser: Any) -> Any:
     """The Chromium of :func:`started_browser` on an empty page, with nothing left of what other files did."""
     started_browser.reset()
     return started_browser
+
+
+@pytest.fixture(scope="module")
+def no_other_scenes() -> None:
+    """Free the scenes of files before this one, for tests that compile large kernels.
+
+    Dr.Jit compiles the materials of every scene that is still there into every kernel, whether it is seen or not.
+    """
+    from mitsim.campaign import many
+
+    many._scene.cache_clear()
+    gc.collect()
 
 
 @pytest.fixture

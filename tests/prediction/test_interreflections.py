@@ -18,6 +18,8 @@ from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from tests.smaller_sensors import binned
 
+pytestmark = pytest.mark.usefixtures("no_other_scenes")
+
 REFLECTANCE = 0.6
 
 

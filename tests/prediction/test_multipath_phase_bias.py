@@ -20,6 +20,8 @@ from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from tests.smaller_sensors import middle_part
 
+pytestmark = pytest.mark.usefixtures("no_other_scenes")
+
 SIZE = (40, 60)
 FACE = np.zeros(SIZE, int)
 

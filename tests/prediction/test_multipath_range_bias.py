@@ -21,6 +21,8 @@ from mitsim.sensor.transforms import look_at
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
+pytestmark = pytest.mark.usefixtures("no_other_scenes")
+
 SIZE = (20, 30)
 FACE = np.zeros(SIZE, int)
 

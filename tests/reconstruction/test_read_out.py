@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from characterisation.point_cloud import Status
+from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.errors import InputError
 from mitsim.reconstruction.cloud import capture_cloud, read_out_of, sensor_geometry
@@ -88,12 +88,15 @@ class Shown:
         self.pose = look_at([150, -100, 560], [0, 0, 0], [0, 1, 0])
         self.corners = self.pose.inverse().points(60.0 * np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)]))
 
-    @cache  # noqa: B019 the tests of one sensor share its captures
+        self.captures: dict[tuple[bool, Noise | None], Capture] = {}  # which the tests of one sensor share
+
     def capture(self, around: bool = False, noise: Noise | None = None):
-        corners = self.corners if around else None
-        return self.simulated.capture(
-            self.scene, self.pose, rendering=Rendering(samples=1), seed=4, around=corners, noise=noise
-        )
+        if (around, noise) not in self.captures:
+            corners = self.corners if around else None
+            self.captures[around, noise] = self.simulated.capture(
+                self.scene, self.pose, rendering=Rendering(samples=1), seed=4, around=corners, noise=noise
+            )
+        return self.captures[around, noise]
 
     def cloud(self, capture, roi=None):
         return capture_cloud(capture, self.sensor.settings, self.geometry, roi, self.sensor.imager)

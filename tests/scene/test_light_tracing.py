@@ -19,6 +19,8 @@ from mitsim.sensor.projector import Projector
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform, look_at
 
+pytestmark = pytest.mark.usefixtures("no_other_scenes")
+
 BESIDE = Transform.from_degrees([0, -4.15, 0], [50.4, 0, 3.7])
 POSE = look_at([60, -330, 240], [0, 10, 25], [0, 0, 1])
 REPEATS = 12

@@ -21,6 +21,8 @@ from mitsim.sensor.projector import Projector
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform, look_at, mitsuba_to_world
 
+pytestmark = pytest.mark.usefixtures("no_other_scenes")
+
 
 def pinhole(width, height, focal, place=None):
     matrix = np.array([[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1.0]])

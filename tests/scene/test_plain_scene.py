@@ -23,6 +23,8 @@ from mitsim.sensor.light_code import PhaseShift, patterns
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.transforms import Transform, look_at
 
+pytestmark = pytest.mark.usefixtures("no_other_scenes")
+
 POSE = look_at([90, -160, 420], [0, 0, 0], [0, 1, 0])
 #: of the steps' sinusoids two dimensions each, and white
 RANK_OF_THREE_PERIODS = 7

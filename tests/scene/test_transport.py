@@ -18,6 +18,8 @@ from mitsim.sensor.projector import Projector
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import FILM_OFFSET_PX, Transform, look_at, mitsuba_to_world
 
+pytestmark = pytest.mark.usefixtures("no_other_scenes")
+
 #: aperture and focus [mm] of all tests that trace four samples of the two pillars: they share the kernels
 LENS = (2.0, 500.0)
 

@@ -19,6 +19,8 @@ from mitsim.simulation.indirect_light import IndirectLight, smoothed
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 
+pytestmark = pytest.mark.usefixtures("no_other_scenes")
+
 ROOT = Path(__file__).parents[2]
 
 
