@@ -211,6 +211,10 @@ def test_light_of_the_scene_is_that_of_stock_mitsuba(depth):
             for s in range(repeats)
         ]
     )
+    dark = ProjectedPatterns(np.zeros((1, 140, 200)), projector)
+    alone = trace(
+        scene, rays, dark, pose, LightPaths(samples=samples, seed=99, depth=depth, jitter=True, with_ambient=True)
+    )
     stock = _stock_scene(scene, camera, projector, np.full((140, 200), np.pi**-1), pose, depth, chosen)
     theirs = np.stack([np.array(mi.render(stock, spp=samples, seed=100 + s))[..., 0] for s in range(repeats)])
 
@@ -227,10 +231,6 @@ def test_light_of_the_scene_is_that_of_stock_mitsuba(depth):
     assert len(z) > 20
     assert abs(z.mean()) < 4 * np.sqrt(1.22 / len(z))
     assert np.sqrt((z**2).mean()) < np.sqrt(1.22) * (1 + 4 / np.sqrt(2 * len(z)))
-    dark = ProjectedPatterns(np.zeros((1, 140, 200)), projector)
-    alone = trace(
-        scene, rays, dark, pose, LightPaths(samples=samples, seed=99, depth=depth, jitter=True, with_ambient=True)
-    )
     assert np.array_equal(alone[0], alone[1])
     assert 0 < alone[1].mean() < ours[0, 0].mean()
 
