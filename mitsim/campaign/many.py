@@ -250,7 +250,7 @@ def _taken(job: Job, simulated: SimulatedSensor) -> dict[str, bytes]:
     return packed(capture, job.place, truth=truth)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=1)  # jobs come finish by finish, and materials of scenes that are kept are part of every kernel
 def _scene(path: str, wavelength_nm: float, parameters: tuple[tuple[str, str], ...], deviation: Deviation) -> Scene:
     return load_scene(path, wavelength_nm, dict(parameters), deviation)
 
