@@ -19,7 +19,7 @@ from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.transforms import look_at
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
-from mitsim.twin import run
+from mitsim.twin import run, specimen_simulator
 from mitsim.twin.input_captures import read_input_captures, repeats
 from mitsim.twin.sensor_text import Entry, moved_paths, with_cameras, with_entries, with_exposure
 
@@ -85,8 +85,9 @@ def test_repeats_are_found_and_the_dark_is_told_by_the_settings(recorded):
 
 
 def test_a_file_of_ones_own_camera(recorded, tmp_path, monkeypatch):
-    # one draw of the dots: how well three of them determine the numbers of dots is for test_dots.py
+    # one draw of the dots, of few rays: how well three of them determine the numbers of dots is for test_dots.py
     monkeypatch.setattr(run, "fit_sensor", partial(run.fit_sensor, draws=1))
+    monkeypatch.setattr(specimen_simulator, "_SAMPLES", 2)
     output = tmp_path / "my-camera.toml"
     folders = [str(folder) for folder in sorted(recorded.iterdir())]
     result = CliRunner().invoke(
