@@ -87,7 +87,7 @@ def test_repeats_are_found_and_the_dark_is_told_by_the_settings(recorded):
 def test_a_file_of_ones_own_camera(recorded, tmp_path, monkeypatch):
     # one draw of the dots, of few rays: how well three of them determine the numbers of dots is for test_dots.py
     monkeypatch.setattr(run, "fit_sensor", partial(run.fit_sensor, draws=1))
-    monkeypatch.setattr(specimen_simulator, "_SAMPLES", 2)
+    monkeypatch.setattr(specimen_simulator, "_SAMPLES", 4)
     output = tmp_path / "my-camera.toml"
     folders = [str(folder) for folder in sorted(recorded.iterdir())]
     result = CliRunner().invoke(
