@@ -173,13 +173,13 @@ def test_a_plane_is_found_in_a_cloud_with_other_things_in_it(rng):
 
 # the estimator --------------------------------------------------------------------------------------------------
 
-POSES = [(6, 30), (10, 120), (14, 210), (18, 300), (22, 60), (25, 150), (35, 240), (45, 330)]
+POSES = [(6, 30), (14, 210), (22, 60), (45, 330)]
 TRUE_ALPHA, TRUE_POWER, TRUE_SHARE, GRAIN = 0.13, 0.9, 0.1, 0.18
 
 
 @pytest.fixture(scope="module")
 def plain_views(ground):
-    """Eight poses of one camera, 48 x 48 px each, and what it would count without noise [e-]."""
+    """Four poses of one camera, 48 x 48 px each, and what it would count without noise [e-]."""
     lobe, side = SpecularLobe(ground.index), 48
     rows, columns = (grid.ravel() for grid in np.indices((side, side)))
     across, down = rows // 8, columns // 8
@@ -260,7 +260,7 @@ def test_the_uncertainty_covers_the_truth(plain_views, ground, size_px):
     if size_px:
         assert chi_square > 1.5
     else:
-        # 14 x 285 degrees of freedom: standard error 0.022; and grain is estimated inside the same blocks
+        # 14 x 141 degrees of freedom: standard error 0.032; and grain is estimated inside the same blocks
         assert chi_square == pytest.approx(1.0, abs=0.08)
         assert np.mean([fit.grain for fit in results]) == pytest.approx(GRAIN, rel=0.03)
 
