@@ -18,13 +18,13 @@ from tests.smaller_sensors import coarse_sensor
 
 @pytest.fixture(scope="module")
 def study_folder(tmp_path_factory):
-    """A study small enough for a test: 16 normals, 2 samples, a dozen views, 3 of the task's measurements."""
+    """A study small enough for a test: 6 normals, 2 samples, a dozen views, 3 of the task's measurements."""
     folder = tmp_path_factory.mktemp("study")
     scenes = (ROOT / "scenes").as_posix()
     (folder / "campaign.toml").write_text(f"""
         distances_mm = [400, 600]
         samples_per_pixel = 4
-        orientations = [{{ up_to_deg = 72, subdivisions = 1 }}]
+        orientations = [{{ up_to_deg = 72, subdivisions = 0 }}]
         [[samples]]
         scene = "{scenes}/coupon/matt_white.xml"
         [[samples]]
