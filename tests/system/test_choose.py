@@ -29,7 +29,7 @@ by = "map"
 shortlist = 1
 trials = 4
 [statement]
-trials = 24
+trials = 16
 """
 
 #: plus or minus, of radii and of the distance [mm]: ones that the better sensor holds, although it is judged by its map
@@ -47,7 +47,7 @@ def chosen(tmp_path_factory):
     task = re.sub(r"(nominal = 20.0)", rf"\1\ntolerance = {RADIUS}", few_measurements())
     task = re.sub(r"(nominal = 70.0)", rf"\1\ntolerance = {DISTANCE}", task)
     (folder / "task.toml").write_text(task)
-    david = coarse_sensor("david-sls-3", 3, folder)
+    david = coarse_sensor("david-sls-3", 4, folder)
     arguments = ("choose", folder / "study.toml", "--sensors", f"kinect-v2,{david}", "-o")
     return folder, arguments, mitsim_here(*arguments, folder / "out")
 
@@ -65,7 +65,7 @@ def test_sensors_are_listed_best_first_with_what_they_fit(chosen):
     assert {cell["by"] for cell in last["measurements"].values()} == {"screening", "none"}
     for cell in best["measurements"].values():
         low, high = cell["accepted"]
-        assert cell["verdict"] == "fits" and cell["trials"] == 24 and (low is None or low < high)
+        assert cell["verdict"] == "fits" and cell["trials"] == 16 and (low is None or low < high)
     assert best["capture"]["seconds"] == pytest.approx(best["capture"]["images"] * sum(best["capture"]["exposures_s"]))
     assert best["ratio"] == max(cell["demand"] for cell in best["measurements"].values())
 
