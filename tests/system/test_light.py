@@ -20,6 +20,7 @@ from mitsim.simulation.render_residual import render_residual, temporal_noise
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.simulation.surface_speckle import finish_contrast
+from tests.smaller_sensors import narrow_search
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +87,8 @@ def test_disparity_of_a_noise_free_plane_has_no_bias_but_pixel_locking(n10, simu
     scene = scene_from_dict({"plate": {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "matt_white"}}}, 850)
     angle = np.radians(tilt)
     pose = look_at([0, -distance * np.sin(angle), distance * np.cos(angle)], [0, 0, 0], [0, 1, 0])
-    cloud = capture_cloud(simulated.capture(scene, pose, seed=1, noise=Noise.none()), n10.settings, geometry)
+    searched = narrow_search(n10, 0.8 * distance, 1.25 * distance).settings
+    cloud = capture_cloud(simulated.capture(scene, pose, seed=1, noise=Noise.none()), searched, geometry)
     grid, pair = cloud.grid, geometry.rectification
     surfaces = cast(scene, PixelRays.of_grid(grid), pose, np.empty((0, 3)))
     true = pair.disparity(surfaces.distance * (grid.rays() @ grid.rotation[:, 2]))
@@ -113,8 +115,13 @@ def test_speckle_has_its_contrast_and_is_one_draw_for_a_pose(n10, simulated):
     camera = n10.rig.reference
     wanted = finish_contrast(scene.finishes[0], n10, camera)
     only = Noise.only("speckle")
-    one, again, other = (simulated.capture(scene, pose, seed=s, noise=only).images for s in (1, 1, 2))
-    plain = simulated.capture(scene, pose, seed=1, noise=Noise.none()).images
+    face = pose.inverse().points(np.array([[x, y, 0.0] for x in (-120, 120) for y in (-120, 120)]))
+
+    def images(seed, noise):
+        return simulated.capture(scene, pose, seed=seed, noise=noise, around=face).images
+
+    one, again, other = (images(seed, only) for seed in (1, 1, 2))
+    plain = images(1, Noise.none())
     assert np.array_equal(one["left"], again["left"])
 
     def gain(images, name):
