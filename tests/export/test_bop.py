@@ -4,6 +4,7 @@ The page is docs/bop_datasets_format.md of bop_toolkit, which is not on PyPI.
 """
 
 import json
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -70,7 +71,12 @@ class BopReader:
 def data_set(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bop")
     (folder / "plan.toml").write_text(PLAN)
-    call = ["render", SCENE, "--many", folder / "plan.toml", "-o", folder / "captures", "--samples", 2, "--depth", 1]
+    # the part stands between these depths: the matcher has to search no others
+    preset = (files("mitsim.sensor") / "presets/ensenso-n10.toml").read_text(encoding="utf-8")
+    sensor = preset.replace("near_mm = 330", "near_mm = 410").replace("far_mm = 950", "far_mm = 600")
+    (folder / "sensor.toml").write_text(sensor, encoding="utf-8")
+    call = ["render", SCENE, "--sensor", folder / "sensor.toml", "--many", folder / "plan.toml"]
+    call += ["-o", folder / "captures", "--samples", 2, "--depth", 1]
     done = CliRunner().invoke(app, [*map(str, call)])
     assert done.exit_code == 0, (done.exception, done.stderr)
     assert "data set" in export("bop", folder / "captures", "-o", folder / "data")

@@ -78,14 +78,6 @@ def test_predict_gives_the_cloud_of_the_command(workplace):
     assert abs(measured["pillar1_radius"].error) < 5 * measured["pillar1_radius"].uncertainty + 0.5
 
 
-def test_score_has_the_figures_of_the_command(workplace):
-    run("score", "study.toml", "-o", "scores")
-    scores = ms.score(ms.open_study("study.toml"))
-    with xr.open_dataset("scores/scores.nc") as theirs:
-        for name in ("predicted_uncertainty", "uncertainty_rank", "V_m"):
-            assert np.array_equal(scores[name].values, theirs[name].values, equal_nan=True)
-
-
 @pytest.fixture
 def coarse_workplace(workplace):
     """The folder, with a study of a sensor that has a quarter of the pixels."""
@@ -94,6 +86,14 @@ def coarse_workplace(workplace):
     (workplace / "study.toml").unlink()  # it is a link to the file of all tests
     (workplace / "study.toml").write_text(text)
     return workplace
+
+
+def test_score_has_the_figures_of_the_command(coarse_workplace):
+    run("score", "study.toml", "-o", "scores")
+    scores = ms.score(ms.open_study("study.toml"))
+    with xr.open_dataset("scores/scores.nc") as theirs:
+        for name in ("predicted_uncertainty", "uncertainty_rank", "V_m"):
+            assert np.array_equal(scores[name].values, theirs[name].values, equal_nan=True)
 
 
 def test_statement_has_the_figures_of_the_command(coarse_workplace):
