@@ -89,7 +89,7 @@ def test_render_decode_and_back(tmp_path):
     capture = read_capture(tmp_path / "capture")
     assert capture.source == "simulated"
     assert capture.images["left"].shape == (1, 480, 752)
-    out = mitsim_here("decode", tmp_path / "capture", "-o", tmp_path / "cloud.ply").stdout
+    out = mitsim_here("decode", tmp_path / "capture", "--range", 450, 650, "-o", tmp_path / "cloud.ply").stdout
     counts = dict(line.split("\t") for line in out.splitlines())
     cloud = read_ply(tmp_path / "cloud.ply")
     assert int(counts["valid"]) == cloud.valid.sum() > 8000

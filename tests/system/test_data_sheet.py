@@ -18,6 +18,7 @@ from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_f
 from mitsim.report.style import write_png
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.published_noise import PublishedNoise
+from tests.smaller_sensors import binned
 
 FRINGES = Path(__file__).parents[1] / "data" / "fringes.toml"
 
@@ -79,7 +80,7 @@ def test_the_sheet_is_numbers_a_table_and_pictures(sheet, tmp_path):
 
 
 def test_a_gallery_shows_every_finish_and_why_points_are_missing(tmp_path):
-    seen = gallery(load_sensor(FRINGES))
+    seen = gallery(binned(load_sensor(FRINGES), 2))
     assert [finish for finish, *_ in seen] == list(data_sheet.FINISHES)
     valid = [int(cloud.valid.sum()) for _, _, cloud in seen]
     assert valid[0] > valid[2]

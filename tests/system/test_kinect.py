@@ -27,6 +27,7 @@ from mitsim.sensor.modulation import LIGHT_MM_S
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.projector import Projector
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
@@ -177,8 +178,10 @@ def test_multipath_pushes_the_corner_of_two_white_walls_away(kinect, simulated, 
     off_edge = np.abs(place[..., 0] - place[..., 1]) / np.sqrt(2)
     row = (np.abs(place[..., 2]) < 100) & (off_edge < 700)
     error = {}
+    ends = np.array([[x, y, z] for x, y in ((0, 0), (1000, 0), (0, 1000)) for z in (-110, 110)])
     for depth in (1, 2, 3):
-        capture = simulated.capture(scene, pose, rendering=Rendering(depth=depth), seed=1, noise=Noise.none())
+        rendering, around = Rendering(depth=depth), pose.inverse().points(ends.astype(float))
+        capture = simulated.capture(scene, pose, rendering=rendering, seed=1, noise=Noise.none(), around=around)
         cloud = capture_cloud(capture, kinect.settings, geometry)
         assert cloud.valid[row].mean() > 0.99
         error[depth] = np.linalg.norm(cloud.points, axis=-1) - distance
@@ -214,11 +217,13 @@ def test_path_lengths_of_two_bounces_are_those_of_an_independent_integration():
     )
     assert len(chosen) >= 20
 
+    (top, left), (bottom, right) = chosen.min(axis=0), chosen.max(axis=0)
+    part = Roi(int(left), int(top), int(right - left) + 1, int(bottom - top) + 1)
     one, two = (
-        trace(scene, CameraRays(camera), light, pose, LightPaths(samples=1024, seed=5, depth=depth)).astype(float)
+        trace(scene, CameraRays(camera), light, pose, LightPaths(samples=1024, seed=5, depth=depth), part).astype(float)
         for depth in (1, 2)
     )
-    bounced = (two - one)[:, chosen[:, 0], chosen[:, 1]].reshape(3, 4, -1)
+    bounced = (two - one)[:, chosen[:, 0] - top, chosen[:, 1] - left].reshape(3, 4, -1)
     # sum of 2 e^(i phi) over the paths, and of 2
     phasor, total = bounced[:, 0] - bounced[:, 2] + 1j * (bounced[:, 1] - bounced[:, 3]), 0.5 * bounced.sum(axis=1)
 
