@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import mitsim as ms
+from tests.smaller_sensors import coarse_sensor
 
 ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).parent
@@ -18,7 +19,6 @@ FILES = (
     ROOT / "scenes/two_pillars/task.toml",
     ROOT / "scenes/coupon/coupon.xml",
     HERE / "small.toml",
-    HERE / "study.toml",
 )
 
 
@@ -41,6 +41,10 @@ def prepared(tmp_path_factory) -> Path:
     for file in FILES:
         shutil.copy(file, folder)
     shutil.copy(ROOT / "scenes/coupon/matt_white.xml", folder / "coupon_white.xml")
+    # a study of a sensor that has a quarter of the pixels
+    study = (HERE / "study.toml").read_text(encoding="utf-8")
+    sensor = coarse_sensor("ensenso-n10", 2, folder).name
+    (folder / "study.toml").write_text(study.replace('"ensenso-n10"', f'"{sensor}"'), encoding="utf-8")
     capture_into(folder)
     return folder
 

@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 
 import mitsim as ms
 from mitsim.cli import app
-from tests.smaller_sensors import coarse_sensor
 
 POSE = ms.look_at((0, -300, 400))
 
@@ -78,17 +77,7 @@ def test_predict_gives_the_cloud_of_the_command(workplace):
     assert abs(measured["pillar1_radius"].error) < 5 * measured["pillar1_radius"].uncertainty + 0.5
 
 
-@pytest.fixture
-def coarse_workplace(workplace):
-    """The folder, with a study of a sensor that has a quarter of the pixels."""
-    sensor = coarse_sensor("ensenso-n10", 2, workplace)
-    text = (workplace / "study.toml").read_text().replace('"ensenso-n10"', f'"{sensor.name}"')
-    (workplace / "study.toml").unlink()  # it is a link to the file of all tests
-    (workplace / "study.toml").write_text(text)
-    return workplace
-
-
-def test_score_has_the_figures_of_the_command(coarse_workplace):
+def test_score_has_the_figures_of_the_command(workplace):
     run("score", "study.toml", "-o", "scores")
     scores = ms.score(ms.open_study("study.toml"))
     with xr.open_dataset("scores/scores.nc") as theirs:
@@ -96,15 +85,15 @@ def test_score_has_the_figures_of_the_command(coarse_workplace):
             assert np.array_equal(scores[name].values, theirs[name].values, equal_nan=True)
 
 
-def test_statement_has_the_figures_of_the_command(coarse_workplace):
-    text = (coarse_workplace / "study.toml").read_text() + "\n[statement]\ntrials = 3\npairs = 0\n"
-    (coarse_workplace / "short.toml").write_text(text)
+def test_statement_has_the_figures_of_the_command(workplace):
+    text = (workplace / "study.toml").read_text() + "\n[statement]\ntrials = 3\npairs = 0\n"
+    (workplace / "short.toml").write_text(text)
     CliRunner().invoke(app, ["budget", "short.toml", "--view", "4", "-o", "budget"], catch_exceptions=False)
-    theirs = json.loads((coarse_workplace / "budget/statement.json").read_text())["measurements"]
+    theirs = json.loads((workplace / "budget/statement.json").read_text())["measurements"]
     for one in ms.statement(ms.open_study("study.toml"), 4, trials=3, pairs=0, folder="mine"):
         assert one.trials == 3
         assert one.standard_uncertainty == pytest.approx(theirs[one.measurement]["standard_uncertainty"], nan_ok=True)
-    kept, mine = (coarse_workplace / one / "trials/view_0004.jsonl" for one in ("budget", "mine"))
+    kept, mine = (workplace / one / "trials/view_0004.jsonl" for one in ("budget", "mine"))
     assert kept.read_bytes() == mine.read_bytes()
 
 
