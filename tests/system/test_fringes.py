@@ -68,8 +68,7 @@ def test_sphere_through_the_phase_code(sensor, simulated, geometry):
     )
 
 
-@pytest.mark.parametrize("steps", [3, 4, 8])
-@pytest.mark.parametrize("exposure", [0.1, 0.3, 1.0])
+@pytest.mark.parametrize(("steps", "exposure"), [(n, e) for n in (3, 4, 8) for e in (0.1, 1.0)])
 def test_phase_noise_is_the_closed_form_over_a_decade_of_exposure(sensor, steps, exposure):
     """sigma_phi = sqrt(2 / N) sigma_I / B, each pixel with its own sigma_I and B, from capture to phase.
 
