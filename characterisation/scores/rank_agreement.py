@@ -37,8 +37,8 @@ def roc_area(score: Floats, measurable: NDArray[np.bool_]) -> float:
     U over its greatest value; Hanley and McNeil, Radiology 143 (1982) 29-36). Views predicted to be impossible, NaN or
     -inf, score lowest. The area is NaN, not defined, where all views are of one kind.
     """
-    yes, no = int(measurable.sum()), int((~measurable).sum())
-    if yes == 0 or no == 0:
+    known = np.where(score > -np.inf, score, -np.inf)
+    yes, no = known[measurable, None], known[~measurable]
+    if not yes.size or not no.size:
         return math.nan
-    ranks = rankdata(np.where(score > -np.inf, score, -np.inf))
-    return float((ranks[measurable].sum() - yes * (yes + 1) / 2) / (yes * no))
+    return float(((yes > no).sum() + (yes == no).sum() / 2) / (yes.size * no.size))
