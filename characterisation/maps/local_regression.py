@@ -140,10 +140,11 @@ def local_fit(
         if not len(which):
             continue
         coarse, radius = data.joined(cell), radii[which, rung]
+        by_abscissa = np.argsort(coarse.place[:, 0], kind="stable")
         side = TILE * radius.min()
         for chosen in _tiles(at[which, :2], side):
             place = at[which[chosen]]
-            part = _Part(coarse, place, radius[chosen], slopes, link)
+            part = _Part(coarse, by_abscissa, place, radius[chosen], slopes, link)
             found = part.fit(radius[chosen], None if own is None else own[which[chosen]], keep)
             estimate[which[chosen], rung[chosen]] = found.estimate
             for name, values in sums.items():
@@ -175,13 +176,23 @@ def _polynomial(place: Floats) -> Floats:
 class _Part:
     """The places of one tile and the rows about them, arranged for matrix products."""
 
-    def __init__(self, data: Observations, at: Floats, radius: Floats, slopes: Slopes, link: str) -> None:
+    def __init__(
+        self,
+        data: Observations,
+        by_abscissa: NDArray[np.int64],
+        at: Floats,
+        radius: Floats,
+        slopes: Slopes,
+        link: str,
+    ) -> None:
         self.log = link == "log"
         self.away = np.array([0.0, *slopes.mean, 0.0, 0.0, 0.0])
         self.precision = np.array([0.0, *slopes.precision, *[slopes.curvature] * 3])
         low, high = at[:, :2].min(0) - radius.max(), at[:, :2].max(0) + radius.max()
         a, b = data.place.T[:2]
-        near = np.flatnonzero((a > low[0]) & (a < high[0]) & (b > low[1]) & (b < high[1]))
+        first = np.searchsorted(a, low[0], "right", by_abscissa)
+        strip = by_abscissa[first : np.searchsorted(a, high[0], "left", by_abscissa)]
+        near = np.sort(strip[(b[strip] > low[1]) & (b[strip] < high[1])])  # sorted by cluster again
         middle = at.mean(axis=0)
         self.offset, self.design = _polynomial(at - middle), _polynomial(data.place[near] - middle)
         self.value, self.base, self.share = data.value[near], data.weight[near], data.share[near]

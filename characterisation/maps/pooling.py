@@ -34,6 +34,7 @@ so that they explain the differences between nearby captures and their predictio
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -265,12 +266,19 @@ def _predicted(data: Observations, slopes: Slopes, link: Literal["identity", "lo
     radii = 1.5 * cKDTree(centres[:, :2]).query(centres[inner, :2], k=[CAPTURES])[0]
     others = local_fit(data, centres[inner], radii, slopes, link, inner, "others")
     itself = local_fit(data, centres[inner], radii, slopes, link, inner, "own")
-    gap = np.array([np.linalg.norm(data.place[data.cluster != c, :2] - centres[c, :2], axis=1).min() for c in inner])
+    gap = np.array([_gap(data, centres[c], c) for c in inner])
     squared = (others.estimate[:, 0, 0] - itself.estimate[:, 0, 0]) ** 2
     chance = (others.scatter * others.independent + itself.scatter * itself.independent)[:, 0]
     clustered = (others.clustered + itself.clustered)[:, 0]
     use = np.isfinite(squared) & np.isfinite(chance)
     return _Predicted(centres[inner[use], :2], squared[use], chance[use], clustered[use], gap[use])
+
+
+def _gap(data: Observations, centre: Floats, cluster: int) -> float:
+    """Return the distance from a centre (3,) to the nearest patch that is not of its capture."""
+    squared = (data.place[:, 0] - centre[0]) ** 2 + (data.place[:, 1] - centre[1]) ** 2
+    squared[data.cluster == cluster] = np.inf
+    return math.sqrt(squared.min())
 
 
 def _common(predicted: _Predicted, at: Floats) -> tuple[Floats, Floats]:

@@ -17,8 +17,8 @@ from characterisation.maps.local_regression import Observations, Slopes, local_f
 from characterisation.maps.pooling import patch_normals, pool
 
 LARGEST = math.radians(60)
-PLACES = lambert_projection(cap_directions(4, math.radians(52)))
-NORMALS = inverse_lambert_projection(PLACES)
+NORMALS = cap_directions(4, math.radians(52))[::2]  # at captures and between them
+PLACES = lambert_projection(NORMALS)
 PLANS = {"even": cap_directions(3, LARGEST), "uneven": uneven_plan()}
 
 
@@ -132,8 +132,9 @@ def test_where_nothing_comes_back_f_is_zero_and_sigma_unknown():
         return np.where(normals[..., 2] > math.cos(math.radians(12)), 0.0, 0.9)
 
     table = shown(Campaign(PLANS["even"]), np.random.default_rng(4), fraction=holed)
-    found = pool(table, NOMINAL, PLACES)
-    incidence = np.degrees(np.arccos(NORMALS[:, 2]))
+    normals = cap_directions(4, math.radians(52))
+    found = pool(table, NOMINAL, lambert_projection(normals))
+    incidence = np.degrees(np.arccos(normals[:, 2]))
     assert (found.fraction[incidence < 8] < 0.01).all() and np.median(found.fraction[incidence < 8]) == 0
     assert np.array_equal(np.isnan(found.sigma), found.fraction <= 1e-6)
     assert np.isfinite(found.sigma[incidence > 20]).all()
