@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from known_clouds import known_source, smooth
 
-from mitsim.campaign import missing_finishes, one_finish
+from characterisation.maps.building import build_map
+from mitsim.campaign import missing_finishes, one_finish, run
 from mitsim.campaign.plan import CampaignFile, plan_campaign
 from tests.smaller_sensors import binned
 
@@ -41,7 +43,13 @@ def planned(scenes, n10):
 
 
 @pytest.fixture
-def quick(monkeypatch, tmp_path):
+def coarse_maps(monkeypatch):
+    """Campaigns that end in a map with nodes 5 deg apart: with all nodes it takes longer than known clouds."""
+    monkeypatch.setattr(run, "build_map", partial(build_map, nodes=25))
+
+
+@pytest.fixture
+def quick(monkeypatch, tmp_path, coarse_maps):
     """Clouds of a known F and sigma in place of light, few orientations, and a cache of its own; counts campaigns."""
     made = []
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -24,11 +24,12 @@ from small_study import small_study
 
 from mitsim import cli
 from mitsim.exposures import exposure_plan
+from tests.smaller_sensors import coarse_sensor
 
 #: milled steel of Ra 3.2 on the plane: the map of the N10 knows ground aluminium from 0.09 to 0.74, and matt white
-STUDY = small_study("{ plane_Ra = 3.2 }")
+STUDY = small_study("{ plane_Ra = 3.2 }", "ensenso-n10.toml")
 DRAWN = STUDY.replace("[measure]\n", '[measure]\nby = "map"\n')
-COMMANDS = {"run": [], "budget": ["--view", "1"], "choose": ["--sensors", "ensenso-n10"]}
+COMMANDS = {"run": [], "budget": ["--view", "1"], "choose": ["--sensors", "ensenso-n10.toml"]}
 #: what each command does with the map, once it has it; and an exit code that says that it came so far
 WORK = {
     "run": "mitsim.run_study.run_study",
@@ -40,8 +41,11 @@ QUESTION = r"ensenso-n10: its map lacks .*Ra 3\.2.*; characterise now \(about \d
 
 
 @pytest.fixture
-def study(tmp_path):
+def study(tmp_path, monkeypatch):
+    """The study of an N10 with a quarter of the pixels, in the working directory."""
+    coarse_sensor("ensenso-n10", 2, tmp_path)
     (tmp_path / "study.toml").write_text(STUDY)
+    monkeypatch.chdir(tmp_path)
     return tmp_path / "study.toml"
 
 

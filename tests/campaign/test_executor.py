@@ -13,6 +13,7 @@ from mitsim.campaign import executor
 from mitsim.campaign.executor import Pool, available_memory, executor_of, fitting_processes, results_of
 from mitsim.cli import app
 from mitsim.errors import DeviceError, InputError, MissingEnvironmentError
+from tests.smaller_sensors import coarse_sensor
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -105,6 +106,7 @@ PLAN = "captures = 2\n[views]\nsubdivisions = 0\nstandoff_mm = 500\n"
 def test_commands_give_the_same_bytes_in_two_processes(tmp_path, pool, monkeypatch):
     monkeypatch.setattr(executor, "Pool", {2: pool}.__getitem__)  # what --processes 2 starts, started once for all
     (tmp_path / "plan.toml").write_text(PLAN)
+    sensor = coarse_sensor("ensenso-n10", 2, tmp_path)
     white = (ROOT / "scenes/coupon/matt_white.xml").as_posix()
     (tmp_path / "campaign.toml").write_text(
         "distances_mm = [500]\nsamples_per_pixel = 1\norientations = [{ up_to_deg = 20, subdivisions = 0 }]\n"
@@ -123,7 +125,7 @@ def test_commands_give_the_same_bytes_in_two_processes(tmp_path, pool, monkeypat
     for command, call in (("many", many), ("map", ["characterise", tmp_path / "campaign.toml"])):
         for processes in (1, 2):
             place = tmp_path / f"{command}_{processes}"
-            asked = [*map(str, [*call, "-o", place, "--processes", processes])]
+            asked = [*map(str, [*call, "--sensor", sensor, "-o", place, "--processes", processes])]
             done = CliRunner().invoke(app, asked)
             assert done.exit_code == 0, (done.exception, done.stderr)
         one, two = (

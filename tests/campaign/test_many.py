@@ -13,6 +13,8 @@ from mitsim.capture.folder import read_capture
 from mitsim.cli import app
 from mitsim.errors import InputError
 from mitsim.sensor.noise_sources import Noise
+from mitsim.sensor.preset import load_sensor
+from tests.smaller_sensors import coarse_sensor
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = ROOT / "scenes/two_pillars/two_pillars.xml"
@@ -35,6 +37,12 @@ COMMON = CommonSettings({"pillar_Ra": "0.6"}, "", 3, 1, 1, Noise(), False)
 OPTIONS = ["--samples", "1", "--depth", "1", "--seed", "3"]
 
 
+@pytest.fixture(scope="module")
+def coarse(tmp_path_factory):
+    """The sensor file of an N10 with a sixteenth of the pixels."""
+    return coarse_sensor("ensenso-n10", 4, tmp_path_factory.mktemp("sensor"))
+
+
 @pytest.fixture
 def plan(tmp_path):
     (tmp_path / "plan.toml").write_text(PLAN)
@@ -42,7 +50,8 @@ def plan(tmp_path):
 
 
 def render(plan, output, *options):
-    done = CliRunner().invoke(app, ["render", str(SCENE), "--many", str(plan), "-o", str(output), *OPTIONS, *options])
+    call = ["render", SCENE, "--many", plan, "-o", output, *OPTIONS, *options]
+    done = CliRunner().invoke(app, [*map(str, call)])
     if done.exception is not None:
         raise done.exception
     return done.stderr
@@ -106,27 +115,28 @@ def test_a_second_start_goes_on_after_kill_9(plan, tmp_path):
     assert "5, all of them finished before" in render(plan, tmp_path / "whole")
 
 
-def test_captures_of_another_plan_are_not_mixed_in(plan, tmp_path):
+def test_captures_of_another_plan_are_not_mixed_in(plan, tmp_path, coarse):
     plan.write_text(PLAN.replace("captures = 5", "captures = 1"))
-    render(plan, tmp_path / "out", "--truth")
+    render(plan, tmp_path / "out", "--truth", "--sensor", coarse)
     (folder,) = (tmp_path / "out").glob("*/view_*")
     assert sorted(one.name for one in (folder / "truth").iterdir()) == ["left.exr", "right.exr"]
     settings = json.loads((folder / "settings.json").read_text())["many"]
     assert settings["finish"] == folder.parent.name and settings["scene"] == str(SCENE)
     before = files(tmp_path / "out")
     with pytest.raises(InputError, match="another scene, sensor or plan"):
-        render(plan, tmp_path / "out")  # without the truth it is another
+        render(plan, tmp_path / "out", "--sensor", coarse)  # without the truth it is another
     with pytest.raises(InputError, match="neither --position nor --many"):
         CliRunner().invoke(app, ["render", str(SCENE), "-o", "x"], standalone_mode=False, catch_exceptions=False)
     assert files(tmp_path / "out") == before
 
 
-def test_a_worker_gives_the_same_capture(plan, tmp_path, n10):
+def test_a_worker_gives_the_same_capture(plan, coarse):
     from mitsim.campaign.many import in_turn, take_job
     from mitsim.simulation.simulate import SimulatedSensor
 
-    job = read_jobs(plan, SCENE, n10, COMMON)[0]
-    ((_, here),) = in_turn([job], SimulatedSensor(n10))
+    sensor = load_sensor(coarse)
+    job = read_jobs(plan, SCENE, sensor, COMMON)[0]
+    ((_, here),) = in_turn([job], SimulatedSensor(sensor))
     there = take_job(job)
     assert {"capture.json", "settings.json", "images/left_000.png"} <= here.keys()
     assert here == there

@@ -21,6 +21,8 @@ from mitsim.campaign import run as run_module
 from mitsim.campaign.run import run_campaign
 from mitsim.errors import InputError, MissingEnvironmentError
 
+pytestmark = pytest.mark.usefixtures("coarse_maps")
+
 #: enough where it does not matter what is shown
 WHITE = [{"scene": "matt_white.xml"}]
 

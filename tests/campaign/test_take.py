@@ -4,7 +4,6 @@ import json
 import re
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,10 +19,17 @@ from mitsim.capture.folder import read_capture, write_capture
 from mitsim.errors import InputError
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.simulation.simulate import SimulatedSensor
+from tests.smaller_sensors import coarse_sensor
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory, scenes, n10):
+def sensor_file(tmp_path_factory):
+    """The sensor file of an N10 with a quarter of the pixels."""
+    return coarse_sensor("ensenso-n10", 2, tmp_path_factory.mktemp("sensor"))
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory, scenes, sensor_file):
     """A rendered campaign that keeps its images, in a folder."""
     from mitsim.campaign.plan import CampaignFile, plan_campaign
 
@@ -36,9 +42,10 @@ def kept(tmp_path_factory, scenes, n10):
             "keep_images": True,
         }
     )
-    plan = plan_campaign(scenes / "coupon/campaign.toml", file, n10)
+    sensor = load_sensor(sensor_file)
+    plan = plan_campaign(scenes / "coupon/campaign.toml", file, sensor)
     folder = tmp_path_factory.mktemp("kept")
-    run_campaign(plan, in_turn(simulated_source(SimulatedSensor(n10), 1), plan), folder)
+    run_campaign(plan, in_turn(simulated_source(SimulatedSensor(sensor), 1), plan), folder)
     return plan, folder
 
 
@@ -81,14 +88,13 @@ def test_coupons_out_of_the_decoders_range_are_told(kept, near, far):
     assert len(planned) == 2 and "at 500 mm: the coupon" in planned[0] and "(by the plan)" in planned[0]
 
 
-def test_characterise_warns_before_it_measures(tmp_path, kept, scenes):
-    import mitsim.sensor
+def test_characterise_warns_before_it_measures(tmp_path, kept, scenes, sensor_file):
     from mitsim.cli import app
 
     _, folder = kept
-    preset = Path(mitsim.sensor.__file__).parent / "presets" / "ensenso-n10.toml"
-    text = re.sub(r"(?m)^near_mm = \d+", "near_mm = 700", preset.read_text())
-    (tmp_path / "n10.toml").write_text(text)
+    text = re.sub(r"(?m)^near_mm = \d+", "near_mm = 700", sensor_file.read_text())
+    other = sensor_file.with_name("n10.toml")  # beside the calibration that it names
+    other.write_text(text)
     (tmp_path / "campaign.toml").write_text(
         f"""distances_mm = [500]
 samples_per_pixel = 1
@@ -104,7 +110,7 @@ parameters = {{ Ra = 0.37 }}
         "characterise",
         str(tmp_path / "campaign.toml"),
         "--sensor",
-        str(tmp_path / "n10.toml"),
+        str(other),
         "--captures",
         str(folder),
         "-o",
