@@ -19,12 +19,19 @@ from mitsim.virtual.race import Job
 from mitsim.virtual.spread_out import SpreadMeasurements
 from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.world import Trial
+from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
 
 dask = pytest.importorskip("dask", reason="pip install distributed: campaigns on a cluster")
 distributed = pytest.importorskip("distributed", reason="pip install distributed: campaigns on a cluster")
 pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.timeout(300)]
+
+
+@pytest.fixture(scope="module")
+def coarse(tmp_path_factory):
+    """The sensor file of an N10 with a quarter of the pixels."""
+    return coarse_sensor("ensenso-n10", 2, tmp_path_factory.mktemp("sensor"))
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +81,7 @@ def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
         Cluster("tcp://127.0.0.1:9")
 
 
-def test_many_captures_are_the_same_on_a_cluster(tmp_path, cluster):
+def test_many_captures_are_the_same_on_a_cluster(tmp_path, cluster, coarse):
     from typer.testing import CliRunner
 
     from mitsim.cli import app
@@ -85,6 +92,8 @@ def test_many_captures_are_the_same_on_a_cluster(tmp_path, cluster):
         "scenes/two_pillars/two_pillars.xml",
         "--many",
         tmp_path / "plan.toml",
+        "--sensor",
+        coarse,
         "--samples",
         1,
         "--depth",
@@ -192,8 +201,8 @@ def test_a_scheduler_without_workers_is_told_and_given_up(planned, monkeypatch, 
     assert "no workers yet, waiting" in capsys.readouterr().err
 
 
-def test_virtual_measurements_are_the_same_on_a_cluster_though_a_worker_is_killed(cluster):
-    study = study_of("ensenso-n10")
+def test_virtual_measurements_are_the_same_on_a_cluster_though_a_worker_is_killed(cluster, coarse):
+    study = study_of(coarse)
     unknowns = study_unknowns(study)
     here = measurements_of(study, unknowns)
     jobs = here.in_order(Job(view, Trial(day)) for view in study.views[:2] for day in range(2))
@@ -219,7 +228,7 @@ def study_of(sensor):
         "scene": "two_pillars.xml",
         "parameters": {"plane_Ra": 0.37, "pillar_Ra": 0.37},
         "task": "task.toml",
-        "sensor": sensor,
+        "sensor": str(sensor),
         "views": {"subdivisions": 0, "rolls_deg": [0], "lowest_elevation_deg": 20},
         "measure": {"light_path_depth": 1, "samples_per_pixel": 1},
     }
