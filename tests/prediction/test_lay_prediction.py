@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 
 from characterisation.coupon.patch_table import overall
+from characterisation.maps.building import build_map
 from characterisation.maps.joined import mean_over, with_directions, with_samples
 from characterisation.maps.lay import lay_angle_deg, mirror_direction
 from characterisation.maps.light import light_variables
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 from characterisation.point_cloud import Status
-from mitsim.campaign import one_finish
+from mitsim.campaign import one_finish, run
 from mitsim.campaign.acquire import in_turn, simulated_source
 from mitsim.campaign.one_finish import OneFinish, characterise_finish, one_finish_campaign, plan_of
 from mitsim.prediction import CharacterisedScene, Predictor, performance
@@ -143,6 +145,7 @@ def test_rendered_coupons_along_and_across_are_as_the_score_predicts_them(n10, p
     monkeypatch.setattr(one_finish, "BANDS", ((30.0, 2),))
     monkeypatch.setattr(one_finish, "REFINED", None)
     monkeypatch.setattr(one_finish, "SAMPLES_PER_PIXEL", 4)
+    monkeypatch.setattr(run, "build_map", partial(build_map, nodes=25))
     near = narrow_search(n10, DISTANCE - 50, DISTANCE + 55)
     finish, simulated = finish_with_lay(n10), SimulatedSensor(near)
     one = OneFinish(finish, near, 30.0)
