@@ -97,13 +97,9 @@ def test_angularity_is_extent_times_lean_and_free_about_the_datum(angle):
         )
         assert angularity(turned, datum, nominal=meant, outline=outline) < 1e-12
         found = angularity(both, datum, nominal=meant, outline=outline)
-        swept = min(
-            np.ptp(
-                (outline - np.outer((outline - both.point) @ both.normal, both.normal))
-                @ Rotation.from_rotvec(turn * Z).apply(nominal.normal)
-            )
-            for turn in np.linspace(-0.05, 0.08, 13001)
-        )
+        on_plane = outline - np.outer((outline - both.point) @ both.normal, both.normal)
+        normals = Rotation.from_rotvec(np.outer(np.linspace(-0.05, 0.08, 13001), Z)).apply(nominal.normal)
+        swept = np.ptp(on_plane @ normals.T, axis=0).min()
         assert found == pytest.approx(swept, abs=1e-3)
     if angle == 90:
         upright = perpendicularity(both, base, outline=outline)
