@@ -68,19 +68,11 @@ class Place:
 
         The margin is tested at four positions, in both directions of x and y.
         """
-
-        def cells(values: NDArray[np.floating], axis: int) -> NDArray[np.intp]:
-            return np.asarray(np.floor((values - self.low[axis]) / self.cell[axis]), int)
-
-        (x, y), (rows, columns) = points.T, self.occupied.shape
-        own_column, own_row = cells(x, 0), cells(y, 1)
         inside = np.ones(len(points), bool)
-        for column, row in (
-            (cells(x + margin, 0), own_row),
-            (cells(x - margin, 0), own_row),
-            (own_column, cells(y + margin, 1)),
-            (own_column, cells(y - margin, 1)),
-        ):
+        for along, across in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            beside = points + margin[:, None] * np.array([along, across])
+            column, row = np.floor((beside - self.low) / self.cell).astype(int).T
+            rows, columns = self.occupied.shape
             known = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
             inside &= known
             inside[known] &= self.occupied[row[known], column[known]]

@@ -28,12 +28,17 @@ def opaque_index(value: int) -> Any:
     return dr.opaque(mi.UInt32, int(value))
 
 
+def opaque_point(point: NDArray[np.floating]) -> Any:
+    """Return a point (3,), in single precision, that is not compiled into kernels."""
+    return mi.Point3f(*[opaque(coordinate) for coordinate in point])
+
+
 def to_device(values: ArrayLike) -> Any:
     """Return numbers (n,) on the device, in single precision."""
-    numbers = np.asarray(values, np.float32)
-    memory = np.empty(numbers.nbytes + _ALIGNMENT, np.uint8)
-    start = -memory.ctypes.data % _ALIGNMENT
-    aligned = memory[start : start + numbers.nbytes].view(np.float32)
+    numbers = np.asarray(values)
+    memory = np.empty(numbers.size + _ALIGNMENT // 4, np.float32)
+    start = -memory.ctypes.data % _ALIGNMENT // 4
+    aligned = memory[start : start + numbers.size]
     aligned[:] = numbers
     return mi.Float(aligned)
 

@@ -167,7 +167,8 @@ def _launch(
     records = depth - 1
     pixels, radiances = dr.zeros(mi.UInt32, count * records), dr.zeros(mi.Float, count * records)
     lengths = dr.zeros(mi.Float, count * records)
-    slot = dr.arange(mi.UInt32, count) * opaque_index(records)
+    per_photon = opaque_index(records)
+    slot = dr.arange(mi.UInt32, count) * per_photon
     initial = _PhotonState(
         active=flux > 0,
         bounce=mi.UInt32(dr.zeros(mi.UInt32, count)),
@@ -254,10 +255,10 @@ def _launch(
         return np.empty(0, np.int32), np.empty(0), uv, lengths
     pixel = row * width + column
     if len(poses) > 1:
-        pixel += dr.arange(mi.UInt32, count * records) // opaque_index(len(batch) * records) * (width * height)
+        pixel += dr.arange(mi.UInt32, count * records) // (per_pose * per_photon) * (width * height)
     pixel = mi.Int32(dr.gather(mi.UInt32, pixel, kept))
     radiance, length = dr.gather(mi.Float, radiances, kept), dr.gather(mi.Float, lengths, kept)
-    uv = dr.gather(mi.Point2f, uv, kept // opaque_index(records))
+    uv = dr.gather(mi.Point2f, uv, kept // per_photon)
     dr.eval(pixel, radiance, length, uv)
     return np.asarray(pixel), np.asarray(radiance, np.float64), uv, length
 

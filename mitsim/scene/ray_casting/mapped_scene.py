@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from characterisation.maps.tables import Surface
 from characterisation.point_cloud import Status, ViewGrid
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.device import opaque, opaque_index, vectors_to_host
+from mitsim.scene.device import opaque_index, opaque_point, vectors_to_host
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.distortion import Distortion
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
@@ -99,7 +99,7 @@ class ViewRays:
         if grid.normalised is not None:
             self.pinhole_pixels = np.ascontiguousarray(np.moveaxis(grid.pinhole_positions(), -1, 0))
         self.seen = mi.Bool(seen_by_reference.ravel())
-        self.baseline, self.origin = mi.Vector3f(_point(baseline)), _point(grid.origin)
+        self.baseline, self.origin = mi.Vector3f(opaque_point(baseline)), opaque_point(grid.origin)
         # the projector comes last, so that SHADOWED takes precedence over HIDDEN
         self.eyes = [_OtherEye(camera, Status.HIDDEN) for camera in cameras]
         self.eyes += [_OtherEye(projector, Status.SHADOWED)] if projector else []
@@ -227,7 +227,7 @@ class MappedScene:
         for eye in view.eyes:
             inside &= eye.sees(point)
         for eye in view.eyes:
-            to_eye = _point(world_from_sensor.points(eye.camera.centre)) - surface.p
+            to_eye = opaque_point(world_from_sensor.points(eye.camera.centre)) - surface.p
             length = dr.norm(to_eye)
             facing = inside & (dr.dot(normal, to_eye) > 0)
             free = facing & ~self.scene.mitsuba.ray_test(shadow_ray(surface, to_eye / length, length), facing)
@@ -237,8 +237,3 @@ class MappedScene:
 
 def _code(status: Status) -> Any:
     return mi.UInt32(int(status))
-
-
-def _point(point: NDArray[np.floating]) -> Any:
-    """Return a point on the device, opaque to Dr.Jit so that other values share the kernel."""
-    return mi.Point3f(*[opaque(v) for v in point])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import ViewGrid
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.device import opaque, vectors_to_device, vectors_to_host
+from mitsim.scene.device import opaque_point, vectors_to_device, vectors_to_host
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
 from mitsim.sensor.camera import Camera
@@ -97,7 +97,7 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
     distance = dr.select(hit, surface.t, dr.nan)
     seen = []
     for eye in world_from_sensor.points(np.asarray(eyes, float).reshape(-1, 3)):
-        to_eye = mi.Point3f(*[opaque(v) for v in eye]) - surface.p
+        to_eye = opaque_point(eye) - surface.p
         length = dr.norm(to_eye)
         ray = shadow_ray(surface, to_eye / length, length)
         front = hit & (dr.dot(surface.n * facing, to_eye) > 0)
