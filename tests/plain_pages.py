@@ -1,25 +1,19 @@
-"""Pages of runs without the pictures of maps, measurements and clouds, which take 5 s, for tests that read no page."""
+"""Pages of runs without pictures, which take 5 s, for tests that look at none."""
 
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
 from unittest import mock
 
-from markupsafe import Markup
-
 from mitsim.report.style import Picture
 
 
 def without_pictures() -> AbstractContextManager[object]:
-    """Let ``mitsim run`` write its page without these pictures; tests/report holds what they show."""
+    """Let the page of a run be written without pictures; tests/report holds what they show."""
     return mock.patch.multiple(
-        "mitsim.report.page", map_pictures=_none, measurement_pictures=_none, cloud_picture=_empty
+        "mitsim.report.page",
+        map_pictures=lambda *_: [],
+        measurement_pictures=lambda *_: [],
+        cloud_picture=lambda *_: Picture("", ""),
+        camera_view=lambda *_: {"images": [], "caption": ""},
     )
-
-
-def _none(*_: object) -> list[object]:
-    return []
-
-
-def _empty(*_: object) -> Picture:
-    return Picture(Markup(), "")

@@ -20,10 +20,8 @@ from characterisation.scores.view_score import score_views, view_statistics
 from characterisation.tasks.evaluation import Feature, Measurement, Task
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import write_capture
-from mitsim.report import page as report_page
 from mitsim.report import style
 from mitsim.report.page import write_report
-from mitsim.report.style import Picture
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import look_at
 
@@ -279,19 +277,6 @@ def plain_pictures() -> Iterator[None]:
     For tests of the page around the pictures.
     """
     with mock.patch.object(style, "_lay_out", lambda figure: figure.set_layout_engine("none")):
-        yield
-
-
-@contextmanager
-def no_pictures() -> Iterator[None]:
-    """Pages without the pictures of the map, of measurements and of checked views, which take most of their time."""
-    left_out = {
-        "map_pictures": lambda *_: [],
-        "measurement_pictures": lambda *_: [],
-        "cloud_picture": lambda *_: Picture("", ""),
-        "camera_view": lambda *_: {"images": [], "caption": ""},
-    }
-    with mock.patch.multiple(report_page, **left_out):
         yield
 
 

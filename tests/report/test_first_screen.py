@@ -15,9 +15,10 @@ from mitsim.report.numbers import with_degree_signs
 from mitsim.report.page import write_report
 from mitsim.report.run_folder import read_run
 from mitsim.report.scene_geometry import read_scene_geometry
+from tests.plain_pages import without_pictures
 
 from .choice_run import write_choice
-from .conftest import MEASUREMENTS, no_pictures, write_run
+from .conftest import MEASUREMENTS, write_run
 
 
 def judged(verdict: str, without_value: float = 0.0) -> Judged:
@@ -114,7 +115,7 @@ def test_without_tolerances_there_is_no_column_of_verdicts(tmp_path):
     stated = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
     stated["measurements"] = {MEASUREMENTS[0]: stated["measurements"][MEASUREMENTS[0]]}
     (folder / "statement.json").write_text(json.dumps(stated), encoding="utf-8")
-    with no_pictures():
+    with without_pictures():
         text = write_report(folder).read_text(encoding="utf-8")
     table = re.search(r'<table id="verdicts">(.*?)</table>', text, re.DOTALL)
     said = html.unescape(re.sub(r"<[^>]*>|\s+", " ", table[1]))

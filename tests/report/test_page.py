@@ -15,8 +15,9 @@ from characterisation.atomic_io import write_netcdf
 from characterisation.errors import InputError
 from mitsim.report.numbers import two_digits
 from mitsim.report.page import write_report
+from tests.plain_pages import without_pictures
 
-from .conftest import CHECKED, FEATURES, HOSTILE, MEASUREMENTS, no_pictures, plain_pictures, write_run
+from .conftest import CHECKED, FEATURES, HOSTILE, MEASUREMENTS, plain_pictures, write_run
 
 
 class Tags(HTMLParser):
@@ -89,7 +90,7 @@ def answers(text: str) -> list[list[str]]:
 @pytest.fixture
 def written():
     """The page of a folder as text, without pictures."""
-    with no_pictures():
+    with without_pictures():
         yield lambda folder: write_report(folder).read_text(encoding="utf-8")
 
 

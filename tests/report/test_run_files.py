@@ -9,8 +9,9 @@ from characterisation.errors import InputError
 from mitsim.report.page import write_report
 from mitsim.report.run_files import claim_folder, digests_of
 from mitsim.report.run_folder import read_run
+from tests.plain_pages import without_pictures
 
-from .conftest import CHECKED, no_pictures
+from .conftest import CHECKED
 
 NAMES = (
     "map.nc",
@@ -42,7 +43,7 @@ def read_all(folder):
 
 def test_a_run_of_named_files_is_read(folder):
     read_all(folder)
-    with no_pictures():
+    with without_pictures():
         assert write_report(folder).stat().st_size > 0
 
 
