@@ -41,6 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
     is there without it.
     """
     os.fsync = lambda handle: None
+    gc.disable()  # until all files are imported: nothing dies before
     # typer would read the signatures of all commands again whenever a test calls one
     typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)
     workers = getattr(config.option, "numprocesses", None)
@@ -63,6 +64,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.slow)
             slow_files.add(item.path)
     items.sort(key=lambda item: item.path not in slow_files)
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage from here on, without another look at modules and tests, which stay to the end."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")
