@@ -24,6 +24,7 @@ from mitsim.report import style
 from mitsim.report.page import write_report
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import look_at
+from tests.plain_pages import without_pictures
 
 HOSTILE = "<script>alert('study')</script>&\"x\".toml"
 MEASUREMENTS = ("angle <b>$1</b>", "radius & co")
@@ -301,5 +302,6 @@ def expecting(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def page(expecting) -> Path:
-    with plain_pictures():
+    """The page of that run, with the sphere of views but without pictures: a browser opens it in half the time."""
+    with without_pictures():
         return write_report(expecting)

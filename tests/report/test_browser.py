@@ -33,9 +33,9 @@ def test_page_is_painted_in_light_and_in_dark(report, browser, scheme, paper):
     browser.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
     browser.open(report)
     browser.scheme(scheme)
-    pixels = cv2.imdecode(np.frombuffer(browser.shot(), np.uint8), cv2.IMREAD_COLOR).astype(int)
+    pixels = cv2.imdecode(np.frombuffer(browser.shot(), np.uint8), cv2.IMREAD_COLOR)
     assert pixels.shape == (height, width, 3)
-    assert abs(pixels[2, 2, 2] - paper) <= 1
+    assert abs(int(pixels[2, 2, 2]) - paper) <= 1
     colourful = (pixels.max(axis=2) - pixels.min(axis=2)) > 60
     assert colourful.mean() > 0.02  # discs are there, not only writing
-    assert len(np.unique(pixels @ [1, 256, 65536])) > 200
+    assert len(np.unique(pixels[::4] @ [1, 256, 65536])) > 200

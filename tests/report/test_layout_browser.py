@@ -1,6 +1,7 @@
 """Layout of both pages in a real browser: no column lost, nothing beside the page, in light, dark and print."""
 
 import json
+import shutil
 
 import pytest
 
@@ -49,7 +50,7 @@ OVERLAPS = """(() => {
 
 
 @pytest.fixture(scope="module")
-def pages(report, tmp_path_factory):
+def pages(run_folder, tmp_path_factory):
     folder = tmp_path_factory.mktemp("layout")
     # a set of so many views that they fill several lines, and a bracket of planned exposures
     sets = write_expecting_run(folder / "sets")
@@ -63,9 +64,10 @@ def pages(report, tmp_path_factory):
     (sets / "run.json").write_text(json.dumps(about), encoding="utf-8")
     statement["exposure"] = {"exposures_s": [0.000815, 0.00231, 0.0131], "power": 0.5}
     (sets / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
+    shutil.copytree(run_folder, folder / "run")
     with plain_pictures():
-        choice, sets = write_choice_page(write_choice(folder / "choice")), write_report(sets)
-    return {"run": report, "choice": choice, "sets": sets}
+        choice = write_choice_page(write_choice(folder / "choice"))
+        return {"run": write_report(folder / "run"), "choice": choice, "sets": write_report(sets)}
 
 
 def set_size(browser, width: int, medium: str, scheme: str) -> None:
