@@ -29,7 +29,7 @@ from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.roi import Roi
 from mitsim.validation.compare_captures import Comparison, Row, compare_captures
 from mitsim.validation.plain_image import plain_image
-from mitsim.validation.rebuild import projector_was_on, rebuild
+from mitsim.validation.rebuild import check_technology, projector_was_on, rebuild
 from mitsim.validation.specimen_patches import PATCH_PX, SpecimenPatches, reference_levels
 
 #: border of the picture around the specimen [px]
@@ -71,18 +71,20 @@ def validate_captures(
             "device, replay, or simulated by a maker's virtual camera",
             "name SIMULATED to compare two simulations",
         )
+    own = None if simulated is not None else load_sensor(_sensor(recorded, sensor, real))
+    if own is not None:
+        check_technology(recorded, own, str(real))  # before the capture is decoded
     settings, _ = decoder_settings(recorded)
     place = specimen_place(recorded, settings, roi, str(real))
     on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector), str(real))
     say(f"specimen: a plane at {_distance(place):.0f} mm, with {place.off_plane:.2g} mm rms deviation")
-    if simulated is None:
-        twin = rebuild(
-            recorded, load_sensor(_sensor(recorded, sensor, real)), place, str(real), projector_on=on, seed=seed
-        )
+    if own is not None:
+        twin = rebuild(recorded, own, place, str(real), projector_on=on, seed=seed)
         write_capture(twin.capture, output / "simulated", overwrite=True)
         say(f"rebuilt: {output / 'simulated'}")
         other, where = twin.capture, str(output / "simulated")
     else:
+        assert simulated is not None
         other, where = read_capture(simulated), str(simulated)
     comparison = compare_captures(recorded, other, place, settings, where, projector_on=on, seed=seed)
     table = comparison_table(comparison.rows, _whose(recorded))

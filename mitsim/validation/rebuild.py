@@ -63,6 +63,13 @@ class Twin:
     power_times_reflectance: float
 
 
+def check_technology(real: Capture, sensor: Sensor, where: str) -> None:
+    """Raise an InputError if a sensor is of another technology than a recording."""
+    if sensor.technology != real.technology:
+        allowed = f"one of technology {real.technology}, as {where}"
+        raise InputError("--sensor", "technology", f"{sensor.name} of {sensor.technology}", allowed)
+
+
 def rebuild(
     real: Capture, sensor: Sensor, place: Place, where: str, *, projector_on: bool = True, seed: int = 1
 ) -> Twin:
@@ -82,9 +89,7 @@ def rebuild(
     InputError
         If the sensor has another technology, or takes other images than the recording.
     """
-    if sensor.technology != real.technology:
-        allowed = f"one of technology {real.technology}, as {where}"
-        raise InputError("--sensor", "technology", f"{sensor.name} of {sensor.technology}", allowed)
+    check_technology(real, sensor, where)
     own = like(real, sensor, where)
     if not projector_on and real.technology == "structured_light":
         allowed = f"on: {where} is structured light, which has no code without it"

@@ -36,7 +36,6 @@ def form_deviation(
 ) -> NDArray[np.float32]:
     """Return points (H, W, 3) [mm], sensor frame, displaced by the form of the faces in ``sizes`` (one sigma, mm)."""
     out = points.copy()
-    rays = grid.rays()
     for name, size in sizes.items():
         index = scene.names.index(name)
         here = (surfaces.shape == index) & np.isfinite(points[..., 2])
@@ -45,8 +44,10 @@ def form_deviation(
         place = world_from_sensor.points(points[here].astype(float))
         extent = float(np.linalg.norm(np.ptp(bounds_of(scene.shapes[index]), axis=0)))
         height = size * random_field(place, extent, np.random.default_rng([seed, zlib.crc32(name.encode())]))
-        cosine = np.maximum(np.abs((surfaces.normal[here] * rays[here]).sum(axis=-1)), _GRAZING)
-        out[here] -= (rays[here] * (height / cosine)[:, None]).astype(np.float32)  # outward means toward the sensor
+        rows, columns = np.nonzero(here)
+        rays = grid.rays_at(columns, rows)
+        cosine = np.maximum(np.abs((surfaces.normal[here] * rays).sum(axis=-1)), _GRAZING)
+        out[here] -= (rays * (height / cosine)[:, None]).astype(np.float32)  # outward means toward the sensor
     return out
 
 
