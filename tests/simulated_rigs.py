@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -10,8 +11,9 @@ import numpy as np
 from mitsim.sensor.light_code import roles, value
 
 
+@lru_cache(maxsize=4)
 def surface_seen(camera, *, depth=500.0, tilt=0.1, ball=True):
-    """Points (H, W, 3) in the sensor frame of a plane z = depth + tilt x, and of a ball that stands before it."""
+    """Points (H, W, 3) in the sensor frame of a plane z = depth + tilt x, and of a ball that stands before it, to be read alone."""
     rays = camera.sensor_from_camera.directions(camera.rays(camera.pixel_grid()))
     centre = camera.centre
     length = (depth + tilt * centre[0] - centre[2]) / (rays[..., 2] - tilt * rays[..., 0])
@@ -20,7 +22,9 @@ def surface_seen(camera, *, depth=500.0, tilt=0.1, ball=True):
         along = rays @ (middle - centre)
         inside = along**2 - (centre - middle) @ (centre - middle) + radius**2
         length = np.where(inside > 0, along - np.sqrt(np.maximum(inside, 0)), length)
-    return centre + rays * length[..., None]
+    points = centre + rays * length[..., None]
+    points.flags.writeable = False
+    return points
 
 
 def images_seen(code, camera, projector, points, *, full=255, noise=1.0, seed=1, gamma=1.0, texture=0.25):

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from trimesh.grouping import unique_rows
 
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
@@ -121,7 +122,9 @@ def _solids(triangles: Floats) -> Solids:
     """Return the triangles of closed surfaces: connected triangles whose area vectors add to zero."""
     corners = triangles.reshape(-1, 3)
     merge = max(_MERGE * float(np.ptp(corners, axis=0).max(initial=0.0)), 1e-9) if len(corners) else 1.0
-    _, at = np.unique(np.round(corners / merge).astype(np.int64), axis=0, return_inverse=True)
+    # from the least corner on, a million steps fit into 20 bits, so that rows are packed and sorted as one number each
+    steps = np.round((corners - corners.min(axis=0, initial=np.inf)) / merge).astype(np.int64)
+    _, at = unique_rows(steps)  # type: ignore[no-untyped-call]
     at = at.reshape(-1, 3)
     count = int(at.max(initial=-1)) + 1
     links = coo_matrix((np.ones(2 * len(at)), (at[:, [0, 1]].ravel(), at[:, [1, 2]].ravel())), shape=(count, count))
