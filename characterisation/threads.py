@@ -1,4 +1,4 @@
-"""In how many threads this process computes: one setting for NumPy's loops in threads of our own.
+"""In how many threads this process computes: one setting for the renderer, and for NumPy's loops in threads of our own.
 
 NumPy, SciPy and OpenCV let go of the interpreter in their loops, so threads share work on arrays. The number is that of
 ``OMP_NUM_THREADS``, which BLAS and Dask's workers read as well; without it, that of the cores that this process may
@@ -24,10 +24,15 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def asked_threads() -> int | None:
+    """Return the number in ``OMP_NUM_THREADS``, None without one."""
+    asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()  # a list has a number for each level
+    return int(asked) or None if asked.isdecimal() else None
+
+
 def thread_count() -> int:
     """Return in how many threads to compute: ``OMP_NUM_THREADS`` or the usable cores, :data:`MOST_THREADS` at most."""
-    asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()  # a list has a number for each level
-    return min(int(asked) if asked.isdecimal() and int(asked) else usable_cores(), MOST_THREADS)
+    return min(asked_threads() or usable_cores(), MOST_THREADS)
 
 
 def in_threads(work: Callable[[Piece], Result], pieces: Iterable[Piece], most: int = MOST_THREADS) -> list[Result]:

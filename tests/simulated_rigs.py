@@ -13,7 +13,7 @@ from mitsim.sensor.light_code import roles, value
 
 @lru_cache(maxsize=4)
 def surface_seen(camera, *, depth=500.0, tilt=0.1, ball=True):
-    """Points (H, W, 3) in the sensor frame of a plane z = depth + tilt x, and of a ball that stands before it, to be read alone."""
+    """Points (H, W, 3), read only, in the sensor frame of a plane z = depth + tilt x, and of a ball before it."""
     rays = camera.sensor_from_camera.directions(camera.rays(camera.pixel_grid()))
     centre = camera.centre
     length = (depth + tilt * centre[0] - centre[2]) / (rays[..., 2] - tilt * rays[..., 0])

@@ -174,8 +174,7 @@ def _start_worker(threads: int, parent: int, variant: str | None) -> None:
         os.environ[name] = str(threads)
     from mitsim.scene import backend
 
-    backend.activate(variant)
-    backend.limit_threads(threads)
+    backend.activate(variant)  # with as many threads
 
 
 def _end_with_parent(parent: int) -> None:

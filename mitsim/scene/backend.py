@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from characterisation.threads import asked_threads
 from mitsim.errors import InputError, MissingEnvironmentError
 
 LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -159,6 +160,8 @@ _active: str | None = None
 def activate(requested: str | None = None) -> str:
     """Start Mitsuba in the requested variant, once per process, and return the name of the variant.
 
+    It renders with ``OMP_NUM_THREADS`` threads, or with one for each core.
+
     Raises
     ------
     InputError
@@ -176,6 +179,8 @@ def activate(requested: str | None = None) -> str:
 
     mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
+    if count := asked_threads():
+        limit_threads(count)
     _active = variant
     return variant
 
@@ -186,7 +191,10 @@ def active() -> str | None:
 
 
 def limit_threads(count: int) -> None:
-    """Set the number of threads of Dr.Jit, so that several processes can share a machine."""
+    """Set the number of threads of Dr.Jit, so that several processes can share a machine.
+
+    Threads without work look for it for a while before they sleep, and take time from other processes.
+    """
     import drjit as dr
 
     dr.set_thread_count(count)

@@ -24,6 +24,12 @@ def squared(value):
     return value**2
 
 
+def threads_of_renderer(_):
+    from mitsim.scene.backend import dr
+
+    return dr.thread_count()
+
+
 def refuse(value):
     raise InputError("a.toml", "key", value, "another", "write one")
 
@@ -53,6 +59,10 @@ def test_every_item_comes_once_with_its_result(pool):
     assert found == {n: (n + 1) ** 2 for n in range(20)}
     assert results_of([3, 1, 2], squared, pool, "squares") == [9, 1, 4] == results_of([3, 1, 2], squared, None, "")
     assert list(pool.distribute([], squared, squared)) == []
+
+
+def test_each_process_renders_with_its_share_of_the_cores(pool):
+    assert results_of([0], threads_of_renderer, pool, "") == [max(1, executor.usable_cores() // 2)]
 
 
 def test_who_stops_asking_leaves_nothing_in_work(pool):

@@ -10,6 +10,7 @@ import pytest
 
 from mitsim.errors import InputError, MissingEnvironmentError
 from mitsim.scene import backend
+from tests.render_threads import threads
 
 
 def test_a_usable_library_is_here():
@@ -70,6 +71,16 @@ def test_a_machine_with_none_ends_with_code_3(tmp_path, scenes):
     assert done.returncode == 3
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "capture").exists()
+
+
+@pytest.mark.parametrize("asked", [1, 3])
+def test_it_renders_with_as_many_threads_as_the_environment_asks_for(monkeypatch, asked):
+    monkeypatch.setenv("OMP_NUM_THREADS", str(asked))
+    variant = backend.activate()
+    with threads(2):
+        monkeypatch.setattr(backend, "_active", None)  # as in a new process
+        assert backend.activate(variant) == variant
+        assert backend.dr.thread_count() == asked
 
 
 def test_unknown_variants_are_refused():

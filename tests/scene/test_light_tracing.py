@@ -18,6 +18,7 @@ from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform, look_at
+from tests.render_threads import threads
 
 pytestmark = pytest.mark.usefixtures("no_other_scenes")
 
@@ -128,7 +129,7 @@ def test_camera_lamp_and_both_have_one_mean(corner, eyes):
 
 
 def test_photons_are_the_same_whatever_is_looked_at(corner):
-    """Same seed, same bytes; a window and a band of rows get what they get in the whole image.
+    """Same seed, same bytes on any threads; a window and a band of rows get what they get in the whole image.
 
     The paths are those of the test before, so that no other kernel is compiled.
     """
@@ -139,7 +140,11 @@ def test_photons_are_the_same_whatever_is_looked_at(corner):
         return trace(corner, rays, light, POSE, paths, roi=roi)
 
     whole = seen(3)
-    assert whole.tobytes() == seen(3).tobytes()
+    with threads(1):
+        alone = seen(3)
+    with threads(3):
+        shared = seen(3)
+    assert whole.tobytes() == alone.tobytes() == shared.tobytes()
     assert not np.array_equal(whole, seen(4))
     window = Roi(31, 17, 40, 21)
     assert np.array_equal(seen(3, window), whole[:, 17:38, 31:71])

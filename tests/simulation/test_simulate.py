@@ -19,6 +19,7 @@ from mitsim.sensor.transforms import look_at
 from mitsim.simulation.lens_blur import gaussian_blur
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
+from tests.render_threads import threads
 
 ROOT = Path(__file__).parents[2]
 
@@ -50,9 +51,10 @@ def test_the_bytes_of_a_seed_do_not_depend_on_the_number_of_threads(path, monkey
     pose = look_at([150, -100, 560], [0, 0, 0], [0, 1, 0])
     corners = pose.inverse().points(40.0 * np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)]))
     taken = {}
-    for threads in (1, 3):
-        monkeypatch.setenv("OMP_NUM_THREADS", str(threads))
-        taken[threads] = simulated.capture(scene, pose, rendering=Rendering(samples=1), seed=5, around=corners).images
+    for count in (1, 3):
+        monkeypatch.setenv("OMP_NUM_THREADS", str(count))
+        with threads(count):
+            taken[count] = simulated.capture(scene, pose, rendering=Rendering(samples=1), seed=5, around=corners).images
     other = simulated.capture(scene, pose, rendering=Rendering(samples=1), seed=6, around=corners).images
     for name, images in taken[1].items():
         assert images.tobytes() == taken[3][name].tobytes()
