@@ -65,9 +65,10 @@ class Observations:
         """
         if cell == 0:
             return self
-        key = np.column_stack([self.cluster, np.floor(self.place[:, :2] / cell).astype(np.int64)])
-        first, group = np.unique(key, axis=0, return_inverse=True)
-        group = group.ravel()
+        cells = np.floor(self.place[:, :2] / cell).astype(np.int64)
+        cells -= cells.min(axis=0)
+        across, along = cells.max(axis=0) + 1
+        number, group = np.unique((self.cluster * across + cells[:, 0]) * along + cells[:, 1], return_inverse=True)
         weight = np.asarray(np.bincount(group, self.weight), float)
 
         def mean(columns: Floats) -> Floats:
@@ -76,7 +77,7 @@ class Observations:
         value = mean(self.value)
         within = mean((self.within + (self.value[:, 0] - value[group, 0]) ** 2)[:, None])[:, 0]
         share = np.asarray(np.bincount(group, self.share), float)
-        return Observations(mean(self.place), value, weight, share, first[:, 0], within)
+        return Observations(mean(self.place), value, weight, share, number // (across * along), within)
 
 
 @dataclass(frozen=True)
