@@ -35,8 +35,10 @@ def tangents(direction: ArrayLike) -> Array:
     least aligned with the direction, made perpendicular to it.
     """
     along = unit(direction)
-    first = np.eye(3)[np.argmin(np.abs(along))]
-    first = unit(first - (first @ along) * along)
+    least = np.argmin(np.abs(along))
+    first = 0.0 - along[least] * along
+    first[least] += 1.0
+    first = unit(first)
     (a, b, c), (x, y, z) = along, first
     return np.array([first, [b * z - c * y, c * x - a * z, a * y - b * x]])  # np.cross is ten times slower
 
@@ -44,7 +46,7 @@ def tangents(direction: ArrayLike) -> Array:
 def unit(vector: ArrayLike) -> Array:
     """Return the vector (3,) of length 1 in the same direction."""
     array: Array = np.asarray(vector, float)
-    of_length_one: Array = array / np.linalg.norm(array)
+    of_length_one: Array = array / np.sqrt(array.dot(array))  # np.linalg.norm takes three times as long
     return of_length_one
 
 
