@@ -65,9 +65,10 @@ class Observations:
         """
         if cell == 0:
             return self
-        key = np.column_stack([self.cluster, np.floor(self.place[:, :2] / cell).astype(np.int64)])
-        first, group = np.unique(key, axis=0, return_inverse=True)
-        group = group.ravel()
+        cells = np.floor(self.place[:, :2] / cell).astype(np.int64)
+        cells -= cells.min(axis=0)
+        across, along = cells.max(axis=0) + 1
+        number, group = np.unique((self.cluster * across + cells[:, 0]) * along + cells[:, 1], return_inverse=True)
         weight = np.asarray(np.bincount(group, self.weight), float)
 
         def mean(columns: Floats) -> Floats:
@@ -76,7 +77,7 @@ class Observations:
         value = mean(self.value)
         within = mean((self.within + (self.value[:, 0] - value[group, 0]) ** 2)[:, None])[:, 0]
         share = np.asarray(np.bincount(group, self.share), float)
-        return Observations(mean(self.place), value, weight, share, first[:, 0], within)
+        return Observations(mean(self.place), value, weight, share, number // (across * along), within)
 
 
 @dataclass(frozen=True)
@@ -141,14 +142,15 @@ def local_fit(
             continue
         coarse, radius = data.joined(cell), radii[which, rung]
         by_abscissa = np.argsort(coarse.place[:, 0], kind="stable")
-        side = TILE * radius.min()
-        for chosen in _tiles(at[which, :2], side):
+        tiles, found = _tiles(at[which, :2], TILE * radius.min()), []
+        for chosen in tiles:
             place = at[which[chosen]]
             part = _Part(coarse, by_abscissa, place, radius[chosen], slopes, link)
-            found = part.fit(radius[chosen], None if own is None else own[which[chosen]], keep)
-            estimate[which[chosen], rung[chosen]] = found.estimate
-            for name, values in sums.items():
-                values[which[chosen], rung[chosen]] = getattr(found, name)
+            found.append(part.fit(radius[chosen], None if own is None else own[which[chosen]], keep))
+        order = np.concatenate(tiles)
+        estimate[which[order], rung[order]] = np.concatenate([one.estimate for one in found])
+        for name, values in sums.items():
+            values[which[order], rung[order]] = np.concatenate([getattr(one, name) for one in found])
     return LocalFit(estimate, **sums)
 
 
@@ -209,10 +211,11 @@ class _Part:
         if own is not None:
             weight[(self.cluster == own[:, None]) == (keep == "others")] = 0.0
         total: Floats = weight.sum(1)
-        known = total > 0
+        unknown = np.flatnonzero(~(total > 0))
         products = (x[:, :, None] * x[:, None, :]).reshape(len(x), -1)
         matrix = (weight @ products).reshape(-1, x.shape[1], x.shape[1]) + np.diag(self.precision)
-        matrix[~known] = np.eye(x.shape[1])
+        if len(unknown):
+            matrix[unknown] = np.eye(x.shape[1])
         inverse = np.linalg.inv(matrix)
         with np.errstate(divide="ignore", invalid="ignore"):
             leverage = weight * (np.einsum("qij,qj->qi", inverse, here) @ x.T)
@@ -229,8 +232,10 @@ class _Part:
             spread = (weight * squared).sum(1) / total * rows / np.maximum(rows - 4, 1)
         clustered = (np.add.reduceat(leverage, self.starts, axis=1) ** 2).sum(1)
         independent = (leverage**2 / self.share).sum(1)
-        out = (independent, clustered, spread, rows, total)
-        return LocalFit(np.where(known[:, None], fitted, np.nan), *(np.where(known, values, np.nan) for values in out))
+        out = (fitted, independent, clustered, spread, rows, total)
+        for values in out if len(unknown) else ():
+            values[unknown] = np.nan
+        return LocalFit(*out)
 
     def _scored(self, weight: Floats, total: Floats, inverse: Floats) -> Floats:
         """Return the coefficients (q, 7) of the log-linear fit, by Fisher scoring from the mean."""

@@ -133,8 +133,9 @@ def interval(
         for cells in groups:
             places = rng.integers(len(cells[0].cost), size=len(cells[0].cost))
             values += [figure(cell.of(places)) for cell in cells]
-        if np.isfinite(values).any():
-            found.append(float(np.nanmean(values)))
+        known = [value for value in values if not math.isnan(value)]
+        if known:
+            found.append(float(np.mean(known)))
     if not found:
         return math.nan, math.nan
     low, high = np.quantile(found, [0.025, 0.975])

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from characterisation.features.figures import Circle
 from characterisation.features.form import zone
 from characterisation.features.pose_fit import Pose
-from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, unit
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, cross, unit
 from characterisation.tasks.places import Axis, Geometry, PointLike, on_axis, place
 from characterisation.tasks.zones import (
     angularity,
@@ -100,7 +100,7 @@ def plane_angle(first: Plane, second: Plane) -> float:
 
 def _line_angle(first: Array, second: Array) -> float:
     # the arc cosine would lose half the digits at small angles, which matter most
-    return float(np.arctan2(np.linalg.norm(np.cross(first, second)), abs(first @ second)))
+    return float(np.arctan2(np.linalg.norm(cross(first, second)), abs(first @ second)))
 
 
 def cone_angle(cone: Cone) -> float:

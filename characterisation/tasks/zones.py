@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.features.figures import Circle, EdgePoint
-from characterisation.features.surfaces import Cone, Cylinder, Plane, unit
+from characterisation.features.surfaces import Cone, Cylinder, Plane, cross, unit
 from characterisation.tasks.places import PARALLEL, Axis, Geometry, PointLike, direction, intersection, on_axis, place
 
 Array = NDArray[np.float64]
@@ -85,7 +85,7 @@ def datum_motion(measured: Sequence[Datum], nominal: Sequence[Datum]) -> Array:
             second = directions[2] if isinstance(tertiary, Plane) else tertiary.point - origin
         second = unit(second - (second @ first) * first)
         frame = np.eye(4)
-        frame[:3, :3] = np.column_stack([first, second, np.cross(first, second)])
+        frame[:3, :3] = np.column_stack([first, second, cross(first, second)])
         frame[:3, 3] = origin
         frames.append(frame)
     motion: Array = frames[0] @ np.linalg.inv(frames[1])

@@ -68,14 +68,18 @@ class Place:
 
         The margin is tested at four positions, in both directions of x and y.
         """
+        occupied = np.pad(self.occupied, 1)  # all other points lie in its rim
+        columns, rows = occupied.shape[1], occupied.shape[0]
+
+        def cells(axis: int, count: int, shift: NDArray[np.floating] | float) -> NDArray[np.intp]:
+            place = np.floor((points[:, axis] + shift - self.low[axis]) / self.cell[axis])
+            return np.asarray(np.fmax(np.fmin(place, count - 2), -1), np.intp) + 1  # NaN lies outside
+
+        column, row = cells(0, columns, 0.0), cells(1, rows, 0.0) * columns
         inside = np.ones(len(points), bool)
-        for along, across in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            beside = points + margin[:, None] * np.array([along, across])
-            column, row = np.floor((beside - self.low) / self.cell).astype(int).T
-            rows, columns = self.occupied.shape
-            known = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-            inside &= known
-            inside[known] &= self.occupied[row[known], column[known]]
+        for shift in (margin, -margin):
+            inside &= occupied.take(row + cells(0, columns, shift))
+            inside &= occupied.take(cells(1, rows, shift) * columns + column)
         return inside
 
 

@@ -144,7 +144,9 @@ def patch_figures(image: Floats, field: Field, window_px: int) -> Floats:
         return np.asarray(np.where(where, values, 0.0).sum(axis=1) / where.sum(axis=1))
 
     level, spread, near, fine = (field.patches(one) for one in (mean, deviation, near, fine))
-    bright = near > np.nanmedian(np.where(inside, near, np.nan), axis=1, keepdims=True)
+    rising, count = np.sort(np.where(inside, near, np.inf), axis=1), inside.sum(axis=1, keepdims=True)
+    beside = np.concatenate([(count - 1) // 2, count // 2], axis=1)
+    bright = near > np.take_along_axis(rising, beside, axis=1).mean(axis=1, keepdims=True)  # than the median
     amounts = np.abs(fine)
     out = np.stack(
         [

@@ -32,27 +32,29 @@ def denoised(image: Floats, mask: NDArray[np.bool_]) -> Floats:
     variance = noise_of_levels(image, mask)
     margin = _SIDE_PX - 1
     wide = np.pad(np.asarray(image, float), margin, mode="symmetric")
-    total, weight = np.zeros(wide.shape), np.zeros(wide.shape)
-    count = wide.shape[1] - margin
-    band, shares = np.empty((_SIDE_PX, wide.shape[1])), np.empty(wide.shape[1])
-    windows = sliding_window_view(band, count, axis=1)  # (row, column, window) of the windows beside each other
-    for top in range(wide.shape[0] - margin):
+    total = np.zeros(wide.shape)
+    height, width = image.shape
+    count = width + margin
+    band, shares = np.empty((_SIDE_PX, wide.shape[1])), np.empty((height + margin, count))
+    beside = sliding_window_view(band, count, axis=1).swapaxes(0, 1)  # (column, row, window), windows beside each other
+    windows, kept = np.empty(beside.shape), np.empty(beside.shape, bool)
+    for top in range(height + margin):
         rows = np.s_[top : top + _SIDE_PX]
         np.matmul(_COSINES, wide[rows], out=band)  # of each column, which eight windows share
-        coefficients = _COSINES @ windows
+        windows[:] = beside
+        coefficients = (_COSINES @ windows.reshape(_SIDE_PX, -1)).reshape(windows.shape)
         spread = np.sqrt(variance(coefficients[0, 0] / _SIDE_PX))
-        kept = np.abs(coefficients) >= _THRESHOLD * spread
+        np.greater_equal(np.abs(coefficients), _THRESHOLD * spread, out=kept)
         kept[0, 0] = True  # the mean of the window
-        share = 1.0 / kept.sum(axis=(0, 1))
+        share = 1.0 / kept.reshape(-1, count).sum(axis=0, dtype=np.uint8)
         coefficients *= kept
         coefficients *= share
-        back = _COSINES.T @ coefficients
-        band[:], shares[:] = 0.0, 0.0
+        back = (_COSINES.T @ coefficients.reshape(_SIDE_PX, -1)).reshape(windows.shape)
+        band[:] = 0.0
         for offset in range(_SIDE_PX):
-            columns = np.s_[offset : offset + count]
-            band[:, columns] += back[:, offset]
-            shares[columns] += share
+            band[:, offset : offset + count] += back[offset]
         total[rows] += _COSINES.T @ band
-        weight[rows] += shares
-    inside = np.s_[margin : margin + image.shape[0], margin : margin + image.shape[1]]
-    return np.asarray(total[inside] / weight[inside])
+        shares[top] = share
+    of_rows = np.sum([shares[first : first + height] for first in range(_SIDE_PX)], axis=0)
+    weight = np.sum([of_rows[:, first : first + width] for first in range(_SIDE_PX)], axis=0)
+    return np.asarray(total[margin : margin + height, margin : margin + width] / weight)

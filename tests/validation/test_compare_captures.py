@@ -85,6 +85,23 @@ def again(n10_module):
     return taken(n10_module, 2)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def patches_of_real(real, place):
+    """The patches of the recorded capture are those of its first comparison."""
+    of_any, of_real = compare_module.specimen_patches, {}
+
+    def once(capture, settings, geometry, at, window_px):
+        if capture is not real or at is not place:
+            return of_any(capture, settings, geometry, at, window_px)
+        if window_px not in of_real:
+            of_real[window_px] = of_any(capture, settings, geometry, at, window_px)
+        return of_real[window_px]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compare_module, "specimen_patches", once)
+        yield
+
+
 @pytest.fixture(scope="module")
 def changed(n10_module):
     """Sensors with one thing changed."""

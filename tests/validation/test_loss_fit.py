@@ -54,11 +54,13 @@ def test_the_data_file_is_read_as_it_was_written(tmp_path):
 
 @pytest.fixture
 def coarse_cases(scenes, tmp_path):
-    """Two of the cases that the shipped numbers come from, a matcher and a code; the camera of the code is coarse."""
-    for part in ("pocket", "stepped_block"):
-        shutil.copytree(scenes / "parts" / part, tmp_path / part)
+    """Two of the cases that the shipped numbers come from, a matcher and a code; the camera of the code is coarse.
+
+    The part has one finish: every finish of a part is compiled into each of its kernels.
+    """
+    shutil.copytree(scenes / "parts/balls_on_plate", tmp_path / "balls_on_plate")
     text = (scenes / "parts/validation.toml").read_text(encoding="utf-8")
-    text = text.replace('"david-sls-3"', f'"{coarse_sensor("david-sls-3", 3, tmp_path)}"')
+    text = text.replace('"photoneo-phoxi-s"', f'"{coarse_sensor("photoneo-phoxi-s", 4, tmp_path)}"')
     file = tmp_path / "validation.toml"
     file.write_text(text, encoding="utf-8")
     return file
@@ -69,11 +71,13 @@ def test_the_command_gives_the_shipped_numbers_back_from_a_few_views(coarse_case
     monkeypatch.setattr(loss_fit, "fitted_loss", partial(fitted_loss, resamples=40))
     out = tmp_path / "losses.toml"
     given = ["validate", "losses", str(coarse_cases), "-o", str(out), "--views", "2"]
-    ran = CliRunner().invoke(app, [*given, "--only", "pocket__ensenso-n10", "--only", "stepped_block__david"])
+    ran = CliRunner().invoke(
+        app, [*given, "--only", "balls_on_plate__ensenso-n10", "--only", "balls_on_plate__photoneo"]
+    )
     assert ran.exit_code == 0, ran.output
     found, shipped = read_toml(out, Losses), losses()
     for kind in ("matched", "coded"):
         one, known = getattr(found, kind), getattr(shipped, kind)
         (low, high), (least, most) = one.half_interval, known.half_interval
         assert low <= most and least <= high
-    assert found.cases == ["pocket__ensenso-n10__Ra0.46_0.2", "stepped_block__david-sls-3__Ra0.74_0.37"]
+    assert found.cases == ["balls_on_plate__ensenso-n10__Ra0.46", "balls_on_plate__photoneo-phoxi-s__Ra0.37"]

@@ -48,13 +48,12 @@ def row_error(
         NaN if the best offset is not within :data:`MAXIMUM_ROWS`.
     """
     left_levels = _sampled(left, geometry.map_left[:, rows, columns])
-    costs = []
-    for step in range(-MAXIMUM_ROWS, MAXIMUM_ROWS + 1):
-        positions = [rows + float(step), columns - disparity]
-        raw = np.stack([map_coordinates(axis, positions, order=1, mode="nearest") for axis in geometry.map_right])
-        right_levels = _sampled(right, raw)
-        difference = left_levels - left_levels.mean() - (right_levels - right_levels.mean())
-        costs.append(float(np.mean(difference**2)))
+    steps = np.arange(-MAXIMUM_ROWS, MAXIMUM_ROWS + 1.0)[:, None]
+    positions = np.broadcast_arrays(rows + steps, columns - disparity)
+    raw = np.stack([map_coordinates(axis, positions, order=1, mode="nearest") for axis in geometry.map_right])
+    right_levels = _sampled(right, raw)
+    difference = left_levels - left_levels.mean() - (right_levels - right_levels.mean(axis=1, keepdims=True))
+    costs = np.mean(difference**2, axis=1).tolist()
     best = int(np.argmin(costs))
     if not 0 < best < 2 * MAXIMUM_ROWS:
         return float("nan")
