@@ -248,7 +248,9 @@ class _Pupils:
 
     def __init__(self, count: int, jitter: bool) -> None:
         self.jitter = jitter
-        self.tables = [mi.Point2f(positions) for positions in aperture_samples(count)]
+        # one more entry than is read, as a table of one would be a number of the kernel
+        padded = (np.pad(positions, ((0, 0), (0, 1))) for positions in aperture_samples(count))
+        self.tables = [mi.Point2f(to_device(x), to_device(y)) for x, y in padded]
 
     def camera(self, sample: Any, random: Any) -> Any:
         """Return the position in the camera's lens."""
