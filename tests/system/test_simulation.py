@@ -58,9 +58,20 @@ def facing(tilt_deg, azimuth_deg=0.0):
     return np.array([math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)])
 
 
+def whole_coupon(simulated, sample, normal, **settings):
+    """Return the capture of a coupon at 600 mm with half of its size around it, where it is dark."""
+    pose = coupon_pose(normal, 600, AXIS)
+    coupon = sample.at(pose)
+    around = coupon.centre + 2 * (coupon.corners() - coupon.centre)
+    return simulated.capture(sample.scene, pose.inverse(), around=around, **settings)
+
+
+#: pixels of both cameras above the coupon, in the dark
+ABOVE = slice(125, 165), slice(260, 390)
+
+
 def test_matt_white_is_as_bright_as_the_exposure_rule_says(n10, simulated, samples):
-    pose = coupon_pose(facing(0), 600, AXIS)
-    capture = simulated.capture(samples[0].scene, pose.inverse(), rendering=Rendering(samples=16), seed=1)
+    capture = whole_coupon(simulated, samples[0], facing(0), seed=1, rendering=Rendering(samples=16))
     image = capture.images["left"][0].astype(float)
     middle = image[200:280, 340:400]
     bright = (np.percentile(middle, 97) - n10.imager.black_level) / (255 - n10.imager.black_level)
@@ -75,8 +86,7 @@ def test_the_pattern_in_the_image_is_like_the_recorded_one(simulated, samples):
 
     The recording has the imager's gamma on, of unknown size: its contrast is 0.38 if that is 1, and 0.71 if it is 2.2.
     """
-    pose = coupon_pose(facing(0), 600, AXIS)
-    capture = simulated.capture(samples[0].scene, pose.inverse(), seed=1, noise=Noise.none())
+    capture = whole_coupon(simulated, samples[0], facing(0), seed=1, noise=Noise.none())
     middle = capture.images["left"][0][200:280, 330:410].astype(float) - 4
     assert np.isclose(mean_run_length(middle, np.median(middle)), 4.1, rtol=0.1)
     low, high = np.percentile(middle, [5, 95])
@@ -84,23 +94,21 @@ def test_the_pattern_in_the_image_is_like_the_recorded_one(simulated, samples):
 
 
 def test_same_seed_same_bytes_and_cameras_do_not_share_noise(simulated, samples):
-    pose = coupon_pose(facing(10), 600, AXIS)
     one, again, other = (
-        simulated.capture(samples[0].scene, pose.inverse(), rendering=Rendering(samples=4), seed=s) for s in (5, 5, 6)
+        whole_coupon(simulated, samples[0], facing(10), seed=s, rendering=Rendering(samples=4)) for s in (5, 5, 6)
     )
     for camera in ("left", "right"):
         assert one.images[camera].tobytes() == again.images[camera].tobytes()
         assert one.images[camera].tobytes() != other.images[camera].tobytes()
-    dark = [one.images[c][0][:60, :60].astype(float) - 4 for c in ("left", "right")]
+    dark = [one.images[c][0][ABOVE].astype(float) - 4 for c in ("left", "right")]
     assert abs(np.corrcoef(dark[0].ravel(), dark[1].ravel())[0, 1]) < 0.06
 
 
 def test_the_dark_is_read_noise_and_fixed_pattern(n10, simulated, samples):
-    pose = coupon_pose(facing(0), 600, AXIS)
     captures = [
-        simulated.capture(samples[0].scene, pose.inverse(), rendering=Rendering(samples=1), seed=s) for s in range(8)
+        whole_coupon(simulated, samples[0], facing(0), seed=s, rendering=Rendering(samples=1)) for s in range(8)
     ]
-    dark = np.stack([c.images["left"][0][:100, :150] for c in captures]).astype(float)
+    dark = np.stack([c.images["left"][0][ABOVE] for c in captures]).astype(float)
     imager = n10.imager
     temporal = np.sqrt((imager.read_noise * imager.gain) ** 2 + 1 / 12)
     assert np.isclose(np.sqrt(dark.var(axis=0, ddof=1).mean()), temporal, rtol=0.08)
