@@ -66,7 +66,7 @@ def whole_coupon(simulated, sample, normal, **settings):
     return simulated.capture(sample.scene, pose.inverse(), around=around, **settings)
 
 
-#: pixels of both cameras above the coupon, in the dark
+#: pixels of the left camera above the coupon, in the dark
 ABOVE = slice(125, 165), slice(260, 390)
 
 
@@ -94,13 +94,14 @@ def test_the_pattern_in_the_image_is_like_the_recorded_one(simulated, samples):
 
 
 def test_same_seed_same_bytes_and_cameras_do_not_share_noise(simulated, samples):
+    pose = coupon_pose(facing(10), 600, AXIS)
     one, again, other = (
-        whole_coupon(simulated, samples[0], facing(10), seed=s, rendering=Rendering(samples=4)) for s in (5, 5, 6)
+        simulated.capture(samples[0].scene, pose.inverse(), rendering=Rendering(samples=4), seed=s) for s in (5, 5, 6)
     )
     for camera in ("left", "right"):
         assert one.images[camera].tobytes() == again.images[camera].tobytes()
         assert one.images[camera].tobytes() != other.images[camera].tobytes()
-    dark = [one.images[c][0][ABOVE].astype(float) - 4 for c in ("left", "right")]
+    dark = [one.images[c][0][:60, :60].astype(float) - 4 for c in ("left", "right")]
     assert abs(np.corrcoef(dark[0].ravel(), dark[1].ravel())[0, 1]) < 0.06
 
 
