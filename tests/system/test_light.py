@@ -187,7 +187,7 @@ def residual(simulated, scene, *rendering):
 
 def test_the_light_s_own_noise_is_none_at_depth_1_and_falls_with_samples_at_depth_3(simulated, ball, scenes):
     """No noise of direct light; that of interreflections falls as the root of the samples."""
-    coarse, fine = residual(simulated, ball, 16, 1), residual(simulated, ball, 36, 1)
+    coarse, fine = residual(simulated, ball, 4, 1), residual(simulated, ball, 16, 1)
     assert coarse.noise == fine.noise == 0
     assert 0 < fine.quadrature < min(coarse.quadrature, 0.2)
     few, many = residual(simulated, ball, 1, 3), residual(simulated, ball, 4, 3)
