@@ -95,8 +95,9 @@ def draw_placement(
         turn = _viewpoint(matrices[0], middle)
         flat, depth = _projected(geometry.corners - middle, turn)
         whole, near = figure.add_axes((0.0, 0.09, 0.46, 0.91)), figure.add_axes((0.46, 0.09, 0.54, 0.91))
+        picture, extent = _part(geometry, flat, depth, turn, verdicts)
         for axes in (whole, near):
-            _part(axes, geometry, flat, depth, turn, verdicts)
+            axes.imshow(picture, origin="lower", extent=extent, interpolation="antialiased", zorder=2)
             axes.set_aspect("equal")
             axes.set_axis_off()
         for number in reversed(range(len(poses))):
@@ -134,8 +135,9 @@ def _projected(points: Floats, turn: Floats) -> tuple[Floats, Floats]:
 
 
 def _part(
-    axes: Axes, geometry: SceneGeometry, flat: Floats, depth: Floats, turn: Floats, verdicts: Mapping[str, str]
-) -> None:
+    geometry: SceneGeometry, flat: Floats, depth: Floats, turn: Floats, verdicts: Mapping[str, str]
+) -> tuple[Floats, tuple[float, float, float, float]]:
+    """Return the picture of the part, (rows, columns, 4), and its extent: left, right, bottom and top."""
     low, high = flat.reshape(-1, 2).min(axis=0), flat.reshape(-1, 2).max(axis=0)
     scale = _PIXELS / max(float((high - low).max()), 1e-9)
     index, _ = depth_buffer((flat - low) * scale, depth, tuple(np.ceil((high - low) * scale).astype(int) + 1))
@@ -161,7 +163,7 @@ def _part(
         low[1] - half,
         low[1] + index.shape[0] / scale - half,
     )
-    axes.imshow(picture, origin="lower", extent=extent, interpolation="antialiased", zorder=2)
+    return picture, extent
 
 
 def depth_buffer(places: Floats, depth: Floats, size: tuple[int, ...]) -> tuple[NDArray[np.int64], Floats]:

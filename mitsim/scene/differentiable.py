@@ -27,6 +27,7 @@ from mitsim.scene import backend
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.coherent_blend import NAME, NUMBERS, register_coherent_blend
 from mitsim.scene.load import Scene, scene_from_dict
+from mitsim.surface.coherence import EVEN_FROM
 from mitsim.surface.scatter import Scatter
 
 #: step of the central differences of the lobe's parameters (energy, coherence); the error is of the order of its square
@@ -67,6 +68,8 @@ class Directions:
             raise ValueError(f"directions {view.shape} and {light.shape}: both must be (N, 3)")
         self.count = len(view)
         self.view, self.light = (mi.Vector3f(np.ascontiguousarray(d.T, np.float32)) for d in (view, light))
+        #: whether the lobe's factor h is 1 for all pairs, with a margin for single precision
+        self.even = bool(((view[:, 2] + light[:, 2]) / 2 > EVEN_FROM + 1e-6).all())
 
 
 class SpecularLobe:
@@ -98,7 +101,8 @@ class SpecularLobe:
 
     def reflectance(self, scatter: Scatter, directions: Directions) -> NDArray[np.float64]:
         """Return pi f [1] of each pair of directions, (N,); 0 where one is below the surface."""
-        self._set({name: mi.Float(dr.opaque(mi.Float, value)) for name, value in _numbers(scatter).items()})
+        numbers = _numbers(scatter, directions)
+        self._set({name: mi.Float(dr.opaque(mi.Float, value)) for name, value in numbers.items()})
         return np.array(self._evaluate(directions), np.float64)
 
     def reflectance_and_slope(
@@ -109,7 +113,7 @@ class SpecularLobe:
         Dr.Jit differentiates pi f by the parameters of the lobes. The derivatives of these few parameters by x are
         central differences.
         """
-        here, above, below = (_numbers(scatter_at(x + step)) for step in (0.0, _STEP, -_STEP))
+        here, above, below = (_numbers(scatter_at(x + step), directions) for step in (0.0, _STEP, -_STEP))
         change = dr.opaque(mi.Float, 0.0)
         dr.enable_grad(change)
         self._set(
@@ -138,8 +142,12 @@ class SpecularLobe:
         return dr.select(above, dr.pi * value / dr.maximum(directions.light.z, 1e-6), 0.0)
 
 
-def _numbers(scatter: Scatter) -> dict[str, float]:
-    """Return the values of the parameters of the BSDF tree, by their names in Mitsuba."""
+def _numbers(scatter: Scatter, directions: Directions) -> dict[str, float]:
+    """Return the values of the parameters of the BSDF tree, by their names in Mitsuba.
+
+    The coefficients of h take most of the time of a fit, so they are 0 where h is 1 whatever they are.
+    """
+    coefficients = (0.0, 0.0, 0.0) if directions.even else scatter.lobe_numbers
     ggx, beckmann = f"{_INCOHERENT}.bsdf_0", f"{_INCOHERENT}.bsdf_1"
     (ggx_u, ggx_v), (mirror_u, mirror_v) = scatter.ggx_alpha, scatter.coherent_alpha
     return {
@@ -153,5 +161,5 @@ def _numbers(scatter: Scatter) -> dict[str, float]:
         f"{_MIRROR}.alpha_u.value": mirror_u,
         f"{_MIRROR}.alpha_v.value": mirror_v,
         "phase_variance": scatter.phase_variance,
-        **dict(zip(NUMBERS, scatter.lobe_numbers, strict=True)),
+        **dict(zip(NUMBERS, coefficients, strict=True)),
     }

@@ -87,6 +87,21 @@ def test_the_derivative_is_that_of_finite_differences(lobe, ground, rng, alpha):
     np.testing.assert_allclose(value, lobe.reflectance(ground.scatter(x), pair), rtol=1e-6)
 
 
+def test_pairs_that_no_coefficient_of_h_concerns_are_the_same_beside_pairs_that_one_does(lobe, ground):
+    """The coefficients are computed only if a pair needs them: its mean cosine is below that of 45 deg."""
+    angles = np.radians([0.0, 30.0, 44.9, 45.1, 60.0, 75.0])
+    slanted = np.column_stack([np.sin(angles), np.zeros(6), np.cos(angles)])
+    back = slanted * [-1.0, 1.0, 1.0]
+    few, all_of_them = Directions(slanted[:3], back[:3]), Directions(slanted, back)
+    assert few.even
+    assert not any(Directions(slanted[[at]], back[[at]]).even for at in (3, 4, 5))
+    x = math.log(0.2)
+    alone, among = (lobe.reflectance_and_slope(ground.scatter, x, pairs) for pairs in (few, all_of_them))
+    assert (np.stack(alone) == np.stack(among)[:, :3]).all()
+    expected = closed_form(ground.scatter(x), slanted, back)
+    np.testing.assert_allclose(lobe.reflectance(ground.scatter(x), all_of_them), expected, rtol=2e-4)
+
+
 @given(st.integers(0, 2**31), st.floats(0.02, 0.6))
 def test_camera_and_lamp_may_change_places(lobe, ground, seed, alpha):
     """Helmholtz: f is symmetric. Single precision leaves a few parts in 10^5 of a steep flank."""

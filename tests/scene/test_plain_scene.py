@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mitsim.scene.backend import mi
-from mitsim.scene.light_transport import path_loop
+from mitsim.scene.light_transport import path_loop, transport
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.plain_scene import single_bsdf, single_plane
 from mitsim.scene.light_transport.projector_light import ProjectedPatterns, independent
@@ -87,7 +87,8 @@ def test_the_short_way_finds_the_light_of_the_long_way(kind, depth, light, monke
     assert single_bsdf(scene) is not None
     rays = CameraRays(pinhole(96, 64, 240.0), 4.0, 430.0)
     short = trace(scene, rays, light, POSE, LightPaths(samples=16, seed=1, depth=depth))
-    monkeypatch.setattr(path_loop, "single_plane", lambda scene: None)
+    for module in (path_loop, transport):
+        monkeypatch.setattr(module, "single_plane", lambda scene: None)
     monkeypatch.setattr(path_loop, "single_bsdf", lambda scene: None)
     long = trace(scene, rays, light, POSE, LightPaths(samples=16, seed=1, depth=depth))
     assert (long > 0).mean() > 0.2

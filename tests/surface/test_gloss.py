@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsim.surface.gloss import alpha_of_gloss, base_gloss, lobe_gloss
@@ -54,6 +54,7 @@ def test_a_mirror_of_black_glass_reads_100_and_smooth_paint_89():
 
 
 @given(st.floats(0.005, 0.4), st.sampled_from(["beckmann", "ggx"]))
+@settings(max_examples=30)
 def test_gloss_and_back(alpha, distribution):
     def reading(candidate):
         return lobe_gloss(candidate, ALUMINIUM, distribution)

@@ -72,7 +72,7 @@ def captures(n10, coupon, tmp_path_factory):
     simulated = SimulatedSensor(n10)
     scene = load_scene(coupon, n10.wavelength_nm, {"Ra": "0.46"})
     folder = tmp_path_factory.mktemp("coupon")
-    for number, (tilt, azimuth) in enumerate([(14, 210), (22, 60), (40, 300)]):
+    for number, (tilt, azimuth) in enumerate([(14, 210), (22, 60), (36, 300)]):
         pose = pose_at(tilt, azimuth)
         around = pose.inverse().points(CORNERS)
         capture = simulated.capture(scene, pose, rendering=Rendering(samples=4), seed=number, around=around)
@@ -173,7 +173,7 @@ def test_a_plane_is_found_in_a_cloud_with_other_things_in_it(rng):
 
 # the estimator --------------------------------------------------------------------------------------------------
 
-POSES = [(6, 30), (14, 210), (22, 60), (45, 330)]
+POSES = [(6, 30), (14, 210), (22, 60), (40, 330)]
 TRUE_ALPHA, TRUE_POWER, TRUE_SHARE, GRAIN = 0.13, 0.9, 0.1, 0.18
 
 
@@ -266,7 +266,7 @@ def test_the_uncertainty_covers_the_truth(plain_views, ground, size_px):
 
 
 def test_poses_that_do_not_show_the_lobe_leave_its_width_open(plain_views, ground):
-    """At 45 deg off the mirror direction only the wide-angle light is left to see."""
+    """At 40 deg off the mirror direction only the wide-angle light is left to see."""
     fit = fit_views(noisy(plain_views[-1:], 0.0, 1), ground)
     assert fit.at_limit or fit.log_alpha.uncertainty > 0.3
 

@@ -16,6 +16,7 @@ from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.transforms import look_at
+from mitsim.simulation.indirect_light import IndirectLight
 from mitsim.simulation.render_residual import render_residual, temporal_noise
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
@@ -167,32 +168,53 @@ def flat_white():
     )
 
 
-def test_the_light_s_own_noise_is_none_at_depth_1_and_falls_with_samples_at_depth_3(simulated, scenes):
-    """White floor and ball: no noise of direct light; that of interreflections falls as the root of the samples.
-
-    In the 6600 pixels around the ball's foot, where most of it is: the ratio is known to 5 % there.
-    """
+@pytest.fixture
+def ball(no_other_scenes):
+    """A white floor and ball."""
     white = {"type": "matt_white"}
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([100, 100, 1]), "bsdf": white}
-    scene = scene_from_dict(
+    return scene_from_dict(
         {"floor": floor, "ball": {"type": "sphere", "radius": 40.0, "center": [0, 0, 40], "bsdf": white}}, 850
     )
+
+
+def residual(simulated, scene, *rendering):
+    """Of the 6600 pixels around the ball's foot, where most noise is: a ratio is known to 5 % there."""
     pose = look_at([0, -400, 300], [0, 0, 20], [0, 0, 1])
-
     around = pose.inverse().points(np.array([[x, y, 10.0] for x in (-45, 45) for y in (-45, 20)]))
+    return render_residual(simulated, scene, pose, "left", Rendering(*rendering), seed=5, around=around)
 
-    def residual(samples, depth, scene=scene):
-        rendering = Rendering(samples=samples, depth=depth)
-        return render_residual(simulated, scene, pose, "left", rendering, seed=5, around=around)
 
-    coarse, fine = residual(16, 1), residual(36, 1)
+def test_the_light_s_own_noise_is_none_at_depth_1_and_falls_with_samples_at_depth_3(simulated, ball, scenes):
+    """No noise of direct light; that of interreflections falls as the root of the samples."""
+    coarse, fine = residual(simulated, ball, 4, 1), residual(simulated, ball, 16, 1)
     assert coarse.noise == fine.noise == 0
     assert 0 < fine.quadrature < min(coarse.quadrature, 0.2)
-    few, many = residual(1, 3), residual(4, 3)
+    few, many = residual(simulated, ball, 1, 3), residual(simulated, ball, 4, 3)
     assert few.noise > 0
     assert np.isclose(few.noise / many.noise, 2, rtol=0.15)
     part = load_scene(scenes / "two_pillars/two_pillars.xml", 850)
-    assert residual(16, 1, part).worst < 0.2
+    assert residual(simulated, part, 16, 1).worst < 0.2
+
+
+def test_the_noise_of_interreflections_that_are_rendered_apart_falls_with_their_own_samples(simulated, ball):
+    """Four times the paths halve it; with the samples of direct light it does not change."""
+    few, many_paths, many_samples = (
+        residual(simulated, ball, samples, 2, IndirectLight(paths, 1.5)).noise
+        for samples, paths in ((1, 1), (1, 4), (4, 1))
+    )
+    assert few > 0.1
+    assert many_paths == pytest.approx(few / 2, rel=0.15)
+    assert many_samples == pytest.approx(few, rel=0.15)
+
+
+@pytest.mark.usefixtures("no_other_scenes")
+def test_a_flat_face_has_no_noise_of_its_own_at_depth_3(simulated):
+    """With interreflections the render has noise of its own: on a coupon there are none, so there is none."""
+    scene, pose = flat_white(), look_at([100, 180, 560], [0, 0, 0], [0, 0, 1])
+    one, other = (simulated.radiance(scene, pose, "left", Rendering(16, 3), seed=seed)[0] for seed in (1, 2))
+    assert one.max() > 0
+    assert np.abs(one - other).max() == 0
 
 
 def test_temporal_noise_is_what_the_imager_adds(n10, rng):

@@ -75,7 +75,7 @@ def launch(
     cells, per_cell = opaque_index(side), opaque(1.0 / side)
     has_aperture = rays.aperture_mm > 0
     aperture, inverse_focus = (opaque(one) for one in (0.5 * rays.aperture_mm, 1.0 / rays.focus_mm))
-    pupils = _Pupils(side * side, jitter)
+    pupils = _Pupils(side * side if has_aperture or projector.has_aperture else 0, jitter)
     has_ambient = has_emitters(scene)
     # the ray from the last surface may meet an emitter of the scene
     surfaces, rays_at_most = (opaque_index(n) for n in (depth, depth + 1 if has_ambient else depth))
@@ -244,11 +244,15 @@ def _density_to_camera(bsdf: Any, surface: Any, toward_projector: Any, active: A
 
 
 class _Pupils:
-    """Positions in the unit discs of the lenses of camera and projector for each sample."""
+    """Positions in the unit discs of the lenses of camera and projector for each of ``count`` samples; 0: no lens."""
 
     def __init__(self, count: int, jitter: bool) -> None:
         self.jitter = jitter
-        self.tables = [mi.Point2f(positions) for positions in aperture_samples(count)]
+        if jitter or not count:  # chosen positions take a fraction of a second to find
+            return
+        # one more entry than is read, as a table of one would be a number of the kernel
+        padded = (np.pad(positions, ((0, 0), (0, 1))) for positions in aperture_samples(count))
+        self.tables = [mi.Point2f(to_device(x), to_device(y)) for x, y in padded]
 
     def camera(self, sample: Any, random: Any) -> Any:
         """Return the position in the camera's lens."""

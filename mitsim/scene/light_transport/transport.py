@@ -16,6 +16,7 @@ Radiometry: code value x plane irradiance E_1 [W] -> radiance [W / (mm^2 sr)], s
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.light_tracing import PHOTONS_AT_ONCE, Photons, add_photons
 from mitsim.scene.light_transport.path_loop import launch
+from mitsim.scene.light_transport.plain_scene import single_plane
 from mitsim.scene.light_transport.projector_light import Light
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
@@ -97,6 +99,8 @@ def _traced(
     shift: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float32]:
     """Return the radiance (poses, P, height, width) of a region, at poses that share their launches."""
+    if single_plane(scene) is not None:  # a flat coupon does not light itself
+        paths = replace(paths, depth=1)
     photons = paths.photon_count(rays.camera.width * rays.camera.height)
     images = np.empty((len(poses), light.count + paths.with_ambient, roi.height, roi.width), np.float32)
     rows = max(1, LARGEST_LAUNCH // (len(poses) * roi.width * (light.count + 1)))
