@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mitsim.scene.backend import mi
+from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport import path_loop, transport
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.plain_scene import single_bsdf, single_plane
@@ -104,6 +104,40 @@ def test_scenes_that_are_not_plain_take_the_long_way(scenes):
     assert single_plane(scene_from_dict({"a": shape("sphere")}, 460)) is None
     several = {"a": shape("rectangle"), "b": shape("rectangle", x=10.0, type="matt_white")}
     assert single_bsdf(scene_from_dict(several, 460)) is None
+
+
+def test_an_instance_is_of_the_material_of_its_shape(light):
+    ball = {"type": "sphere", "center": [0.0, 0.0, -20.0], "radius": 40.0, "bsdf": {"type": "matt_white"}}
+    instance = {"type": "instance", "of": {"type": "ref", "id": "group"}}
+    rays = CameraRays(pinhole(24, 16, 60.0))
+    one, other = (
+        trace(scene_from_dict(description, 460), rays, light, POSE, LightPaths(samples=1, seed=1))
+        for description in ({"a": ball}, {"group": {"type": "shapegroup", "one": ball}, "b": instance})
+    )
+    assert one.any()
+    np.testing.assert_allclose(other, one, rtol=1e-3, atol=1e-5 * one.max())
+
+
+def test_materials_of_other_scenes_are_not_compiled(light):
+    """A second scene is there, with a material of its own: kernels grow by the digits of larger numbers alone."""
+    two = {"a": shape("rectangle"), "b": shape("rectangle", x=140.0, type="matt_white")}
+    rays, scene = CameraRays(pinhole(24, 16, 60.0)), scene_from_dict(two, 460)
+
+    def compiled():
+        dr.set_flag(dr.JitFlag.KernelHistory, True)
+        try:
+            dr.kernel_history_clear()
+            image = trace(scene, rays, light, POSE, LightPaths(samples=1, seed=1, photons=100, depth=2))
+            return image, [len(k["ir"].getvalue()) for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+        finally:
+            dr.set_flag(dr.JitFlag.KernelHistory, False)
+
+    alone, before = compiled()
+    other = scene_from_dict({"c": shape("rectangle", type="gloss_paint"), "d": shape("rectangle")}, 460)
+    again, after = compiled()
+    assert len(other.shapes) == 2 and len(before) > 1
+    np.testing.assert_allclose(after, before, atol=20)
+    np.testing.assert_array_equal(again, alone)
 
 
 @pytest.mark.parametrize("steps", [3, 8])

@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque, opaque_index
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
+from mitsim.scene.light_transport.plain_scene import SceneBsdfs
 from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays, pixel_area
@@ -164,6 +165,7 @@ def _launch(
     lens = _in_disc(random) if projector.has_aperture else None
     origin, direction, flux, uv = projector.emit_photon(image_point, lens)
 
+    bsdfs = SceneBsdfs(scene)
     records = depth - 1
     pixels, radiances = dr.zeros(mi.UInt32, count * records), dr.zeros(mi.Float, count * records)
     lengths = dr.zeros(mi.Float, count * records)
@@ -190,7 +192,7 @@ def _launch(
         surface = scene.mitsuba.ray_intersect(mi.Ray3f(origin, direction), active)
         hit = active & surface.is_valid()
         length = length + dr.select(hit, surface.t, 0.0)
-        bsdf, context = surface.bsdf(), mi.BSDFContext()
+        bsdf, context = bsdfs.at(surface), mi.BSDFContext()
         toward_projector = mi.Vector3f(surface.wi)
         cosine_in = dr.maximum(dr.abs(dr.dot(surface.n, direction)), 1e-9)
         # n_C p_C / (n_L p_L) of the surfaces so far, without the factors of the next direction

@@ -27,7 +27,7 @@ from mitsim.scene.light_transport.ambient import has_emitters, hit_emitter_light
 from mitsim.scene.light_transport.aperture_samples import aperture_samples
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
-from mitsim.scene.light_transport.plain_scene import intersect_plane, single_bsdf, single_plane
+from mitsim.scene.light_transport.plain_scene import SceneBsdfs, intersect_plane, single_bsdf, single_plane
 from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays, bilinear, pixel_area
@@ -79,7 +79,7 @@ def launch(
     has_ambient = has_emitters(scene)
     # the ray from the last surface may meet an emitter of the scene
     surfaces, rays_at_most = (opaque_index(n) for n in (depth, depth + 1 if has_ambient else depth))
-    plane, shared_bsdf = single_plane(scene), single_bsdf(scene)
+    plane, shared_bsdf, bsdfs = single_plane(scene), single_bsdf(scene), SceneBsdfs(scene)
     occluders = scene.mitsuba if plane is None else None
     photons_per_sample = opaque(photons / side**2)
     area = pixel_area(x, y)
@@ -129,7 +129,7 @@ def launch(
         hit = surface.is_valid() & (bounce < surfaces)
         length = dr.select(at_first, 0.0, length) + dr.select(hit, surface.t, 0.0)
         context = mi.BSDFContext()
-        bsdf = surface.bsdf() if shared_bsdf is None else shared_bsdf
+        bsdf = bsdfs.at(surface) if shared_bsdf is None else shared_bsdf
         contributes = hit & ~at_first if paths.indirect_only else hit
 
         lens = pupils.projector(sample, random) if projector.has_aperture else None

@@ -3,11 +3,18 @@
 Mitsuba calls shapes and BSDFs indirectly, for each lane. If all lanes reach the same object, mitsim calls the object
 directly. Its arithmetic becomes part of the kernel: the same formulas in a third of the time. A single flat shape also
 needs no shadow rays, because it cannot shadow itself.
+
+If the scene has several materials, mitsim calls them indirectly, but those of the scene alone. Mitsuba's own call
+compiles every BSDF of the process into the kernel: also those of other scenes, and the parts of a blend beside the
+blend. It takes half as long again to compile, and twice the time for small images.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
+
+import numpy as np
 
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport.ambient import has_emitters
@@ -24,8 +31,59 @@ def single_plane(scene: Scene) -> Any | None:
 
 def single_bsdf(scene: Scene) -> Any | None:
     """Return the BSDF that all shapes share; None if there are several."""
-    first, *others = [shape.bsdf() for shape in scene.shapes]
-    return first if all(bsdf is first for bsdf in others) else None
+    bsdfs = _distinct_bsdfs(scene)
+    return bsdfs[0] if bsdfs is not None and len(bsdfs) == 1 else None
+
+
+def _distinct_bsdfs(scene: Scene) -> list[Any] | None:
+    """Return the BSDFs of a scene, each once; None if there are instances, whose BSDFs Mitsuba does not tell."""
+    if any(shape.class_name() == "Instance" for shape in scene.shapes):
+        return None
+    return list(dict.fromkeys(shape.bsdf() for shape in scene.shapes))
+
+
+class SceneBsdfs:
+    """The BSDFs of a scene, for indirect calls that compile no others."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._bsdfs = _distinct_bsdfs(scene)
+        if self._bsdfs is None:
+            return
+        numbers = np.array(dr.reinterpret_array(mi.UInt32, scene.mitsuba.shapes_dr()))
+        places = np.zeros(numbers.max() + 1, np.uint32)  # for each of Mitsuba's numbers of shapes
+        places[numbers] = [self._bsdfs.index(shape.bsdf()) for shape in scene.shapes]
+        self._places = mi.UInt32(places)
+
+    def at(self, surface: Any) -> Any:
+        """Return the BSDF of each lane's surface, with the methods that light paths need."""
+        if self._bsdfs is None:
+            return surface.bsdf()
+        valid = surface.is_valid()
+        place = dr.gather(mi.UInt32, self._places, dr.reinterpret_array(mi.UInt32, surface.shape), valid)
+        return _BsdfOfLane(self._bsdfs, place, valid)
+
+
+class _BsdfOfLane:
+    """A BSDF that calls, for each ``valid`` lane, the one of some BSDFs that is at its ``place`` in the list."""
+
+    def __init__(self, bsdfs: list[Any], place: Any, valid: Any) -> None:
+        self._bsdfs, self._place, self._valid = bsdfs, place, valid
+
+    def eval(self, context: Any, surface: Any, outgoing: Any, active: Any) -> Any:
+        return self._call("eval", context, active, surface, outgoing)
+
+    def pdf(self, context: Any, surface: Any, outgoing: Any, active: Any) -> Any:
+        return self._call("pdf", context, active, surface, outgoing)
+
+    def eval_pdf(self, context: Any, surface: Any, outgoing: Any, active: Any) -> Any:
+        return self._call("eval_pdf", context, active, surface, outgoing)
+
+    def sample(self, context: Any, surface: Any, sample1: Any, sample2: Any, active: Any) -> Any:
+        return self._call("sample", context, active, surface, sample1, sample2)
+
+    def _call(self, method: str, context: Any, active: Any, *arguments: Any) -> Any:
+        targets = [partial(getattr(bsdf, method), context) for bsdf in self._bsdfs]
+        return dr.switch(self._place, targets, *arguments, self._valid & active)
 
 
 def intersect_plane(plane: Any, ray: Any) -> Any:
