@@ -73,9 +73,9 @@ def corners(n10):
                 trace(scene, rays[name], white, pose, LightPaths(samples=9, seed=1))[0], n10.imager.blur_px
             )
             electrons = light / np.percentile(light, 99.9) * 0.9 * n10.imager.full_well
-            # hundreds of electrons or none: their Poisson numbers are normal, too
-            sigma = np.sqrt((electrons + np.float32(n10.imager.read_noise**2)) / EXPOSURES)
-            noisy = electrons + sigma * rng.standard_normal(electrons.shape, np.float32)
+            # a sum of Poisson numbers is one, too
+            noisy = rng.poisson(EXPOSURES * electrons) / EXPOSURES
+            noisy += rng.normal(0, n10.imager.read_noise / np.sqrt(EXPOSURES), electrons.shape)
             grey = np.clip(np.rint(4 + noisy / n10.imager.full_well * 251), 0, 255).astype(np.uint8)
             pixels, ids, *_ = detector.detectBoard(grey)
             # the detector's own window reaches markers and bends with the distortion: refine in a smaller one
