@@ -104,7 +104,8 @@ def browser(started_browser: Any) -> Any:
 def no_other_scenes() -> None:
     """Free the scenes of files before this one, for tests that compile large kernels.
 
-    Dr.Jit compiles the materials of every scene that is still there into every kernel, whether it is seen or not.
+    Dr.Jit compiles the number of shapes of all scenes that are still there into every kernel, and Mitsuba's own
+    integrators compile their materials: with other scenes before it, a kernel is another one.
     """
     from mitsim.campaign import many
 
