@@ -72,8 +72,6 @@ def distortion_names(camera: Camera) -> tuple[str, ...]:
     if camera.model == "fisheye":
         return FISHEYE_NAMES
     given = PERSPECTIVE_NAMES[: len(camera.distortion)]
-    if len(given) <= 5:
-        return given
     values = dict(zip(given, camera.distortion, strict=True))
     used = [group for group in _GROUPS if any(values.get(name, 0.0) != 0 for name in group)]
     return (*given[:5], *(name for group in used for name in group))

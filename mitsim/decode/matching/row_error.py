@@ -29,7 +29,7 @@ def row_error(
     columns: NDArray[np.intp],
     disparity: Floats,
 ) -> float:
-    """Return the number of rows [px] by which the right image must be shifted to fit a patch best.
+    """Return by how many rows [px] a patch lies lower in the right image than in the left one.
 
     Parameters
     ----------
