@@ -79,7 +79,8 @@ def launch(
     has_ambient = has_emitters(scene)
     # the ray from the last surface may meet an emitter of the scene
     surfaces, rays_at_most = (opaque_index(n) for n in (depth, depth + 1 if has_ambient else depth))
-    plane, shared_bsdf, bsdfs = single_plane(scene), single_bsdf(scene), SceneBsdfs(scene)
+    plane, shared_bsdf = single_plane(scene), single_bsdf(scene)
+    bsdfs = SceneBsdfs(scene) if shared_bsdf is None else None
     occluders = scene.mitsuba if plane is None else None
     photons_per_sample = opaque(photons / side**2)
     area = pixel_area(x, y)
@@ -129,7 +130,7 @@ def launch(
         hit = surface.is_valid() & (bounce < surfaces)
         length = dr.select(at_first, 0.0, length) + dr.select(hit, surface.t, 0.0)
         context = mi.BSDFContext()
-        bsdf = bsdfs.at(surface) if shared_bsdf is None else shared_bsdf
+        bsdf: Any = shared_bsdf if bsdfs is None else bsdfs.at(surface)
         contributes = hit & ~at_first if paths.indirect_only else hit
 
         lens = pupils.projector(sample, random) if projector.has_aperture else None
