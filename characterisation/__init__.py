@@ -18,8 +18,8 @@ _NAMES = {
     "Cylinder": "characterisation.features.surfaces",
     "CylinderFit": "characterisation.features.fitted",
     "FitError": "characterisation.features.robust_fit",
-    "InputError": "characterisation.errors",
-    "MissingEnvironmentError": "characterisation.errors",
+    "InputError": "characterisation.files.errors",
+    "MissingEnvironmentError": "characterisation.files.errors",
     "Overall": "characterisation.coupon.patch_table",
     "PerformanceMap": "characterisation.maps.performance_map",
     "PlaneFit": "characterisation.features.fitted",
@@ -41,11 +41,11 @@ if TYPE_CHECKING:
     from characterisation.coupon.patch_table import Overall, overall
     from characterisation.coupon.patches import Coupon
     from characterisation.coupon_cloud import measure_coupon, patch_metrics
-    from characterisation.errors import InputError, MissingEnvironmentError
     from characterisation.features.fits import fit_cylinder, fit_plane, fit_sphere
     from characterisation.features.fitted import CylinderFit, PlaneFit, SphereFit
     from characterisation.features.robust_fit import FitError
     from characterisation.features.surfaces import Cylinder
+    from characterisation.files.errors import InputError, MissingEnvironmentError
     from characterisation.interface import read_cloud, write_cloud
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.point_cloud import PointCloud, Status, ViewGrid

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.atomic_io import atomic_write
-from characterisation.checked_files import read_bounded
-from characterisation.errors import InputError
+from characterisation.files.atomic_io import atomic_write
+from characterisation.files.checked_files import read_bounded
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
 _VERTEX = np.dtype(

@@ -17,9 +17,9 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from characterisation.coupon.patches import Coupon, measure_patches
-from characterisation.errors import InputError
 from characterisation.features.fits import fit_plane
 from characterisation.features.robust_fit import FitError
+from characterisation.files.errors import InputError
 from characterisation.pinhole_grid import PINHOLE_RMS_PX, pinhole_of
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.errors import MissingEnvironmentError
+from characterisation.files.errors import MissingEnvironmentError
 
 Floats = NDArray[np.floating]
 

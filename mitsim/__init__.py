@@ -10,50 +10,51 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from mitsim.version import __version__ as __version__
+from mitsim.running.version import __version__ as __version__
 
 #: name -> module that defines it
 _NAMES = {
     "BudgetLine": "characterisation.statements.budget",
     "Capture": "mitsim.capture.capture",
-    "InputError": "characterisation.errors",
-    "MissingEnvironmentError": "characterisation.errors",
+    "InputError": "characterisation.files.errors",
+    "MissingEnvironmentError": "characterisation.files.errors",
     "PerformanceMap": "characterisation.maps.performance_map",
     "PointCloud": "characterisation.point_cloud",
-    "Result": "mitsim.measuring.result",
+    "Result": "characterisation.tasks.result",
     "Scene": "mitsim.scene.load",
     "Sensor": "mitsim.sensor.preset",
     "Statement": "characterisation.statements.statement",
     "Study": "mitsim.study",
     "Task": "characterisation.tasks.task_file",
     "Transform": "mitsim.sensor.transforms",
-    "label": "mitsim.interface.measurements",
-    "load_scene": "mitsim.interface.captures",
-    "load_sensor": "mitsim.interface.captures",
-    "look_at": "mitsim.interface.poses",
-    "measure": "mitsim.interface.measurements",
-    "open_study": "mitsim.interface.studies",
-    "performance_map": "mitsim.interface.maps",
-    "predict": "mitsim.interface.maps",
-    "read_capture": "mitsim.interface.captures",
-    "read_cloud": "mitsim.interface.captures",
-    "read_task": "mitsim.interface.measurements",
-    "render": "mitsim.interface.captures",
-    "score": "mitsim.interface.studies",
-    "statement": "mitsim.interface.studies",
-    "write_capture": "mitsim.interface.captures",
-    "write_cloud": "mitsim.interface.captures",
+    "label": "mitsim.study.measurements",
+    "load_scene": "mitsim.decode.captures",
+    "load_sensor": "mitsim.decode.captures",
+    "look_at": "mitsim.sensor.poses",
+    "measure": "mitsim.study.measurements",
+    "open_study": "mitsim.study.programs",
+    "performance_map": "mitsim.maps.use",
+    "predict": "mitsim.maps.use",
+    "read_capture": "mitsim.decode.captures",
+    "read_cloud": "mitsim.decode.captures",
+    "read_task": "mitsim.study.measurements",
+    "render": "mitsim.decode.captures",
+    "score": "mitsim.study.programs",
+    "statement": "mitsim.study.programs",
+    "write_capture": "mitsim.decode.captures",
+    "write_cloud": "mitsim.decode.captures",
 }
 
 if TYPE_CHECKING:
-    from characterisation.errors import InputError, MissingEnvironmentError
+    from characterisation.files.errors import InputError, MissingEnvironmentError
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.point_cloud import PointCloud
     from characterisation.statements.budget import BudgetLine
     from characterisation.statements.statement import Statement
+    from characterisation.tasks.result import Result
     from characterisation.tasks.task_file import Task
     from mitsim.capture.capture import Capture
-    from mitsim.interface.captures import (
+    from mitsim.decode.captures import (
         load_scene,
         load_sensor,
         read_capture,
@@ -62,15 +63,14 @@ if TYPE_CHECKING:
         write_capture,
         write_cloud,
     )
-    from mitsim.interface.maps import performance_map, predict
-    from mitsim.interface.measurements import label, measure, read_task
-    from mitsim.interface.poses import look_at
-    from mitsim.interface.studies import open_study, score, statement
-    from mitsim.measuring.result import Result
+    from mitsim.maps.use import performance_map, predict
     from mitsim.scene.load import Scene
+    from mitsim.sensor.poses import look_at
     from mitsim.sensor.preset import Sensor
     from mitsim.sensor.transforms import Transform
     from mitsim.study import Study
+    from mitsim.study.measurements import label, measure, read_task
+    from mitsim.study.programs import open_study, score, statement
 
 __all__ = [
     "BudgetLine",

@@ -1,5 +1,5 @@
 """Entry point of ``python -m mitsim``."""
 
-from mitsim.cli import main
+from mitsim.cli.program import main
 
 main()

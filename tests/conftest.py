@@ -14,7 +14,7 @@ import pytest
 import typer.testing
 from hypothesis import HealthCheck, settings
 
-from characterisation.threads import usable_cores
+from characterisation.files.threads import usable_cores
 from mitsim.sensor.preset import Sensor, load_sensor
 
 # The same examples at every run, so that a run tells of a change; HYPOTHESIS_PROFILE=explore looks for new ones.
@@ -107,7 +107,7 @@ def no_other_scenes() -> None:
     Dr.Jit compiles the number of shapes of all scenes that are still there into every kernel, and Mitsuba's own
     integrators compile their materials: with other scenes before it, a kernel is another one.
     """
-    from mitsim.campaign import many
+    from mitsim.study import many_captures as many
 
     many._scene.cache_clear()
     gc.collect()

@@ -27,7 +27,7 @@ FOLDERS = [HERE.parent, HERE, HERE / "campaign", HERE / "hardware"]
 PRELOADED = [
     "known_clouds",
     "mitsim.cli",
-    "mitsim.campaign.many",
+    "mitsim.study.many_captures",
     "mitsim.report.figures",
     "trimesh.exchange.load",
     "dask.array",  # xarray imports it

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
 
-from mitsim import cli
+from mitsim.cli import program as cli
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mitsim.prediction import EDGE_MARGIN_PX, Predictor
-from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.prediction import EDGE_MARGIN_PX, Predictor
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at

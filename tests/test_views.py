@@ -11,8 +11,8 @@ import trimesh
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from characterisation.documents import validate
-from characterisation.errors import InputError
+from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.preset import load_sensor

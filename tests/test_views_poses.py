@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from characterisation.documents import validate
+from characterisation.files.documents import validate
 from mitsim.views import ViewsTable, candidate_views, write_poses, write_views
 
 STAGE = {

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from characterisation.coupon.orientations import cap_directions, sphere_directions
-from characterisation.documents import validate
-from characterisation.errors import InputError
+from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
 from characterisation.stage.angles import Stage
 from mitsim.sensor.transforms import Transform
 from mitsim.views.reach import reach_directions, reach_rotations, stage_from_part, stage_from_sensor

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from characterisation.errors import InputError
 from characterisation.features.robust_fit import MEDIAN_TO_STD
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, ViewGrid
 
 Floats = NDArray[np.float64]

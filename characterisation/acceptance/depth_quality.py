@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from characterisation.acceptance.vdi_2634 import plane_distances
 from characterisation.coupon.patches import Coupon
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 
 Floats = NDArray[np.float64]

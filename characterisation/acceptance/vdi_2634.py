@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 
 Floats = NDArray[np.float64]
 

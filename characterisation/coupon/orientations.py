@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial import cKDTree
 
-from characterisation.documents import Document
+from characterisation.files.documents import Document
 
 # an icosahedron on the unit sphere has 10 * 4^k + 2 vertices after k subdivisions:
 # k = 1: 42, 2: 162, 3: 642, 4: 2562, with neighbours about 34, 17, 8.6, 4.3 deg apart

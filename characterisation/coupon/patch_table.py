@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.coupon.metrics import LEAST_DEGREES
-from characterisation.datasets import Schema, Variable
+from characterisation.files.datasets import Schema, Variable
 
 
 @dataclass(frozen=True)

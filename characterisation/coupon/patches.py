@@ -37,7 +37,7 @@ from characterisation.coupon.offsets import known_offset, neighbour_products
 from characterisation.coupon.patch_table import patch_table
 from characterisation.coupon.residual_field import disc_autocorrelation, disc_lengths, disc_residuals, plane_degrees
 from characterisation.coupon.view_frame import in_view_frame
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, ViewGrid
 
 Floats = NDArray[np.float64]

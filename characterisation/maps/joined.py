@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.maps.lay import LAY_FIELDS, LAY_NODES
 from characterisation.maps.light import light_variables
 from characterisation.maps.performance_map import PerformanceMap

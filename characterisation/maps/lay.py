@@ -25,7 +25,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from characterisation.datasets import Variable
+from characterisation.files.datasets import Variable
 from characterisation.maps.tables import AT_KNOT, FIELDS, Floats, Surface
 
 #: dimensions of the fields over the directions of a lay

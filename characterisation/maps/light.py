@@ -5,7 +5,7 @@ reflectance. A map therefore identifies its samples by these: two surfaces that 
 sensor, whatever their names.
 
 A sample is *as made* if its optical properties follow from its finish and Ra alone, by the laws of
-:mod:`mitsim.surface`. A third surface between two as-made samples of one finish follows the same laws, so a map may
+:mod:`mitsim.scene.surface`. A third surface between two as-made samples of one finish follows the same laws, so a map may
 interpolate by Ra. A lobe from another source (a trace, a gloss, alpha itself) has no such neighbours: it equals a
 sample, or it is unknown to the map.
 """
@@ -21,7 +21,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from characterisation.datasets import Variable
+from characterisation.files.datasets import Variable
 
 #: two surfaces are optically equal if all numbers agree within this share or, near 0, within this difference [1].
 #: Assumed: a tenth of the uncertainty of the renderer's laws for a well-known finish

@@ -25,9 +25,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from characterisation.atomic_io import write_netcdf
-from characterisation.datasets import Schema, Variable, read_dataset
-from characterisation.errors import InputError
+from characterisation.files.atomic_io import write_netcdf
+from characterisation.files.datasets import Schema, Variable, read_dataset
+from characterisation.files.errors import InputError
 from characterisation.lambert_projection import inverse_lambert_projection, lambert_projection
 from characterisation.maps.lay import LAY_FIELDS, LAY_NODES, between_directions, directions_of
 from characterisation.maps.lay import SCHEMA as LAY_SCHEMA

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.errors import InputError, nearest
+from characterisation.files.errors import InputError, nearest
 from characterisation.maps.light import Light, lies_between, same_light
 
 Floats = NDArray[np.float64]

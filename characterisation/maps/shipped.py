@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from characterisation.checked_files import is_file
-from characterisation.errors import InputError, nearest
+from characterisation.files.checked_files import is_file
+from characterisation.files.errors import InputError, nearest
 
 FOLDER = Path(__file__).parent
 

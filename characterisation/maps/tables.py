@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from characterisation.threads import in_threads
+from characterisation.files.threads import in_threads
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

@@ -20,7 +20,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from characterisation.atomic_io import atomic_write
+from characterisation.files.atomic_io import atomic_write
 from characterisation.tasks.evaluation import Task
 
 Floats = NDArray[np.floating[Any]]

@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 
 Floats = NDArray[np.float64]
 Model = TypeVar("Model")

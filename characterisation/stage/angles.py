@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from characterisation.documents import Document, Name
+from characterisation.files.documents import Document, Name
 
 Floats = NDArray[np.float64]
 

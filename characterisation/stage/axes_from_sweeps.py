@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lstsq
 from scipy.spatial.transform import Rotation
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.stage.turning_axes import TurningAxes, rotation_about
 
 Floats = NDArray[np.float64]

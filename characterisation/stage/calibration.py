@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from characterisation.errors import InputError
 from characterisation.features.fitted import PlaneFit
 from characterisation.features.surfaces import Plane, tangents
+from characterisation.files.errors import InputError
 from characterisation.stage.adjustment import adjusted, whitened
 from characterisation.stage.axes_from_sweeps import axes_from_normals, axes_from_rotations
 from characterisation.stage.turning_axes import LINE_PARAMETERS, TurningAxes, axial_vector, cross_matrix

@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from characterisation.documents import Document
+from characterisation.files.documents import Document
 
 RuleName = Literal["iso_14253_1", "jcgm_106", "simple_acceptance"]
 

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
-from characterisation.errors import InputError, nearest
 from characterisation.features.edges import fit_circle, fit_edge_point
 from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.fits import LEAST_BELONGING, belonging, fit_surface
@@ -31,6 +30,7 @@ from characterisation.features.form import Form, fit_form
 from characterisation.features.pose_fit import PoseFit, fit_pose
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Surface
+from characterisation.files.errors import InputError, nearest
 from characterisation.point_cloud import PointCloud
 from characterisation.tasks.definitions import (
     DEFINITIONS,

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from characterisation.documents import Document, Name
 from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, Surface
+from characterisation.files.documents import Document, Name
 from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.definitions import DEFINITIONS, MeasurementKind
 from characterisation.tasks.places import intersection, mid_plane

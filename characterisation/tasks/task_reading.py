@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from characterisation.documents import read_toml
-from characterisation.errors import InputError, nearest
 from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone, Cylinder, Plane
+from characterisation.files.documents import read_toml
+from characterisation.files.errors import InputError, nearest
 from characterisation.tasks.definitions import AXIS, DEFINITIONS, FLAT, Definition
 from characterisation.tasks.task_file import KEYS, Feature, Nominal, Task
 from characterisation.tasks.zones import ASKEW, frame_fault

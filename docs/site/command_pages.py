@@ -9,7 +9,7 @@ from typing import Any
 
 import typer
 
-from mitsim.cli import app
+from mitsim.cli.program import app
 
 
 def command_reference() -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from characterisation.documents import Document
+from characterisation.files.documents import Document
 from mitsim.capture.png import LONGEST_SIDE_PX
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.transforms import Transform

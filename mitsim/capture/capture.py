@@ -37,7 +37,7 @@ class Capture:
         Preset or model name (``ensenso-n10``, ``N35-604-16-BL``).
     technology
         Measuring principle, which selects the decoder, such as ``active_stereo``: a key of
-        :data:`mitsim.reconstruction.decoder_registry.TECHNOLOGIES`.
+        :data:`mitsim.decode.decoder_registry.TECHNOLOGIES`.
     source
         Origin of the images: one of :data:`SOURCES`.
     rig
@@ -133,8 +133,8 @@ class Capture:
         True
         """
         # imported here because a capture alone does not need the decoders
-        from mitsim.reconstruction.cloud import capture_cloud, decoder_settings, in_range
-        from mitsim.reconstruction.noise import known_noise
+        from mitsim.decode.cloud import capture_cloud, decoder_settings, in_range
+        from mitsim.decode.noise import known_noise
 
         chosen = self.taken_by if sensor is None else sensor
         if chosen is None or isinstance(chosen, str | Path):

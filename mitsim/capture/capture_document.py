@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from characterisation.documents import Document, Name
+from characterisation.files.documents import Document, Name
 
 #: version that is written. Version 1, without derived maps and units, can still be read
 SCHEMA_VERSION = 2
@@ -45,7 +45,7 @@ class FileEntry(Document):
 class CaptureDocument(Document):
     """Content of ``capture.json``. Its ``checksum`` covers all other keys.
 
-    See :func:`characterisation.checked_files.content_checksum`.
+    See :func:`characterisation.files.checked_files.content_checksum`.
     """
 
     schema_version: Literal[1, 2]

@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.atomic_io import FULL, write_folder
-from characterisation.checked_files import content_checksum, is_inside, read_bounded
-from characterisation.documents import validate
-from characterisation.errors import InputError
+from characterisation.files.atomic_io import FULL, write_folder
+from characterisation.files.checked_files import content_checksum, is_inside, read_bounded
+from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
 from mitsim.capture.calibration import CalibrationDocument, PoseDocument, rig_of
 from mitsim.capture.capture import DERIVED_UNITS, SOURCES, Capture
 from mitsim.capture.capture_document import SCHEMA_VERSION, CaptureDocument, FileEntry
@@ -63,7 +63,7 @@ def write_capture(
     vendor
         The maker's own files by name, kept unchanged.
     truth
-        OpenEXR images by camera, see :func:`mitsim.simulation.truth.encode_exr`.
+        OpenEXR images by camera, see :func:`mitsim.capture.simulated.truth.encode_exr`.
 
     Returns
     -------

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.checked_files import LARGEST_FILE, read_bounded
-from characterisation.errors import InputError
+from characterisation.files.checked_files import LARGEST_FILE, read_bounded
+from characterisation.files.errors import InputError
 from mitsim.capture.png import LONGEST_SIDE_PX, PNG_SIGNATURE, decode_png, png_chunks
 
 #: suffixes of the image files that are read

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.capture.png import LONGEST_SIDE_PX
 
 #: allowed types of the values of a map

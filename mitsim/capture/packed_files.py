@@ -18,15 +18,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.checked_files import content_checksum
-from characterisation.documents import validate
-from characterisation.errors import InputError
+from characterisation.files.checked_files import content_checksum
+from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
 from mitsim.capture.calibration import CalibrationDocument, PoseDocument, calibration_table, pose_table
 from mitsim.capture.capture import DERIVED_UNITS, Capture
 from mitsim.capture.capture_document import FRAME, SCHEMA_VERSION, UNITS, CaptureDocument
 from mitsim.capture.npy import encode_npy
 from mitsim.capture.png import LONGEST_SIDE_PX, encode_png
-from mitsim.version import __version__
+from mitsim.running.version import __version__
 
 #: allowed names of cameras and files
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 
 Image = NDArray[np.unsignedinteger[Any]]
 

@@ -2,7 +2,7 @@
 
 Signal chain: ``sensor_from_workspace`` in a capture's settings -> its inverse ->
 :class:`~characterisation.cloud_files.WrittenFrame`. The setting comes from a recording whose device has a ``Link``
-(:mod:`mitsim.recordings.nxlib_calibration`).
+(:mod:`mitsim.capture.recordings.nxlib_calibration`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from characterisation.cloud_files import WrittenFrame
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.sensor.transforms import Transform
 

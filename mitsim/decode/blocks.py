@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from characterisation.threads import in_threads, thread_count
+from characterisation.files.threads import in_threads, thread_count
 
 #: pixels of a block: as float32, the images of one period take half a megabyte
 BLOCK = 16384

@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from characterisation.documents import Document
-from characterisation.errors import InputError
+from characterisation.files.documents import Document
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.region_of_interest import Roi, checked_roi
 from mitsim.decode.grid_cloud import cloud_on_grid
 from mitsim.decode.structured_light.geometry import camera_grid
 from mitsim.sensor.camera import Rectification, Rig
-from mitsim.sensor.roi import Roi, checked_roi
 
 
 class DeviceMapSettings(Document):

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 
 #: linear levels, relative to the range from black to full scale, between which the weight of a longer exposure falls to
 #: 0

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.sensor.roi import Roi
+from characterisation.region_of_interest import Roi
 
 
 class GridGeometry(Protocol):

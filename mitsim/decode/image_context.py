@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from characterisation.region_of_interest import Roi
 from mitsim.decode.grey_levels import MeasuredNoise
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.roi import Roi
 
 
 @dataclass(frozen=True)

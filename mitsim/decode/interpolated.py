@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.sensor.roi import Roi
+from characterisation.region_of_interest import Roi
 
 
 def needed_region(positions: NDArray[np.float32], width: int, height: int) -> Roi:

@@ -43,8 +43,9 @@ from math import gcd, lcm
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.region_of_interest import checked_roi
 from mitsim.decode.blocks import in_blocks
 from mitsim.decode.grey_levels import check_full_scale
 from mitsim.decode.grid_cloud import cloud_on_grid
@@ -54,7 +55,6 @@ from mitsim.decode.structured_light.phase_shift import fit_phases, rejection_sta
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import LIGHT_MM_S, AmplitudeModulation, TimeOfFlightSettings, sample_variance
-from mitsim.sensor.roi import checked_roi
 
 #: largest number of candidate turns of the highest frequency: 160 m of optical path at 120 MHz
 _MAXIMUM_TURNS = 64

@@ -2,7 +2,7 @@
 
 Signal chain:
 
-- :mod:`~mitsim.report.run_folder` reads and checks the folder.
+- :mod:`~mitsim.study.run_folder` reads and checks the folder.
 - :mod:`~mitsim.report.findings` derives results; :mod:`~mitsim.report.agreement` compares predictions with errors.
 - :mod:`~mitsim.report.figures` draws the map, :mod:`~mitsim.report.view_figures` the views and
   :mod:`~mitsim.report.cloud_figures` images and clouds. :mod:`~mitsim.report.page_pictures` writes their captions.

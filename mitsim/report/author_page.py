@@ -21,19 +21,19 @@ import trimesh
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 from characterisation.tasks.definitions import DEFINITIONS
-from mitsim.authoring.check import Finding, TaskFeatures
 from mitsim.report.view_clouds import box_around, fewer_triangles, packed
 from mitsim.report.view_data import COLOURS, as_json
+from mitsim.scene.authoring.check import Finding, TaskFeatures
 from mitsim.scene.inspect import SceneFacts
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.triangles import triangles_by_shape
+from mitsim.scene.surface.metals import CONSTANTS
+from mitsim.scene.surface.processes import PROCESSES
 from mitsim.sensor.preset import Sensor
-from mitsim.surface.metals import CONSTANTS
-from mitsim.surface.processes import PROCESSES
 
 #: in the order in which they are joined to one script
 SCRIPTS = ("view_scene.js", "author_files.js", "author_geometry.js", "author_page.js")

@@ -17,10 +17,10 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
-from characterisation.atomic_io import atomic_write
-from characterisation.documents import read_toml
-from characterisation.errors import InputError
-from mitsim.authoring.check import read_features
+from characterisation.files.atomic_io import atomic_write
+from characterisation.files.documents import read_toml
+from characterisation.files.errors import InputError
+from mitsim.scene.authoring.check import read_features
 
 _LARGEST = 64 * 1024**2
 

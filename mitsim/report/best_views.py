@@ -7,7 +7,7 @@ import math
 import xarray as xr
 
 from mitsim.report.findings import ranked_views
-from mitsim.report.numbers import percent, two_digits
+from mitsim.running.numbers import percent, two_digits
 
 _HEAD = (
     "rank",

@@ -16,11 +16,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from characterisation.atomic_io import atomic_write
+from characterisation.files.atomic_io import atomic_write
 from characterisation.point_cloud import Status
 from mitsim.report.cloud_figures import REASONS
-from mitsim.report.numbers import percent
 from mitsim.report.style import BLUE, FIELD, VERMILION, drawing, write_png
+from mitsim.running.numbers import percent
 
 #: percentile of |residual| at the ends of the colour scale, so that a few wrong matches do not set it
 _RESIDUAL_PERCENTILE = 97.0

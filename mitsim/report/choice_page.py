@@ -12,14 +12,14 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from characterisation.atomic_io import atomic_write
-from characterisation.errors import InputError
-from mitsim.report.choice_document import CHOICE, CellEntry, ChoiceDocument, SensorEntry, read_choice
+from characterisation.files.atomic_io import atomic_write
+from characterisation.files.errors import InputError
 from mitsim.report.first_rows import breakable, exact, tolerance_words
 from mitsim.report.first_screen import of_choice, sensor_rows
-from mitsim.report.numbers import NONE, listed, percent, quantity, rounded, two_digits, with_degree_signs
 from mitsim.report.placement_figure import VERDICTS
-from mitsim.report.scene_geometry import read_scene_geometry
+from mitsim.running.numbers import NONE, listed, percent, quantity, rounded, two_digits, with_degree_signs
+from mitsim.study.choice_document import CHOICE, CellEntry, ChoiceDocument, SensorEntry, read_choice
+from mitsim.study.scene_geometry import read_scene_geometry
 
 
 def write_choice_page(folder: Path) -> Path:

@@ -15,8 +15,8 @@ from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
 from mitsim.capture.png import encode_png
 from mitsim.report.findings import reason_shares
-from mitsim.report.numbers import percent
 from mitsim.report.style import FIELD, SEQUENTIAL, drawing
+from mitsim.running.numbers import percent
 from mitsim.sensor.camera import Camera
 
 #: percentiles of the grey values shown as black and white, and the display exponent, since metal is dark but for its

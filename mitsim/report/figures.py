@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from characterisation.maps.performance_map import PerformanceMap, lambert_projection
 from mitsim.report.findings import incidence_of_nodes
-from mitsim.report.numbers import count, finish_name
 from mitsim.report.style import FIELD, INK, NOISE, SEQUENTIAL, disc, drawing, write_png
+from mitsim.running.numbers import count, finish_name
 
 Floats = NDArray[np.float64]
 

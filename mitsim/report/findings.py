@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from characterisation.maps.performance_map import PerformanceMap, inverse_lambert_projection
 from characterisation.point_cloud import PointCloud, Status
-from mitsim.report.numbers import finish_name, quantity, rounded, two_digits
+from mitsim.running.numbers import finish_name, quantity, rounded, two_digits
 
 Floats = NDArray[np.float64]
 

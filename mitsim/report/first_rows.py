@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 from markupsafe import Markup, escape
 
-from mitsim.report.numbers import MINUS, NONE, count, listed, percent, quantity, unit_symbol
 from mitsim.report.placement_figure import VERDICTS
+from mitsim.running.numbers import MINUS, NONE, count, listed, percent, quantity, unit_symbol
 
 #: beginning of the names of rules whose demand is the share of the tolerance over the largest share that fits
 _BY_SHARE = ("ISO 14253-1", "simple acceptance")

@@ -17,15 +17,15 @@ from markupsafe import Markup
 from numpy.typing import ArrayLike
 
 from characterisation.statements.verdict_words import OFTEN, Judged, fits_all, losses_in_words, result_in_words
-from mitsim.report.choice_document import ChoiceDocument, SensorEntry, judged
 from mitsim.report.first_rows import Row, RowValues, measured_words
-from mitsim.report.numbers import NONE, count, rounded, with_degree_signs
 from mitsim.report.placement_figure import face_verdicts, placement_figure
-from mitsim.report.run_folder import Run
-from mitsim.report.scene_geometry import SceneGeometry
 from mitsim.report.set_words import with_sets
 from mitsim.report.statement_section import StatedMeasurement
 from mitsim.report.style import Picture, as_svg
+from mitsim.running.numbers import NONE, count, rounded, with_degree_signs
+from mitsim.study.choice_document import ChoiceDocument, SensorEntry, judged
+from mitsim.study.run_folder import Run
+from mitsim.study.scene_geometry import SceneGeometry
 
 #: good: every tolerance fits; plain: there are no tolerances; warn: values are missing, or a verdict is open; bad: a
 #: tolerance does not fit, or a set of views exceeds a limit

@@ -16,11 +16,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from mitsim.report.figures import colour_bar, disc_view, matt_to_shiny, noise_limits
-from mitsim.report.numbers import finish_name
 from mitsim.report.style import NOISE, SEQUENTIAL, disc, drawing
+from mitsim.running.numbers import finish_name
 
 Sample = tuple[str, float]
 

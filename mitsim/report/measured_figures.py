@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from characterisation.acceptance.cloud_difference import Difference
 from characterisation.point_cloud import PointCloud
+from characterisation.region_of_interest import Roi
 from mitsim.report.style import BLUE, FIELD, INK, SEQUENTIAL, VERMILION, drawing
-from mitsim.sensor.roi import Roi
 
 #: ends of the colours: this percentile of |difference|, or this many robust deviations from the median if that is less
 _PERCENTILE, _DEVIATIONS = 98.0, 6.0

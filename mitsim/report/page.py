@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
-from characterisation.atomic_io import atomic_write
+from characterisation.files.atomic_io import atomic_write
 from characterisation.point_cloud import Status
 from characterisation.scores.coverage import NORMAL_COVERAGE
 from characterisation.tasks.covariance import LEAST_CHANCE, PERSISTENT_REACH_PX, PERSISTENT_TURN
@@ -30,12 +30,12 @@ from mitsim.report.agreement import Agreement, agreement, chance_level
 from mitsim.report.cloud_figures import REASONS
 from mitsim.report.first_rows import breakable
 from mitsim.report.first_screen import of_run
-from mitsim.report.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
 from mitsim.report.page_pictures import camera_view, cloud_picture, map_pictures, measurement_pictures
-from mitsim.report.run_folder import Run, read_run
-from mitsim.report.scene_geometry import read_scene_geometry
 from mitsim.report.statement_section import statement_section
 from mitsim.report.view_sphere import view_sphere
+from mitsim.running.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
+from mitsim.study.run_folder import Run, read_run
+from mitsim.study.scene_geometry import read_scene_geometry
 
 #: rows of the ranked table; scores.csv holds all views
 TOP = 10

@@ -17,11 +17,11 @@ from characterisation.point_cloud import Status
 from mitsim.report import figures, findings
 from mitsim.report.agreement import CHANCE, CONFIRMED, TOO_FEW, Agreement, chance_level
 from mitsim.report.cloud_figures import REASONS, camera_images, cloud_figure
-from mitsim.report.numbers import count, finish_name, listed, percent, quantity, rounded, two_digits
-from mitsim.report.run_folder import Run
 from mitsim.report.style import Picture, as_svg
 from mitsim.report.view_data import LIMITS
 from mitsim.report.view_figures import agreement_figure, uncertainty_figure
+from mitsim.running.numbers import count, finish_name, listed, percent, quantity, rounded, two_digits
+from mitsim.study.run_folder import Run
 
 
 def pose_words(run: Run, view: int) -> str:

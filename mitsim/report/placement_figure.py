@@ -24,8 +24,8 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
-from mitsim.report.scene_geometry import SceneGeometry
 from mitsim.report.style import INK, MUTED, PAPER, drawing
+from mitsim.study.scene_geometry import SceneGeometry
 
 Floats = NDArray[np.float64]
 

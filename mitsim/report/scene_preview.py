@@ -18,8 +18,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
-from mitsim.report.numbers import finish_name
 from mitsim.report.style import FIELD, INK, MUTED, drawing
+from mitsim.running.numbers import finish_name
 from mitsim.scene.first_hits import VisibleSurfaces, trace
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.load import Scene

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.authoring.check import Finding
+from mitsim.running.text_table import aligned
+from mitsim.scene.authoring.check import Finding
 from mitsim.scene.first_hits import VisibleSurfaces
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
-from mitsim.text_table import aligned
 
 _NONE = "-"
 

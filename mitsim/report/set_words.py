@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from characterisation.statements.verdict_words import OFTEN
-from mitsim.report.run_folder import ConfirmedEntry, ViewSetEntry
+from mitsim.study.run_folder import ConfirmedEntry, ViewSetEntry
 
 
 @dataclass(frozen=True)

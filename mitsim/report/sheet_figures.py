@@ -13,13 +13,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
-from mitsim.data_sheet import DataSheet, Recovery
+from mitsim.maps.data_sheet import DataSheet, Recovery
 from mitsim.report.cloud_figures import REASONS, STRETCH_EXPONENT
-from mitsim.report.numbers import two_digits
 from mitsim.report.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing, plain_log
+from mitsim.running.numbers import two_digits
 from mitsim.sensor.preset_covariance import preset_covariance
 
 _LINES = ("-", "--", ":", "-.")

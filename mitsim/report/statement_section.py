@@ -13,10 +13,10 @@ from typing import Any, Literal
 
 from pydantic import ConfigDict, Field
 
-from characterisation.checked_files import read_json_object
-from characterisation.documents import Document, validate
+from characterisation.files.checked_files import read_json_object
+from characterisation.files.documents import Document, validate
 from characterisation.statements.losses import Loss, common_losses
-from mitsim.report.numbers import NONE, listed, percent, quantity, rounded, two_digits
+from mitsim.running.numbers import NONE, listed, percent, quantity, rounded, two_digits
 
 #: colour and name of a group of unknowns (Okabe and Ito, safe for colour-blind readers)
 GROUPS = {

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from characterisation.atomic_io import atomic_write
+from characterisation.files.atomic_io import atomic_write
 
 #: colours that the page may replace: text, muted lines, areas without data, background, and points
 INK, MUTED, FIELD, PAPER, BLUE = "#1a1c20", "#6a7079", "#e3e5e9", "#fdfdfc", "#0072b2"

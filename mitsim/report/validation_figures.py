@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from characterisation.maps.validation import Pair, within_limits
-from mitsim.report.numbers import finish_name
 from mitsim.report.style import BLUE, VERMILION, drawing
+from mitsim.running.numbers import finish_name
 
 #: residuals are drawn up to this many standard deviations
 HISTOGRAM_REACH = 4.0

@@ -19,8 +19,6 @@ from matplotlib.colors import to_hex
 from numpy.typing import ArrayLike, NDArray
 
 from mitsim.report.agreement import agreement
-from mitsim.report.numbers import count, percent
-from mitsim.report.run_folder import Run
 from mitsim.report.style import NOISE, SEQUENTIAL
 from mitsim.report.view_clouds import (
     MOST_POINTS,
@@ -32,6 +30,8 @@ from mitsim.report.view_clouds import (
     packed_part,
     shown_cloud,
 )
+from mitsim.running.numbers import count, percent
+from mitsim.study.run_folder import Run
 
 #: Okabe and Ito's palette, for the features
 COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#f0e442")

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from mitsim.report.agreement import Agreement
 from mitsim.report.figures import colour_bar
-from mitsim.report.numbers import rounded, signed, unit_symbol
 from mitsim.report.style import BLUE, FIELD, INK, MUTED, PAPER, SEQUENTIAL, VERMILION, disc, drawing, plain_log
+from mitsim.running.numbers import rounded, signed, unit_symbol
 
 Floats = NDArray[np.float64]
 

@@ -26,9 +26,9 @@ from markupsafe import Markup
 
 from characterisation.tasks.covariance import LEAST_CHANCE
 from mitsim.report import findings
-from mitsim.report.numbers import NONE, count, percent, quantity, rounded, two_digits
-from mitsim.report.run_folder import Run, TriedEntry, ViewSetEntry
 from mitsim.report.view_data import as_json, solids, view_data
+from mitsim.running.numbers import NONE, count, percent, quantity, rounded, two_digits
+from mitsim.study.run_folder import Run, TriedEntry, ViewSetEntry
 
 #: views in the table that replaces the sphere
 TOP = 10

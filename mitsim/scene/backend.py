@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from characterisation.threads import asked_threads
-from mitsim.errors import InputError, MissingEnvironmentError
+from characterisation.files.errors import InputError, MissingEnvironmentError
+from characterisation.files.threads import asked_threads
 
 LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 LLVM_MINIMUM = 19

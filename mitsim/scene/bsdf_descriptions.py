@@ -1,6 +1,6 @@
-"""Describe finishes as Mitsuba BSDFs that reflect light as :mod:`mitsim.surface` computes.
+"""Describe finishes as Mitsuba BSDFs that reflect light as :mod:`mitsim.scene.surface` computes.
 
-Signal chain: refractive index and :class:`~mitsim.surface.scatter.Scatter` of a finish -> widths, factors and blend
+Signal chain: refractive index and :class:`~mitsim.scene.surface.scatter.Scatter` of a finish -> widths, factors and blend
 weights of stock BSDFs -> dictionary for ``mi.load_dict``.
 """
 
@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from mitsim.scene.coherent_blend import NAME, NUMBERS, register_coherent_blend
-from mitsim.surface.coherence import LARGEST_INCIDENCE
-from mitsim.surface.microfacet import GGX_PER_BECKMANN, fresnel
-from mitsim.surface.paint import INDEX, surface_share
-from mitsim.surface.scatter import Scatter
+from mitsim.scene.surface.coherence import LARGEST_INCIDENCE
+from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, fresnel
+from mitsim.scene.surface.paint import INDEX, surface_share
+from mitsim.scene.surface.scatter import Scatter
 
 #: a coherent share below this at every angle where its law holds is not rendered
 _LEAST_COHERENT = 0.005

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mitsim.errors import InputError, nearest
+from characterisation.files.errors import InputError, nearest
 
 
 def only_known(props: Any, where: str, known: tuple[str, ...]) -> None:

@@ -4,7 +4,7 @@ Signal chain: directions i and o in the local frame -> coherent share A -> value
 weighted sum.
 
 Mitsuba's ``blendbsdf`` weights its two children by one constant. The coherent share of the light that a rough surface
-reflects depends on both directions (:mod:`mitsim.surface.coherence`):
+reflects depends on both directions (:mod:`mitsim.scene.surface.coherence`):
 
     f(i, o) = A f_mirror(i, o) + (1 - A) h f_lobe(i, o),      A = exp(-g [(cos i + cos o) / 2]^2)
 
@@ -18,7 +18,7 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
-from mitsim.surface.coherence import EVEN_FROM
+from mitsim.scene.surface.coherence import EVEN_FROM
 
 #: Mitsuba's name of the BSDF
 NAME = "coherent_blend"

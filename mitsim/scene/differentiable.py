@@ -27,8 +27,8 @@ from mitsim.scene import backend
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.coherent_blend import NAME, NUMBERS, register_coherent_blend
 from mitsim.scene.load import Scene, scene_from_dict
-from mitsim.surface.coherence import EVEN_FROM
-from mitsim.surface.scatter import Scatter
+from mitsim.scene.surface.coherence import EVEN_FROM
+from mitsim.scene.surface.scatter import Scatter
 
 #: step of the central differences of the lobe's parameters (energy, coherence); the error is of the order of its square
 _STEP = 1e-3

@@ -2,7 +2,7 @@
 
 Signal chain: scene XML -> Mitsuba's shapes -> triangles (:mod:`mitsim.scene.mesh_facts`), areas, boxes and materials;
 rays from all directions (:mod:`mitsim.scene.first_hits`) -> counts of hits on the front and back of each shape.
-:mod:`mitsim.authoring.check` evaluates the facts.
+:mod:`mitsim.scene.authoring.check` evaluates the facts.
 """
 
 from __future__ import annotations

@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.errors import InputError, nearest
+from characterisation.files.errors import InputError, nearest
 from mitsim.scene import backend
 from mitsim.scene.materials import Finish, loading, register
 from mitsim.scene.scene_errors import explain_error
+from mitsim.scene.surface.scatter import NOMINAL, Deviation
 from mitsim.scene.xml_check import checked_xml
-from mitsim.surface.scatter import NOMINAL, Deviation
 
 _registered = False
 

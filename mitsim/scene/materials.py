@@ -1,7 +1,7 @@
 """Materials that a scene's author names as on a drawing: metal, process and Ra, or paint and gloss.
 
-Signal chain: properties of a BSDF in the XML, checked -> :class:`~mitsim.surface.scatter.Scatter`
-(:mod:`mitsim.surface`) -> description of a Mitsuba BSDF (:mod:`mitsim.scene.bsdf_descriptions`) -> BSDF, and its
+Signal chain: properties of a BSDF in the XML, checked -> :class:`~mitsim.scene.surface.scatter.Scatter`
+(:mod:`mitsim.scene.surface`) -> description of a Mitsuba BSDF (:mod:`mitsim.scene.bsdf_descriptions`) -> BSDF, and its
 :class:`Finish`.
 
 Four types of BSDF are added to Mitsuba:
@@ -27,18 +27,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from characterisation.files.errors import InputError
 from characterisation.maps.light import Light
-from mitsim.errors import InputError
 from mitsim.scene.bsdf_descriptions import diffuse_bsdf, gloss_paint_bsdf, metal_bsdf, powder_coat_bsdf
 from mitsim.scene.bsdf_properties import choice, number_within, only_known
-from mitsim.surface.machined import Face, machined
-from mitsim.surface.measured import HeightMap, Profile, read_height_map, read_profile
-from mitsim.surface.metals import CONSTANTS, refractive_index
-from mitsim.surface.microfacet import fresnel
-from mitsim.surface.paint import ALPHA_RANGE, matt_white, paint
-from mitsim.surface.processes import PROCESSES
-from mitsim.surface.scatter import NOMINAL, Deviation, Scatter
-from mitsim.surface.surface_light import USUAL_REFLECTANCE, surface_light
+from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.measured import HeightMap, Profile, read_height_map, read_profile
+from mitsim.scene.surface.metals import CONSTANTS, refractive_index
+from mitsim.scene.surface.microfacet import fresnel
+from mitsim.scene.surface.paint import ALPHA_RANGE, matt_white, paint
+from mitsim.scene.surface.processes import PROCESSES
+from mitsim.scene.surface.scatter import NOMINAL, Deviation, Scatter
+from mitsim.scene.surface.surface_light import USUAL_REFLECTANCE, surface_light
 
 
 @dataclass(frozen=True)

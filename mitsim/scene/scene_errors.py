@@ -10,7 +10,7 @@ import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
-from mitsim.errors import InputError, nearest
+from characterisation.files.errors import InputError, nearest
 
 #: properties of the Mitsuba plugins that parts use (Mitsuba's documentation, version 3.9), to suggest the nearest name
 _EVERY_SHAPE = ("to_world", "flip_normals")

@@ -12,8 +12,8 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
-from characterisation.checked_files import read_bounded
-from mitsim.errors import InputError, nearest
+from characterisation.files.checked_files import read_bounded
+from characterisation.files.errors import InputError, nearest
 
 #: limits of one XML: size [bytes], number of elements, depth of nested elements and of nested BSDFs
 LARGEST_XML, MOST_ELEMENTS, DEEPEST, DEEPEST_BSDF = 16 * 1024**2, 200_000, 40, 6

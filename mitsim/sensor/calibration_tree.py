@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat, whosmat
 
-from characterisation.checked_files import read_bounded
-from characterisation.errors import InputError, nearest
+from characterisation.files.checked_files import read_bounded
+from characterisation.files.errors import InputError, nearest
 
 #: endings of names in MATLAB's toolbox and similar programs: one camera, the cameras of a pair, camera and projector
 _ENDINGS = ("", "_left", "_right", "_cam", "_proj", "_camera", "_projector")

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import eyes

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from characterisation.documents import Document
-from characterisation.errors import InputError
+from characterisation.files.documents import Document
+from characterisation.files.errors import InputError
 from mitsim.sensor.image_role import Axis, Period, Role, Share, Steps
 
 

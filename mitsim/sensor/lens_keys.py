@@ -14,7 +14,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 
 #: common misnomers of the focal length and the pixel pitch, and the correct keys
 _MEANT = {

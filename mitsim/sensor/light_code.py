@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from characterisation.documents import Document
-from characterisation.errors import InputError
+from characterisation.files.documents import Document
+from characterisation.files.errors import InputError
 from mitsim.sensor.image_role import Axis, Period, Role, Share, Steps
 from mitsim.sensor.image_sequence import ImageSequence
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from characterisation.documents import Document
+from characterisation.files.documents import Document
 
 
 class MatcherSettings(Document):

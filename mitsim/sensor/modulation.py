@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from characterisation.documents import Document
+from characterisation.files.documents import Document
 from mitsim.sensor.image_formation import FixedPattern, converter, expose
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from mitsim.errors import InputError, nearest
+from characterisation.files.errors import InputError, nearest
 
 
 @dataclass(frozen=True)

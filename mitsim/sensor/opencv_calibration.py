@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from characterisation.documents import Document, validate
-from characterisation.errors import InputError, nearest
+from characterisation.files.documents import Document, validate
+from characterisation.files.errors import InputError, nearest
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
 from mitsim.sensor.calibration_tree import CalibrationTree, read_tree
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import correlate1d, gaussian_filter
 
-from characterisation.documents import Document
+from characterisation.files.documents import Document
 from mitsim.sensor.point_spread import point_spread
 
 Positive = Annotated[float, Field(gt=0)]

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from characterisation.documents import Document, read_toml, validate
-from mitsim.errors import InputError, nearest
-from mitsim.progress import say
+from characterisation.files.documents import Document, read_toml, validate
+from characterisation.files.errors import InputError, nearest
+from mitsim.running.progress import say
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.exposure import automatic, bracket

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.resources import files
 from pathlib import Path
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.drift import Drift, with_drift
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance

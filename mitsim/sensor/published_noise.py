@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from characterisation.documents import Document
+from characterisation.files.documents import Document
 
 Positive = Annotated[float, Field(gt=0)]
 

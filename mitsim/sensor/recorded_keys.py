@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from characterisation.documents import missing_keys
+from characterisation.files.documents import missing_keys
 from mitsim.sensor.sensor_file import SensorFile
 
 #: the table that describes a technology's decoder

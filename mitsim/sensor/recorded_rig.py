@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from characterisation.documents import Document, Name, missing_keys, validate
-from characterisation.errors import InputError
+from characterisation.files.documents import Document, Name, missing_keys, validate
+from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from characterisation.atomic_io import atomic_write
-from characterisation.documents import Document, read_toml
-from characterisation.errors import InputError
+from characterisation.files.atomic_io import atomic_write
+from characterisation.files.documents import Document, read_toml
+from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.rig_parameters import check_names, parameter_values
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from characterisation.errors import InputError, nearest
+from characterisation.files.errors import InputError, nearest
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import Transform
 

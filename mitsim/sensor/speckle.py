@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv, ndtr
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 
 #: full width at half maximum of a Gaussian over its standard deviation
 _FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))

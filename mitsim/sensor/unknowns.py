@@ -1,7 +1,7 @@
 """Define the ``[unknowns]`` tables of a study and of a sensor file: unknown properties of a measurement.
 
 Each table is one group of unknowns, given by standard deviations. A virtual measurement draws all of them
-(:mod:`mitsim.virtual.world`). A sensor file states the unknowns of the type of sensor, such as the stability of its
+(:mod:`mitsim.study.virtual.world`). A sensor file states the unknowns of the type of sensor, such as the stability of its
 calibration and the width of its optical filter. A study states those of the part and the room; its keys override the
 sensor's. Defaults are the assumptions of an engineer who knows the workshop but has not measured it.
 docs/reference/unknowns.md grades each of them.
@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from characterisation.documents import Document
+from characterisation.files.documents import Document
 from mitsim.sensor.drift import Drift
 
 NotNegative = Annotated[float, Field(ge=0)]
@@ -53,7 +53,7 @@ class FinishUnknowns(Document):
     """Uncertainty of the surface finish.
 
     ``alpha``, ``wide_angle`` and ``reflectance`` scale the one-sigma ranges of every finish
-    (:class:`mitsim.surface.scatter.Deviation`): 1 is the whole range, 0 is a known finish.
+    (:class:`mitsim.scene.surface.scatter.Deviation`): 1 is the whole range, 0 is a known finish.
     """
 
     alpha: Annotated[float, Field(ge=0, le=1)] = 1.0

@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera
 
 

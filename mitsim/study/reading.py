@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import norm
 
-from characterisation.documents import read_toml
+from characterisation.files.documents import read_toml
+from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.samples import Samples
 from characterisation.maps.shipped import map_path, shipped_maps
 from characterisation.statements.decision import needed, tolerance_of
 from characterisation.tasks.evaluation import Task, check_features, read_task
-from mitsim.campaign.missing_finishes import (
+from mitsim.maps.campaign.missing_finishes import (
     Ask,
     NeededFinishes,
     map_with_finishes,
@@ -28,19 +29,18 @@ from mitsim.campaign.missing_finishes import (
     unknown_finishes,
     with_lights,
 )
-from mitsim.campaign.plan import Campaign, check_exposure, read_campaign, sensor_checksum
-from mitsim.errors import InputError
-from mitsim.progress import say
+from mitsim.maps.campaign.plan import Campaign, check_exposure, read_campaign, sensor_checksum
+from mitsim.running.progress import say
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.materials import Finish
 from mitsim.scene.ray_casting.triangles import triangles
+from mitsim.scene.surface.lay import lays_in_words
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
 from mitsim.study.tables import ExposureTable, StudyFile
-from mitsim.surface.lay import lays_in_words
-from mitsim.view_scores import MATT_WHITE
 from mitsim.views import Candidates, View, candidate_views
 from mitsim.views.standoffs import characterised_range, chosen_standoffs
+from mitsim.views.view_scores import MATT_WHITE
 
 #: fewest points on a feature that allow a measurement
 MINIMUM_POINTS = 100

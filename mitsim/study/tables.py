@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from characterisation.documents import Document
+from characterisation.files.documents import Document
 from characterisation.scores.joining import POSE_KNOWN, Joining
 from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.views import ViewsTable

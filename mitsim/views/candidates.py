@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import sphere_directions
-from mitsim.errors import InputError
-from mitsim.progress import track_if_long
+from characterisation.files.errors import InputError
+from mitsim.running.progress import track_if_long
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.sensor.working_volume import in_image

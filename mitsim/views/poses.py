@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from characterisation.atomic_io import write_folder
-from mitsim.progress import say
+from characterisation.files.atomic_io import write_folder
+from mitsim.running.progress import say
+from mitsim.running.version import __version__
 from mitsim.sensor.transforms import Transform
-from mitsim.version import __version__
 from mitsim.views.candidates import Candidates, LeftOut, View
 from mitsim.views.table import ViewsTable
 

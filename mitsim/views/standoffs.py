@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.working_volume import nearest_standoff
 from mitsim.views.table import ViewsTable

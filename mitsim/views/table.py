@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, model_validator
 
-from characterisation.documents import Document
+from characterisation.files.documents import Document
 from characterisation.stage.angles import StageAxis
 from mitsim.sensor.transforms import Transform
 

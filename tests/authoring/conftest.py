@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from mitsim.authoring import read_step, step_worker
+from mitsim.scene.authoring import read_step, step_worker
 
 
 def convert_here(command, **_):

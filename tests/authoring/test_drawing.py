@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from characterisation.files.errors import InputError
 from characterisation.tasks.evaluation import measurement_model
 from characterisation.tasks.task_reading import read_task
-from mitsim.authoring.part21 import Enumeration, Reference, Typed, read_step_text
-from mitsim.authoring.part_folder import read_part, write_part
-from mitsim.authoring.product_information import read_product_information
-from mitsim.authoring.read_step import step_installed
-from mitsim.errors import InputError
+from mitsim.scene.authoring.part21 import Enumeration, Reference, Typed, read_step_text
+from mitsim.scene.authoring.part_folder import read_part, write_part
+from mitsim.scene.authoring.product_information import read_product_information
+from mitsim.scene.authoring.read_step import step_installed
 from tests.authoring.bracket import bracket, write_step
 from tests.authoring.drawing import Drawing
 

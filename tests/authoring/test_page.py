@@ -18,8 +18,8 @@ import pytest
 from quick_process import QuickProcess
 from shell import mitsim_here
 
-from mitsim.authoring.read_step import step_installed
 from mitsim.report.author_page import fair_share
+from mitsim.scene.authoring.read_step import step_installed
 from mitsim.study import read_study
 from tests.authoring.author import Author
 from tests.authoring.bracket import bracket, write_step

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.authoring.fineness import chord_for, sensor_sigma_mm
-from mitsim.authoring.naming import identifier, with_names
-from mitsim.authoring.part_folder import Finishing, finish_names, scene_xml
-from mitsim.authoring.read_step import read_step, step_installed
+from mitsim.scene.authoring.fineness import chord_for, sensor_sigma_mm
+from mitsim.scene.authoring.naming import identifier, with_names
+from mitsim.scene.authoring.part_folder import Finishing, finish_names, scene_xml
+from mitsim.scene.authoring.read_step import read_step, step_installed
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 from tests.authoring.bracket import bracket, write_step
@@ -190,8 +190,8 @@ def test_the_sensor_chooses_how_fine_the_mesh_is(tmp_path):
 
 
 def test_nothing_is_wrong_with_a_bracket_and_its_seat(tmp_path, n10):
-    from mitsim.authoring.check import findings, read_features
-    from mitsim.authoring.part_folder import write_part
+    from mitsim.scene.authoring.check import findings, read_features
+    from mitsim.scene.authoring.part_folder import write_part
     from mitsim.scene.first_hits import visible_surfaces
     from mitsim.sensor.working_volume import pose_at, usual_place
 

@@ -23,14 +23,14 @@ from characterisation.coupon.metrics import LEAST_DEGREES
 from characterisation.coupon.patch_table import overall
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
-from mitsim.campaign.acquire import in_turn, simulated_source
-from mitsim.campaign.finish_cache import kept_finish, made_finish
-from mitsim.campaign.hold_out import random_normals
-from mitsim.campaign.one_finish import OneFinish, largest_incidence_deg, one_finish_campaign, plan_of
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.maps.campaign.acquire import in_turn, simulated_source
+from mitsim.maps.campaign.finish_cache import kept_finish, made_finish
+from mitsim.maps.campaign.hold_out import random_normals
+from mitsim.maps.campaign.one_finish import OneFinish, largest_incidence_deg, one_finish_campaign, plan_of
 from mitsim.scene import backend
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.preset import load_sensor
-from mitsim.simulation.simulate import SimulatedSensor
 
 SIX = {
     "milled steel Ra 1.6": {"type": "machined_metal", "metal": "carbon_steel", "process": "milled", "Ra": 1.6},

@@ -21,13 +21,13 @@ import numpy as np
 
 from characterisation.coupon.residual_field import autocorrelation
 from characterisation.point_cloud import PointCloud
-from mitsim.prediction import CharacterisedScene, Predictor
-from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.maps.prediction import CharacterisedScene, Predictor
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform, look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import read_map
 
 SCENE = Path(__file__).parents[2] / "scenes/two_pillars/two_pillars.xml"

@@ -29,18 +29,18 @@ from typing import Any
 
 import numpy as np
 
-import mitsim.simulation.simulate as simulate
+import mitsim.capture.simulated.simulate as simulate
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.point_cloud import PointCloud
-from mitsim.campaign.acquire import coupon_cloud, one_ahead
-from mitsim.campaign.plan import coupon_pose
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import write_capture
-from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.campaign.acquire import coupon_cloud, one_ahead
+from mitsim.maps.campaign.plan import coupon_pose
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import Sensor, load_sensor, presets
 from mitsim.sensor.transforms import Transform
-from mitsim.simulation.rendering import Rendering
 
 COUPON = Path(__file__).parents[2] / "scenes/coupon/coupon.xml"
 SIZE_MM = 120.0

@@ -18,14 +18,14 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from mitsim.campaign.acquire import in_turn, simulated_source
-from mitsim.campaign.cluster import Cluster
-from mitsim.campaign.executor import Executor, Pool
-from mitsim.campaign.orders import Order, order_of, take_order
-from mitsim.campaign.plan import Shot, read_campaign
-from mitsim.campaign.store import _table_bytes
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.maps.campaign.acquire import in_turn, simulated_source
+from mitsim.maps.campaign.orders import Order, order_of, take_order
+from mitsim.maps.campaign.plan import Shot, read_campaign
+from mitsim.maps.campaign.store import _table_bytes
+from mitsim.running.cluster import Cluster
+from mitsim.running.executor import Executor, Pool
 from mitsim.sensor.preset import load_sensor
-from mitsim.simulation.simulate import SimulatedSensor
 
 CAMPAIGN = Path(__file__).parents[2] / "scenes/coupon/quick.toml"
 

@@ -32,15 +32,15 @@ def main() -> None:
     from mitsim.scene import backend
 
     backend.activate(None)
-    from characterisation.documents import read_toml
-    from mitsim.exposures.exposure_plan import PlanRules
-    from mitsim.exposures.exposure_sweep import needed_shapes
-    from mitsim.exposures.planned import exposure_in_words, plan_view
+    from characterisation.files.documents import read_toml
     from mitsim.sensor.exposure import PlannedExposure
     from mitsim.study import StudyFile, open_study
-    from mitsim.virtual.plan import measurements_of
-    from mitsim.virtual.study_unknowns import study_unknowns
-    from mitsim.virtual.world import Trial
+    from mitsim.study.exposures.exposure_plan import PlanRules
+    from mitsim.study.exposures.exposure_sweep import needed_shapes
+    from mitsim.study.exposures.planned import exposure_in_words, plan_view
+    from mitsim.study.virtual.plan import measurements_of
+    from mitsim.study.virtual.study_unknowns import study_unknowns
+    from mitsim.study.virtual.world import Trial
 
     print(
         "| sensor | Ra [um] | view | own | planned | light, planned over own | points, own to planned | values "

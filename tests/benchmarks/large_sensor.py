@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.load import load_scene
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.light_code import PhaseShift
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.simulate import SimulatedSensor
 
 ROOT = Path(__file__).parents[2]
 

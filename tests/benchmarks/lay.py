@@ -14,12 +14,12 @@ from dataclasses import replace
 import numpy as np
 
 from characterisation.coupon.patch_table import overall
-from mitsim.campaign.acquire import in_turn, simulated_source
-from mitsim.campaign.one_finish import OneFinish, one_finish_campaign, plan_of
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.maps.campaign.acquire import in_turn, simulated_source
+from mitsim.maps.campaign.one_finish import OneFinish, one_finish_campaign, plan_of
 from mitsim.scene import backend
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.preset import load_sensor
-from mitsim.simulation.simulate import SimulatedSensor
 
 TILTS_DEG = (0.0, 5.0, 10.0, 20.0, 30.0, 45.0)
 REPEATS, LARGEST_DEG = 2, 80.0

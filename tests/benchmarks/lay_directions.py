@@ -19,15 +19,15 @@ from characterisation.coupon.patch_table import overall
 from characterisation.coupon.view_frame import view_frame
 from characterisation.maps.lay import lay_angle_deg, mirror_direction
 from characterisation.maps.performance_map import PerformanceMap
-from mitsim.campaign.acquire import in_turn, simulated_source
-from mitsim.campaign.finish_cache import kept_finish, made_finish
-from mitsim.campaign.hold_out import random_normals
-from mitsim.campaign.one_finish import TURNS_DEG, OneFinish, mirror_mm, one_finish_campaign, plan_of
-from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.campaign.acquire import in_turn, simulated_source
+from mitsim.maps.campaign.finish_cache import kept_finish, made_finish
+from mitsim.maps.campaign.hold_out import random_normals
+from mitsim.maps.campaign.one_finish import TURNS_DEG, OneFinish, mirror_mm, one_finish_campaign, plan_of
 from mitsim.scene import backend
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.preset import load_sensor
-from mitsim.simulation.simulate import SimulatedSensor
 
 #: the map reaches to the first; half of the normals lie within the second, where the line of light is, the rest within
 #: the third

@@ -11,11 +11,11 @@ import tempfile
 import time
 from pathlib import Path
 
-from mitsim.campaign.acquire import coupon_cloud, simulated_source
-from mitsim.campaign.plan import read_campaign
-from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.campaign.acquire import coupon_cloud, simulated_source
+from mitsim.maps.campaign.plan import read_campaign
 from mitsim.sensor.preset import load_sensor
-from mitsim.simulation.simulate import SimulatedSensor
 
 CAMPAIGN = Path(__file__).parents[2] / "scenes/coupon/campaign.toml"
 

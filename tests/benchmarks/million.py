@@ -17,8 +17,8 @@ import argparse
 import os
 import time
 
+from mitsim.capture.simulated.rendering import Rendering
 from mitsim.scene import backend
-from mitsim.simulation.rendering import Rendering
 
 ROW = "| {:<25} | {:>8} | {:>8} | {:>9} | {:>9} | {:>9} |"
 
@@ -33,12 +33,12 @@ def cost(name: str) -> tuple[float, float, int, int, int]:
     from characterisation.cloud_files import write_ply
     from mitsim.capture.capture import Capture
     from mitsim.capture.packed_files import packed
-    from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
+    from mitsim.capture.simulated.simulate import SimulatedSensor
+    from mitsim.decode.cloud import capture_cloud, sensor_geometry
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
     from mitsim.sensor.transforms import look_at
     from mitsim.sensor.working_volume import nearest_standoff
-    from mitsim.simulation.simulate import SimulatedSensor
 
     sensor = load_sensor(name)
     scene = load_scene(Path(__file__).parents[2] / "scenes/two_pillars/two_pillars.xml", sensor.wavelength_nm)

@@ -7,7 +7,7 @@ The second form predicts each of the poses from the others. A verdict compares u
 miss is its distance from the interval, and the 95 % interval of that distance over repeated draws.
 
 Signal chain: poses of a board -> corners in camera and projector (:mod:`pi_fringe_code`) -> calibration and its
-covariance (:mod:`mitsim.calibration.recorded`) -> for each pose to be measured, from the camera's image alone, where
+covariance (:mod:`mitsim.study.calibration.recorded`) -> for each pose to be measured, from the camera's image alone, where
 the board is -> rigs and boards drawn -> what would be measured of squares of 10 mm: ``predicted.json`` -> only then the
 projector's coordinates of that pose -> what is measured, and whether the intervals hold it.
 
@@ -32,14 +32,14 @@ from numpy.typing import NDArray
 from pi_fringe_code import CORNERS, PROJECTOR, SQUARE_MM, Corners, camera_corners, in_order, read_corners
 from scipy.spatial.transform import Rotation
 
-from characterisation.atomic_io import atomic_write
-from mitsim.calibration.board import Board
-from mitsim.calibration.bundle import eye_jacobian, homographies
-from mitsim.calibration.recorded import RecordedBoard, RecordedCalibration, calibrate_recorded
+from characterisation.files.atomic_io import atomic_write
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.rig_covariance import write_rig_covariance
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform
+from mitsim.study.calibration.board import Board
+from mitsim.study.calibration.bundle import eye_jacobian, homographies
+from mitsim.study.calibration.recorded import RecordedBoard, RecordedCalibration, calibrate_recorded
 
 Floats = NDArray[np.float64]
 BOARD = Board(CORNERS[0] + 1, CORNERS[1] + 1, SQUARE_MM, "paper")

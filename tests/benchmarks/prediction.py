@@ -26,8 +26,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from mitsim.prediction import CharacterisedScene, Predictor, performance
-from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.prediction import CharacterisedScene, Predictor, performance
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.load import Scene, load_scene, scene_from_dict
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray

@@ -22,14 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 from real_uncertainties import smooth_residuals
 
-from mitsim.reconstruction.cloud import capture_cloud
-from mitsim.recordings.organised_cloud import read_organised_cloud
+from mitsim.capture.recordings.organised_cloud import read_organised_cloud
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import capture_cloud
 from mitsim.scene import backend
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 
 Floats = NDArray[np.float64]
 CLOUDS = (("milk_cartoon_all_small_clorox", "opengl"), *((f"capture000{number}", "opencv") for number in range(1, 6)))

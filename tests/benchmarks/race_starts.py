@@ -19,8 +19,8 @@ import numpy as np
 from characterisation.statements.judgement import true_risk
 from characterisation.statements.selection import judge, posterior, sampled
 from mitsim.scene import backend
-from mitsim.validation.part_cases import read_part_cases
-from mitsim.validation.screening_run import PREDICTED, screen_case
+from tests.proofs.part_cases import read_part_cases
+from tests.proofs.screening_run import PREDICTED, screen_case
 
 CASES = Path(__file__).parents[2] / "scenes" / "parts" / "validation.toml"
 

@@ -25,18 +25,18 @@ from characterisation.maps.noise_structure import noise_structure
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from characterisation.point_cloud import PointCloud
+from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
+from mitsim.capture.recordings.ensenso import read_ensenso
+from mitsim.decode.cloud import capture_cloud, decoder_settings
+from mitsim.decode.plate import Plate, image_on_grid, plate_dots, plate_scale
 from mitsim.decode.triangulate import triangulate
-from mitsim.measuring.plate import Plate, image_on_grid, plate_dots, plate_scale
-from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
-from mitsim.recordings.ensenso import read_ensenso
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.drift import Drift, drift_modes
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import moved, parameter_names
-from mitsim.sensor.roi import Roi
 
 Floats = NDArray[np.float64]
 PITCH, DRAWS = 18.75, 400

@@ -4,7 +4,7 @@
 
 There are three processes: the scheduler, all workers in one event loop, and this one as the command. With
 ``--threads``, fewer workers sleep in several threads each, which costs less on two cores. The command hands out orders
-as campaigns do (:class:`mitsim.campaign.cluster.Cluster`), and gets back the bytes that a campaign keeps of a capture.
+as campaigns do (:class:`mitsim.running.cluster.Cluster`), and gets back the bytes that a campaign keeps of a capture.
 
 Printed are captures per second, the share of the workers' time that was slept, and the processor time of scheduler and
 command for each capture. The inverse of a processor time is what that process can do on a core of its own. Memory is
@@ -21,7 +21,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from mitsim.campaign.cluster import Cluster
+from mitsim.running.cluster import Cluster
 
 SCHEDULER = """
 import asyncio, sys

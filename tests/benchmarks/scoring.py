@@ -13,12 +13,12 @@ import sys
 import time
 from pathlib import Path
 
-from mitsim.prediction import Predictor
-from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.prediction import Predictor
 from mitsim.study import MINIMUM_POINTS, CharacterisationTable, StudyFile, open_study
-from mitsim.view_scores import score_candidates
+from mitsim.study.virtual.screening import screen
 from mitsim.views import ViewsTable
-from mitsim.virtual.screening import screen
+from mitsim.views.view_scores import score_candidates
 
 ROOT = Path(__file__).parents[2]
 

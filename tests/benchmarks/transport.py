@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.projector_light import ProjectedPatterns
@@ -26,7 +27,6 @@ from mitsim.scene.load import load_scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.eye import Eye
 from mitsim.sensor.preset import load_sensor
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import look_at, mitsuba_to_world
 
 SCENE = Path(__file__).parents[2] / "scenes/two_pillars/two_pillars.xml"

@@ -10,10 +10,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from mitsim.calibration.accuracy import _BARS, measured_points, measuring_volume
-from mitsim.calibration.board import default_board
-from mitsim.calibration.bundle import linearise
-from mitsim.calibration.virtual_calibration import (
+from mitsim.sensor.drift import Drift, with_drift
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.rig_covariance import RigCovariance
+from mitsim.sensor.rig_parameters import PATH_NAMES, moved, path_error
+from mitsim.study.calibration.accuracy import _BARS, measured_points, measuring_volume
+from mitsim.study.calibration.board import default_board
+from mitsim.study.calibration.bundle import linearise
+from mitsim.study.calibration.virtual_calibration import (
     POSES,
     _with_path,
     board_views,
@@ -21,10 +25,6 @@ from mitsim.calibration.virtual_calibration import (
     calibrated_eyes,
     sensor_drift,
 )
-from mitsim.sensor.drift import Drift, with_drift
-from mitsim.sensor.preset import load_sensor
-from mitsim.sensor.rig_covariance import RigCovariance
-from mitsim.sensor.rig_parameters import PATH_NAMES, moved, path_error
 
 SENSORS = (
     "ensenso-n10",

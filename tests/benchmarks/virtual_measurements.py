@@ -34,13 +34,13 @@ def main() -> None:
 
 def row(name: str, count: int) -> str:
     """Time the trials of one sensor."""
-    import mitsim.virtual.rendered as rendered
-    from mitsim.simulation.simulate import SimulatedSensor
+    import mitsim.study.virtual.rendered as rendered
+    from mitsim.capture.simulated.simulate import SimulatedSensor
     from mitsim.study import StudyFile, open_study
-    from mitsim.virtual.plan import measurements_of
-    from mitsim.virtual.race import Job
-    from mitsim.virtual.study_unknowns import study_unknowns
-    from mitsim.virtual.world import Trial
+    from mitsim.study.virtual.plan import measurements_of
+    from mitsim.study.virtual.race import Job
+    from mitsim.study.virtual.study_unknowns import study_unknowns
+    from mitsim.study.virtual.world import Trial
 
     study = open_study(
         SCENES / "study.toml",

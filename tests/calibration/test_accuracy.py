@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.calibration import virtual_calibration
-from mitsim.calibration.accuracy import accuracy, measured_points, measuring_volume
-from mitsim.calibration.board import seen_by_all
-from mitsim.calibration.virtual_calibration import calibrate, calibrated_eyes
+from characterisation.files.errors import InputError
 from mitsim.decode.structured_light.geometry import evaluate, structured_light_geometry
-from mitsim.errors import InputError
 from mitsim.sensor.drift import SOURCES, Drift, drift_modes, with_drift
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import moved, parameter_names
+from mitsim.study.calibration import virtual_calibration
+from mitsim.study.calibration.accuracy import accuracy, measured_points, measuring_volume
+from mitsim.study.calibration.board import seen_by_all
+from mitsim.study.calibration.virtual_calibration import calibrate, calibrated_eyes
 from tests.smaller_sensors import binned
 
 

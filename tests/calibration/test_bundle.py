@@ -8,13 +8,13 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from mitsim.calibration.board import TILTS_DEG, Board, board_poses, default_board, parse_board, seen_by_all
-from mitsim.calibration.bundle import BoardView, Linearised, linearise, view_jacobian
-from mitsim.calibration.simulated import coverage, estimate, simulate_corners
-from mitsim.calibration.virtual_calibration import _with_path, calibrated_eyes
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.rig_parameters import moved, parameter_differences, parameter_names
+from mitsim.study.calibration.board import TILTS_DEG, Board, board_poses, default_board, parse_board, seen_by_all
+from mitsim.study.calibration.bundle import BoardView, Linearised, linearise, view_jacobian
+from mitsim.study.calibration.simulated import coverage, estimate, simulate_corners
+from mitsim.study.calibration.virtual_calibration import _with_path, calibrated_eyes
 
 BOARD = Board(8, 6, 40.0, "glass")
 

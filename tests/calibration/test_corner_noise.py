@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from characterisation.point_cloud import Status
-from mitsim.calibration.corner_noise import WHITE, board_level, coordinate_noise, corner_noise
 from mitsim.decode.structured_light.gray_code import decode_gray_code
 from mitsim.decode.structured_light.phase_shift import decode_phase_shift
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -16,6 +15,7 @@ from mitsim.sensor.image_formation import expose
 from mitsim.sensor.light_code import GrayCode, PhaseShift, roles, value
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
+from mitsim.study.calibration.corner_noise import WHITE, board_level, coordinate_noise, corner_noise
 
 
 def test_without_noise_the_detector_errs_less_the_softer_the_image(n10):

@@ -10,15 +10,15 @@ import pytest
 from typer.testing import CliRunner
 
 import mitsim.sensor
-from mitsim.calibration import virtual_calibration
-from mitsim.calibration.virtual_calibration import calibrate, calibrated_eyes
-from mitsim.cli import app
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
+from mitsim.cli.program import app
 from mitsim.sensor.drift import Drift
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_covariance import read_rig_covariance
 from mitsim.sensor.rig_parameters import moved
+from mitsim.study.calibration import virtual_calibration
+from mitsim.study.calibration.virtual_calibration import calibrate, calibrated_eyes
 
 FOLDER = Path(mitsim.sensor.__file__).parent / "presets" / "calibrations"
 

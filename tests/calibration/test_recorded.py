@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mitsim.calibration.board import Board
-from mitsim.calibration.bundle import BoardView
-from mitsim.calibration.recorded import RecordedBoard, calibrate_recorded
-from mitsim.calibration.simulated import simulate_corners
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.rig_parameters import eyes, parameter_differences
 from mitsim.sensor.transforms import Transform
+from mitsim.study.calibration.board import Board
+from mitsim.study.calibration.bundle import BoardView
+from mitsim.study.calibration.recorded import RecordedBoard, calibrate_recorded
+from mitsim.study.calibration.simulated import simulate_corners
 
 BOARD = Board(9, 7, 10.0, "glass")
 SIZES = {"camera": (1280, 720), "projector": (1920, 1080)}

@@ -14,8 +14,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from known_clouds import known_source, smooth
 
 from characterisation.maps.building import build_map
-from mitsim.campaign import missing_finishes, one_finish, run
-from mitsim.campaign.plan import CampaignFile, plan_campaign
+from mitsim.maps.campaign import missing_finishes, one_finish, run
+from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
 from tests.smaller_sensors import binned
 
 

@@ -21,8 +21,8 @@ from ptu_emulator import RESOLUTION
 
 from characterisation.stage.calibration import BoardCalibration
 from characterisation.stage.turning_axes import TurningAxes
+from mitsim.capture.simulated.rendering import Rendering
 from mitsim.sensor.camera import stereo_rectification
-from mitsim.simulation.rendering import Rendering
 
 SCENE = Path(__file__).resolve().parents[2] / "scenes/coupon/matt_white.xml"
 SERIAL = "emulated-n10"
@@ -64,10 +64,10 @@ def node_of(sensor):
 
 def rendering_camera(counts_now):
     """A camera that sees the coupon where the stage holds it, ``counts_now()`` from zero."""
-    from mitsim.campaign.coupons import CouponRecipe, load_sample
+    from mitsim.capture.simulated.simulate import SimulatedSensor
+    from mitsim.maps.campaign.coupons import CouponRecipe, load_sample
     from mitsim.sensor.preset import load_sensor
     from mitsim.sensor.transforms import Transform
-    from mitsim.simulation.simulate import SimulatedSensor
 
     sensor, fit, made = load_sensor("ensenso-n10"), known_fit(), {}
 
@@ -94,7 +94,7 @@ def rendering_camera(counts_now):
 def main():
     import nxlib.api
 
-    from mitsim.cli import main as command_line
+    from mitsim.cli.program import main as command_line
 
     nxlib.api.CDLL = StandIn(rendering_camera(partial(standing, sys.argv[1])))
     sys.argv = ["mitsim", *sys.argv[2:]]

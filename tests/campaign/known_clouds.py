@@ -15,10 +15,10 @@ import numpy as np
 
 from characterisation.coupon.patches import measure_patches
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.campaign.acquire import Source
-from mitsim.campaign.plan import Campaign, Shot, read_campaign
-from mitsim.campaign.run import run_campaign
-from mitsim.campaign.store import Finished
+from mitsim.maps.campaign.acquire import Source
+from mitsim.maps.campaign.plan import Campaign, Shot, read_campaign
+from mitsim.maps.campaign.run import run_campaign
+from mitsim.maps.campaign.store import Finished
 from mitsim.sensor.preset import load_sensor
 
 #: F and sigma [mm] of |V| [mm] and unit normals (n, 3) in the view frame

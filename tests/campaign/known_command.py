@@ -9,10 +9,10 @@ from typing import Any
 
 from known_clouds import known_source, smooth
 
-from mitsim import cli
-from mitsim.campaign import acquire
-from mitsim.campaign.acquire import Source
-from mitsim.simulation import simulate
+from mitsim.capture.simulated import simulate
+from mitsim.cli import program as cli
+from mitsim.maps.campaign import acquire
+from mitsim.maps.campaign.acquire import Source
 
 
 def known_in_turn(*_: Any) -> Source:

@@ -14,20 +14,20 @@ import pytest
 from known_clouds import known_source, smooth
 from shell import mitsim_here
 
+from characterisation.files.errors import InputError
 from characterisation.maps.lay import mirror_direction, tangent_at
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
-from mitsim.campaign import finish_cache, missing_finishes, one_finish
-from mitsim.campaign.finish_cache import cache_folder, kept_finish
-from mitsim.campaign.missing_finishes import NeededFinishes, distances_about, map_with_finishes, with_lights
-from mitsim.campaign.one_finish import OneFinish, one_finish_campaign, plan_of
-from mitsim.choose import read_candidates
-from mitsim.commands.options import asking
-from mitsim.errors import InputError
+from mitsim.cli.options import asking
+from mitsim.maps.campaign import finish_cache, missing_finishes, one_finish
+from mitsim.maps.campaign.finish_cache import cache_folder, kept_finish
+from mitsim.maps.campaign.missing_finishes import NeededFinishes, distances_about, map_with_finishes, with_lights
+from mitsim.maps.campaign.one_finish import OneFinish, one_finish_campaign, plan_of
 from mitsim.scene.load import load_scene, scene_from_dict
+from mitsim.scene.surface.lay import lay_left_out
+from mitsim.scene.surface.named_finishes import NAMED_FINISHES
 from mitsim.study import read_map
-from mitsim.surface.lay import lay_left_out
-from mitsim.surface.named_finishes import NAMED_FINISHES
+from mitsim.study.choose import read_candidates
 
 AHEAD = np.array([[0.0, 0.0, 1.0]])
 

@@ -22,8 +22,8 @@ from plain_pages import without_pictures
 from shell import mitsim_here
 from small_study import small_study
 
-from mitsim import cli
-from mitsim.exposures import exposure_plan
+from mitsim.cli import program as cli
+from mitsim.study.exposures import exposure_plan
 from tests.smaller_sensors import coarse_sensor
 
 #: milled steel of Ra 3.2 on the plane: the map of the N10 knows ground aluminium from 0.09 to 0.74, and matt white
@@ -32,9 +32,9 @@ DRAWN = STUDY.replace("[measure]\n", '[measure]\nby = "map"\n')
 COMMANDS = {"run": [], "budget": ["--view", "1"], "choose": ["--sensors", "ensenso-n10.toml"]}
 #: what each command does with the map, once it has it; and an exit code that says that it came so far
 WORK = {
-    "run": "mitsim.run_study.run_study",
-    "budget": "mitsim.interface.studies.stated_view",
-    "choose": "mitsim.choose.choose_sensor",
+    "run": "mitsim.study.run_study",
+    "budget": "mitsim.study.programs.stated_view",
+    "choose": "mitsim.study.choose.choose_sensor",
 }
 REACHED = 7
 QUESTION = r"ensenso-n10: its map lacks .*Ra 3\.2.*; characterise now \(about \d+ (s|min)\)\?"

@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.campaign.acquire import in_turn, simulated_source
-from mitsim.campaign.cluster import Cluster
-from mitsim.campaign.orders import worker_source
-from mitsim.campaign.run import run_campaign
-from mitsim.errors import InputError, MissingEnvironmentError
-from mitsim.simulation.simulate import SimulatedSensor
+from characterisation.files.errors import InputError, MissingEnvironmentError
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.maps.campaign.acquire import in_turn, simulated_source
+from mitsim.maps.campaign.orders import worker_source
+from mitsim.maps.campaign.run import run_campaign
+from mitsim.running.cluster import Cluster
 from mitsim.study import StudyFile, open_study
-from mitsim.virtual.plan import measurements_of
-from mitsim.virtual.race import Job
-from mitsim.virtual.spread_out import SpreadMeasurements
-from mitsim.virtual.study_unknowns import study_unknowns
-from mitsim.virtual.world import Trial
+from mitsim.study.virtual.plan import measurements_of
+from mitsim.study.virtual.race import Job
+from mitsim.study.virtual.spread_out import SpreadMeasurements
+from mitsim.study.virtual.study_unknowns import study_unknowns
+from mitsim.study.virtual.world import Trial
 from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
@@ -76,7 +76,7 @@ def test_who_is_no_longer_held_leaves_the_scheduler(cluster):
 
 
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
-    monkeypatch.setattr("mitsim.campaign.cluster.CONNECT_TIMEOUT_S", 1)
+    monkeypatch.setattr("mitsim.running.cluster.CONNECT_TIMEOUT_S", 1)
     with pytest.raises(MissingEnvironmentError, match="no scheduler answers there"):
         Cluster("tcp://127.0.0.1:9")
 
@@ -84,7 +84,7 @@ def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
 def test_many_captures_are_the_same_on_a_cluster(tmp_path, cluster, coarse):
     from typer.testing import CliRunner
 
-    from mitsim.cli import app
+    from mitsim.cli.program import app
 
     (tmp_path / "plan.toml").write_text("captures = 2\n[views]\nsubdivisions = 0\nstandoff_mm = 500\n")
     call = [
@@ -111,8 +111,8 @@ def test_many_captures_are_the_same_on_a_cluster(tmp_path, cluster, coarse):
 
 def _spoil():
     """Have a worker say that someone changed its shot noise, wherever it is asked."""
-    import mitsim.campaign.build as build_module
-    import mitsim.campaign.cluster as cluster_module
+    import mitsim.running.build as build_module
+    import mitsim.running.cluster as cluster_module
 
     told = build_module.own_build() | {"source": "another"}
     build_module.own_build = cluster_module.own_build = lambda: told
@@ -121,8 +121,8 @@ def _spoil():
 def _mend():
     import importlib
 
-    import mitsim.campaign.build as build_module
-    import mitsim.campaign.cluster as cluster_module
+    import mitsim.running.build as build_module
+    import mitsim.running.cluster as cluster_module
 
     cluster_module.own_build = importlib.reload(build_module).own_build
 
@@ -133,7 +133,7 @@ def test_a_worker_of_another_mitsim_takes_nothing(tmp_path, planned, cluster, mo
     with distributed.Client(cluster, set_as_default=False) as client:
         client.run(_spoil)
         if joined_later:
-            monkeypatch.setattr("mitsim.campaign.cluster._compare_builds", lambda *_: None)
+            monkeypatch.setattr("mitsim.running.cluster._compare_builds", lambda *_: None)
         try:
             with pytest.raises(MissingEnvironmentError, match="other source files"):
                 run_campaign(plan, worker_source(Cluster(cluster.scheduler_address), plan), tmp_path)
@@ -143,7 +143,7 @@ def test_a_worker_of_another_mitsim_takes_nothing(tmp_path, planned, cluster, mo
 
 
 def test_builds_differ_in_versions_and_in_any_file(tmp_path, monkeypatch):
-    from mitsim.campaign import build
+    from mitsim.running import build
 
     mine = build.own_build()
     assert build.differences(mine, dict(mine)) == ""
@@ -190,7 +190,7 @@ def test_tls_without_certificates_is_one_message(tmp_path):
 
 
 def test_a_scheduler_without_workers_is_told_and_given_up(planned, monkeypatch, capsys):
-    monkeypatch.setattr("mitsim.campaign.cluster.NO_WORKER_S", 1.5)
+    monkeypatch.setattr("mitsim.running.cluster.NO_WORKER_S", 1.5)
     with (
         distributed.LocalCluster(n_workers=0, processes=True, dashboard_address=None, silence_logs="ERROR") as empty,
         pytest.raises(MissingEnvironmentError, match=r"no workers in 1\.5 s"),

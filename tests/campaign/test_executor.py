@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mitsim.campaign import executor
-from mitsim.campaign.executor import Pool, available_memory, executor_of, fitting_processes, results_of
-from mitsim.cli import app
-from mitsim.errors import DeviceError, InputError, MissingEnvironmentError
+from characterisation.files.errors import InputError, MissingEnvironmentError
+from mitsim.capture.devices.device_error import DeviceError
+from mitsim.cli.program import app
+from mitsim.running import executor
+from mitsim.running.executor import Pool, available_memory, executor_of, fitting_processes, results_of
 from tests.smaller_sensors import coarse_sensor
 
 pytestmark = pytest.mark.timeout(300)
@@ -147,7 +148,7 @@ def test_commands_give_the_same_bytes_in_two_processes(tmp_path, pool, monkeypat
 
 
 def test_a_data_sheet_is_the_same_in_two_processes(pool, half_n10, monkeypatch):
-    from mitsim import data_sheet
+    from mitsim.maps import data_sheet
 
     monkeypatch.setattr(data_sheet, "DISTANCES", 2)
     monkeypatch.setattr(data_sheet, "METALS", [])

@@ -22,18 +22,18 @@ from known_clouds import known_source, smooth
 from matplotlib.figure import Figure
 from quick_process import QuickProcess
 
-from characterisation.atomic_io import FULL, write_json, write_netcdf
-from mitsim.campaign.plan import read_campaign
-from mitsim.campaign.run import run_campaign
-from mitsim.campaign.store import read_shot
+from characterisation.files.atomic_io import FULL, write_json, write_netcdf
+from characterisation.files.errors import InputError
 from mitsim.capture.folder import write_capture
-from mitsim.commands.options import check_file
-from mitsim.errors import InputError
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.cli.options import check_file
+from mitsim.maps.campaign.plan import read_campaign
+from mitsim.maps.campaign.run import run_campaign
+from mitsim.maps.campaign.store import read_shot
 from mitsim.report.style import write_png
 from mitsim.scene.load import load_scene
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 
 KNOWN = [Path(__file__).with_name("known_command.py"), "characterise"]
 MITSIM = ["-m", "mitsim"]

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
+from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
-from mitsim.campaign.acquire import simulated_source
-from mitsim.campaign.hold_out import (
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.maps.campaign.acquire import simulated_source
+from mitsim.maps.campaign.hold_out import (
     LARGEST_SIGMA_ERROR,
     MOST_REPEATS,
     compare,
@@ -22,8 +24,6 @@ from mitsim.campaign.hold_out import (
     hold_out_order,
     random_normals,
 )
-from mitsim.errors import InputError
-from mitsim.simulation.simulate import SimulatedSensor
 
 MAPS = Path(__file__).parents[2] / "scenes" / "coupon" / "maps.toml"
 

@@ -16,19 +16,20 @@ from test_live_campaign import CAMPAIGN
 
 import mitsim
 from characterisation.coupon.patches import measure_patches
-from characterisation.documents import validate
-from mitsim.campaign import live as live_module
-from mitsim.campaign.acquire import coupon_cloud, in_turn, measured
-from mitsim.campaign.live import live_source, place_by_place, plan_live
-from mitsim.campaign.plan import MEASUREMENT_VERSION, CampaignFile, plan_campaign
-from mitsim.campaign.run import run_campaign
-from mitsim.campaign.stage_pose import write_stage_calibration
-from mitsim.commands.devices import mount
-from mitsim.errors import DeviceError, InputError
-from mitsim.reconstruction.cloud import sensor_geometry
+from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
+from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.cli.devices import mount
+from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.campaign import live as live_module
+from mitsim.maps.campaign.acquire import coupon_cloud, in_turn, measured
+from mitsim.maps.campaign.live import live_source, place_by_place, plan_live
+from mitsim.maps.campaign.plan import MEASUREMENT_VERSION, CampaignFile, plan_campaign
+from mitsim.maps.campaign.run import run_campaign
+from mitsim.maps.campaign.stage_pose import write_stage_calibration
 from mitsim.sensor.preset import load_sensor
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 
 nxlib = pytest.importorskip("nxlib", reason="pip install ensenso-nxlib: live Ensenso cameras")
 
@@ -101,7 +102,7 @@ def test_nothing_is_simulated_in_the_place_of_a_device(written, n10):
 
 def test_a_campaign_without_a_device_keeps_the_digests_that_it_had(planned, n10):
     """Written out as it was before there were devices: captures that users have kept stay valid."""
-    from mitsim.campaign.plan import _written
+    from mitsim.maps.campaign.plan import _written
 
     axes = [{"name": "pan", "direction": [0, 1, 0], "limits_deg": [-30, 30]}]
     for changes in ({}, {"stage": {"axes": axes}}):

@@ -12,8 +12,8 @@ from emulated_rig import SCENE, SERIAL, known_fit
 from emulator_process import start_emulator
 from quick_process import QuickProcess
 
-from mitsim.campaign.stage_pose import write_stage_calibration
 from mitsim.capture.folder import read_capture
+from mitsim.maps.campaign.stage_pose import write_stage_calibration
 
 pytest.importorskip("nxlib", reason="pip install ensenso-nxlib: live Ensenso cameras")
 pytest.importorskip("serial", reason="pip install pyserial: stages")

@@ -9,16 +9,16 @@ from emulated_rig import SCENE, SERIAL, known_fit, rendering_camera
 from nxlib_standin import installed
 from test_live_campaign import CAMPAIGN
 
-from characterisation.documents import validate
+from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
-from mitsim.campaign import live as live_module
-from mitsim.campaign.hold_out import compare, held_out_live, held_out_shots
-from mitsim.campaign.live import live_source
-from mitsim.campaign.plan import CampaignFile
-from mitsim.campaign.stage_pose import write_stage_calibration
-from mitsim.commands.devices import mount
-from mitsim.errors import InputError
+from mitsim.cli.devices import mount
+from mitsim.maps.campaign import live as live_module
+from mitsim.maps.campaign.hold_out import compare, held_out_live, held_out_shots
+from mitsim.maps.campaign.live import live_source
+from mitsim.maps.campaign.plan import CampaignFile
+from mitsim.maps.campaign.stage_pose import write_stage_calibration
 
 nxlib = pytest.importorskip("nxlib", reason="pip install ensenso-nxlib: live Ensenso cameras")
 

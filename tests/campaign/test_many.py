@@ -8,12 +8,12 @@ import pytest
 from quick_process import QuickProcess
 from typer.testing import CliRunner
 
-from mitsim.campaign.many import CommonSettings, ManyFile, read_jobs
+from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture
-from mitsim.cli import app
-from mitsim.errors import InputError
+from mitsim.cli.program import app
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
+from mitsim.study.many_captures import CommonSettings, ManyFile, read_jobs
 from tests.smaller_sensors import coarse_sensor
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -131,8 +131,8 @@ def test_captures_of_another_plan_are_not_mixed_in(plan, tmp_path, coarse):
 
 
 def test_a_worker_gives_the_same_capture(plan, coarse):
-    from mitsim.campaign.many import in_turn, take_job
-    from mitsim.simulation.simulate import SimulatedSensor
+    from mitsim.capture.simulated.simulate import SimulatedSensor
+    from mitsim.study.many_captures import in_turn, take_job
 
     sensor = load_sensor(coarse)
     job = read_jobs(plan, SCENE, sensor, COMMON)[0]

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from mitsim.campaign.acquire import one_ahead
+from mitsim.maps.campaign.acquire import one_ahead
 
 
 def spared(name: str) -> set[threading.Thread]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mitsim.campaign.plan import sensor_checksum
+from mitsim.maps.campaign.plan import sensor_checksum
 from mitsim.sensor.preset import load_sensor
 
 

@@ -15,11 +15,11 @@ import xarray as xr
 from known_clouds import known_source, smooth, stepped
 from quick_process import QuickProcess
 
-from characterisation import atomic_io
 from characterisation.coupon.orientations import sphere_directions
-from mitsim.campaign import run as run_module
-from mitsim.campaign.run import run_campaign
-from mitsim.errors import InputError, MissingEnvironmentError
+from characterisation.files import atomic_io
+from characterisation.files.errors import InputError, MissingEnvironmentError
+from mitsim.maps.campaign import run as run_module
+from mitsim.maps.campaign.run import run_campaign
 
 pytestmark = pytest.mark.usefixtures("coarse_maps")
 

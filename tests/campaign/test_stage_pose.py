@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from characterisation.documents import validate
 from characterisation.features.surfaces import Plane
+from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
 from characterisation.stage.calibration import BoardCalibration, CouponCalibration
 from characterisation.stage.turning_axes import TurningAxes
-from mitsim.campaign.stage_pose import StageTable, read_stage_calibration, write_stage_calibration
-from mitsim.errors import InputError
+from mitsim.maps.campaign.stage_pose import StageTable, read_stage_calibration, write_stage_calibration
 from mitsim.sensor.transforms import Transform
 
 AXES = TurningAxes(

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from known_clouds import known_source, smooth
 
-from characterisation.checked_files import content_checksum
-from mitsim.campaign.run import run_campaign
-from mitsim.errors import InputError
+from characterisation.files.checked_files import content_checksum
+from characterisation.files.errors import InputError
+from mitsim.maps.campaign.run import run_campaign
 
 
 @pytest.fixture

@@ -10,15 +10,15 @@ import pytest
 import xarray as xr
 from typer.testing import CliRunner
 
-from mitsim.campaign import store
-from mitsim.campaign.acquire import NAMED, found_shots, found_source, in_turn, out_of_range, simulated_source
-from mitsim.campaign.plan import covering
-from mitsim.campaign.run import measure_captures, run_campaign
-from mitsim.campaign.store import shot_folder
+from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.errors import InputError
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.maps.campaign import store
+from mitsim.maps.campaign.acquire import NAMED, found_shots, found_source, in_turn, out_of_range, simulated_source
+from mitsim.maps.campaign.plan import covering
+from mitsim.maps.campaign.run import measure_captures, run_campaign
+from mitsim.maps.campaign.store import shot_folder
 from mitsim.sensor.preset import load_sensor, presets
-from mitsim.simulation.simulate import SimulatedSensor
 from tests.smaller_sensors import coarse_sensor
 
 
@@ -31,7 +31,7 @@ def sensor_file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory, scenes, sensor_file):
     """A rendered campaign that keeps its images, in a folder."""
-    from mitsim.campaign.plan import CampaignFile, plan_campaign
+    from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
 
     file = CampaignFile.model_validate(
         {
@@ -89,7 +89,7 @@ def test_coupons_out_of_the_decoders_range_are_told(kept, near, far):
 
 
 def test_characterise_warns_before_it_measures(tmp_path, kept, scenes, sensor_file):
-    from mitsim.cli import app
+    from mitsim.cli.program import app
 
     _, folder = kept
     text = re.sub(r"(?m)^near_mm = \d+", "near_mm = 700", sensor_file.read_text())

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from characterisation import atomic_io, checked_files
-from characterisation.checked_files import content_checksum
-from characterisation.errors import InputError
+from characterisation.files import atomic_io, checked_files
+from characterisation.files.checked_files import content_checksum
+from characterisation.files.errors import InputError
 from mitsim.capture import folder
 from mitsim.capture.capture import Capture
 from mitsim.capture.capture_document import capture_schema, schema_text

@@ -12,10 +12,10 @@ from simulated_rigs import images_seen, surface_seen
 
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
-from mitsim.capture_checks.rig_sanity import measured_row_error
-from mitsim.capture_checks.sanity import capture_findings, capture_warnings, cloud_warnings, row_error_in_words
+from mitsim.decode.checks.rig_sanity import measured_row_error
+from mitsim.decode.checks.sanity import capture_findings, capture_warnings, cloud_warnings, row_error_in_words
+from mitsim.decode.cloud import capture_cloud
 from mitsim.decode.matching.stereo import stereo_geometry
-from mitsim.reconstruction.cloud import capture_cloud
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from characterisation.acceptance.vdi_2634 import flatness_error, plane_distances, probing_error, sphere_spacing_error
-from characterisation.errors import InputError
 from characterisation.features.fits import fit_sphere
+from characterisation.files.errors import InputError
 
 
 def cap(count: int, half_angle_deg: float = 70.0) -> np.ndarray:

@@ -6,7 +6,7 @@ import errno
 
 import pytest
 
-from characterisation.atomic_io import atomic_write, atomic_write_named
+from characterisation.files.atomic_io import atomic_write, atomic_write_named
 
 both = pytest.mark.parametrize("written", [atomic_write, atomic_write_named])
 

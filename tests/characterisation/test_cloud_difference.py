@@ -9,7 +9,7 @@ from characterisation.acceptance.cloud_difference import (
     distribution,
     same_grid,
 )
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
 GRID = ViewGrid(300.0, 300.0, 59.5, 49.5, 120, 100)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from characterisation.atomic_io import write_netcdf
-from characterisation.datasets import LARGEST_DATASET, Schema, Variable, read_dataset
-from characterisation.errors import InputError
+from characterisation.files.atomic_io import write_netcdf
+from characterisation.files.datasets import LARGEST_DATASET, Schema, Variable, read_dataset
+from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 
@@ -142,7 +142,7 @@ def test_a_damaged_file_is_known_before_hdf5_parses_it(tmp_path, monkeypatch):
 
 def test_a_reader_that_does_not_end_is_given_up(tmp_path, monkeypatch):
     dataset().to_netcdf(tmp_path / "a.nc")
-    monkeypatch.setattr("characterisation.datasets._PROBE", "import time; time.sleep(60)")
-    monkeypatch.setattr("characterisation.datasets.PATIENCE_S", 0.5)
+    monkeypatch.setattr("characterisation.files.datasets._PROBE", "import time; time.sleep(60)")
+    monkeypatch.setattr("characterisation.files.datasets.PATIENCE_S", 0.5)
     with pytest.raises(InputError, match=r"did not finish within 0\.5 s"):
         read_dataset(tmp_path / "a.nc", SCHEMA)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom, gamma, norm, t
 
-from characterisation.documents import validate
-from characterisation.errors import InputError
+from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
 from characterisation.statements.decision import (
     Tolerance,
     acceptance,

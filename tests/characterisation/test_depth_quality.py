@@ -13,7 +13,7 @@ from characterisation.acceptance.depth_quality import (
     temporal_noise,
 )
 from characterisation.coupon.patches import Coupon
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
 GRID = ViewGrid(600.0, 600.0, 99.5, 74.5, 200, 150)

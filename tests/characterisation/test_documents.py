@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field
 
-from characterisation.documents import Document, missing_keys, validate
-from characterisation.errors import InputError
+from characterisation.files.documents import Document, missing_keys, validate
+from characterisation.files.errors import InputError
 
 
 class Fixed(Document):

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from two_balls import TASK
 
-from characterisation.errors import InputError
 from characterisation.features.fitted import with_covariance
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
+from characterisation.files.errors import InputError
 from characterisation.scores.joining import (
     POSE_KNOWN,
     JoinedView,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.lambert_projection import inverse_lambert_projection
 from characterisation.maps.joined import mean_over, with_directions, with_samples
 from characterisation.maps.lay import LAY_FIELDS, lay_angle_deg, mirror_direction, tangent_at, turned

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.maps.building import NODES
 from characterisation.maps.performance_map import (
     SCHEMA_VERSION,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.maps.noise_structure import noise_structure
 from characterisation.maps.performance_map import PerformanceMap
 

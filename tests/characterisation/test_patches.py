@@ -12,7 +12,7 @@ from characterisation.coupon.discs import disc_offsets
 from characterisation.coupon.metrics import density_fraction
 from characterisation.coupon.patches import Coupon, measure_patches, patch_centres
 from characterisation.coupon.view_frame import in_view_frame, view_frame
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
 GRID = ViewGrid(626.0, 626.0, 375.5, 239.5, 752, 480)

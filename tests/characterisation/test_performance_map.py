@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from characterisation.coupon.orientations import cap_directions, sphere_directions
 from characterisation.coupon.patch_table import patch_table
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.maps.building import SampleTable, build_map
 from characterisation.maps.performance_map import (
     PerformanceMap,

@@ -11,7 +11,7 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.maps.joined import mean_over, with_samples
 from characterisation.maps.light import NUMBERS, Light, lies_between, light_variables, lights_of, same_light
 from characterisation.maps.performance_map import SCHEMA_VERSION, PerformanceMap

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from characterisation.coupon.orientations import cap_directions
-from characterisation.documents import validate
-from characterisation.errors import InputError
+from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
 from characterisation.stage.angles import Stage
 
 PAN_TILT = {

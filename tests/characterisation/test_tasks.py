@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from characterisation.errors import InputError
 from characterisation.features.fitted import CylinderFit, PlaneFit
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Cylinder, Plane
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.tasks.evaluation import (
     Feature,

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from characterisation.documents import validate
-from characterisation.errors import InputError
 from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone
+from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
 from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.evaluation import check_features, measurement_model, read_task
 from characterisation.tasks.task_file import KEYS, Task

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial.transform import Rotation
 
-from characterisation.documents import validate
 from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.fits import fit_plane
 from characterisation.features.fitted import with_covariance
 from characterisation.features.pose_fit import Pose
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Cylinder, Plane, Sphere, tangents
+from characterisation.files.documents import validate
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.tasks.definitions import (
     DEFINITIONS,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from characterisation.documents import validate
-from characterisation.errors import InputError
 from characterisation.features.fitted import with_covariance
 from characterisation.features.surfaces import Cylinder, Plane
+from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
 from characterisation.statements.decision import decide, tolerance_of
 from characterisation.tasks.evaluation import Task, evaluate, measurement_model
 from characterisation.tasks.places import mid_plane

@@ -7,10 +7,10 @@ import threading
 import numpy as np
 import pytest
 
-from characterisation import threads
-from characterisation.threads import MOST_THREADS, in_threads, thread_count
+from characterisation.files import threads
+from characterisation.files.threads import MOST_THREADS, in_threads, thread_count
 from mitsim.decode.blocks import BLOCK, in_blocks
-from mitsim.prediction.noise_field import averaging_field, persistent_field
+from mitsim.maps.prediction.noise_field import averaging_field, persistent_field
 
 
 @pytest.mark.parametrize(

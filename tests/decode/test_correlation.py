@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
+from characterisation.region_of_interest import Roi
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching import correlation
 from mitsim.decode.matching.correlation import correlate_both_ways
 from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 240, 90, 400.0, 80.0

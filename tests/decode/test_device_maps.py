@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status, ViewGrid
+from characterisation.region_of_interest import Roi
 from mitsim.decode.device_maps import (
     camera_map_geometry,
     decode_depth_map,
@@ -17,7 +18,6 @@ from mitsim.decode.device_maps import (
     roi_of_other_grid,
 )
 from mitsim.sensor.camera import Camera, Rectification, Rig
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT = 60, 40

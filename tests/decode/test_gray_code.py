@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decode.structured_light.gray_code import binary_of_gray, decode_gray_code, decode_gray_code_phase_shift
 from mitsim.decode.structured_light.phase_shift import phase_noise

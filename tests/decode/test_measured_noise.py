@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mitsim.capture.capture import Capture
+from mitsim.decode.cloud import capture_cloud
+from mitsim.decode.noise import known_noise, sigma_source
 from mitsim.decode.structured_light.measured_noise import measured_noise
-from mitsim.reconstruction.cloud import capture_cloud
-from mitsim.reconstruction.noise import known_noise, sigma_source
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence

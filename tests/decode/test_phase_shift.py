@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decode.structured_light.phase_shift import decode_phase_shift, fit_phases, phase_noise
 from mitsim.decode.structured_light.projector_gamma import correct_phase, estimate_gamma, harmonic_ratio

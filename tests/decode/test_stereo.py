@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
+from characterisation.region_of_interest import Roi
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.sgbm import search_range
 from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 320, 240, 420.0, 80.0

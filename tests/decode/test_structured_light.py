@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from characterisation.cloud_files import read_ply, write_ply
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.structured_light.decoder import decode_structured_light

@@ -17,8 +17,8 @@ from pydantic.fields import FieldInfo
 
 from characterisation.cloud_files import write_ply
 from characterisation.coupon.patches import Coupon, measure_patches
-from characterisation.documents import Document, validate
-from characterisation.errors import InputError
+from characterisation.files.documents import Document, validate
+from characterisation.files.errors import InputError
 from characterisation.maps.building import SampleTable, build_map
 from characterisation.maps.joined import with_directions
 from characterisation.maps.performance_map import PerformanceMap
@@ -26,23 +26,23 @@ from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.scores.joining import POSE_KNOWN
 from characterisation.scores.view_score import score_table, score_views, view_statistics
 from characterisation.tasks.evaluation import Task
-from mitsim.campaign.many import ManyFile
-from mitsim.campaign.plan import CampaignFile
-from mitsim.campaign.run import _all_patches
-from mitsim.campaign.stage_pose import StageCalibrationFile
 from mitsim.capture.capture_document import CaptureDocument
-from mitsim.cli import app
-from mitsim.hardware.depthai_settings import DepthaiSettings
-from mitsim.report.choice_document import ChoiceDocument
-from mitsim.report.run_folder import RunDocument
+from mitsim.capture.devices.depthai_settings import DepthaiSettings
+from mitsim.cli.program import app
+from mitsim.maps.campaign.plan import CampaignFile
+from mitsim.maps.campaign.run import _all_patches
+from mitsim.maps.campaign.stage_pose import StageCalibrationFile
 from mitsim.report.statement_section import StatementDocument
-from mitsim.run_study import pose_columns
+from mitsim.scene.surface.surface_light import nominal_light
 from mitsim.sensor.rig_covariance import CovarianceFile
 from mitsim.sensor.sensor_file import SensorFile
 from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.study import StudyFile
-from mitsim.surface.surface_light import nominal_light
-from mitsim.validation.part_cases import PartCasesFile
+from mitsim.study.choice_document import ChoiceDocument
+from mitsim.study.many_captures import ManyFile
+from mitsim.study.run_folder import RunDocument
+from mitsim.study.scoring import pose_columns
+from tests.proofs.part_cases import PartCasesFile
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -349,8 +349,8 @@ def test_documented_properties_are_those_of_the_bsdf(kind, tmp_path):
 
 
 def test_documented_names_of_metals_and_processes():
-    from mitsim.surface.metals import CONSTANTS
-    from mitsim.surface.processes import PROCESSES
+    from mitsim.scene.surface.metals import CONSTANTS
+    from mitsim.scene.surface.processes import PROCESSES
 
     for key, names in (("metal", CONSTANTS), ("process", PROCESSES)):
         rows = table_rows("properties: machined_metal")

@@ -12,7 +12,7 @@ import typer
 
 import characterisation
 import mitsim
-from mitsim.cli import app
+from mitsim.cli.program import app
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"

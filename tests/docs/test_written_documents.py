@@ -10,17 +10,17 @@ from test_docs import FORMATS, JSON_MODELS, first_column
 from characterisation.statements.budget import BudgetLine
 from characterisation.statements.decision import plus_minus
 from characterisation.statements.statement import statement
-from mitsim.exposures.exposure_plan import ExposurePlan
-from mitsim.exposures.exposure_sweep import ExposureResult, FeatureResult
-from mitsim.exposures.planned import plan_document, write_plan_csv
-from mitsim.hardware.stage_connection import BAUD
-from mitsim.measuring.document import measured_document
-from mitsim.measuring.result import Repeatability, Result
+from characterisation.tasks.result import Repeatability, Result
+from mitsim.capture.devices.stage_connection import BAUD
+from mitsim.capture.simulated.truth import Truth, encode_exr, read_exr
+from mitsim.decode.measured_document import measured_document
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import UnknownsTable
-from mitsim.simulation.truth import Truth, encode_exr, read_exr
-from mitsim.virtual.stated import statement_document
+from mitsim.study.exposures.exposure_plan import ExposurePlan
+from mitsim.study.exposures.exposure_sweep import ExposureResult, FeatureResult
+from mitsim.study.exposures.planned import plan_document, write_plan_csv
+from mitsim.study.virtual.stated import statement_document
 
 
 @pytest.fixture(scope="module")

@@ -16,10 +16,10 @@ from PIL import Image
 from scipy.ndimage import minimum_filter
 from typer.testing import CliRunner
 
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.cli import app
-from mitsim.errors import InputError
-from mitsim.export.bop import depth_scale, on_pinhole
+from mitsim.cli.program import app
+from mitsim.report.export.bop import depth_scale, on_pinhole
 
 from .test_export_command import export
 

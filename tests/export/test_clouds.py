@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from mitsim.errors import MissingEnvironmentError
-from mitsim.export.cloud_points import COVARIANCE, cloud_points
-from mitsim.export.cloud_writers import write_cloud_pcd, write_cloud_ply
-from mitsim.export.e57 import PREFIX, write_e57
-from mitsim.export.ros_bag import _CLOUD, _FRAMES, Stamped, write_mcap
-from mitsim.recordings.pcd import decode_pcd
+from characterisation.files.errors import MissingEnvironmentError
+from mitsim.capture.recordings.pcd import decode_pcd
+from mitsim.report.export.cloud_points import COVARIANCE, cloud_points
+from mitsim.report.export.cloud_writers import write_cloud_pcd, write_cloud_ply
+from mitsim.report.export.e57 import PREFIX, write_e57
+from mitsim.report.export.ros_bag import _CLOUD, _FRAMES, Stamped, write_mcap
 
 from .known_cloud import POSE, expected, known_cloud, symmetric
 

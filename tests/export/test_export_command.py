@@ -8,8 +8,8 @@ from report.view_sphere_run import write_expecting_run
 from typer.testing import CliRunner
 
 from characterisation.cloud_files import write_ply
-from mitsim.cli import app
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
+from mitsim.cli.program import app
 
 from .known_cloud import POSE, expected, known_cloud
 

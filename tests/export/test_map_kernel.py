@@ -9,12 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from characterisation.coupon.view_frame import in_view_frame
+from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from characterisation.point_cloud import Status, ViewGrid
-from mitsim.errors import InputError
-from mitsim.export.map_export import write_map_kernel
-from mitsim.export.map_kernel import SensorMap, normals_from_depth
+from mitsim.report.export.map_export import write_map_kernel
+from mitsim.report.export.map_kernel import SensorMap, normals_from_depth
 from mitsim.sensor.preset import load_sensor
 
 from .test_export_command import export
@@ -76,7 +76,7 @@ def test_look_up_with_unknown_nodes_and_one_distance(tmp_path, rng):
 
 
 def test_image_is_what_predict_predicts(tmp_path, scenes):
-    from mitsim.prediction import CharacterisedScene, Predictor
+    from mitsim.maps.prediction import CharacterisedScene, Predictor
     from mitsim.scene.load import load_scene
     from mitsim.sensor.transforms import look_at
 

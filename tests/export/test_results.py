@@ -13,12 +13,12 @@ from report.conftest import FEATURES as SEEN
 from report.conftest import MEASUREMENTS
 from report.view_sphere_run import write_expecting_run
 
-from characterisation.atomic_io import write_netcdf
-from characterisation.errors import InputError
+from characterisation.files.atomic_io import write_netcdf
+from characterisation.files.errors import InputError
 from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.task_reading import read_task
-from mitsim.export.qif import NAMESPACE, write_qif
-from mitsim.export.results import Result, RunResults, read_results, write_results_csv, write_results_json
+from mitsim.report.export.qif import NAMESPACE, write_qif
+from mitsim.report.export.results import Result, RunResults, read_results, write_results_csv, write_results_json
 
 from .known_cloud import POSE
 

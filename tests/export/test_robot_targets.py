@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from report.view_sphere_run import write_expecting_run
 from scipy.spatial.transform import Rotation
 
-from mitsim.errors import InputError
-from mitsim.export.robot_targets import ROBOT_FORMATS, Target, kuka_numbers, read_targets
+from characterisation.files.errors import InputError
+from mitsim.report.export.robot_targets import ROBOT_FORMATS, Target, kuka_numbers, read_targets
 from mitsim.sensor.transforms import Transform
 
 from .known_cloud import POSE

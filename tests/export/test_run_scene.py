@@ -6,12 +6,12 @@ import trimesh
 from report.view_sphere_run import WITH_CLOUD, write_expecting_run
 from scipy.spatial.transform import Rotation
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.export.gltf import write_glb
-from mitsim.export.rerun_recording import write_rrd
-from mitsim.export.run_scene import frustum, read_run_scene
-from mitsim.export.usd import write_usd
+from mitsim.report.export.gltf import write_glb
+from mitsim.report.export.rerun_recording import write_rrd
+from mitsim.report.export.run_scene import frustum, read_run_scene
+from mitsim.report.export.usd import write_usd
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ import pytest
 
 from characterisation.features.surfaces import Plane
 from characterisation.point_cloud import PointCloud, ViewGrid
-from mitsim.exposures.exposure_plan import PlanRules, plan_exposures, shortfall
-from mitsim.exposures.exposure_sweep import ExposureResult, FeatureResult, feature_result
-from mitsim.exposures.planned import plan_document, plan_in_words, plan_table
 from mitsim.sensor.exposure import PlannedExposure
+from mitsim.study.exposures.exposure_plan import PlanRules, plan_exposures, shortfall
+from mitsim.study.exposures.exposure_sweep import ExposureResult, FeatureResult, feature_result
+from mitsim.study.exposures.planned import plan_document, plan_in_words, plan_table
 
 POINTS = 4000
 

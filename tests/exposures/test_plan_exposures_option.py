@@ -13,8 +13,8 @@ from plain_pages import without_pictures
 from shell import mitsim_here
 from small_study import few_measurements, small_study
 
-from mitsim.cli import app
-from mitsim.exposures import exposure_plan, planned
+from mitsim.cli.program import app
+from mitsim.study.exposures import exposure_plan, planned
 from tests.smaller_sensors import coarse_sensor
 
 #: ground aluminium of Ra 0.37: from the side the N10's own exposure, 1.15 ms, is too short

@@ -7,8 +7,8 @@ from emulator_process import connection
 from grbl_emulator import Grbl
 from ptu_emulator import PanTiltUnit
 
-from mitsim.hardware.serial_line import TICK_S, Clock, SerialLine
-from mitsim.hardware.stage import start_stage
+from mitsim.capture.devices.serial_line import TICK_S, Clock, SerialLine
+from mitsim.capture.devices.stage import start_stage
 
 BYTE_S, STEP_S = 1e-4, 0.01
 

@@ -10,8 +10,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from characterisation.documents import validate
-from mitsim.hardware.stage_connection import StageConnection
+from characterisation.files.documents import validate
+from mitsim.capture.devices.stage_connection import StageConnection
 
 HERE = Path(__file__).parent
 

@@ -7,7 +7,7 @@ import pytest
 from nxlib_standin import StandInCamera, counted_frames, installed, small_node
 
 from mitsim.capture.folder import read_capture
-from mitsim.cli import main
+from mitsim.cli.program import main
 
 nxlib = pytest.importorskip("nxlib", reason="pip install ensenso-nxlib: live Ensenso cameras")
 
@@ -61,7 +61,7 @@ def test_what_was_taken_before_an_error_or_ctrl_c_is_kept(camera, mitsim, tmp_pa
     assert [read_capture(folder).serial for folder in out.splitlines()] == ["150358"] * 2
     camera.lose_after, camera.log = None, []  # plugged in again, it stands as at the beginning
     camera.node.update(small_node())
-    from mitsim.hardware.ensenso import EnsensoCamera
+    from mitsim.capture.devices.ensenso import EnsensoCamera
 
     images = EnsensoCamera._images
 

@@ -11,11 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from characterisation.documents import validate
-from mitsim.campaign.devices import depthai_capture, depthai_rig
-from mitsim.capture.folder import read_capture, write_capture
-from mitsim.errors import DeviceError, InputError, MissingEnvironmentError
-from mitsim.hardware.depthai_camera import (
+from characterisation.files.documents import validate
+from characterisation.files.errors import InputError, MissingEnvironmentError
+from mitsim.capture.devices.depthai_camera import (
     DepthaiCamera,
     DepthaiShot,
     aligned,
@@ -29,7 +27,10 @@ from mitsim.hardware.depthai_camera import (
     pixels,
     stereo_pipeline,
 )
-from mitsim.hardware.depthai_settings import SIZES, DepthaiSettings, configuration, configure
+from mitsim.capture.devices.depthai_settings import SIZES, DepthaiSettings, configuration, configure
+from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.maker_captures import depthai_capture, depthai_rig
+from mitsim.capture.folder import read_capture, write_capture
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.transforms import Transform
 

@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from nxlib_standin import NO_STRIP, StandInCamera, counted_frames, installed, small_node
 
-from mitsim.campaign.devices import ensenso_capture, points_in_left_camera
+from characterisation.files.errors import InputError, MissingEnvironmentError
+from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.ensenso import EnsensoSettings, open_ensenso
+from mitsim.capture.devices.maker_captures import ensenso_capture, points_in_left_camera
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.errors import DeviceError, InputError, MissingEnvironmentError
-from mitsim.hardware.ensenso import EnsensoSettings, open_ensenso
 
 nxlib = pytest.importorskip("nxlib", reason="pip install ensenso-nxlib: live Ensenso cameras")
 
@@ -278,7 +279,7 @@ def test_points_that_agree_in_neither_frame_are_not_taken(camera):
 
 @given(text=st.text(max_size=30))
 def test_any_text_as_a_device_is_a_camera_or_is_refused(text):
-    from mitsim.commands.devices import device_table
+    from mitsim.cli.devices import device_table
 
     try:
         table = device_table(text, None)
@@ -290,6 +291,6 @@ def test_any_text_as_a_device_is_a_camera_or_is_refused(text):
 
 @given(serial=st.from_regex("[A-Za-z0-9][A-Za-z0-9._-]{0,49}", fullmatch=True))
 def test_a_serial_number_is_taken_as_it_is(serial):
-    from mitsim.commands.devices import device_table
+    from mitsim.cli.devices import device_table
 
     assert device_table(f"ensenso:{serial}", None).serial == serial

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from nxlib_standin import StandInCamera, installed
 
-from mitsim.campaign.devices import ensenso_capture
 from mitsim.capture.calibration import calibration_table
+from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.ensenso import EnsensoSettings, open_ensenso
+from mitsim.capture.devices.maker_captures import ensenso_capture
 from mitsim.capture.png import decode_png
-from mitsim.errors import DeviceError
-from mitsim.hardware.ensenso import EnsensoSettings, open_ensenso
-from mitsim.recordings.ensenso import read_ensenso
+from mitsim.capture.recordings.ensenso import read_ensenso
 
 nxlib = pytest.importorskip("nxlib", reason="pip install ensenso-nxlib: live Ensenso cameras")
 
@@ -62,7 +62,7 @@ def test_an_n10_has_no_flexview(recorded):
 @pytest.mark.real
 def test_a_recording_that_is_lost_midway_keeps_what_was_taken(recorded, tmp_path, capsys):
     from mitsim.capture.folder import read_capture
-    from mitsim.commands.devices import capture
+    from mitsim.cli.devices import capture
 
     camera, _, images = recorded
     camera.lose_after = 2

@@ -12,7 +12,7 @@ from nxlib_standin import StandInCamera, installed, small_node
 from scipy.spatial.transform import Rotation
 
 from characterisation.stage.turning_axes import TurningAxes
-from mitsim.campaign.stage_pose import read_stage_calibration
+from mitsim.maps.campaign.stage_pose import read_stage_calibration
 
 nxlib = pytest.importorskip("nxlib", reason="pip install ensenso-nxlib: live Ensenso cameras")
 
@@ -35,7 +35,7 @@ def seen(board, node, pose):
 def test_the_script_of_the_page_calibrates_a_stage(tmp_path, monkeypatch):
     (script,) = (block for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S) if "Charuco" in block)
     stage, port = emulated("ptu")
-    monkeypatch.setattr("mitsim.hardware.stage.open_stage", lambda connection: stage)
+    monkeypatch.setattr("mitsim.capture.devices.stage.open_stage", lambda connection: stage)
     directions = np.array([[0.02, -1.0, 0.03], [1.0, 0.01, -0.02]])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     axes = TurningAxes(directions, np.array([[4.0, 0.0, 505.0], [0.0, -3.0, 492.0]]))

@@ -6,8 +6,9 @@ from emulated_port import EmulatedPort, device, emulated, true_angles
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mitsim.errors import DeviceError, InputError
-from mitsim.hardware.grbl_reports import (
+from characterisation.files.errors import InputError
+from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.grbl_reports import (
     ALARMS,
     ERRORS,
     Status,

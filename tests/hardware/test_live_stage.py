@@ -7,9 +7,10 @@ from emulator_process import connection
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mitsim.errors import DeviceError, InputError
-from mitsim.hardware.serial_line import SerialLine
-from mitsim.hardware.stage import PATIENCE, LiveStage, start_stage
+from characterisation.files.errors import InputError
+from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.serial_line import SerialLine
+from mitsim.capture.devices.stage import PATIENCE, LiveStage, start_stage
 
 KINDS = pytest.mark.parametrize("kind", ["ptu", "grbl"])
 

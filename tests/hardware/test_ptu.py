@@ -3,7 +3,8 @@
 import pytest
 from emulated_port import emulated
 
-from mitsim.errors import DeviceError, InputError
+from characterisation.files.errors import InputError
+from mitsim.capture.devices.device_error import DeviceError
 
 
 def sent(port):

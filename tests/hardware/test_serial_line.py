@@ -5,8 +5,9 @@ import sys
 import pytest
 from emulated_port import TalkingPort
 
-from mitsim.errors import DeviceError, InputError, MissingEnvironmentError
-from mitsim.hardware.serial_line import SerialLine, line_ends, open_line, text_of
+from characterisation.files.errors import InputError, MissingEnvironmentError
+from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.serial_line import SerialLine, line_ends, open_line, text_of
 
 
 def line(*chunks, endless=b""):
@@ -100,5 +101,5 @@ def test_without_pyserial_the_extra_is_named(monkeypatch):
 def test_the_room_is_imported_without_pyserial():
     import subprocess
 
-    code = "import sys; sys.modules['serial'] = None; import mitsim.hardware.stage"
+    code = "import sys; sys.modules['serial'] = None; import mitsim.capture.devices.stage"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -12,10 +12,10 @@ from known_stage import axes_error, pose_covariance, unit
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from characterisation.errors import InputError
 from characterisation.features.fits import fit_plane
 from characterisation.features.fitted import PlaneFit
 from characterisation.features.surfaces import Plane, tangents
+from characterisation.files.errors import InputError
 from characterisation.stage.calibration import (
     axis_deviations,
     calibrate_with_board,

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.stage.calibration import axis_deviations, calibrate_with_board, calibration_angles
 from characterisation.stage.turning_axes import TurningAxes
+from mitsim.capture.simulated.lens_blur import gaussian_blur
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.projector_light import ProjectedPatterns
@@ -16,7 +17,6 @@ from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.transforms import Transform
-from mitsim.simulation.lens_blur import gaussian_blur
 
 COLUMNS, ROWS, SQUARE, MARKER, TEXELS = 11, 8, 32.0, 19.0, 96
 STEP = np.radians(185.1428 / 3600)  # of a PTU-D46

@@ -9,9 +9,9 @@ from emulator_process import GRBL, PTU, connection
 from hypothesis import given
 from hypothesis import strategies as st
 
-from characterisation.documents import validate
-from characterisation.errors import InputError
-from mitsim.hardware.stage_connection import AxisConnection, StageConnection
+from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
+from mitsim.capture.devices.stage_connection import AxisConnection, StageConnection
 
 
 def test_ports_have_the_speed_that_devices_are_delivered_with():

@@ -13,8 +13,8 @@ import pytest
 from emulator_process import connection, start_emulator
 from numpy.typing import NDArray
 
-from mitsim.errors import DeviceError
-from mitsim.hardware.stage import open_stage
+from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.stage import open_stage
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are POSIX only")
 
@@ -162,7 +162,7 @@ import signal  # a shell that starts tests in the background has them ignore Ctr
 signal.signal(signal.SIGINT, signal.default_int_handler)
 import sys; sys.path.insert(0, "tests/hardware")
 from emulator_process import connection
-from mitsim.hardware.stage import open_stage
+from mitsim.capture.devices.stage import open_stage
 with open_stage(connection("ptu", {emulator.port!r}, speed_deg_s=10)) as stage:
     stage.home()
     print("moving", flush=True)
@@ -186,7 +186,7 @@ def test_axes_that_a_killed_program_left_moving_are_stopped_when_the_stage_is_op
         code = f"""
 import os, sys; sys.path.insert(0, "tests/hardware")
 from emulator_process import connection
-from mitsim.hardware.stage import open_stage
+from mitsim.capture.devices.stage import open_stage
 stage = open_stage(connection({kind!r}, {emulator.port!r}, speed_deg_s=2))
 stage.home()
 stage._controller.start([20.0, 20.0] if {kind!r} == "ptu" else [-20.0] * 3)

@@ -7,9 +7,10 @@ from emulator_process import connection
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsim.errors import DeviceError, InputError
-from mitsim.hardware.serial_line import SerialLine
-from mitsim.hardware.stage import start_stage
+from characterisation.files.errors import InputError
+from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.serial_line import SerialLine
+from mitsim.capture.devices.stage import start_stage
 
 #: no run may take longer [s]: opening, homing, two moves and closing with every time-out of the connection used up
 #: once for each of the exchanges that they are made of would be 90 s; a run ends with its first

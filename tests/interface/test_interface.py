@@ -11,7 +11,7 @@ import xarray as xr
 from typer.testing import CliRunner
 
 import mitsim as ms
-from mitsim.cli import app
+from mitsim.cli.program import app
 
 POSE = ms.look_at((0, -300, 400))
 

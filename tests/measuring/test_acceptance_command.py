@@ -8,8 +8,8 @@ from seen_shapes import GRID, cloud_of, plane, sphere
 from shell import mitsim_here
 
 from characterisation.cloud_files import write_ply
-from mitsim.errors import InputError
-from mitsim.measuring.acceptance import read_artefacts
+from characterisation.files.errors import InputError
+from mitsim.cli.acceptance_request import read_artefacts
 
 SIGMA = 0.05
 

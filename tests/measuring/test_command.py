@@ -8,14 +8,14 @@ from seen_shapes import cloud_of, plane
 from typer.testing import CliRunner
 
 from characterisation.cloud_files import write_ply
+from characterisation.files.errors import InputError
 from mitsim.capture.folder import write_capture
-from mitsim.cli import app
-from mitsim.errors import InputError
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.cli.program import app
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 
 
 def run(*arguments):

@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from seen_shapes import GRID, cloud_of, cylinder, plane, sphere
 
-from characterisation.errors import InputError
 from characterisation.features.fits import fit_cylinder
 from characterisation.features.starts import cylinder_start
-from mitsim.measuring.document import repeatability_table
-from mitsim.measuring.result import Result, repeatability
-from mitsim.measuring.windows import WindowPlan, measure_windows
-from mitsim.sensor.roi import Roi
+from characterisation.files.errors import InputError
+from characterisation.region_of_interest import Roi
+from characterisation.tasks.result import Result, repeatability
+from characterisation.tasks.windows import WindowPlan, measure_windows
+from mitsim.decode.measured_document import repeatability_table
 
 #: left half a plane, right half one that leans by 30 deg against it; below them a ball and a pin
 LEFT, RIGHT = (Roi(5, 5, 85, 60), Roi(110, 5, 85, 60))

@@ -30,9 +30,9 @@ GOOD = ("refused", "accepted")
 IMPORTED = [
     "mutations.readers",
     "report.conftest",
-    "mitsim.authoring.read_mesh",
-    "mitsim.campaign.plan",
-    "mitsim.recordings.recognise",
+    "mitsim.scene.authoring.read_mesh",
+    "mitsim.maps.campaign.plan",
+    "mitsim.capture.recordings.recognise",
     "netCDF4",
     "scipy.io",
 ]
@@ -144,9 +144,8 @@ def child(name, folder, start, count, telling) -> None:
     import numpy as np
     import xarray as xr
 
-    from characterisation.atomic_io import write_netcdf
-    from characterisation.errors import InputError
-    from mitsim.errors import MissingEnvironmentError
+    from characterisation.files.atomic_io import write_netcdf
+    from characterisation.files.errors import InputError, MissingEnvironmentError
     from mutations.mutate import mutated_bytes, mutated_dataset
     from mutations.readers import READERS
 

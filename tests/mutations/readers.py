@@ -26,7 +26,7 @@ class Reader:
 
 def command(*arguments):
     """A command in this process; exit codes of a bug of ours are none."""
-    from mitsim.cli import main
+    from mitsim.cli.program import main
 
     before, sys.argv = sys.argv, ["mitsim", *map(str, arguments)]
     try:
@@ -34,7 +34,7 @@ def command(*arguments):
             main()
     except SystemExit as done:
         if done.code == 2:
-            from mitsim.errors import InputError
+            from characterisation.files.errors import InputError
 
             raise InputError("command", "", told.getvalue()[-200:], "") from None
         if done.code not in (0, 1, 3):
@@ -81,15 +81,15 @@ def _study(folder):
 
 
 def _read_study(path):
-    from characterisation.documents import read_toml
+    from characterisation.files.documents import read_toml
     from mitsim.study import StudyFile
 
     read_toml(path, StudyFile)
 
 
 def _read_campaign(path):
-    from characterisation.documents import read_toml
-    from mitsim.campaign.plan import CampaignFile
+    from characterisation.files.documents import read_toml
+    from mitsim.maps.campaign.plan import CampaignFile
 
     read_toml(path, CampaignFile)
 
@@ -121,7 +121,7 @@ def _run_folder(name):
 
 def _read_run(path):
     from mitsim.report.agreement import agreement
-    from mitsim.report.run_folder import read_run
+    from mitsim.study.run_folder import read_run
 
     folder = path.parent if path.parent.name != "view_0004" else path.parents[2]
     run = read_run(folder)
@@ -161,7 +161,7 @@ def _foreign(folder):
 
 
 def _decode_foreign(path):
-    from mitsim.recordings.ply import decode_ply
+    from mitsim.capture.recordings.ply import decode_ply
 
     decode_ply(path.read_bytes(), path)
 
@@ -235,7 +235,7 @@ def _heights(suffix):
 
 
 def _read_heights(path):
-    from mitsim.surface.measured import read_height_map
+    from mitsim.scene.surface.measured import read_height_map
 
     read_height_map(path, 1.0)
 
@@ -248,7 +248,7 @@ def _profile(folder):
 
 
 def _read_profile(path):
-    from mitsim.surface.measured import read_profile
+    from mitsim.scene.surface.measured import read_profile
 
     read_profile(path)
 
@@ -265,8 +265,8 @@ def _mesh(suffix):
 
 
 def _read_mesh(path):
-    from mitsim.authoring.read_mesh import read_mesh
-    from mitsim.authoring.segment_mesh import segment_mesh
+    from mitsim.scene.authoring.read_mesh import read_mesh
+    from mitsim.scene.authoring.segment_mesh import segment_mesh
 
     mesh = read_mesh(path)
     segment_mesh(mesh.vertices, mesh.triangles, where=str(path))
@@ -288,8 +288,8 @@ def _patches(folder):
     sys.path.insert(0, str(ROOT / "tests" / "campaign"))
     from known_clouds import known_source, smooth
 
-    from mitsim.campaign.plan import CampaignFile, plan_campaign
-    from mitsim.campaign.run import run_campaign
+    from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
+    from mitsim.maps.campaign.run import run_campaign
     from mitsim.sensor.preset import load_sensor
 
     table = {
@@ -310,15 +310,15 @@ def _patches(folder):
 def _read_patches(path):
     """As if the index beside it had been signed again."""
     from characterisation.coupon.patch_table import overall
-    from mitsim.campaign.run import joined
-    from mitsim.campaign.store import _table
+    from mitsim.maps.campaign.run import joined
+    from mitsim.maps.campaign.store import _table
 
     table = _table(path.read_bytes(), path)
     overall(table), joined([table, table])
 
 
 def _read_scene_geometry(path):
-    from mitsim.report.scene_geometry import read_scene_geometry
+    from mitsim.study.scene_geometry import read_scene_geometry
 
     read_scene_geometry(path.parent)
 
@@ -337,8 +337,8 @@ def _read_choice(path):
 
 
 def _trials(folder):
-    from mitsim.virtual.trials import Outcome, TrialFolder
-    from mitsim.virtual.world import Trial
+    from mitsim.study.virtual.trials import Outcome, TrialFolder
+    from mitsim.study.virtual.world import Trial
 
     trials = TrialFolder(folder / "trials", "0123", ["a", "b"])
     for day in range(5):
@@ -347,7 +347,7 @@ def _trials(folder):
 
 
 def _read_trials(path):
-    from mitsim.virtual.trials import TrialFolder
+    from mitsim.study.virtual.trials import TrialFolder
 
     found = TrialFolder(path.parent, "0123", ["a", "b"])
     trials = list(found.known(3))
@@ -372,9 +372,9 @@ deviation = "alpha=1"
 
 
 def _read_many(path):
-    from mitsim.campaign.many import CommonSettings, read_jobs
     from mitsim.sensor.noise_sources import Noise
     from mitsim.sensor.preset import load_sensor
+    from mitsim.study.many_captures import CommonSettings, read_jobs
 
     common = CommonSettings({}, "", 1, 1, 1, Noise(), False)
     read_jobs(path, SCENES / "two_pillars" / "two_pillars.xml", load_sensor("ensenso-n10"), common)
@@ -420,8 +420,8 @@ def _step(folder):
 
 
 def _read_step(path):
-    from mitsim.authoring.part21 import read_step_text
-    from mitsim.authoring.product_information import read_product_information
+    from mitsim.scene.authoring.part21 import read_step_text
+    from mitsim.scene.authoring.product_information import read_product_information
 
     read_product_information(read_step_text(path))
 
@@ -446,7 +446,7 @@ def _recording(name):
 
 
 def _read_recording(path):
-    from mitsim.recordings.recognise import ReadOptions, read_recording
+    from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 
     read_recording(path.parent if path.suffix == ".json" else path, ReadOptions())
 

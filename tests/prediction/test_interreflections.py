@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from characterisation.point_cloud import Status
-from mitsim.prediction import Predictor
-from mitsim.prediction.interreflections import InterreflectionEffect, Loss, found_share
-from mitsim.prediction.perturbation import SceneView
-from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.prediction import Predictor
+from mitsim.maps.prediction.interreflections import InterreflectionEffect, Loss, found_share
+from mitsim.maps.prediction.perturbation import SceneView
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform, look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 from tests.smaller_sensors import binned
 
 pytestmark = pytest.mark.usefixtures("no_other_scenes")

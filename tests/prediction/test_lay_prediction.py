@@ -16,15 +16,15 @@ from characterisation.maps.light import light_variables
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 from characterisation.point_cloud import Status
-from mitsim.campaign import one_finish, run
-from mitsim.campaign.acquire import in_turn, simulated_source
-from mitsim.campaign.one_finish import OneFinish, characterise_finish, one_finish_campaign, plan_of
-from mitsim.prediction import CharacterisedScene, Predictor, performance
-from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.campaign import one_finish, run
+from mitsim.maps.campaign.acquire import in_turn, simulated_source
+from mitsim.maps.campaign.one_finish import OneFinish, characterise_finish, one_finish_campaign, plan_of
+from mitsim.maps.prediction import CharacterisedScene, Predictor, performance
 from mitsim.scene.load import Scene, flat_coupon, scene_from_dict
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.simulate import SimulatedSensor
 from tests.smaller_sensors import narrow_search
 
 DISTANCE = 504.0

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 from characterisation.point_cloud import Status
-from mitsim.errors import InputError
-from mitsim.prediction import CharacterisedScene, Predictor, performance
-from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.prediction import CharacterisedScene, Predictor, performance
 from mitsim.scene.load import Scene, load_scene, scene_from_dict
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at

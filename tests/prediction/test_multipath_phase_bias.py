@@ -6,18 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.prediction import Ideal, Predictor
-from mitsim.prediction.interreflections import InterreflectionEffect
-from mitsim.prediction.multipath_phase_bias import WINDOW_PX, amplitude, finest_fringe, fringes, phase_bias
-from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.maps.prediction import Ideal, Predictor
+from mitsim.maps.prediction.interreflections import InterreflectionEffect
+from mitsim.maps.prediction.multipath_phase_bias import WINDOW_PX, amplitude, finest_fringe, fringes, phase_bias
 from mitsim.scene.backend import activate
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.light_code import PhaseShift
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 from tests.smaller_sensors import middle_part
 
 pytestmark = pytest.mark.usefixtures("no_other_scenes")

@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 
 from characterisation.point_cloud import Status
-from mitsim.prediction import Ideal, Predictor
-from mitsim.prediction.interreflections import InterreflectionEffect
-from mitsim.prediction.multipath_range_bias import path_amplitudes, path_bias, range_bias
-from mitsim.prediction.perturbation import SceneView
-from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.maps.prediction import Ideal, Predictor
+from mitsim.maps.prediction.interreflections import InterreflectionEffect
+from mitsim.maps.prediction.multipath_range_bias import path_amplitudes, path_bias, range_bias
+from mitsim.maps.prediction.perturbation import SceneView
 from mitsim.scene.backend import activate
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.modulation import LIGHT_MM_S
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 
 pytestmark = pytest.mark.usefixtures("no_other_scenes")
 

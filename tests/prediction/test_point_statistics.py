@@ -8,10 +8,10 @@ import pytest
 from characterisation.maps.noise_structure import noise_structure
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
-from mitsim.prediction import Predictor
-from mitsim.prediction.perturbation import Perturbation, together
-from mitsim.prediction.point_statistics import ViewPoints, expected_points
-from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.prediction import Predictor
+from mitsim.maps.prediction.perturbation import Perturbation, together
+from mitsim.maps.prediction.point_statistics import ViewPoints, expected_points
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at

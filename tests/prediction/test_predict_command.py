@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from characterisation.cloud_files import read_ply
 from characterisation.coupon.residual_field import autocorrelation
 from characterisation.point_cloud import PointCloud
-from mitsim.cli import app
+from mitsim.cli.program import app
 
 
 def predicted(scenes: Path, folder: Path, *options: str) -> PointCloud:

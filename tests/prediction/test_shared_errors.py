@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from mitsim.calibration.accuracy import measured_points
-from mitsim.prediction.shared_errors import SharedErrors, independent_fields, terms
+from mitsim.maps.prediction.shared_errors import SharedErrors, independent_fields, terms
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import moved, path_error
+from mitsim.study.calibration.accuracy import measured_points
 
 RNG = np.random.default_rng(5)
 

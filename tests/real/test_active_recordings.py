@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 
 from characterisation.coupon.metrics import ray_noise_std
+from characterisation.region_of_interest import Roi
+from mitsim.capture.recordings.ensenso import read_ensenso
+from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+from mitsim.capture.recordings.stereo_pair import read_stereo_pair
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.decode.cloud import capture_cloud, decoder_settings
+from mitsim.decode.depth_range import surface_beyond
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
-from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
-from mitsim.reconstruction.depth_range import surface_beyond
-from mitsim.recordings.ensenso import read_ensenso
-from mitsim.recordings.recognise import ReadOptions, read_recording
-from mitsim.recordings.stereo_pair import read_stereo_pair
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import mean_run_length
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
-from mitsim.simulation.rendering import Rendering
 
 pytestmark = pytest.mark.real
 
@@ -226,9 +226,9 @@ def simulated_sheet(recording, tmp_path_factory):
     scale, were it straight, stands for 1920 electrons, and 2.3 DN in the dark. All of the sheet lies under the first
     knee of the unit's companding curve, where the curve is straight.
     """
+    from mitsim.capture.simulated.simulate import SimulatedSensor
     from mitsim.scene.load import scene_from_dict
     from mitsim.sensor.preset import load_sensor
-    from mitsim.simulation.simulate import SimulatedSensor
 
     cloud = sheet_cloud(recording, recording.rig)
     mesh = tmp_path_factory.mktemp("sheet") / "sheet.ply"

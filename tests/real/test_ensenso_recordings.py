@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.point_cloud import Status
+from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
+from mitsim.capture.recordings.ensenso import ensenso_originals, read_ensenso
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
-from mitsim.recordings.ensenso import ensenso_originals, read_ensenso
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 pytestmark = pytest.mark.real

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from characterisation.coupon.metrics import ray_noise_std
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
+from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture_checks.sanity import cloud_warnings, pair_row_error
+from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+from mitsim.decode.checks.sanity import cloud_warnings, pair_row_error
+from mitsim.decode.cloud import capture_cloud, decoder_settings
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.stereo import decode_stereo
-from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
-from mitsim.recordings.recognise import ReadOptions, read_recording
-from mitsim.sensor.roi import Roi
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recordings"))
 

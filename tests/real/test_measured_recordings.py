@@ -2,12 +2,12 @@
 
 import pytest
 
-from mitsim.measuring.clouds import cloud_paths, read_cloud
-from mitsim.measuring.plate import Plate, image_on_grid, measure_plate
-from mitsim.measuring.windows import WindowPlan, measure_windows
-from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
-from mitsim.recordings.ensenso import read_ensenso
-from mitsim.sensor.roi import Roi
+from characterisation.region_of_interest import Roi
+from characterisation.tasks.windows import WindowPlan, measure_windows
+from mitsim.capture.recordings.ensenso import read_ensenso
+from mitsim.decode.cloud import capture_cloud, decoder_settings
+from mitsim.decode.input_clouds import cloud_paths, read_cloud
+from mitsim.decode.plate import Plate, image_on_grid, measure_plate
 
 pytestmark = pytest.mark.real
 

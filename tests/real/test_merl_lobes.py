@@ -7,7 +7,7 @@ import csv
 import numpy as np
 import pytest
 
-from mitsim.surface.microfacet import alpha_of_half_width, half_width
+from mitsim.scene.surface.microfacet import alpha_of_half_width, half_width
 
 pytestmark = pytest.mark.real
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.recordings.recognise import ReadOptions, read_recording
+from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 from mitsim.sensor.preset import load_sensor
-from mitsim.sensor.roi import Roi
-from mitsim.twin.response import first_knee
-from mitsim.validation.captures_run import validate_captures
+from mitsim.twin.compare.captures_run import validate_captures
+from mitsim.twin.sensor.response import first_knee
 
 pytestmark = pytest.mark.real
 

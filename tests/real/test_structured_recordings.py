@@ -15,14 +15,14 @@ from typer.testing import CliRunner
 
 from characterisation.point_cloud import Status
 from mitsim.capture.grey_image import read_grey
-from mitsim.capture_checks.image_sanity import image_warnings
-from mitsim.capture_checks.sanity import capture_warnings
-from mitsim.cli import app
+from mitsim.capture.recordings.image_folder import read_image_folder
+from mitsim.cli.program import app
+from mitsim.decode.checks.image_sanity import image_warnings
+from mitsim.decode.checks.sanity import capture_warnings
+from mitsim.decode.cloud import capture_cloud, sensor_geometry
 from mitsim.decode.structured_light.decoder import decode_coordinates
 from mitsim.decode.structured_light.phase_shift import fit_phases
 from mitsim.decode.structured_light.projector_gamma import correct_phase, gamma_from_white
-from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
-from mitsim.recordings.image_folder import read_image_folder
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.preset import load_sensor

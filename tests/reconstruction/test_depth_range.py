@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mitsim.campaign.plan import coupon_pose
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import write_capture
-from mitsim.cli import app
-from mitsim.reconstruction.cloud import capture_cloud
-from mitsim.reconstruction.depth_range import _coarse_capture, depths_of, neighbour_agreement, surface_beyond
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.cli.program import app
+from mitsim.decode.cloud import capture_cloud
+from mitsim.decode.depth_range import _coarse_capture, depths_of, neighbour_agreement, surface_beyond
+from mitsim.maps.campaign.plan import coupon_pose
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.camera import stereo_rectification
 from mitsim.sensor.preset import load_sensor
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 from tests.smaller_sensors import middle_part
 
 NAMES = ["ensenso-n10", "david-sls-3", "kinect-v2"]
@@ -72,7 +72,7 @@ def test_an_ordinary_capture_is_not_looked_at_twice(taken, monkeypatch):
     def twice(*_):
         raise AssertionError("decoded twice")
 
-    monkeypatch.setattr("mitsim.reconstruction.depth_range.capture_cloud", twice)
+    monkeypatch.setattr("mitsim.decode.depth_range.capture_cloud", twice)
     assert surface_beyond(capture, cloud, sensor.settings) is None
 
 

@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
+from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.errors import InputError
-from mitsim.reconstruction.cloud import capture_cloud, read_out_of, sensor_geometry
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import capture_cloud, read_out_of, sensor_geometry
 from mitsim.scene.load import load_scene
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 from tests.smaller_sensors import middle_part, narrow_search
 
 ROOT = Path(__file__).parents[2]

@@ -11,10 +11,10 @@ from cloud_files_of_others import lzf, pcd, pinhole_cloud, ply
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from characterisation.errors import InputError
-from mitsim.recordings.lzf import decode_lzf
-from mitsim.recordings.pcd import decode_pcd
-from mitsim.recordings.ply import decode_ply
+from characterisation.files.errors import InputError
+from mitsim.capture.recordings.lzf import decode_lzf
+from mitsim.capture.recordings.pcd import decode_pcd
+from mitsim.capture.recordings.ply import decode_ply
 
 SMALL = pinhole_cloud(12, 9)
 FORMS = ["ascii", "binary", "binary_compressed"]

@@ -24,13 +24,13 @@ from mcap.writer import CompressionType, IndexType
 from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
-from mitsim.recordings.depthai_calibration import read_depthai_calibration
-from mitsim.recordings.depthai_frames import read_frames
-from mitsim.recordings.depthai_recording import read_depthai_recording
-from mitsim.recordings.mcap_messages import mcap_messages
+from mitsim.capture.recordings.depthai_calibration import read_depthai_calibration
+from mitsim.capture.recordings.depthai_frames import read_frames
+from mitsim.capture.recordings.depthai_recording import read_depthai_recording
+from mitsim.capture.recordings.mcap_messages import mcap_messages
+from mitsim.decode.cloud import capture_cloud, decoder_settings
 
 needs_depthai = pytest.mark.skipif(find_spec("depthai") is None, reason="no depthai: pip install 'mitsim[depthai]'")
 
@@ -545,9 +545,9 @@ def test_without_the_extra_other_recordings_load_and_these_say_what_to_install(r
     """In a process of its own, where none of its packages can be imported."""
     code = (
         "import sys; sys.modules.update(dict.fromkeys(('mcap', 'mcap_protobuf', 'lz4', 'zstandard', 'google')))\n"
-        "import mitsim.commands.import_recording, mitsim.measuring.clouds\n"
-        "from mitsim.errors import MissingEnvironmentError\n"
-        "from mitsim.recordings.recognise import ReadOptions, read_recording\n"
+        "import mitsim.cli.import_recording, mitsim.decode.input_clouds\n"
+        "from characterisation.files.errors import MissingEnvironmentError\n"
+        "from mitsim.capture.recordings.recognise import ReadOptions, read_recording\n"
         "try: read_recording(sys.argv[1], ReadOptions(frame=0))\n"
         "except MissingEnvironmentError as error: print(error)\n"
     )

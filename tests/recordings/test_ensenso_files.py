@@ -15,11 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.capture.png import encode_png
-from mitsim.reconstruction.cloud import decoder_settings
-from mitsim.recordings.ensenso import ensenso_originals, read_ensenso
-from mitsim.recordings.nxlib_tree import NxLibTree, link_of
+from mitsim.capture.recordings.ensenso import ensenso_originals, read_ensenso
+from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of
+from mitsim.decode.cloud import decoder_settings
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, BASELINE = 40, 24, 101.0
@@ -314,11 +314,11 @@ def test_the_link_takes_the_target_to_the_rectified_camera(tmp_path):
 
 def test_a_zip_of_too_many_files_or_too_many_bytes_is_stopped(tmp_path, monkeypatch):
     path = pack(tmp_path / "r.zip", files(node()) | {f"more/{number}": b"" for number in range(50)})
-    monkeypatch.setattr("mitsim.recordings.recording_files.MOST_FILES", 50)
+    monkeypatch.setattr("mitsim.capture.recordings.recording_files.MOST_FILES", 50)
     with pytest.raises(InputError, match="53 files; allowed: up to 50"):
         read_ensenso(path)
     monkeypatch.undo()
-    monkeypatch.setattr("mitsim.recordings.recording_files.LARGEST_RECORDING", 500)
+    monkeypatch.setattr("mitsim.capture.recordings.recording_files.LARGEST_RECORDING", 500)
     with pytest.raises(InputError, match="up to 500 bytes in all"):
         read_ensenso(path)
 
@@ -347,7 +347,7 @@ def test_what_is_no_recording(tmp_path):
 
 
 def test_a_zip_that_swells_is_stopped(tmp_path, monkeypatch):
-    monkeypatch.setattr("mitsim.recordings.recording_files.LARGEST_FILE", 10_000)
+    monkeypatch.setattr("mitsim.capture.recordings.recording_files.LARGEST_FILE", 10_000)
     with pytest.raises(InputError, match="10000 bytes"):
         read_ensenso(pack(tmp_path / "r.zip", files(node()) | {"1_150358_left.png": bytes(1_000_000)}))
 

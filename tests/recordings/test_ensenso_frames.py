@@ -17,15 +17,15 @@ from test_ensenso_files import LEFT_ROTATION, files, intrinsic, node, pack
 from typer.testing import CliRunner
 
 from characterisation.cloud_files import WrittenFrame, read_ply, write_ply
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
+from mitsim.capture.recordings.calibration_file import read_calibration
+from mitsim.capture.recordings.ensenso import read_ensenso
+from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 from mitsim.capture.workspace import written_frame
-from mitsim.cli import app
+from mitsim.cli.program import app
 from mitsim.decode.device_maps import camera_map_geometry, decode_depth_map
-from mitsim.recordings.calibration_file import read_calibration
-from mitsim.recordings.ensenso import read_ensenso
-from mitsim.recordings.recognise import ReadOptions, read_recording
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, F, CX, CY = 80, 60, 66.0, 37.0, 31.0

@@ -17,21 +17,21 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.coupon.patch_table import overall
 from characterisation.coupon.patches import Coupon, measure_patches
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.campaign.acquire import coupon_cloud
+from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
+from mitsim.capture.recordings.depth_image import read_depth_image
+from mitsim.capture.recordings.organised_cloud import read_organised_cloud
+from mitsim.capture.recordings.pinhole_fit import fit_pinhole
+from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+from mitsim.capture.recordings.stereo_pair import read_stereo_pair
+from mitsim.decode.cloud import capture_cloud, capture_geometry, decoder_settings, sensor_geometry
 from mitsim.decode.device_maps import DeviceMapSettings
-from mitsim.reconstruction.cloud import capture_cloud, capture_geometry, decoder_settings, sensor_geometry
-from mitsim.recordings.depth_image import read_depth_image
-from mitsim.recordings.organised_cloud import read_organised_cloud
-from mitsim.recordings.pinhole_fit import fit_pinhole
-from mitsim.recordings.recognise import ReadOptions, read_recording
-from mitsim.recordings.stereo_pair import read_stereo_pair
+from mitsim.maps.campaign.acquire import coupon_cloud
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.preset import Sensor
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 CLOUD = pinhole_cloud()

@@ -12,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
+from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.grey_image import CHANNELS, read_grey
-from mitsim.cli import app
-from mitsim.errors import InputError
-from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
-from mitsim.recordings.image_count import advice
-from mitsim.recordings.image_folder import counted, read_image_folder
+from mitsim.capture.recordings.image_count import advice
+from mitsim.capture.recordings.image_folder import counted, read_image_folder
+from mitsim.cli.program import app
+from mitsim.decode.cloud import capture_cloud, decoder_settings
 from mitsim.sensor.light_code import LightCode, patterns, roles, value
 from mitsim.sensor.preset import load_sensor
 

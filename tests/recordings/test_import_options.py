@@ -11,12 +11,12 @@ import pytest
 from simulated_rigs import images_seen, save_images, surface_seen
 from typer.testing import CliRunner
 
+from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture
-from mitsim.cli import app
-from mitsim.errors import InputError
-from mitsim.recordings.pose_file import read_pose
-from mitsim.recordings.recognise import ReadOptions, read_recording
-from mitsim.recordings.recording_files import frame_of
+from mitsim.capture.recordings.pose_file import read_pose
+from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+from mitsim.capture.recordings.recording_files import frame_of
+from mitsim.cli.program import app
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.light_code import GrayCode
 from mitsim.sensor.transforms import Transform

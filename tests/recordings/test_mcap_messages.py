@@ -16,9 +16,9 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, Chunk, DataEnd, Footer, Message, Schema
 from mcap.writer import CompressionType, Writer
 
-from characterisation.errors import InputError
-from mitsim.recordings.mcap_messages import LARGEST_CHUNK, LARGEST_SCHEMA, MOST_RECORDS, mcap_messages
-from mitsim.recordings.recording_files import MCAP_MAGIC as MAGIC
+from characterisation.files.errors import InputError
+from mitsim.capture.recordings.mcap_messages import LARGEST_CHUNK, LARGEST_SCHEMA, MOST_RECORDS, mcap_messages
+from mitsim.capture.recordings.recording_files import MCAP_MAGIC as MAGIC
 
 #: what is repeated, so that compression has something to do, and what is not
 PAYLOADS = [b"abc" * 40, b"", np.random.default_rng(1).bytes(60)]
@@ -168,7 +168,7 @@ def test_a_chunk_of_countless_empty_records_is_refused():
 
 def test_chunks_that_unpack_to_too_much_together_are_refused(monkeypatch):
     """Each within its limit; the limit of all is lowered here, for 4 GiB take seconds."""
-    monkeypatch.setattr("mitsim.recordings.mcap_messages.LARGEST_RECORDING", 10_000)
+    monkeypatch.setattr("mitsim.capture.recordings.mcap_messages.LARGEST_RECORDING", 10_000)
     unknown = b"\x80" + (3000).to_bytes(8, "little") + bytes(3000)
     one = chunk(lz4.frame.compress(unknown), "lz4", len(unknown))
     assert read(assembled(one, one, one)) == []

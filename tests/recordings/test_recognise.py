@@ -19,14 +19,14 @@ from test_ensenso_files import files as ensenso_files
 from test_ensenso_files import node, pack, unpack
 from typer.testing import CliRunner
 
-from characterisation.atomic_io import HOST
 from characterisation.cloud_files import read_ply
-from characterisation.errors import InputError
+from characterisation.files.atomic_io import HOST
+from characterisation.files.errors import InputError
 from mitsim.capture.calibration import calibration_table
 from mitsim.capture.folder import read_capture
-from mitsim.cli import app
-from mitsim.recordings.calibration_file import read_calibration
-from mitsim.recordings.recognise import KINDS, ReadOptions, kind_of, read_recording
+from mitsim.capture.recordings.calibration_file import read_calibration
+from mitsim.capture.recordings.recognise import KINDS, ReadOptions, kind_of, read_recording
+from mitsim.cli.program import app
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.preset import load_sensor
 

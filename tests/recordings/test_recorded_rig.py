@@ -11,9 +11,9 @@ from simulated_rigs import images_seen, save_calibration, save_images, surface_s
 from typer.testing import CliRunner
 
 from characterisation.cloud_files import read_ply
+from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture
-from mitsim.cli import app
-from mitsim.errors import InputError
+from mitsim.cli.program import app
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.recorded_rig import RecordedRig, load_recorded_rig, rig_named

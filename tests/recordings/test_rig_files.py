@@ -15,7 +15,7 @@ from simulated_rigs import images_seen, save_calibration, save_images, surface_s
 from typer.testing import CliRunner
 
 from characterisation.cloud_files import read_ply
-from mitsim.cli import app
+from mitsim.cli.program import app
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.recorded_rig import load_recorded_rig
 from mitsim.sensor.transforms import Transform

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture
-from mitsim.cli import app
-from mitsim.errors import InputError
-from mitsim.reconstruction.cloud import capture_cloud, decoder_settings
-from mitsim.recordings.recognise import ReadOptions, kind_of, read_recording
-from mitsim.recordings.robi import read_robi
+from mitsim.capture.recordings.recognise import ReadOptions, kind_of, read_recording
+from mitsim.capture.recordings.robi import read_robi
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.cli.program import app
+from mitsim.decode.cloud import capture_cloud, decoder_settings
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 
 #: the disparity at this distance is a whole number, to which SGBM draws what lies between
 WIDTH, HEIGHT, FOCAL, BASELINE, UNIT, DISTANCE = 400, 300, 420.0, 100.0, 0.03125, 525.0

@@ -11,9 +11,9 @@ import pytest
 import trimesh
 import xarray as xr
 
-from characterisation.atomic_io import write_netcdf
 from characterisation.cloud_files import write_ply
 from characterisation.coupon.patch_table import patch_table
+from characterisation.files.atomic_io import write_netcdf
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.scores.view_score import score_views, view_statistics

@@ -1,7 +1,7 @@
 """The best views as a table of text, by predicted uncertainty."""
 
 from mitsim.report.best_views import best_views
-from mitsim.report.run_folder import read_run
+from mitsim.study.run_folder import read_run
 
 from .conftest import FEATURES, MEASUREMENTS
 

@@ -12,9 +12,9 @@ from mitsim.capture.png import decode_png
 from mitsim.report import figures
 from mitsim.report.agreement import agreement
 from mitsim.report.cloud_figures import REASONS, camera_images, shrink, window
-from mitsim.report.run_folder import read_run
 from mitsim.report.style import as_svg
 from mitsim.report.view_figures import agreement_figure, uncertainty_figure, uncertainty_limits, view_places
+from mitsim.study.run_folder import read_run
 
 from .conftest import MEASUREMENTS, cloud
 

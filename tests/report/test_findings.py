@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.report import findings
-from mitsim.report.numbers import count, listed, percent, rounded, two_digits
+from mitsim.running.numbers import count, listed, percent, rounded, two_digits
 
 
 def scores_of(u, possible=None, tolerance=None):

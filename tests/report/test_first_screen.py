@@ -8,13 +8,13 @@ import pytest
 
 from characterisation.statements.verdict_words import Judged
 from characterisation.tasks.definitions import DEFINITIONS
-from mitsim.report.choice_document import read_choice
 from mitsim.report.first_rows import RowValues, measured_words, tolerance_words
 from mitsim.report.first_screen import of_choice, of_run, pose_words, tone_of
-from mitsim.report.numbers import with_degree_signs
 from mitsim.report.page import write_report
-from mitsim.report.run_folder import read_run
-from mitsim.report.scene_geometry import read_scene_geometry
+from mitsim.running.numbers import with_degree_signs
+from mitsim.study.choice_document import read_choice
+from mitsim.study.run_folder import read_run
+from mitsim.study.scene_geometry import read_scene_geometry
 from tests.plain_pages import without_pictures
 
 from .choice_run import write_choice

@@ -6,8 +6,8 @@ import shutil
 import pytest
 
 from mitsim.report.choice_page import write_choice_page
-from mitsim.report.numbers import percent
 from mitsim.report.page import write_report
+from mitsim.running.numbers import percent
 
 from .choice_run import write_choice
 from .chromium import BROWSER

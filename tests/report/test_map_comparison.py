@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from mitsim.report.map_comparison import (

@@ -11,10 +11,10 @@ import pytest
 import xarray as xr
 from markupsafe import escape
 
-from characterisation.atomic_io import write_netcdf
-from characterisation.errors import InputError
-from mitsim.report.numbers import two_digits
+from characterisation.files.atomic_io import write_netcdf
+from characterisation.files.errors import InputError
 from mitsim.report.page import write_report
+from mitsim.running.numbers import two_digits
 from tests.plain_pages import without_pictures
 
 from .conftest import CHECKED, FEATURES, HOSTILE, MEASUREMENTS, plain_pictures, write_run

@@ -12,7 +12,7 @@ from html.parser import HTMLParser
 import pytest
 import xarray as xr
 
-from characterisation.atomic_io import write_netcdf
+from characterisation.files.atomic_io import write_netcdf
 from mitsim.report.page import write_report
 
 from .conftest import plain_pictures

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from mitsim.report.placement_figure import depth_buffer, face_verdicts, placement_figure, spread
-from mitsim.report.scene_geometry import read_scene_geometry
+from mitsim.study.scene_geometry import read_scene_geometry
 
 from .conftest import write_scene_geometry
 

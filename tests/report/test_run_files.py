@@ -5,10 +5,10 @@ import shutil
 
 import pytest
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.report.page import write_report
-from mitsim.report.run_files import claim_folder, digests_of
-from mitsim.report.run_folder import read_run
+from mitsim.study.run_files import claim_folder, digests_of
+from mitsim.study.run_folder import read_run
 from tests.plain_pages import without_pictures
 
 from .conftest import CHECKED

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from characterisation.atomic_io import write_netcdf
 from characterisation.cloud_files import write_ply
-from characterisation.errors import InputError
+from characterisation.files.atomic_io import write_netcdf
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, ViewGrid
-from mitsim.report.run_folder import read_run
+from mitsim.study.run_folder import read_run
 
 from .conftest import CHECKED, MEASUREMENTS
 

@@ -5,8 +5,8 @@ import json
 import pytest
 
 from mitsim.report.first_screen import of_run
-from mitsim.report.run_folder import ConfirmedEntry, ViewSetEntry, read_run
 from mitsim.report.set_words import set_result, with_sets
+from mitsim.study.run_folder import ConfirmedEntry, ViewSetEntry, read_run
 
 from .conftest import MEASUREMENTS, write_run
 

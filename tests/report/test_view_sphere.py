@@ -17,17 +17,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from characterisation.atomic_io import write_netcdf
 from characterisation.cloud_files import read_ply
-from characterisation.errors import InputError
+from characterisation.files.atomic_io import write_netcdf
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.report import view_clouds
 from mitsim.report.page import _rolls, _standoffs, write_report
-from mitsim.report.run_folder import read_run
 from mitsim.report.view_clouds import Box, box_around, choose_clouds, fewer_triangles, packed_part, shown_cloud
 from mitsim.report.view_data import sites, target
 from mitsim.report.view_figures import uncertainty_figure
 from mitsim.report.view_sphere import LEAST_CHANCE, page_script, view_sphere
+from mitsim.study.run_folder import read_run
 
 from .conftest import CHECKED, FEATURES, MEASUREMENTS
 from .test_page import Tags
@@ -99,7 +99,7 @@ def test_a_view_is_able_with_an_uncertainty_and_a_chance_of_one_half(data):
 
 
 def test_least_chance_is_that_of_the_score():
-    from mitsim import view_scores
+    from mitsim.views import view_scores
 
     assert view_scores.LEAST_CHANCE == LEAST_CHANCE
 

@@ -11,10 +11,10 @@ import xarray as xr
 from jinja2 import Environment, FileSystemLoader
 from matplotlib import colormaps
 
-from characterisation.atomic_io import write_netcdf
-from mitsim.report import numbers
-from mitsim.report.run_folder import read_run
+from characterisation.files.atomic_io import write_netcdf
 from mitsim.report.view_sphere import view_sphere
+from mitsim.running import numbers
+from mitsim.study.run_folder import read_run
 
 from .chromium import BROWSER
 from .conftest import FEATURES, MEASUREMENTS

@@ -13,8 +13,8 @@ import numpy as np
 import trimesh
 import xarray as xr
 
-from characterisation.atomic_io import write_netcdf
 from characterisation.cloud_files import write_ply
+from characterisation.files.atomic_io import write_netcdf
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.sensor.transforms import look_at
 

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from mitsim.errors import InputError, MissingEnvironmentError
+from characterisation.files.errors import InputError, MissingEnvironmentError
 from mitsim.scene import backend
 from tests.render_threads import threads
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.bsdf_descriptions import metal_bsdf
 from mitsim.scene.coherent_blend import NAME, register_coherent_blend
-from mitsim.surface.energy import directional_albedo, energy_factors
-from mitsim.surface.machined import Face, machined
+from mitsim.scene.surface.energy import directional_albedo, energy_factors
+from mitsim.scene.surface.machined import Face, machined
 
 ANGLES_DEG = (0, 30, 45, 60, 75)
 

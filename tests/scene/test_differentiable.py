@@ -9,18 +9,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mitsim.fit.finish import metal_finish
-from mitsim.fit.place import known_place
-from mitsim.fit.white_coupon import WhiteCouponRenderer, coupon_roi
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
+from mitsim.scene.surface.coherence import lobe_factor
+from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.metals import refractive_index
+from mitsim.scene.surface.microfacet import fresnel, shadowing, slope_density
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
-from mitsim.surface.coherence import lobe_factor
-from mitsim.surface.machined import Face, machined
-from mitsim.surface.metals import refractive_index
-from mitsim.surface.microfacet import fresnel, shadowing, slope_density
+from mitsim.twin.finish.finish import metal_finish
+from mitsim.twin.finish.place import known_place
+from mitsim.twin.finish.white_coupon import WhiteCouponRenderer, coupon_roi
 
 INDEX = refractive_index("aluminium", 850.0)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.scene.first_hits import trace, visible_surfaces
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene

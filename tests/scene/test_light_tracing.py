@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.light_tracing import Photons, add_photons
@@ -16,7 +17,6 @@ from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform, look_at
 from tests.render_threads import threads
 

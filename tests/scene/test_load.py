@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.scene.load import load_scene, scene_from_dict
 
 TWO = "two_pillars/two_pillars.xml"

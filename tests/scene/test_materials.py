@@ -8,17 +8,17 @@ import math
 import numpy as np
 import pytest
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.scene import backend
 from mitsim.scene.bsdf_descriptions import gloss_paint_bsdf, metal_bsdf, powder_coat_bsdf
 from mitsim.scene.load import load_scene
 from mitsim.scene.materials import Finish
-from mitsim.surface.energy import directional_albedo, energy_factors
-from mitsim.surface.machined import Face, machined
-from mitsim.surface.metals import normal_reflectance, refractive_index
-from mitsim.surface.paint import ALPHA_RANGE, paint
-from mitsim.surface.processes import PROCESSES
-from mitsim.surface.scatter import NOMINAL, Deviation
+from mitsim.scene.surface.energy import directional_albedo, energy_factors
+from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.metals import normal_reflectance, refractive_index
+from mitsim.scene.surface.paint import ALPHA_RANGE, paint
+from mitsim.scene.surface.processes import PROCESSES
+from mitsim.scene.surface.scatter import NOMINAL, Deviation
 
 FURNACE_DEG = np.array([0, 15, 30, 45, 60])
 

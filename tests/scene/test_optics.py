@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
+from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.light_transport import transport
 from mitsim.scene.light_transport.aperture_samples import aperture_samples
@@ -18,7 +19,6 @@ from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform, look_at, mitsuba_to_world
 
 pytestmark = pytest.mark.usefixtures("no_other_scenes")

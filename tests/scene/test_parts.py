@@ -9,10 +9,10 @@ import pytest
 
 from characterisation.point_cloud import PointCloud, Status
 from characterisation.tasks.evaluation import measure, read_task
-from mitsim.authoring.face import surface_distance
-from mitsim.prediction import Predictor
-from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.prediction import Predictor
 from mitsim.scene import load
+from mitsim.scene.authoring.face import surface_distance
 from mitsim.scene.load import load_scene
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.preset import load_sensor

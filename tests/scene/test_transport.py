@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from characterisation.features.fits import fit_sphere
+from characterisation.region_of_interest import Roi
 from mitsim.decode.triangulate import triangulate
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_paths import LightPaths
@@ -15,7 +16,6 @@ from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import FILM_OFFSET_PX, Transform, look_at, mitsuba_to_world
 
 pytestmark = pytest.mark.usefixtures("no_other_scenes")

@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
+from characterisation.files.errors import MissingEnvironmentError
 from mitsim.capture.folder import read_capture
-from mitsim.errors import MissingEnvironmentError
 from mitsim.scene.backend import VARIANTS, choose_variant
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.recorded_rig import load_recorded_rig
 
 K1 = np.array([[900.5, 0, 317.2], [0, 901.25, 241.4], [0, 0, 1]])

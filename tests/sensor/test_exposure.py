@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.exposure import automatic, bracket
 
 LIMITS = (1e-5, 1e-2)

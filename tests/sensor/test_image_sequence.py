@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decode.structured_light.decoder import decode_coordinates
-from mitsim.errors import InputError
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, patterns, roles

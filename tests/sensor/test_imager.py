@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.image_formation import converter, counted_below, expose, fixed_pattern
 from mitsim.sensor.imager import Imager, electrons_per_radiance
 from mitsim.sensor.noise_sources import Noise

@@ -6,7 +6,7 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.preset import load_sensor
 
 PRESET = (files("mitsim.sensor") / "presets" / "zivid-2-m70.toml").read_text()

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from characterisation.documents import validate
-from characterisation.errors import InputError
+from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
 from mitsim.sensor.light_code import (
     GrayCode,
     GrayCodePhaseShift,

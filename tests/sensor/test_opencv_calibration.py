@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.preset import load_sensor
 
 FRINGES = (Path(__file__).parents[1] / "data/fringes.toml").read_text(encoding="utf-8")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.transforms import Transform

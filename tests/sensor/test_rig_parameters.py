@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance, write_rig_covariance

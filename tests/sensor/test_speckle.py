@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.special import j1
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.speckle import (
     SpeckleOptics,
     SpeckleSurface,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.vignetting import camera_illumination, cos4_corner, relative_illumination

@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from characterisation.region_of_interest import Roi
+from mitsim.capture.simulated import simulate
+from mitsim.capture.simulated.indirect_light import IndirectLight, smoothed
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.backend import mi
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation import simulate
-from mitsim.simulation.indirect_light import IndirectLight, smoothed
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 
 pytestmark = pytest.mark.usefixtures("no_other_scenes")
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from characterisation.region_of_interest import Roi
+from mitsim.capture.simulated.lens_blur import blur_by_lens, gaussian_blur
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
-from mitsim.simulation.lens_blur import blur_by_lens, gaussian_blur
 
 WIDTH, HEIGHT = 201, 161
 CAMERA = Camera(

@@ -11,14 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import correlate1d
 
+from mitsim.capture.simulated.lens_blur import gaussian_blur
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.backend import mi
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.lens_blur import gaussian_blur
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 from tests.render_threads import threads
 
 ROOT = Path(__file__).parents[2]

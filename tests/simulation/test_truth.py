@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.capture.simulated.truth import encode_exr, read_exr, true_image
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.simulate import SimulatedSensor
-from mitsim.simulation.truth import encode_exr, read_exr, true_image
 
 POSE = look_at([40, -480, 300], [0, 0, 20], [0, 0, 1], 10)
 RADIUS = 40.0

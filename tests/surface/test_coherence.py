@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.surface.coherence import coherent_weight, lobe_factor
-from mitsim.surface.energy import facets
-from mitsim.surface.machined import Face, machined
-from mitsim.surface.processes import PROCESSES
+from mitsim.scene.surface.coherence import coherent_weight, lobe_factor
+from mitsim.scene.surface.energy import facets
+from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.processes import PROCESSES
 
 
 def returned(scatter, angle, shared):

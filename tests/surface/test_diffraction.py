@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.special import j1
 
-from mitsim.surface.diffraction import coherent_share, lobe_alpha, phase_variance, sampled
-from mitsim.surface.roughness import correlation_length, matern, rms_height
+from mitsim.scene.surface.diffraction import coherent_share, lobe_alpha, phase_variance, sampled
+from mitsim.scene.surface.roughness import correlation_length, matern, rms_height
 
 
 def gaussian(length):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mitsim.surface.energy import NOMINAL_INCIDENCE, compensation, directional_albedo, energy_factors
+from mitsim.scene.surface.energy import NOMINAL_INCIDENCE, compensation, directional_albedo, energy_factors
 
 ANGLES = np.radians([0.1, 30, 45, 60, 75, 85])
 TABLE = {

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsim.surface.gloss import alpha_of_gloss, base_gloss, lobe_gloss
-from mitsim.surface.microfacet import fresnel
+from mitsim.scene.surface.gloss import alpha_of_gloss, base_gloss, lobe_gloss
+from mitsim.scene.surface.microfacet import fresnel
 
 PAINT, ALUMINIUM = (1.5, 0.0), (0.96, 6.7)
 

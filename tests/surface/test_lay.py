@@ -2,9 +2,9 @@
 
 import pytest
 
-from mitsim.surface.lay import lay_left_out, lays_in_words
-from mitsim.surface.machined import Face, machined
-from mitsim.surface.paint import matt_white
+from mitsim.scene.surface.lay import lay_left_out, lays_in_words
+from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.paint import matt_white
 
 
 @pytest.mark.parametrize(

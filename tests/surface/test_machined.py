@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mitsim.errors import InputError
-from mitsim.surface.gloss import lobe_gloss
-from mitsim.surface.machined import Face, machined
-from mitsim.surface.measured import height_map, profile
-from mitsim.surface.metals import CONSTANTS, refractive_index
-from mitsim.surface.processes import PROCESSES, feed, feed_slope
-from mitsim.surface.roughness import band_limited_slope, rms_height
+from characterisation.files.errors import InputError
+from mitsim.scene.surface.gloss import lobe_gloss
+from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.measured import height_map, profile
+from mitsim.scene.surface.metals import CONSTANTS, refractive_index
+from mitsim.scene.surface.processes import PROCESSES, feed, feed_slope
+from mitsim.scene.surface.roughness import band_limited_slope, rms_height
 
 
 def random_profile(rng, points=20000, length=16.0, rms=0.5):

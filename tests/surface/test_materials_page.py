@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from mitsim.surface.diffraction import coherent_share, lobe_alpha
-from mitsim.surface.energy import directional_albedo, energy_factors
-from mitsim.surface.machined import Face, machined
-from mitsim.surface.microfacet import GGX_PER_BECKMANN, alpha_of_half_width, half_width
-from mitsim.surface.processes import PROCESSES
-from mitsim.surface.roughness import (
+from mitsim.scene.surface.diffraction import coherent_share, lobe_alpha
+from mitsim.scene.surface.energy import directional_albedo, energy_factors
+from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, alpha_of_half_width, half_width
+from mitsim.scene.surface.processes import PROCESSES
+from mitsim.scene.surface.roughness import (
     ALPHA_LARGEST,
     correlation_length,
     rms_height,
     short_wave_height,
     stylus_slope,
 )
-from mitsim.surface.scatter import ALPHA_FORM
+from mitsim.scene.surface.scatter import ALPHA_FORM
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "explanation" / "materials.md"
 

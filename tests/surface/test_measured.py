@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mitsim.errors import InputError
-from mitsim.surface.diffraction import lobe_alpha
-from mitsim.surface.measured import height_map, profile, read_height_map, read_profile
+from characterisation.files.errors import InputError
+from mitsim.scene.surface.diffraction import lobe_alpha
+from mitsim.scene.surface.measured import height_map, profile, read_height_map, read_profile
 
 
 def gaussian_surface(rng, size, length_u, length_v=None):

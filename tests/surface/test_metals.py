@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.surface.metals import CONSTANTS, WAVELENGTH_RANGE_NM, normal_reflectance, refractive_index
-from mitsim.surface.microfacet import fresnel
+from mitsim.scene.surface.metals import CONSTANTS, WAVELENGTH_RANGE_NM, normal_reflectance, refractive_index
+from mitsim.scene.surface.microfacet import fresnel
 
 WAVELENGTHS = (405, 450, 520, 532, 640, 660, 830, 850, 940)
 REFLECTANCES = {

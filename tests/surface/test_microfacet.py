@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from mitsim.surface.microfacet import (
+from mitsim.scene.surface.microfacet import (
     GGX_PER_BECKMANN,
     alpha_of_half_width,
     half_width,

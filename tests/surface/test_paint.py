@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from mitsim.errors import InputError
-from mitsim.surface.microfacet import GGX_PER_BECKMANN
-from mitsim.surface.paint import ALPHA_RANGE, matt_white, paint, surface_share
+from characterisation.files.errors import InputError
+from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN
+from mitsim.scene.surface.paint import ALPHA_RANGE, matt_white, paint, surface_share
 
 
 @pytest.mark.parametrize(

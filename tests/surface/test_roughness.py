@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from mitsim.surface.processes import PROCESSES, feed, feed_slope, micro_roughness
-from mitsim.surface.roughness import (
+from mitsim.scene.surface.processes import PROCESSES, feed, feed_slope, micro_roughness
+from mitsim.scene.surface.roughness import (
     band_limited_slope,
     correlation_length,
     matern,

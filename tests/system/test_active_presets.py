@@ -11,15 +11,15 @@ from functools import cache
 import numpy as np
 import pytest
 
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.errors import InputError
-from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.simulate import SimulatedSensor
 from tests.smaller_sensors import middle_part
 
 CARMINE, N35, D435, OAK = "primesense-carmine-1.09", "ensenso-n35", "realsense-d435", "oak-d-pro"

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.calibration.accuracy import measured_points
-from mitsim.campaign.plan import coupon_pose
-from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.maps.campaign.plan import coupon_pose
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
+from mitsim.study.calibration.accuracy import measured_points
 from tests.smaller_sensors import middle_part, narrow_search
 
 

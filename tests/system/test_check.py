@@ -11,11 +11,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
 from shell import ROOT, mitsim_here
 
-from mitsim.authoring.check import findings, read_features
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.report.scene_preview import preview_figure
 from mitsim.report.scene_table import as_data, as_text
 from mitsim.report.style import write_png
+from mitsim.scene.authoring.check import findings, read_features
 from mitsim.scene.first_hits import visible_surfaces
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from shell import ROOT, mitsim, mitsim_here
 
-from characterisation.atomic_io import HOST
 from characterisation.cloud_files import read_ply
+from characterisation.files.atomic_io import HOST
 from mitsim.capture.folder import read_capture
-from mitsim.progress import be_quiet, say, say_progress, track
-from mitsim.simulation.truth import read_exr
+from mitsim.capture.simulated.truth import read_exr
+from mitsim.running.progress import be_quiet, say, say_progress, track
 from tests.smaller_sensors import coarse_sensor
 
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from mitsim import data_sheet
-from mitsim.cli import app
-from mitsim.data_sheet import correlation_length, gallery, measure_sensor
+from mitsim.cli.program import app
+from mitsim.maps import data_sheet
+from mitsim.maps.data_sheet import correlation_length, gallery, measure_sensor
 from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_leaves_out, sheet_table
 from mitsim.report.style import write_png
 from mitsim.sensor.preset import load_sensor

@@ -15,30 +15,30 @@ from hypothesis import strategies as st
 from scipy import stats
 from typer.testing import CliRunner
 
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.cli import app
-from mitsim.errors import InputError
-from mitsim.fit.dots import compare_dots
-from mitsim.fit.electrons import PixelNoise, linearised, pixel_noise
-from mitsim.fit.estimate import fit_views
-from mitsim.fit.finish import ALPHA_RANGE, metal_finish
-from mitsim.fit.observation import CouponCapture, View, observe
-from mitsim.fit.place import found_place, known_place
-from mitsim.fit.run import KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX, fit_captures
-from mitsim.fit.specimen import place_of
-from mitsim.fit.white_coupon import WhiteCouponRenderer
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.cli.program import app
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
+from mitsim.scene.surface.machined import Face, machined
 from mitsim.sensor.image_formation import expose
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.speckle import speckle_field
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
-from mitsim.surface.machined import Face, machined
+from mitsim.twin.finish.dots import compare_dots
+from mitsim.twin.finish.electrons import PixelNoise, linearised, pixel_noise
+from mitsim.twin.finish.estimate import fit_views
+from mitsim.twin.finish.finish import ALPHA_RANGE, metal_finish
+from mitsim.twin.finish.observation import CouponCapture, View, observe
+from mitsim.twin.finish.place import found_place, known_place
+from mitsim.twin.finish.run import KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX, fit_captures
+from mitsim.twin.finish.specimen import place_of
+from mitsim.twin.finish.white_coupon import WhiteCouponRenderer
 
 REAL_DATA = Path(os.environ.get("MITSIM_REAL_DATA") or Path(__file__).resolve().parents[2].parent / "shared" / "real")
 CORNERS = np.array([[x, y, 0.0] for x in (-60, 60) for y in (-60, 60)])
@@ -484,7 +484,7 @@ def test_the_recorded_sheet_and_what_is_left_of_it(scenes, tmp_path):
     Measured were 0.47 +- 0.11 by the means, 0.62 and 0.67 by the dots, and a residual of 12 % of the mean. The bounds
     leave room for another machine's matcher, not for another result.
     """
-    from mitsim.recordings.ensenso import read_ensenso
+    from mitsim.capture.recordings.ensenso import read_ensenso
 
     recording = REAL_DATA / "ensenso" / "colorized_point_cloud" / "stereo.zip"
     if not recording.is_file():

@@ -13,15 +13,15 @@ import pytest
 from shell import mitsim_here
 from small_study import small_study
 
-from characterisation.atomic_io import HOST, atomic_write, atomic_write_named, write_folder
-from mitsim.commands.folder_lock import LOCK, lock_folder, remove_partial, remove_partial_beside
-from mitsim.errors import InputError
-from mitsim.run_study import score_study
+from characterisation.files.atomic_io import HOST, atomic_write, atomic_write_named, write_folder
+from characterisation.files.errors import InputError
+from mitsim.cli.folder_lock import LOCK, lock_folder, remove_partial, remove_partial_beside
+from mitsim.study.scoring import score_study
 from tests.smaller_sensors import coarse_sensor
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
 
-HOLD = "import sys, time, pathlib; from mitsim.commands.folder_lock import lock_folder; f = pathlib.Path(sys.argv[1]); "
+HOLD = "import sys, time, pathlib; from mitsim.cli.folder_lock import lock_folder; f = pathlib.Path(sys.argv[1]); "
 HOLD += "release = lock_folder(f); (f / f'.scores.csv.{__import__(\"os\").getpid()}.partial').write_text('half'); "
 HOLD += "print('held', flush=True); time.sleep(600)"
 
@@ -92,7 +92,7 @@ def test_what_is_being_written_names_its_process(tmp_path, monkeypatch):
     with atomic_write(tmp_path / "a.csv") as partial:
         names.append(partial.name)
         partial.write_text("", encoding="utf-8")
-    monkeypatch.setattr("characterisation.atomic_io._sync_directory", lambda d: names.append(d.name))
+    monkeypatch.setattr("characterisation.files.atomic_io._sync_directory", lambda d: names.append(d.name))
     write_folder(tmp_path / "poses", {"a": b""})
     assert all(str(os.getpid()) in name for name in names[:2])
 
@@ -103,7 +103,7 @@ def test_signals_end_a_command_as_ctrl_c_does(tmp_path, number):
     # tests that a shell runs in its background, or under nohup, ignore SIGINT or SIGHUP, and so does what they start
     wait = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
     wait += "signal.signal(signal.SIGHUP, signal.SIG_DFL); "
-    wait += "import mitsim.commands.machine as m, time; import mitsim.cli as c; "
+    wait += "import mitsim.cli.machine as m, time; import mitsim.cli as c; "
     wait += "c.app.command(name='wait')(lambda: (print('on', flush=True), time.sleep(60))[1]); c.main()"
     with subprocess.Popen(
         [sys.executable, "-c", wait, "wait"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -132,7 +132,7 @@ def test_commands_hold_their_folders_and_let_them_go(tmp_path, tmp_path_factory,
         seen.append(json.loads((tmp_path / LOCK).read_text())["pid"])
         return score_study(*given)
 
-    with mock.patch("mitsim.run_study.score_study", scored):
+    with mock.patch("mitsim.study.score_study", scored):
         mitsim_here("score", study, *into)
     assert seen == [os.getpid()]
     assert (tmp_path / "scores.csv").exists() and not (tmp_path / LOCK).exists()

@@ -9,15 +9,15 @@ import numpy as np
 from typer.testing import CliRunner
 
 from characterisation.cloud_files import read_ply
-from mitsim.cli import app
-from mitsim.reconstruction.cloud import capture_cloud
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.cli.program import app
+from mitsim.decode.cloud import capture_cloud
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 
 FRINGES = (Path(__file__).parents[1] / "data/fringes.toml").read_text(encoding="utf-8")
 SEQUENCE = """[pattern]

@@ -12,21 +12,21 @@ import numpy as np
 import pytest
 
 from characterisation.cloud_files import read_ply, write_ply
-from characterisation.documents import Document, read_toml
-from characterisation.errors import InputError
+from characterisation.files.documents import Document, read_toml
+from characterisation.files.errors import InputError
 from characterisation.maps.shipped import map_path
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.authoring.read_mesh import read_mesh
 from mitsim.capture.grey_image import read_grey
-from mitsim.recordings.image_folder import counted
-from mitsim.recordings.ply import decode_ply
+from mitsim.capture.recordings.image_folder import counted
+from mitsim.capture.recordings.ply import decode_ply
 from mitsim.report.choice_page import write_choice_page
-from mitsim.report.scene_geometry import read_scene_geometry
+from mitsim.scene.authoring.read_mesh import read_mesh
+from mitsim.scene.surface.measured import read_height_map, read_profile
 from mitsim.scene.xml_check import checked_xml
 from mitsim.sensor.calibration_tree import read_tree
-from mitsim.surface.measured import read_height_map, read_profile
-from mitsim.virtual.trials import Outcome, TrialFolder
-from mitsim.virtual.world import Trial
+from mitsim.study.scene_geometry import read_scene_geometry
+from mitsim.study.virtual.trials import Outcome, TrialFolder
+from mitsim.study.virtual.world import Trial
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -179,7 +179,7 @@ def test_clouds_with_points_at_infinity(tmp_path, value):
 
 
 def test_text_of_a_quarter_of_a_gigabyte(monkeypatch):
-    monkeypatch.setattr("mitsim.recordings.ply._LARGEST_TEXT", 1000)
+    monkeypatch.setattr("mitsim.capture.recordings.ply._LARGEST_TEXT", 1000)
     head = (
         b"ply\nformat ascii 1.0\nelement vertex 400\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
     )

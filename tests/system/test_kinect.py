@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 
 from characterisation.features.fits import fit_sphere
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.campaign.acquire import in_turn, simulated_source
-from mitsim.campaign.plan import read_campaign
-from mitsim.campaign.run import run_campaign
+from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.errors import InputError
-from mitsim.reconstruction.cloud import capture_cloud, decoder_settings, sensor_geometry
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import capture_cloud, decoder_settings, sensor_geometry
+from mitsim.maps.campaign.acquire import in_turn, simulated_source
+from mitsim.maps.campaign.plan import read_campaign
+from mitsim.maps.campaign.run import run_campaign
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.projector_light import ModulatedLight
@@ -27,10 +30,7 @@ from mitsim.sensor.modulation import LIGHT_MM_S
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.projector import Projector
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform, look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 
 ROOT = Path(__file__).parents[2]
 PRESET = ROOT / "mitsim/sensor/presets/kinect-v2.toml"

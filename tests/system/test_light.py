@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from characterisation.coupon.patches import measure_patches
-from mitsim.campaign.acquire import coupon_cloud, simulated_source
-from mitsim.campaign.plan import CampaignFile, plan_campaign
-from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
+from mitsim.capture.simulated.indirect_light import IndirectLight
+from mitsim.capture.simulated.render_residual import render_residual, temporal_noise
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.capture.simulated.surface_speckle import finish_contrast
+from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.maps.campaign.acquire import coupon_cloud, simulated_source
+from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
 from mitsim.scene.backend import mi
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.indirect_light import IndirectLight
-from mitsim.simulation.render_residual import render_residual, temporal_noise
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
-from mitsim.simulation.surface_speckle import finish_contrast
 from tests.smaller_sensors import narrow_search
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import typer
 
-from characterisation.documents import LONGEST_NAME, checked_name
-from mitsim.cli import main
-from mitsim.errors import InputError
+from characterisation.files.documents import LONGEST_NAME, checked_name
+from characterisation.files.errors import InputError
+from mitsim.cli.program import main
 from mitsim.sensor.preset import load_sensor
 
 SCENES = Path(__file__).parents[2] / "scenes"

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from characterisation.cloud_files import read_ply
+from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.commands.decode import decode
-from mitsim.errors import InputError
-from mitsim.reconstruction.cloud import decoder_settings
-from mitsim.reconstruction.decoder_registry import technology_of
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.cli.decode import decode
+from mitsim.decode.cloud import decoder_settings
+from mitsim.decode.decoder_registry import technology_of
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.sensor_file import ImagerTable
 from mitsim.sensor.transforms import look_at
 from mitsim.sensor.written_imager import imager_of, written_imager
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 
 ROOT = Path(__file__).parents[2]
 PRESETS = ROOT / "mitsim/sensor/presets"

@@ -17,16 +17,16 @@ from hypothesis import strategies as st
 from shell import mitsim_here
 
 from characterisation.features.surfaces import Cylinder
-from mitsim.authoring.check import read_features
-from mitsim.authoring.face import surface_distance
-from mitsim.authoring.part_folder import Finishing, scene_xml, write_part
-from mitsim.authoring.read_mesh import read_mesh
-from mitsim.authoring.read_step import read_step, step_installed
-from mitsim.authoring.segment_mesh import segment_mesh
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
+from mitsim.scene.authoring.check import read_features
+from mitsim.scene.authoring.face import surface_distance
+from mitsim.scene.authoring.part_folder import Finishing, scene_xml, write_part
+from mitsim.scene.authoring.read_mesh import read_mesh
+from mitsim.scene.authoring.read_step import read_step, step_installed
+from mitsim.scene.authoring.segment_mesh import segment_mesh
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
-from mitsim.surface.named_finishes import NAMED_FINISHES
+from mitsim.scene.surface.named_finishes import NAMED_FINISHES
 
 needs_step = pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which reads STEP, is not installed")
 

@@ -12,28 +12,23 @@ import xarray as xr
 
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.coupon.patches import measure_patches
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.campaign.acquire import coupon_cloud, coupon_residuals, in_turn, simulated_source
-from mitsim.campaign.coupons import VARIANTS
-from mitsim.campaign.plan import CampaignFile, coupon_pose, plan_campaign, read_campaign
-from mitsim.campaign.run import run_campaign
+from mitsim.capture.simulated.render_residual import LIMIT, RenderResidual, largest_residual, warn_above_limit
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import capture_cloud
 from mitsim.decode.matching.stereo import stereo_geometry
-from mitsim.errors import InputError
-from mitsim.prediction import Predictor, feature_statistics, performance
-from mitsim.reconstruction.cloud import capture_cloud
+from mitsim.maps.campaign.acquire import coupon_cloud, coupon_residuals, in_turn, simulated_source
+from mitsim.maps.campaign.coupons import VARIANTS
+from mitsim.maps.campaign.plan import CampaignFile, coupon_pose, plan_campaign, read_campaign
+from mitsim.maps.campaign.run import run_campaign
+from mitsim.maps.prediction import Predictor, feature_statistics, performance
 from mitsim.scene.load import load_scene
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import mean_run_length
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.render_residual import (
-    LIMIT,
-    RenderResidual,
-    largest_residual,
-    warn_above_limit,
-)
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import read_study
 from tests.smaller_sensors import narrow_search
 

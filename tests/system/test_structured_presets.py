@@ -9,15 +9,15 @@ import pytest
 
 from characterisation.features.fits import fit_sphere
 from characterisation.point_cloud import Status
-from mitsim.campaign.plan import coupon_pose
-from mitsim.reconstruction.cloud import capture_cloud, sensor_geometry
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.maps.campaign.plan import coupon_pose
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 
 NAMES = ["photoneo-phoxi-s", "david-sls-3", "zivid-2-m70"]
 WHITE = {"type": "matt_white"}

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from characterisation.features.fits import fit_sphere
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.errors import InputError
-from mitsim.reconstruction.cloud import capture_cloud, decoder_settings, sensor_geometry
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import capture_cloud, decoder_settings, sensor_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 
 FRINGES = (Path(__file__).parents[1] / "data/fringes.toml").read_text(encoding="utf-8")
 LEFT = FRINGES[FRINGES.index("[cameras.camera]") : FRINGES.index("[projector]")]

@@ -13,10 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsim.calibration.board import Board
-from mitsim.calibration.bundle import BoardView, linearise
-from mitsim.calibration.corner_noise import corner_noise
-from mitsim.calibration.simulated import SimulatedCorners, estimate
+from mitsim.capture.simulated.lens_blur import gaussian_blur
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.projector_light import ProjectedPatterns
@@ -25,7 +22,10 @@ from mitsim.scene.load import scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.rig_parameters import parameter_differences
 from mitsim.sensor.transforms import Transform, look_at
-from mitsim.simulation.lens_blur import gaussian_blur
+from mitsim.study.calibration.board import Board
+from mitsim.study.calibration.bundle import BoardView, linearise
+from mitsim.study.calibration.corner_noise import corner_noise
+from mitsim.study.calibration.simulated import SimulatedCorners, estimate
 
 COLUMNS, ROWS, SQUARE, MARKER, TEXELS = 11, 8, 32.0, 19.0, 96
 MIDDLE = np.array([COLUMNS * SQUARE / 2, ROWS * SQUARE / 2, 0.0])
@@ -115,7 +115,7 @@ def test_the_corners_are_where_they_are(corners, n10):
 
 
 def test_corners_are_as_noisy_as_patches_predict(corners, n10):
-    """Noise of corners simulated one by one (mitsim.calibration) against that of whole rendered boards."""
+    """Noise of corners simulated one by one (mitsim.study.calibration) against that of whole rendered boards."""
     predicted = np.mean(
         [
             corner_noise(replace(n10, focus_mm=600.0), d, SQUARE * 626 / d, patches=150, window_px=4).sigma ** 2

@@ -8,17 +8,17 @@ from functools import cache
 import numpy as np
 
 from mitsim.capture.capture import Capture
-from mitsim.fit.place import Place, known_place
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.sensor_file import RoomTable
 from mitsim.sensor.transforms import Transform, look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
-from mitsim.twin.dots import DotDraws, DotsFit, fit_dots
-from mitsim.twin.estimate import scaled
-from mitsim.twin.parameters import (
+from mitsim.twin.finish.place import Place, known_place
+from mitsim.twin.sensor.dots import DotDraws, DotsFit, fit_dots
+from mitsim.twin.sensor.estimate import scaled
+from mitsim.twin.sensor.parameters import (
     FLUX,
     FULL_WELL,
     PROJECTOR_CORNER,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.twin.defocus import _fitted
+from mitsim.twin.sensor.defocus import _fitted
 
 
 @pytest.mark.parametrize(("aperture", "focus"), [(30.0, 3450.0), (12.0, 800.0)])

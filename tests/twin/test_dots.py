@@ -12,11 +12,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from small_unit import capture_of, place, small_sensor, standard_errors, unit
 
-from mitsim.errors import InputError
-from mitsim.fit.place import known_place
-from mitsim.twin import specimen_simulator
-from mitsim.twin.dots import DotDraws, fit_dots
-from mitsim.twin.parameters import FLUX
+from characterisation.files.errors import InputError
+from mitsim.twin.finish.place import known_place
+from mitsim.twin.sensor import specimen_simulator
+from mitsim.twin.sensor.dots import DotDraws, fit_dots
+from mitsim.twin.sensor.parameters import FLUX
 
 
 def test_intervals_of_dots_hold_the_truth_as_often_as_they_say(monkeypatch):

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from characterisation.files.errors import InputError
 from mitsim.capture.folder import write_capture
-from mitsim.cli import app
-from mitsim.errors import InputError
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.cli.program import app
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
-from mitsim.twin import run, specimen_simulator
-from mitsim.twin.input_captures import read_input_captures, repeats
-from mitsim.twin.sensor_text import Entry, moved_paths, with_cameras, with_entries, with_exposure
+from mitsim.twin.sensor import run, specimen_simulator
+from mitsim.twin.sensor.input_captures import read_input_captures, repeats
+from mitsim.twin.sensor.sensor_text import Entry, moved_paths, with_cameras, with_entries, with_exposure
 
 sys.path.insert(0, str(Path(__file__).parent))
 

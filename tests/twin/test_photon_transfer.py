@@ -10,8 +10,8 @@ import pytest
 from mitsim.sensor.image_formation import expose, fixed_pattern
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise
-from mitsim.twin.noise import fine_gain, smoothing_of
-from mitsim.twin.photon_transfer import Repeats, fixed_variance, one_image_line, repeated_line
+from mitsim.twin.sensor.noise import fine_gain, smoothing_of
+from mitsim.twin.sensor.photon_transfer import Repeats, fixed_variance, one_image_line, repeated_line
 
 TRUE = Imager(
     pixel_um=6,

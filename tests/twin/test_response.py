@@ -9,14 +9,14 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from mitsim.fit.electrons import linearised
 from mitsim.sensor.image_formation import expose
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise
-from mitsim.twin import response
-from mitsim.twin.photon_transfer import TransferLine, one_image_line
-from mitsim.twin.response import Knee, first_knee, quiet_pixels
-from mitsim.validation.denoise import denoised
+from mitsim.twin.compare.denoise import denoised
+from mitsim.twin.finish.electrons import linearised
+from mitsim.twin.sensor import response
+from mitsim.twin.sensor.photon_transfer import TransferLine, one_image_line
+from mitsim.twin.sensor.response import Knee, first_knee, quiet_pixels
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "validation"))
 

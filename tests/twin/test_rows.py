@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mitsim.twin.rows import _line
+from mitsim.twin.sensor.rows import _line
 
 
 def test_a_prior_decides_what_the_rows_do_not():

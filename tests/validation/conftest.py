@@ -7,7 +7,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from known_trials import CASES, KnownMaker
 
-import mitsim.validation.case_trials as case_trials
+import tests.proofs.case_trials as case_trials
 
 
 @pytest.fixture

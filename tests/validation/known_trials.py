@@ -4,7 +4,7 @@ import csv
 
 import numpy as np
 
-from mitsim.virtual.trials import Outcome
+from mitsim.study.virtual.trials import Outcome
 
 NAMES = ["large_radius", "small_radius", "large_height", "balls_distance"]
 

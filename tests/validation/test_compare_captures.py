@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from characterisation.files.errors import InputError
+from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.cli import app
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.cli.program import app
 from mitsim.decode.matching.stereo import stereo_geometry
-from mitsim.errors import InputError
-from mitsim.fit.electrons import linearised, pixel_noise
-from mitsim.fit.specimen import image_mask, specimen_place
 from mitsim.scene.test_targets import plate
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import look_at
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
-from mitsim.validation import compare_captures as compare_module
-from mitsim.validation.captures_run import validate_captures
-from mitsim.validation.compare_captures import compare_captures
-from mitsim.validation.compared_quantities import QUANTITIES
-from mitsim.validation.rebuild import projector_was_on, rebuild
-from mitsim.validation.specimen_patches import PATCH_PX, specimen_patches
+from mitsim.twin.compare import compare_captures as compare_module
+from mitsim.twin.compare.captures_run import validate_captures
+from mitsim.twin.compare.compare_captures import compare_captures
+from mitsim.twin.compare.compared_quantities import QUANTITIES
+from mitsim.twin.compare.rebuild import projector_was_on, rebuild
+from mitsim.twin.compare.specimen_patches import PATCH_PX, specimen_patches
+from mitsim.twin.finish.electrons import linearised, pixel_noise
+from mitsim.twin.finish.specimen import image_mask, specimen_place
 from tests.smaller_sensors import narrow_search
 
 SIZE, DISTANCE = 190.0, 480.0

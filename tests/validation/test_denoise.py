@@ -7,7 +7,7 @@ from scipy.fft import dctn
 from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.stats import norm
 
-from mitsim.validation.denoise import denoised
+from mitsim.twin.compare.denoise import denoised
 
 #: standard deviation of the noise [DN]; blur of the lens [px]: the dots of two recorded N10 plates have edges of 0.775
 #: px, of which a pixel is 0.29 px

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from characterisation.documents import read_toml
-from mitsim.cli import app
-from mitsim.prediction.interreflections import Loss, Losses, losses
-from mitsim.validation import loss_fit
-from mitsim.validation.loss_fit import SeenPoints, fitted_loss, losses_document
+from characterisation.files.documents import read_toml
+from mitsim.cli.program import app
+from mitsim.maps.prediction.interreflections import Loss, Losses, losses
+from tests.proofs import loss_fit
+from tests.proofs.loss_fit import SeenPoints, fitted_loss, losses_document
 from tests.smaller_sensors import coarse_sensor
 
 HALF, STEEPNESS = 1.8, 1.5

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mitsim.validation.map_comparison import (
+from mitsim.study.virtual.beyond_map import BeyondMap, Sizes, beyond_map
+from tests.proofs.map_comparison import (
     LEVELS,
     ComparedCase,
     beyond_map_document,
@@ -15,7 +16,6 @@ from mitsim.validation.map_comparison import (
     inside,
     judged_table,
 )
-from mitsim.virtual.beyond_map import BeyondMap, Sizes, beyond_map
 
 
 def case(drawn_std, beyond_std, seed, kind="coded", sealed=False, predicted=0.02):

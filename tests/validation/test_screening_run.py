@@ -5,12 +5,12 @@ import pytest
 import xarray as xr
 from known_trials import NAMES, rows
 
-import mitsim.validation.screening_run as screening_run
+import tests.proofs.screening_run as screening_run
 from characterisation.scores import screening
 from characterisation.statements.selection import chance_after
-from mitsim.validation.part_cases import read_part_cases
-from mitsim.validation.screening_page import cells_of, described_screening, write_screening_page
-from mitsim.validation.screening_run import (
+from tests.proofs.part_cases import read_part_cases
+from tests.proofs.screening_page import cells_of, described_screening, write_screening_page
+from tests.proofs.screening_run import (
     ALONE,
     COSINE,
     POINTS,

@@ -8,16 +8,16 @@ import xarray as xr
 from known_trials import NAMES, KnownMaker, rows
 from scipy.stats import norm
 
-import mitsim.validation.case_trials as case_trials
-import mitsim.validation.statement_run as statement_run
-from mitsim.errors import InputError
-from mitsim.validation.judged_statements import choices_of
-from mitsim.validation.kept_trials import take_up_trials, write_trials
-from mitsim.validation.part_cases import described, read_part_cases
-from mitsim.validation.statement_page import write_statement_page
-from mitsim.validation.statement_run import run_cases
-from mitsim.virtual.trials import Outcome, TrialFolder
-from mitsim.virtual.world import Trial
+import tests.proofs.case_trials as case_trials
+import tests.proofs.statement_run as statement_run
+from characterisation.files.errors import InputError
+from mitsim.study.virtual.trials import Outcome, TrialFolder
+from mitsim.study.virtual.world import Trial
+from tests.proofs.judged_statements import choices_of
+from tests.proofs.kept_trials import take_up_trials, write_trials
+from tests.proofs.part_cases import described, read_part_cases
+from tests.proofs.statement_page import write_statement_page
+from tests.proofs.statement_run import run_cases
 
 
 def scores(study, *_):

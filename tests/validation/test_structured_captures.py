@@ -8,21 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.campaign.plan import coupon_pose
+from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.errors import InputError
-from mitsim.fit import specimen
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.maps.campaign.plan import coupon_pose
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, patterns
 from mitsim.sensor.preset import load_sensor
-from mitsim.sensor.roi import Roi
-from mitsim.simulation.rendering import Rendering
-from mitsim.simulation.simulate import SimulatedSensor
-from mitsim.validation.captures_run import validate_captures
-from mitsim.validation.plain_image import plain_image
+from mitsim.twin.compare.captures_run import validate_captures
+from mitsim.twin.compare.plain_image import plain_image
+from mitsim.twin.finish import specimen
 
 SIZE, DISTANCE = 70.0, 500.0
 

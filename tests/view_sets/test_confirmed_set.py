@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from two_balls import TASK
 
-import mitsim.view_sets.confirmed_set as confirmed_set
+import mitsim.study.view_sets.confirmed_set as confirmed_set
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import statement
 from mitsim.study import SetTable
-from mitsim.view_sets.confirmed_set import MOST_SETS, stricter, tried_entries
+from mitsim.study.view_sets.confirmed_set import MOST_SETS, stricter, tried_entries
 
 VIEWS = 12
 LIMITS = {"apart": 0.1, "radius": 0.1}

@@ -13,8 +13,8 @@ from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import statement
 from mitsim.sensor.transforms import Transform
 from mitsim.study import SetTable
-from mitsim.view_sets.confirmed_set import confirmed_entry, joining_in_words, set_table, write_set_csv
-from mitsim.view_sets.joined import JoinedMeasurements
+from mitsim.study.view_sets.confirmed_set import confirmed_entry, joining_in_words, set_table, write_set_csv
+from mitsim.study.view_sets.joined import JoinedMeasurements
 
 #: the balls are seen from 500 mm above
 FROM_ABOVE = Transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 500.0]))

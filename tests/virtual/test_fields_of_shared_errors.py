@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsim.calibration.accuracy import measured_points
-from mitsim.prediction.shared_errors import terms
+from mitsim.maps.prediction.shared_errors import terms
 from mitsim.sensor.rig_parameters import moved
-from mitsim.validation.part_cases import read_part_cases
-from mitsim.virtual.screening import shared_errors
-from mitsim.virtual.study_unknowns import study_unknowns
+from mitsim.study.calibration.accuracy import measured_points
+from mitsim.study.virtual.screening import shared_errors
+from mitsim.study.virtual.study_unknowns import study_unknowns
+from tests.proofs.part_cases import read_part_cases
 
 CASES = Path(__file__).parents[2] / "scenes" / "parts" / "validation.toml"
 

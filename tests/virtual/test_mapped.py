@@ -6,21 +6,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
-from mitsim.calibration.accuracy import measured_points
-from mitsim.errors import InputError
 from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, StudyFile, open_study
-from mitsim.view_scores import score_candidates
-from mitsim.virtual.beyond_map import beyond_map
-from mitsim.virtual.mapped import MappedMeasurements, drawn_map, moved_by_calibration
-from mitsim.virtual.plan import measured_by, measurements_of, trial_digest
-from mitsim.virtual.race import Job
-from mitsim.virtual.rendered import RenderedMeasurements
-from mitsim.virtual.stated import budget_groups
-from mitsim.virtual.study_unknowns import study_unknowns
-from mitsim.virtual.world import BEYOND, FINISHES, Trial
+from mitsim.study.calibration.accuracy import measured_points
+from mitsim.study.virtual.beyond_map import beyond_map
+from mitsim.study.virtual.mapped import MappedMeasurements, drawn_map, moved_by_calibration
+from mitsim.study.virtual.plan import measured_by, measurements_of, trial_digest
+from mitsim.study.virtual.race import Job
+from mitsim.study.virtual.rendered import RenderedMeasurements
+from mitsim.study.virtual.stated import budget_groups
+from mitsim.study.virtual.study_unknowns import study_unknowns
+from mitsim.study.virtual.world import BEYOND, FINISHES, Trial
+from mitsim.views.view_scores import score_candidates
 from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"

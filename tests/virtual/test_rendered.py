@@ -6,8 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from characterisation.documents import read_toml
+from characterisation.files.documents import read_toml
 from characterisation.point_cloud import PointCloud, Status
+from mitsim.capture.simulated.indirect_light import IndirectLight
+from mitsim.capture.simulated.rendering import IndirectImages, Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene import load
 from mitsim.scene.light_transport.room_light import directional_albedos
 from mitsim.scene.load import load_scene
@@ -17,17 +20,14 @@ from mitsim.sensor.imager import electrons_per_radiance
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform, look_at
-from mitsim.simulation.indirect_light import IndirectLight
-from mitsim.simulation.rendering import IndirectImages, Rendering
-from mitsim.simulation.simulate import SimulatedSensor
 from mitsim.study import StudyFile, open_study
-from mitsim.virtual.plan import measurements_of, trial_digest
-from mitsim.virtual.race import Job
-from mitsim.virtual.rendered import displaced
-from mitsim.virtual.stated import budget_groups, state_view, statement_document
-from mitsim.virtual.study_unknowns import study_unknowns
-from mitsim.virtual.trials import TrialFolder
-from mitsim.virtual.world import Trial, finish_deviation
+from mitsim.study.virtual.plan import measurements_of, trial_digest
+from mitsim.study.virtual.race import Job
+from mitsim.study.virtual.rendered import displaced
+from mitsim.study.virtual.stated import budget_groups, state_view, statement_document
+from mitsim.study.virtual.study_unknowns import study_unknowns
+from mitsim.study.virtual.trials import TrialFolder
+from mitsim.study.virtual.world import Trial, finish_deviation
 from tests.smaller_sensors import binned, coarse_sensor, middle_part
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
@@ -276,7 +276,7 @@ def test_a_statement_from_a_few_trials(coarse_n10, tmp_path):
 
 
 def test_unknowns_of_a_study_are_checked(tmp_path):
-    from mitsim.errors import InputError
+    from characterisation.files.errors import InputError
 
     study = study_of("ensenso-n10", unknowns={"form": {"features": {"plate": 0.05}}})
     with pytest.raises(InputError, match=r"unknowns\.form\.features\.plate"):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from mitsim.virtual.race import ALL, FIRST, Job, RaceRules, run_race, shortlist
-from mitsim.virtual.race_table import raced_errors, with_race
-from mitsim.virtual.trials import Outcome, TrialFolder
-from mitsim.virtual.world import Trial
+from mitsim.study.virtual.race import ALL, FIRST, Job, RaceRules, run_race, shortlist
+from mitsim.study.virtual.race_table import raced_errors, with_race
+from mitsim.study.virtual.trials import Outcome, TrialFolder
+from mitsim.study.virtual.world import Trial
 
 NAMES = ["radius", "angle"]
 
@@ -223,7 +223,9 @@ def test_a_line_that_is_no_trial_ends_what_is_trusted(tmp_path, line):
 
 def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
     trials = filled(tmp_path, count=1)
-    monkeypatch.setattr("mitsim.virtual.trials.os.fsync", lambda handle: (_ for _ in ()).throw(OSError(28, "full")))
+    monkeypatch.setattr(
+        "mitsim.study.virtual.trials.os.fsync", lambda handle: (_ for _ in ()).throw(OSError(28, "full"))
+    )
     with pytest.raises(OSError, match="full") as caught:
         trials.add(3, Trial(1), Outcome({"radius": 1.0, "angle": 2.0}))
     assert caught.value.filename.endswith("view_0003.jsonl")

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import parameter_names
 from mitsim.sensor.room_light import room_irradiance
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
-from mitsim.virtual.world import (
+from mitsim.study.virtual.world import (
     FINISH_DAYS,
     FINISHES,
     FRESH,
@@ -171,7 +171,7 @@ def test_a_study_overrules_the_sensor_key_by_key():
     ],
 )
 def test_what_is_no_unknown_is_refused(table):
-    from characterisation.documents import validate
+    from characterisation.files.documents import validate
 
     with pytest.raises(InputError):
         validate("study.toml", table, UnknownsTable)

@@ -35,7 +35,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.threads import in_threads
+from characterisation.files.threads import in_threads
 from mitsim.decode.matching.correlation_products import (
     BLANK_VARIANCE,
     Floats,

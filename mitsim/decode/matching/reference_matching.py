@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.stereo import Raw, StereoGeometry, decode_stereo, stereo_geometry

@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.errors import InputError
-from characterisation.threads import in_threads
+from characterisation.files.errors import InputError
+from characterisation.files.threads import in_threads
 from mitsim.decode.matching.sgbm_bands import (
     Penalties,
     bytes_by_opencv,

@@ -30,8 +30,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.region_of_interest import Roi, checked_roi
 from mitsim.decode.grid_cloud import cloud_on_grid
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.interpolated import needed_region, was_read_out
@@ -46,7 +47,6 @@ from mitsim.decode.matching.evidence import (
 from mitsim.decode.matching.sgbm import local_contrast, match_both_ways, search_range
 from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.roi import Roi, checked_roi
 
 Raw = NDArray[np.uint8] | NDArray[np.uint16]
 Strips = list[NDArray[Any]]

@@ -16,8 +16,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
+from characterisation.region_of_interest import checked_roi
 from mitsim.decode.blocks import in_blocks
 from mitsim.decode.grey_levels import MeasuredNoise
 from mitsim.decode.grid_cloud import cloud_on_grid
@@ -33,7 +34,6 @@ from mitsim.sensor.image_role import Axis
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import GrayCode, LightCode, PhaseShift, axes
-from mitsim.sensor.roi import checked_roi
 
 
 def decode_coordinates(

@@ -21,7 +21,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.errors import InputError, nearest
+from characterisation.files.errors import InputError, nearest
 from characterisation.point_cloud import ViewGrid
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.image_role import Axis

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decode.grey_levels import MeasuredNoise, check_full_scale, grey_level_variance
 from mitsim.decode.structured_light.phase_shift import (

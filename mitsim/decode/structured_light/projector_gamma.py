@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 
 #: range of possible gammas
 GAMMA_RANGE = (0.2, 5.0)

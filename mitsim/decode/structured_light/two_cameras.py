@@ -30,8 +30,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
+from characterisation.region_of_interest import Roi, checked_roi
 from mitsim.decode.grid_cloud import cloud_on_grid
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.interpolated import needed_region, was_read_out
@@ -41,7 +42,6 @@ from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordin
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import LightCode, axes, has_fringes
-from mitsim.sensor.roi import Roi, checked_roi
 
 #: largest difference of the coordinates of neighbouring pixels on one surface [projector px]
 LARGEST_STEP_PX = 8.0

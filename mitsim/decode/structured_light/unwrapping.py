@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfc
 
-from characterisation.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.decode.blocks import in_blocks
 
 #: largest residual [cycles] that is accepted whatever the noise: half of the residual that changes the order

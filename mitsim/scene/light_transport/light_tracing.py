@@ -39,6 +39,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque, opaque_index
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
@@ -47,7 +48,6 @@ from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays, pixel_area
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 #: number of photons in one launch; each needs 24 bytes for every surface after its first

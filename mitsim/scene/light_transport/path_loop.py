@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque, opaque_index, to_device
 from mitsim.scene.light_transport.ambient import has_emitters, hit_emitter_light, sampled_emitter_light
@@ -32,7 +33,6 @@ from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays, bilinear, pixel_area
 from mitsim.scene.ray_casting.eye import Eye
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 #: largest ratio of densities, so that it stays finite

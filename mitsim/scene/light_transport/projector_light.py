@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque
 from mitsim.scene.ray_casting.distortion import Distortion

@@ -21,6 +21,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.region_of_interest import Roi
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.light_tracing import PHOTONS_AT_ONCE, Photons, add_photons
 from mitsim.scene.light_transport.path_loop import launch
@@ -28,7 +29,6 @@ from mitsim.scene.light_transport.plain_scene import single_plane
 from mitsim.scene.light_transport.projector_light import Light
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 #: number of floats in the images of one launch (64 MiB); a larger capture is traced in bands of rows. The device needs

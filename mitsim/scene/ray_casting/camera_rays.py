@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.sparse import csr_array
 
-from mitsim.errors import InputError
+from characterisation.files.errors import InputError
+from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque_index, to_device
 from mitsim.scene.ray_casting.distortion import Distortion
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.roi import Roi
 
 #: spacing of the grid on which the rays of two calibrations are compared [px]
 _GRID_PX = 8

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from characterisation.maps.tables import Surface
 from characterisation.point_cloud import Status, ViewGrid
+from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque_index, opaque_point, vectors_to_host
 from mitsim.scene.load import Scene
@@ -27,7 +28,6 @@ from mitsim.scene.ray_casting.eye import Eye, shadow_ray
 from mitsim.scene.ray_casting.map_tables import MapTables
 from mitsim.scene.ray_casting.raycast import PixelRays, shape_number
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 

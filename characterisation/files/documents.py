@@ -1,0 +1,249 @@
+"""Read TOML documents (studies, tasks, campaigns, sensors) into checked, frozen models.
+
+A document is a subclass of :class:`Document`. For an unknown key the error names the nearest known key. For a wrong
+type or value it names the file, the field, the value found and the allowed values.
+"""
+
+from __future__ import annotations
+
+import copy
+import re
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, WithJsonSchema
+
+from characterisation.files.checked_files import read_text_bounded
+from characterisation.files.errors import InputError, nearest
+
+
+class Document(BaseModel):
+    """Base class of all models read from TOML files: unknown keys are rejected, and values cannot change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+Model = TypeVar("Model", bound=Document)
+
+#: largest TOML file [bytes], and its deepest nesting
+LARGEST_TOML, DEEPEST = 4 * 1024**2, 32
+
+_BRACKETS = re.compile(r"[][{}]")
+_PART = r"(?<![A-Za-z0-9_-])(?:[A-Za-z0-9_-]++|[\"'][^\"'\n]*+[\"'])[ \t]*+\.[ \t]*+"
+_LONG_KEY = re.compile(f"(?:{_PART}){{{DEEPEST}}}")
+
+#: what a name may be made of: it may become part of a file's name, of a table or of a page; none begins or ends with a
+#: space or a dot, and no separator of a path, quotation mark, bracket of markup or control character is in one
+_NAME = r"\w(?:[\w .,()#&'=@~°%+-]*[\w)'°%+-])?"
+
+#: longest name [bytes]: with prefix and suffix, a file name stays under the common limit of 255 bytes
+LONGEST_NAME = 100
+
+
+def checked_name(name: str) -> str:
+    """Return a name that may become part of a file's name or of a page.
+
+    Raises
+    ------
+    ValueError
+        If the name is not allowed; pydantic turns it into an :class:`InputError`.
+    """
+    if len(name.encode("utf-8", "replace")) > LONGEST_NAME or not re.fullmatch(_NAME, name):
+        raise ValueError(
+            f"a name of at most {LONGEST_NAME} bytes that begins with a letter, digit or underscore, of these, spaces "
+            "and . , ( ) # & ' = @ ~ + - %; no / \\ : < > | * ? and no quotation marks"
+        )
+    return name
+
+
+#: name that a user gives to a sensor, feature or measurement
+Name = Annotated[
+    str, AfterValidator(checked_name), WithJsonSchema({"type": "string", "pattern": f"^{_NAME}$", "maxLength": 100})
+]
+
+
+def read_toml(path: str | Path, model: type[Model]) -> Model:
+    """Read one TOML file into a model.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is not TOML, or violates the model.
+    """
+    path = Path(path)
+    text = read_text_bounded(path, "a TOML file", _neighbours(path), LARGEST_TOML).replace("\r\n", "\n")
+    _check_nesting(path, text)
+    try:
+        table = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # also a whole number of thousands of digits
+        cause = " ".join(str(error).split())[:200]
+        raise InputError(path, "", f"text that is not TOML ({cause})", "TOML, see https://toml.io") from None
+    _check_numbers(path, table)
+    return validate(path, table, model)
+
+
+def _check_nesting(path: Path, text: str) -> None:
+    """Reject text whose nesting would occupy the parser for minutes; brackets inside strings count too."""
+    if _LONG_KEY.search(text):
+        raise InputError(path, "", f"a key of over {DEEPEST} parts", f"keys of up to {DEEPEST} parts")
+    depth = 0
+    for mark in _BRACKETS.findall(text):
+        depth = depth + 1 if mark in "[{" else max(depth - 1, 0)
+        if depth > DEEPEST:
+            raise InputError(path, "", f"tables or arrays nested over {DEEPEST} deep", "less nesting")
+
+
+def _check_numbers(path: Path, table: Any, field: str = "") -> None:
+    """Reject integers outside 64 bits."""
+    entries = table.items() if isinstance(table, dict) else enumerate(table) if isinstance(table, list) else ()
+    for key, value in entries:
+        place = f"{field}.{key}" if field else str(key)
+        if isinstance(value, int) and not -(2**63) <= value < 2**63:
+            digits = value.bit_length() * 3 // 10
+            raise InputError(path, place, f"a whole number of {digits} digits", "-2^63 to 2^63 - 1")
+        if isinstance(value, (dict, list)):
+            _check_numbers(path, value, place)
+
+
+def validate(where: str | Path, table: dict[str, Any], model: type[Model]) -> Model:
+    """Check a table against a model; raise an :class:`InputError` with the first fault and all missing keys."""
+    try:
+        return model.model_validate(table)
+    except ValidationError as error:
+        raise _explain(where, table, error, missing_keys(table, model)) from None
+
+
+def missing_keys(table: dict[str, Any], model: type[Document]) -> list[str]:
+    """Return the dotted names of all required keys that a table lacks, including those of missing tables.
+
+    An empty table is inserted for each missing key. If validation then finds keys missing in it, it is a table;
+    otherwise the key is a value.
+    """
+    filled = copy.deepcopy(table)
+    lacking: dict[tuple[Any, ...], None] = {}
+    while True:
+        new = [loc for loc in _missing_in(filled, model) if loc not in lacking]
+        if not new:
+            break
+        for loc in new:
+            lacking[loc] = None
+            _fill(filled, loc)
+    tables = {loc[:depth] for loc in lacking for depth in range(1, len(loc))}
+    return [".".join(map(str, loc)) for loc in lacking if loc not in tables]
+
+
+def _missing_in(table: dict[str, Any], model: type[Document]) -> list[tuple[Any, ...]]:
+    try:
+        model.model_validate(table)
+    except ValidationError as error:
+        out = []
+        for fault in error.errors():
+            if fault["type"] == "missing":
+                out.append(_location(table, fault["loc"]))
+            elif fault["type"] == "union_tag_not_found":
+                out.append((*_location(table, fault["loc"]), fault["ctx"]["discriminator"].strip("'")))
+        return out
+    return []
+
+
+def _fill(table: Any, location: tuple[Any, ...]) -> None:
+    """Put an empty table where a key is missing."""
+    for part in location[:-1]:
+        table = table[part]
+    if isinstance(table, dict):
+        table[location[-1]] = {}
+
+
+def _location(table: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return the location of a fault in the table as written, without names of validators and table variants."""
+    out: list[Any] = []
+    for index, part in enumerate(parts):
+        if isinstance(part, str) and (part.startswith("function-") or part == "[key]"):
+            continue
+        inside = isinstance(table, list) if isinstance(part, int) else isinstance(table, dict) and part in table
+        if not inside and index < len(parts) - 1:
+            continue  # the table variant that a key has selected
+        out.append(part)
+        try:
+            table = table[part]
+        except (KeyError, IndexError, TypeError):
+            table = None
+    return tuple(out)
+
+
+def _explain(where: str | Path, table: dict[str, Any], error: ValidationError, missing: list[str]) -> InputError:
+    faults = error.errors()
+    # a misspelt key usually makes the correct key "missing" too: report the misspelling first, as the cause
+    order = {"extra_forbidden": 0, "missing": 2, "union_tag_not_found": 2}
+    fault = min(faults, key=lambda each: order.get(each["type"], 1))
+    location = _location(table, fault["loc"])
+    field = ".".join(str(part) for part in location)
+    context = fault.get("ctx", {})
+    also = f"Also missing: {', '.join(missing)}" if missing else ""
+    match fault["type"]:
+        case "extra_forbidden":
+            key = str(location[-1])
+            table_of = field.rpartition(".")[0]
+            beside = [each.rpartition(".")[2] for each in missing if each.rpartition(".")[0] == table_of]
+            meant = nearest(key, beside + sorted(_keys_beside()))
+            others = [each for each in missing if f"{each.rpartition('.')[2]!r}" not in meant]
+            also = f"Also missing: {', '.join(others)}" if others else ""
+            allowed = "the keys in docs/reference/formats"
+            return InputError(where, field, "an unknown key", allowed, _joined(meant, also))
+        case "missing" | "union_tag_not_found":
+            if len(missing) < 2:
+                return InputError(where, missing[0] if missing else field, "nothing", "a value: this key is required")
+            return InputError(where, ", ".join(missing), "nothing", "a value for each: these keys are required")
+        case "union_tag_invalid":
+            key = f"{field}.{context['discriminator'].strip(chr(39))}".strip(".")
+            known = [each.strip("' ") for each in context["expected_tags"].split(",")]
+            return InputError(
+                where,
+                key,
+                _shown(context["tag"]),
+                ", ".join(map(repr, known)),
+                _joined(nearest(str(context["tag"]), known), also),
+            )
+        case "value_error":
+            return InputError(where, field, _shown(fault["input"]), str(context.get("error", fault["msg"])), also)
+        case "int_parsing_size" | "int_type" if isinstance(fault["input"], int):
+            return InputError(where, field, "a whole number of too many digits", "-2^63 to 2^63 - 1", also)
+        case _:
+            allowed = fault["msg"].removeprefix("Input should be ")
+            return InputError(where, field, _shown(fault["input"]), allowed, also)
+
+
+def _joined(*sentences: str) -> str:
+    return " ".join(sentence for sentence in sentences if sentence)
+
+
+def _keys_beside() -> set[str]:
+    """Return the field names of all document models, among which to find the nearest to a misspelt key."""
+    return {name for model in _all_models(Document) for name in model.model_fields}
+
+
+def _all_models(model: type[Document]) -> Iterable[type[Document]]:
+    for child in model.__subclasses__():
+        yield child
+        yield from _all_models(child)
+
+
+def _shown(value: Any) -> str:
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of thousands of digits, or nesting as deep
+        text = f"a {type(value).__name__} too long to show"
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def _neighbours(path: Path) -> str:
+    """List existing files of the same type beside a missing one."""
+    try:
+        if not path.parent.is_dir():
+            return f"the folder {path.parent} does not exist either"
+        there = sorted(p.name for p in path.parent.iterdir() if p.suffix == path.suffix)
+    except (OSError, ValueError):
+        return ""
+    return (nearest(path.name, there) or f"there are: {', '.join(there[:6])}") if there else ""

@@ -1,0 +1,254 @@
+"""Fit features to windows of a cloud's grid, and measure the angles and distances between them.
+
+Signal chain: window [px] -> its points -> robust fit along the view rays, seen from the origin of the grid
+(:mod:`characterisation.features.fits`) -> value and standard uncertainty, propagated from the covariance of the fit
+(:func:`characterisation.tasks.evaluation.evaluate`).
+
+A window should contain one feature and little else. If fewer than :data:`LEAST_SHARE` of its points lie on the fitted
+surface, the result has no value and states this reason.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.features.fits import fit_cylinder, fit_plane, fit_sphere
+from characterisation.features.fitted import CylinderFit, PlaneFit, SphereFit
+from characterisation.features.form import fit_form, zone
+from characterisation.features.robust_fit import FitError
+from characterisation.features.starts import cylinder_start
+from characterisation.files.errors import InputError, nearest
+from characterisation.point_cloud import PointCloud
+from characterisation.region_of_interest import Roi
+from characterisation.tasks.definitions import (
+    axis_angle,
+    axis_distance,
+    plane_angle,
+    plane_axis_angle,
+    plane_distance,
+    point_distance,
+    point_plane_distance,
+)
+from characterisation.tasks.evaluation import evaluate
+from characterisation.tasks.result import Result, failed
+
+Shape = Literal["plane", "sphere", "cylinder"]
+PairKind = Literal["angle", "distance"]
+ShapeFit = PlaneFit | SphereFit | CylinderFit
+
+#: least share of a window's points on the fitted surface
+LEAST_SHARE = 0.5
+
+#: least number of points in a window
+LEAST_POINTS = 30
+
+
+def window_slices(window: Roi | None, cloud: PointCloud, name: str) -> tuple[slice, slice]:
+    """Return rows and columns of a window [px] of a cloud's grid; None is the whole grid.
+
+    Raises
+    ------
+    InputError
+        If the window does not lie in the grid. The error names ``name``, the feature of the window.
+    """
+    grid = cloud.grid
+    if window is None:
+        return slice(0, grid.height), slice(0, grid.width)
+    if not window.fits(grid.width, grid.height):
+        found = f"{window.left},{window.top},{window.width},{window.height}"
+        allowed = f"column,row,width,height within {grid.width} x {grid.height} pixels"
+        raise InputError("window", name, found, allowed, "--picture shows the cloud with its rows and columns")
+    return window.slices
+
+
+def window_points(window: Roi | None, cloud: PointCloud, name: str) -> NDArray[np.float64]:
+    """Return the valid points (n, 3) [mm] of a window, in the sensor frame; raises as :func:`window_slices`."""
+    inside = window_slices(window, cloud, name)
+    return np.asarray(cloud.points[inside][cloud.valid[inside]], float)
+
+
+@dataclass(frozen=True)
+class WindowPlan:
+    """Features to measure in windows, and the angles and distances between pairs of them.
+
+    - ``features``: shape and window by name; a window of None is the whole grid.
+    - ``pairs``: kind of measurement, and the names of two features.
+    """
+
+    features: Mapping[str, tuple[Shape, Roi | None]]
+    pairs: Sequence[tuple[PairKind, str, str]] = ()
+
+    def check(self) -> None:
+        """Check that every pair names two features of the plan that have this measurement.
+
+        Raises
+        ------
+        InputError
+            For the first pair that does not.
+        """
+        for kind, first, second in self.pairs:
+            for name in (first, second):
+                if name not in self.features:
+                    known = list(self.features)
+                    allowed = ", ".join(known) or "the name of a --plane, --sphere or --cylinder"
+                    raise InputError(f"--{kind}", "", repr(name), allowed, nearest(name, known))
+            shapes = self.features[first][0], self.features[second][0]
+            if _pair_function(kind, *shapes) is None:
+                raise InputError(
+                    f"--{kind}", "", f"{first} ({shapes[0]}) and {second} ({shapes[1]})", _ALLOWED_SHAPES[kind]
+                )
+
+
+def measure_windows(cloud: PointCloud, plan: WindowPlan) -> list[Result]:
+    """Measure every feature of a plan in a cloud, then the angles and distances between features.
+
+    - Plane: flatness, noise, distance from the grid's origin along the ray to the middle of the points.
+    - Sphere: diameter, noise, distance of the centre from the grid's origin.
+    - Cylinder: diameter, cylindricity, noise.
+
+    Flatness and cylindricity are ranges of the low-order form (:mod:`characterisation.features.form`). Noise is the
+    standard deviation of the residuals along the view rays. Lengths are in mm, angles in deg.
+
+    Standard uncertainties follow from the covariance of the fits by the law of propagation of uncertainty (JCGM 100,
+    5.2). That of the noise is s / sqrt(2 nu), with nu degrees of freedom and normal noise (JCGM 100, E.4.3).
+
+    Raises
+    ------
+    InputError
+        If a window does not lie in the grid, or a pair of features has no such measurement.
+    """
+    plan.check()
+    results: list[Result] = []
+    fits: dict[str, ShapeFit | FitError] = {}
+    counts: dict[str, int] = {}
+    for name, (shape, window) in plan.features.items():
+        points = window_points(window, cloud, name)
+        counts[name] = len(points)
+        fits[name] = fit = _fit_shape(points, shape, cloud.grid.origin)
+        if isinstance(fit, FitError):
+            results += [failed(f"{name} {quantity}", "mm", str(fit), 0, len(points)) for quantity in _QUANTITIES[shape]]
+        else:
+            results += _shape_results(name, fit, points, cloud.grid.origin)
+    for kind, first, second in plan.pairs:
+        results.append(_pair_result(kind, (first, second), fits, counts, plan))
+    return results
+
+
+_QUANTITIES: dict[Shape, tuple[str, ...]] = {
+    "plane": ("flatness", "noise", "distance"),
+    "sphere": ("diameter", "noise", "distance"),
+    "cylinder": ("diameter", "cylindricity", "noise"),
+}
+
+_ALLOWED_SHAPES: dict[PairKind, str] = {
+    "angle": "planes and cylinders",
+    "distance": "two planes, two cylinders, two spheres, or a sphere and a plane",
+}
+
+
+def _fit_shape(points: NDArray[np.float64], shape: Shape, viewpoint: NDArray[np.float64]) -> ShapeFit | FitError:
+    """Return the fit of a shape to points (n, 3) [mm], or the error that says why there is none."""
+    try:
+        if len(points) < LEAST_POINTS:
+            raise FitError(f"{len(points)} points in the window, at least {LEAST_POINTS} are needed")
+        fit: ShapeFit
+        match shape:
+            case "plane":
+                fit = fit_plane(points, viewpoint)
+            case "sphere":
+                fit = fit_sphere(points, viewpoint)
+            case "cylinder":
+                fit = fit_cylinder(points, cylinder_start(points), viewpoint)
+        if fit.count < LEAST_SHARE * len(points):
+            share = f"{100 * fit.count / len(points):.0f} % of the {len(points)} points"
+            raise FitError(f"only {share} lie on the fitted {shape}")
+        return fit
+    except FitError as error:
+        return FitError(f"{error}: does the window show one {shape}?")
+
+
+def _shape_results(
+    name: str, fit: ShapeFit, points: NDArray[np.float64], viewpoint: NDArray[np.float64]
+) -> list[Result]:
+    """Return the results of one fitted feature."""
+    result = partial(Result, unit="mm", origin="fit", points=fit.count, points_given=len(points))
+    # relative standard uncertainty 1 / sqrt(2 nu) of a standard deviation, normal noise (JCGM 100, E.4.3)
+    degrees = fit.count - fit.parameter_count
+    noise = result(f"{name} noise", value=fit.residual_std, uncertainty=fit.residual_std / math.sqrt(2 * degrees))
+
+    def evaluated(quantity: str, function: Callable[[Any], float]) -> Result:
+        value, uncertainty = evaluate(function, [fit])
+        return result(f"{name} {quantity}", value=value, uncertainty=uncertainty)
+
+    if isinstance(fit, SphereFit):
+        distance = evaluated("distance", lambda sphere: float(np.linalg.norm(sphere.centre - viewpoint)))
+        return [evaluated("diameter", lambda sphere: 2 * float(sphere.radius)), noise, distance]
+    form_name = f"{name} cylindricity" if isinstance(fit, CylinderFit) else f"{name} flatness"
+    try:
+        form = fit_form(points, fit, viewpoint)
+        form_result = Result(form_name, "mm", *evaluate(zone, [form]), "fit", form.count, len(points))
+    except FitError as error:
+        form_result = failed(form_name, "mm", str(error), points_given=len(points))
+    if isinstance(fit, CylinderFit):
+        return [evaluated("diameter", lambda cylinder: 2 * float(cylinder.radius)), form_result, noise]
+    middle = fit.point - viewpoint
+    ray = middle / np.linalg.norm(middle)
+    distance = evaluated(
+        "distance", lambda plane: float((plane.point - viewpoint) @ plane.normal / (ray @ plane.normal))
+    )
+    return [form_result, noise, distance]
+
+
+def _pair_result(
+    kind: PairKind,
+    names: tuple[str, str],
+    fits: Mapping[str, ShapeFit | FitError],
+    counts: Mapping[str, int],
+    plan: WindowPlan,
+) -> Result:
+    """Return the angle, 0 to 90 deg, or the distance [mm] between two features."""
+    label, unit = f"{names[0]}-{names[1]} {kind}", "deg" if kind == "angle" else "mm"
+    inputs: list[ShapeFit] = []
+    for name in names:
+        fit = fits[name]
+        if isinstance(fit, FitError):
+            return failed(label, unit, f"{name}: {fit}")
+        inputs.append(fit)
+    selected = _pair_function(kind, plan.features[names[0]][0], plan.features[names[1]][0])
+    assert selected is not None  # plan.check()
+    function, swapped = selected
+    ordered = inputs[::-1] if swapped else inputs
+    if function is plane_distance:
+        value, uncertainty = evaluate(lambda a, b: plane_distance(a, b, nominal=ordered), ordered)
+    else:
+        value, uncertainty = evaluate(function, ordered)
+    if not math.isfinite(value):
+        return failed(label, unit, "the features are parallel or coincide")
+    scale = math.degrees(1.0) if unit == "deg" else 1.0
+    count, total = sum(one.count for one in inputs), sum(counts[name] for name in names)
+    return Result(label, unit, value * scale, uncertainty * scale, "fit", count, total)
+
+
+def _pair_function(kind: PairKind, first: Shape, second: Shape) -> tuple[Callable[..., Any], bool] | None:
+    """Return the function that measures two shapes, and whether it takes them in reverse order; None without one."""
+    shapes_of_pair = (first, second)
+    table: dict[tuple[PairKind, Shape, Shape], Callable[..., Any]] = {
+        ("angle", "plane", "plane"): plane_angle,
+        ("angle", "plane", "cylinder"): plane_axis_angle,
+        ("angle", "cylinder", "cylinder"): axis_angle,
+        ("distance", "plane", "plane"): plane_distance,
+        ("distance", "cylinder", "cylinder"): axis_distance,
+        ("distance", "sphere", "sphere"): point_distance,
+        ("distance", "sphere", "plane"): point_plane_distance,
+    }
+    for ordered, swapped in ((shapes_of_pair, False), (shapes_of_pair[::-1], True)):
+        if (kind, *ordered) in table:
+            return table[(kind, *ordered)], swapped
+    return None

@@ -1,0 +1,364 @@
+"""Operate a live DepthAI camera (OAK-D and similar) with the package ``depthai`` 3.
+
+Signal chain: settings -> pipeline of two cameras and the device's own matcher -> synchronised frames of one sequence
+number -> raw left and right images, disparity -> with the calibration stored in the device, as JSON.
+
+The device's depth is never used: its conversion may use the design baseline or the calibrated one
+(:mod:`mitsim.capture.devices.depthai_settings`). Dot projector and flood light are switched off on closing, on every error and
+on Ctrl-C. The tests use the real package's frames, queues and calibrations. Its pipelines need a device; they have not
+been run on one.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import timedelta
+from importlib import import_module
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.errors import MissingEnvironmentError
+from mitsim.capture.devices.depthai_settings import DepthaiSettings, configuration, configure
+from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.open_camera import check_open
+
+Image = NDArray[np.unsignedinteger[Any]]
+
+#: outputs of the matcher's node that are used
+_IMAGES, _DISPARITY = {"left": "syncedLeft", "right": "syncedRight"}, "disparity"
+
+
+@dataclass(frozen=True)
+class DepthaiShot:
+    """The data of one capture.
+
+    - ``images`` of ``left`` and ``right`` (H, W) [DN], raw.
+    - ``disparity`` (H, W) of the device's own matcher in its rectified left image [px], NaN where missing, or None.
+    - ``calibration``: as stored in the device, in its own JSON.
+    - ``settings``: the values set, and those that the frames report, with units in the names.
+    - ``model`` and ``serial``.
+    """
+
+    images: dict[str, Image]
+    disparity: NDArray[np.float32] | None
+    calibration: dict[str, Any]
+    settings: dict[str, Any]
+    model: str
+    serial: str
+
+
+class DepthaiCamera:
+    """An open camera; a context manager that switches its light off and closes it."""
+
+    def __init__(self, settings: DepthaiSettings, identifier: str, dai: Any) -> None:
+        self.where, self.settings = f"camera depthai{':' + identifier if identifier else ''}", settings
+        self._dai, self._device, self._pipeline = dai, None, None
+        self._fault, self._closed = "", False
+        with self._light_off_on_error("open"):
+            self._device = dai.Device(dai.DeviceInfo(identifier)) if identifier else dai.Device()
+            self._pipeline = dai.Pipeline(self._device)
+            stereo = stereo_pipeline(self._pipeline, settings, dai)
+            self._queues = {name: getattr(stereo, output).createOutputQueue() for name, output in _IMAGES.items()}
+            if settings.disparity:
+                self._queues["disparity"] = stereo.disparity.createOutputQueue()
+            self._configuration = configuration(stereo.initialConfig)
+            self.calibration: dict[str, Any] = self._device.readCalibration().eepromToJson()
+            self.model, self.serial = str(self._device.getDeviceName()), str(self._device.getDeviceId())
+            self._pipeline.start()
+            self._light(settings.dot_projector, settings.flood_light)
+            for _ in range(settings.warm_up_frames):
+                aligned(self._queues, settings.timeout_s, self.where)
+
+    def take(self) -> DepthaiShot:
+        """Take one capture; its frames are exposed after the call.
+
+        Raises
+        ------
+        DeviceError
+            If the camera fails; its light is switched off before the error is raised.
+        """
+        with self._light_off_on_error("capture"):
+            newest = -1
+            for queue in self._queues.values():  # queued frames are older than the call
+                for old in queue.tryGetAll():
+                    newest = max(newest, old.getSequenceNum())
+            # the frame in progress may have begun before the call: skip one more
+            frames = aligned(self._queues, self.settings.timeout_s, self.where, newest + 2)
+            settings = {
+                "maker": "Luxonis",
+                "stereo": self._configuration,
+                "spec_baseline": False,
+                **self.settings.model_dump(mode="json", include={"dot_projector", "flood_light", "frames_per_second"}),
+                **frame_settings(frames["left"]),
+            }
+            images = {name: pixels(frames[name]) for name in _IMAGES}
+            disparity = None
+            if "disparity" in frames:
+                disparity = disparity_of(pixels(frames["disparity"]), self.settings.subpixel_bits)
+            return DepthaiShot(images, disparity, self.calibration, settings, self.model, self.serial)
+
+    def close(self) -> None:
+        """Switch the light off and close the camera; further calls do nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        with suppress(Exception):  # the camera may be disconnected
+            self._light(0.0, 0.0)
+        with suppress(Exception):
+            if self._pipeline is not None:
+                self._pipeline.stop()
+        with suppress(Exception):
+            if self._device is not None:
+                self._device.close()
+
+    def __enter__(self) -> DepthaiCamera:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _light(self, dots: float, flood: float) -> None:
+        device = self._device
+        if device is None:
+            return
+        for share, switch, name in (
+            (dots, device.setIrLaserDotProjectorIntensity, "dot_projector"),
+            (flood, device.setIrFloodLightIntensity, "flood_light"),
+        ):
+            if not switch(share) and share > 0:
+                raise DeviceError(
+                    self.where,
+                    f"set {name}",
+                    "a camera without one",
+                    "one that has it (OAK-D Pro)",
+                    f"Write {name} = 0",
+                )
+
+    @contextmanager
+    def _light_off_on_error(self, what: str) -> Iterator[None]:
+        check_open(self.where, what, self._closed, self._fault)
+        try:
+            yield
+        except BaseException as error:  # Ctrl-C as well
+            self._fault = what
+            self.close()
+            fault = fault_of(error, self._dai, self.where, what)
+            if fault is error:
+                raise
+            raise fault from error
+
+
+def open_depthai(settings: DepthaiSettings, identifier: str = "") -> DepthaiCamera:
+    """Open a camera and configure it; ``identifier``: its id, address or USB port, if there are several.
+
+    Raises
+    ------
+    MissingEnvironmentError
+        Without the package ``depthai``.
+    DeviceError
+        If there is no such camera, or it rejects the settings.
+    """
+    return DepthaiCamera(settings, identifier, depthai())
+
+
+def depthai() -> Any:
+    """Import the package without its log messages, or raise an error with the installation command."""
+    os.environ.setdefault("DEPTHAI_LEVEL", "error")  # it warns if there is no USB bus
+    os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # mitsim handles Ctrl-C
+    try:
+        return import_module("depthai")
+    except ImportError:
+        raise MissingEnvironmentError(
+            "DepthAI cameras need depthai, which is not installed: pip install 'mitsim[depthai]'"
+        ) from None
+
+
+def stereo_pipeline(pipeline: Any, settings: DepthaiSettings, dai: Any) -> Any:
+    """Add two cameras and a ``StereoDepth`` node to a pipeline that is not started, and return the node."""
+    outputs = []
+    for socket in (dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C):
+        camera = pipeline.create(dai.node.Camera).build(socket)
+        if settings.exposure_s is not None:
+            camera.initialControl.setManualExposure(round(1e6 * settings.exposure_s), settings.sensitivity_iso)
+        outputs.append(
+            camera.requestOutput(settings.size_px, type=dai.ImgFrame.Type.GRAY8, fps=settings.frames_per_second)
+        )
+    preset = getattr(dai.node.StereoDepth.PresetMode, settings.preset)
+    stereo = pipeline.create(dai.node.StereoDepth).build(*outputs, presetMode=preset)
+    _matcher(stereo, settings, dai)
+    return stereo
+
+
+def match_on_device(
+    left: Image,
+    right: Image,
+    settings: DepthaiSettings,
+    identifier: str = "",
+    rectified: bool = True,
+    package: Any = None,
+) -> NDArray[np.float32]:
+    """Return the disparity (H, W) [px] that a connected device's own matcher finds in a pair of images.
+
+    Parameters
+    ----------
+    left, right
+        (H, W) uint8.
+    rectified
+        Whether the pair is rectified already. If not, the device rectifies it with its stored calibration, so a
+        rendered pair must use that calibration: :func:`mitsim.capture.devices.maker_captures.depthai_rig`.
+
+    Raises
+    ------
+    DeviceError
+        If there is no such device, or it returns nothing in time.
+    """
+    dai, where = package or depthai(), f"camera depthai{':' + identifier if identifier else ''}"
+    device = pipeline = None
+    try:
+        device = dai.Device(dai.DeviceInfo(identifier)) if identifier else dai.Device()
+        pipeline = dai.Pipeline(device)
+        stereo = pipeline.create(dai.node.StereoDepth)
+        stereo.setDefaultProfilePreset(getattr(dai.node.StereoDepth.PresetMode, settings.preset))
+        _matcher(stereo, settings, dai)
+        stereo.setRectification(not rectified)
+        stereo.setInputResolution(left.shape[1], left.shape[0])
+        inputs = [stereo.left.createInputQueue(), stereo.right.createInputQueue()]
+        out = {"disparity": stereo.disparity.createOutputQueue()}
+        pipeline.start()
+        sockets = (dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C)
+        for queue, image, socket in zip(inputs, (left, right), sockets, strict=True):
+            queue.send(grey_frame(image, socket, dai))
+        frame = aligned(out, settings.timeout_s, where)["disparity"]
+        return disparity_of(pixels(frame), settings.subpixel_bits)
+    except Exception as error:
+        raise fault_of(error, dai, where, "match") from error
+    finally:
+        for close in (pipeline and pipeline.stop, device and device.close):
+            if close:
+                with suppress(Exception):
+                    close()
+
+
+def _matcher(stereo: Any, settings: DepthaiSettings, dai: Any) -> None:
+    configure(stereo.initialConfig, settings, dai)
+    stereo.setDisparityToDepthUseSpecTranslation(False)
+    stereo.setRectificationUseSpecTranslation(False)
+    stereo.setDepthAlignmentUseSpecTranslation(False)
+
+
+def grey_frame(image: Image, socket: Any, dai: Any, number: int = 0) -> Any:
+    """Make an ``ImgFrame`` of a grey image (H, W) uint8, as from the camera at a socket."""
+    frame = dai.ImgFrame()
+    frame.setType(dai.ImgFrame.Type.GRAY8)
+    frame.setWidth(image.shape[1])
+    frame.setHeight(image.shape[0])
+    frame.setData(np.ascontiguousarray(image, np.uint8).ravel())
+    frame.setInstanceNum(int(socket.value))
+    frame.setSequenceNum(number)
+    return frame
+
+
+def pixels(frame: Any) -> Image:
+    """Return a copy of the grey levels or raw disparities (H, W) of an ``ImgFrame``."""
+    image = np.array(frame.getFrame())
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+        raise DeviceError(
+            "camera depthai",
+            "read a frame",
+            f"{image.dtype} {image.shape} of type {frame.getType()}",
+            "a grey image of 8 or 16 bits",
+        )
+    return image
+
+
+def disparity_of(raw: Image, subpixel_bits: int) -> NDArray[np.float32]:
+    """Return the disparity [px] of raw values in units of 2^-bits px; 0 is missing."""
+    return np.where(raw == 0, np.float32(np.nan), raw.astype(np.float32) / np.float32(2**subpixel_bits))
+
+
+def frame_settings(frame: Any) -> dict[str, Any]:
+    """Return the values that a frame reports: exposure, sensitivity, temperature, sequence number."""
+    read = {
+        "exposure_s": frame.getExposureTime().total_seconds(),
+        "sensitivity_iso": frame.getSensitivity(),
+        "imager_temperature_degC": frame.getSensorTemperature(),
+        "sequence_number": frame.getSequenceNum(),
+    }
+    return {name: value for name, value in read.items() if value is not None}
+
+
+def aligned(
+    queues: Mapping[str, Any], timeout_s: float, where: str, first: int = 0, now: Callable[[], float] = time.monotonic
+) -> dict[str, Any]:
+    """Return the next frames of a common sequence number, at least ``first``, one from each queue.
+
+    Raises
+    ------
+    DeviceError
+        If they do not arrive in time.
+    """
+    deadline = now() + timeout_s
+    newest: dict[str, Any] = {}
+    wanted = first
+    while len(newest) < len(queues) or any(frame.getSequenceNum() < wanted for frame in newest.values()):
+        for name, queue in queues.items():
+            while name not in newest or newest[name].getSequenceNum() < wanted:
+                left = deadline - now()
+                frame = queue.get(timedelta(seconds=left)) if left > 0 else None
+                if frame is None:
+                    raise DeviceError(
+                        where,
+                        "capture",
+                        f"no frame of {name} within {timeout_s:g} s",
+                        "frames",
+                        "Check the cable (USB 3), or lower frames_per_second",
+                    )
+                newest[name] = frame
+                wanted = max(wanted, frame.getSequenceNum())
+    return newest
+
+
+def fault_of(error: BaseException, dai: Any, where: str, what: str) -> BaseException:
+    """Return the error to raise instead of ``error``: a DeviceError for errors of the package, else itself."""
+    if isinstance(error, DeviceError) or not isinstance(error, RuntimeError):
+        return error
+    message = " ".join(str(error).split())[:200]
+    listed: list[str] = []
+    with suppress(Exception):
+        listed = [str(info.getDeviceId()) for info in dai.Device.getAllAvailableDevices()]
+    there = f"Connected: {', '.join(listed)}" if listed else "None is connected"
+    lowered = message.lower()
+    if "no available devices" in lowered or "cannot find any device" in lowered or "failed to find device" in lowered:
+        return DeviceError(
+            where,
+            what,
+            f"no such camera ({message})",
+            "one that answers",
+            f"{there}. Check the cable. On Linux its udev rule is needed: docs.luxonis.com",
+        )
+    if "already_in_use" in lowered or "already used" in lowered:
+        return DeviceError(where, what, f"the camera in use ({message})", "a free camera", "Close the other program")
+    if "permission" in lowered:
+        return DeviceError(
+            where,
+            what,
+            f"permission denied ({message})",
+            "a camera that you may open",
+            "On Linux its udev rule is needed: docs.luxonis.com",
+        )
+    return DeviceError(
+        where,
+        what,
+        f"the camera disconnected or failed ({message})",
+        "a connected camera",
+        "Check the cable and the power, then open it again",
+    )

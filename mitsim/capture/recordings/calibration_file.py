@@ -1,0 +1,176 @@
+"""Read a file that describes the cameras of a recording, in any of these formats, as a rig.
+
+========================= ============================================================
+a sensor                  preset, or sensor TOML: its cameras
+a small TOML              ``[cameras.NAME]`` alone, or ``[calibration]``, as in a sensor TOML
+a small JSON              ``fx fy cx cy width height``, and optionally ``distortion``
+DepthAI                   JSON with ``cameraData``: its left and right camera
+a capture's               ``calibration.json`` of a capture folder
+an Ensenso's              ``*_calib.json`` of a recording: left and right camera, manufacturer's rectification
+OpenCV                    YAML, XML or JSON of FileStorage, under the usual names
+========================= ============================================================
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import ConfigDict, Field
+
+from characterisation.files.checked_files import read_bounded
+from characterisation.files.documents import Document, read_toml, validate
+from characterisation.files.errors import InputError
+from mitsim.capture.calibration import CalibrationDocument, rig_of
+from mitsim.capture.recordings.depthai_calibration import is_depthai_calibration, read_depthai_calibration
+from mitsim.capture.recordings.nxlib_calibration import nxlib_rig
+from mitsim.capture.recordings.nxlib_tree import NxLibTree
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.opencv_calibration import CalibrationTable, with_calibration
+from mitsim.sensor.preset import presets
+from mitsim.sensor.recorded_rig import load_recorded_rig
+from mitsim.sensor.sensor_file import OpticsTable
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A ``rig`` read from a file, the name of its ``sensor``, and its range if the file states one.
+
+    ``notes``: warnings for the user.
+    """
+
+    rig: Rig
+    sensor: str
+    range_mm: tuple[float, float] | None = None
+    notes: tuple[str, ...] = ()
+
+
+class RigFile(Document):
+    """A small TOML file: ``name`` of the sensor, and its cameras as in a sensor TOML."""
+
+    name: str = ""
+    calibration: CalibrationTable | None = None
+    cameras: dict[str, OpticsTable] = Field(min_length=1, max_length=2)
+
+
+class PinholeFile(Document):
+    """A small JSON file: camera matrix [px], image size, and OpenCV's distortion coefficients."""
+
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
+    cx: float
+    cy: float
+    width: Annotated[int, Field(ge=1, le=16384)]
+    height: Annotated[int, Field(ge=1, le=16384)]
+    distortion: list[float] = Field(default=[], max_length=14)
+    name: str = ""
+
+
+class _Written(Document):
+    model_config = ConfigDict(extra="allow")
+
+
+def read_calibration(source: str | Path, size: tuple[int, int] | None = None) -> Calibrated:
+    """Read the cameras of a preset by name, or of a file.
+
+    Parameters
+    ----------
+    size
+        (width, height) [px] of the images: the size of an OpenCV file without one, and the size to which the cameras
+        of a DepthAI calibration are scaled.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it has none of the formats above.
+    """
+    path = Path(source)
+    if path.suffix.lower() == ".toml" or str(source) in presets():
+        return _of_toml(path, size)
+    if path.suffix.lower() in (".yml", ".yaml", ".xml", ".mat", ".npz"):
+        return _of_opencv(path, size)
+    if path.suffix.lower() != ".json":
+        known = f".toml, .json, .yml, .yaml, .xml, .mat or .npz, or a preset: {', '.join(presets())}"
+        raise InputError(path, "", f"the ending {path.suffix!r}", known)
+    try:
+        table = json.loads(read_bounded(path, "a calibration").decode("utf-8-sig"), parse_constant=lambda _: None)
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, "", f"text that is not JSON ({error})", "a calibration in JSON") from None
+    if is_depthai_calibration(table):
+        read = read_depthai_calibration(path)
+        return Calibrated(read.rig(*size) if size else read.rig(), read.name)
+    if isinstance(table, dict) and isinstance(table.get("Calibration"), dict):
+        tree = NxLibTree(read_bounded(path, "a calibration"), str(path))
+        return Calibrated(nxlib_rig(tree, None if tree.has("Sensor/Size") else size), str(tree.get("ModelName", "")))
+    if isinstance(table, dict) and isinstance(table.get("cameras"), list):
+        return Calibrated(rig_of(validate(path, table, CalibrationDocument)), "")
+    if isinstance(table, dict) and "fx" in table:
+        return _of_pinhole(path, table)
+    return _of_opencv(path, size)
+
+
+def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], where: str | Path) -> Camera:
+    """Return the camera of a name, or the first; its images must have the size (width, height).
+
+    Raises
+    ------
+    InputError
+        If no camera has that name, or its size differs.
+    """
+    cameras = calibrated.rig.cameras
+    if name is not None and name not in cameras:
+        raise InputError("--camera", "", repr(name), ", ".join(cameras))
+    camera = calibrated.rig.reference if name is None else cameras[name]
+    if (camera.width, camera.height) != size:
+        allowed = f"{camera.width} x {camera.height} px, as the calibration says"
+        raise InputError(where, "size", f"{size[0]} x {size[1]} px", allowed)
+    return camera
+
+
+def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
+    if path.suffix.lower() == ".toml":
+        written = read_toml(path, _Written).model_extra or {}
+        if "technology" not in written:
+            optics, notes = with_calibration(path, written)
+            table = validate(path, _sized(optics, size), RigFile)
+            rig = Rig({name: each.camera() for name, each in table.cameras.items()})
+            return Calibrated(rig, table.name, notes=tuple(notes))
+    sensor = load_recorded_rig(path, size)
+    return Calibrated(sensor.rig, sensor.name, sensor.range_mm, sensor.notes)
+
+
+def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:
+    """Read a pair if the file has the second camera, else one camera."""
+    asked = {"file": path.name, "projector": False}
+    try:
+        table, notes = with_calibration(path, {"calibration": {**asked, "cameras": ["left", "right"]}})
+    except InputError:
+        table, notes = with_calibration(path, {"calibration": {**asked, "cameras": ["camera"]}})
+    read = validate(path, _sized(table, size), RigFile)
+    return Calibrated(Rig({name: each.camera() for name, each in read.cameras.items()}), "", notes=tuple(notes))
+
+
+def _sized(table: dict[str, Any], size: tuple[int, int] | None) -> dict[str, Any]:
+    """Set the image size of cameras that have none."""
+    cameras = table.get("cameras")
+    if size is None or not isinstance(cameras, dict):
+        return table
+    sized = {"width": size[0], "height": size[1]}
+    return table | {
+        "cameras": {name: sized | each if isinstance(each, dict) else each for name, each in cameras.items()}
+    }
+
+
+def _of_pinhole(path: Path, table: dict[str, Any]) -> Calibrated:
+    read = validate(path, table, PinholeFile)
+    if len(read.distortion) not in (0, 4, 5, 8, 12, 14):
+        raise InputError(path, "distortion", f"{len(read.distortion)} numbers", "0, 4, 5, 8, 12 or 14, as OpenCV takes")
+    if not all(map(math.isfinite, (read.cx, read.cy))):
+        raise InputError(path, "cx, cy", f"{read.cx}, {read.cy}", "finite numbers")
+    matrix = np.array([[read.fx, 0.0, read.cx], [0.0, read.fy, read.cy], [0.0, 0.0, 1.0]])
+    distortion = np.array(read.distortion) if read.distortion else np.zeros(5)
+    return Calibrated(Rig({"camera": Camera(matrix, distortion, read.width, read.height)}), read.name)

@@ -1,0 +1,266 @@
+"""Read recordings of Luxonis' DepthAI (``RecordMessage``: MCAP files), with the device's calibration, as captures.
+
+Signal chain: streams by the names of their files -> one frame of each -> raw pair, else disparity, else depth ->
+rig of the calibration at the size of the images.
+
+Points are measured from the first of these that was recorded; the setting ``measured_from`` names it:
+
+raw pair
+    matched by mitsim. The device's own maps, if recorded, are kept beside the images.
+disparity
+    Z = f B / d with the calibrated baseline B and the frame's own f.
+device depth
+    as computed by the device. Devices may use the design baseline instead of the calibrated one, which scales all
+    depths (DepthAI's ``useSpecTranslation``; depthai-core, issues 358 and 847). The settings state both.
+
+A disparity has units of 1/2^n px, and the recording does not state n. With a depth map, n follows from Z d = f B.
+Otherwise it is the given one, or 5 for 16 bits (DepthAI 3's default) and 0 for 8.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.checked_files import is_inside
+from characterisation.files.errors import InputError, MissingEnvironmentError
+from mitsim.capture.capture import Capture
+from mitsim.capture.recordings.depthai_calibration import DepthaiCalibration, read_depthai_calibration
+from mitsim.sensor.camera import Camera, Rig, stereo_rectification
+
+if TYPE_CHECKING:
+    from mitsim.capture.recordings.depthai_frames import RecordedFrame
+
+_VIDEOS = (".mp4", ".h264", ".h265", ".hevc", ".mjpeg", ".avi", ".mkv")
+
+#: default n for a disparity of 16 bits: that of DepthAI 3
+DEFAULT_SUBPIXEL_BITS = 5
+
+#: largest relative difference of f B between the maps and the calibration: the design baseline and rounding of f differ
+_LOOSE = 0.25
+
+
+def recorded_streams(path: str | Path) -> dict[str, Path]:
+    """Return the files of the streams ``left``, ``right``, ``disparity`` and ``depth``, recognised by their names.
+
+    Raises
+    ------
+    InputError
+        If there is none, there are two of one stream, or there are videos instead.
+    """
+    path = Path(path)
+    if path.is_file():
+        found = [path]
+    elif path.is_dir():
+        found = sorted(file for file in path.glob("*.mcap") if file.is_file() and is_inside(file, path))
+    else:
+        raise InputError(path, "", "no such file or folder", "an .mcap file, or a folder of them")
+    streams: dict[str, Path] = {}
+    for file in found:
+        stream = _stream_of(file.stem)
+        if stream is None:
+            continue
+        if stream in streams:
+            raise InputError(path, stream, f"{streams[stream].name} and {file.name}", "one file of each stream")
+        streams[stream] = file
+    videos = [] if path.is_file() else sorted(file.name for file in path.iterdir() if file.suffix.lower() in _VIDEOS)
+    if not streams and videos:
+        raise InputError(
+            path,
+            videos[0],
+            "a video",
+            "streams recorded by RecordMessage, .mcap",
+            "video is compressed with loss, which adds noise: record the streams themselves",
+        )
+    if not streams:
+        names = ", ".join(file.name for file in found[:6]) or "no .mcap"
+        raise InputError(path, "", names, "files whose names say left, right, disparity or depth")
+    return streams
+
+
+def read_depthai_recording(
+    path: str | Path,
+    calibration: str | Path | None = None,
+    *,
+    frame: int | None = None,
+    subpixel_bits: int | None = None,
+    sensor: str | None = None,
+) -> Capture:
+    """Read one frame of a recording.
+
+    Parameters
+    ----------
+    path
+        An .mcap file, or a folder of them, one for each stream.
+    calibration
+        JSON as DepthAI saves it; by default ``calibration.json`` or the only ``*calib*.json`` beside the streams.
+    frame
+        Number of the frame, counted from 0; required if there are several.
+    subpixel_bits
+        n of a disparity in units of 1/2^n px.
+    sensor
+        Name of the sensor; by default that of the calibration.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, damaged or lossily compressed, or does not fit the calibration.
+    MissingEnvironmentError
+        Without the packages of the extra ``recordings``.
+    """
+    path = Path(path)
+    streams = recorded_streams(path)
+    known = read_depthai_calibration(calibration or calibration_beside(path))
+    frames = _read_frames(streams, frame)
+    first = frames.get("left", next(iter(frames.values())))
+    settings: dict[str, Any] = {
+        "imported_from": path.name,
+        "maker": "Luxonis",
+        "streams": {name: file.name for name, file in streams.items()},
+        "sequence": first.sequence,
+        "baseline_mm": float(np.linalg.norm(known.right_from_left.translation)),
+        "spec_baseline_mm": known.spec_baseline_mm,
+    }
+    if first.exposure_s > 0:
+        settings |= {"exposure_s": first.exposure_s, "sensitivity_iso": first.sensitivity_iso}
+    derived = _derived(frames, known, subpixel_bits, settings)
+    images: dict[str, NDArray[Any]] = {}
+    if {"left", "right"} <= set(frames):
+        technology, settings["measured_from"] = "active_stereo", "raw pair"
+        images = {side: frames[side].image[None] for side in ("left", "right")}
+        rig = _pair(frames["left"], frames["right"], known, streams["right"])
+    elif "disparity" in frames:
+        technology, settings["measured_from"] = "disparity_map", "disparity"
+        rig = _disparity_rig(frames["disparity"], known)
+    elif "depth" in frames:
+        technology, settings["measured_from"] = "depth_map", "device depth"
+        rig = _depth_rig(frames["depth"], known)
+    else:
+        raise InputError(path, ", ".join(streams), "a single image", "left and right, disparity, or depth")
+    return Capture(
+        sensor=sensor or known.name,
+        technology=technology,
+        source="replay",
+        rig=rig,
+        images=images,
+        bits=8 * max((stack.dtype.itemsize for stack in images.values()), default=2),
+        settings=settings,
+        derived=derived,
+    )
+
+
+def _read_frames(streams: dict[str, Path], frame: int | None) -> dict[str, RecordedFrame]:
+    """Return the frames of the streams; only here are the packages of the extra ``recordings`` imported."""
+    try:
+        from mitsim.capture.recordings.depthai_frames import read_frames
+    except ModuleNotFoundError as error:
+        raise MissingEnvironmentError(
+            f"{next(iter(streams.values()))}: a recording of DepthAI needs packages that are not installed "
+            f"({error.name}): pip install 'mitsim[recordings]'"
+        ) from None
+    return read_frames(streams, frame)
+
+
+def calibration_beside(path: Path) -> Path:
+    """Return the calibration in the folder of a recording.
+
+    Raises
+    ------
+    InputError
+        If there is none, or more than one.
+    """
+    folder = path if path.is_dir() else path.parent
+    if (folder / "calibration.json").is_file():
+        return folder / "calibration.json"
+    found = sorted(folder.glob("*calib*.json"))
+    if len(found) != 1:
+        names = ", ".join(file.name for file in found[:4]) or "no such file"
+        raise InputError(folder, "*calib*.json", names, "one calibration beside the recording", "or --calibration FILE")
+    return found[0]
+
+
+def _stream_of(name: str) -> str | None:
+    """Return the stream of a file's name; None for unused ones, such as rectified images and confidence."""
+    plain = re.sub("[^a-z0-9]", "", name.lower())
+    if "rectified" in plain or "confidence" in plain:
+        return None
+    for stream, words in {
+        "disparity": ("disparity",),
+        "depth": ("depth",),
+        "left": ("left", "camb"),
+        "right": ("right", "camc"),
+    }.items():
+        if any(word in plain for word in words):
+            return stream
+    return None
+
+
+def _derived(
+    frames: dict[str, RecordedFrame], known: DepthaiCalibration, bits: int | None, settings: dict[str, Any]
+) -> dict[str, NDArray[np.float32]]:
+    """Return the device's own maps, NaN where it has no value."""
+    derived = {}
+    if "depth" in frames:
+        depth = frames["depth"].image.astype(np.float32)  # DepthAI: uint16 [mm]
+        derived["depth"] = np.where(depth > 0, depth, np.float32(np.nan))
+    if "disparity" in frames:
+        frame = frames["disparity"]
+        found = _subpixel_bits(frame, frames.get("depth"), known)
+        settings["subpixel_bits_from"] = "option" if bits is not None else "depth" if found is not None else "default"
+        if bits is None:
+            bits = found if found is not None else DEFAULT_SUBPIXEL_BITS if frame.image.dtype == np.uint16 else 0
+        settings["subpixel_bits"] = bits
+        disparity = frame.image.astype(np.float32) / np.float32(2**bits)
+        derived["disparity"] = np.where(disparity > 0, disparity, np.float32(np.nan))
+    return derived
+
+
+def _subpixel_bits(frame: RecordedFrame, depth: RecordedFrame | None, known: DepthaiCalibration) -> int | None:
+    """Return n for which Z d = f B; None without a depth map of the same pixels, or if no n fits."""
+    if depth is None or depth.image.shape != frame.image.shape:
+        return None
+    both = (depth.image > 0) & (frame.image > 0) & (depth.image < 65535)
+    if not both.any():
+        return None
+    product = float(np.median(depth.image[both].astype(float) * frame.image[both]))
+    steps = np.log2(product / (_matrix(frame, known)[0, 0] * float(np.linalg.norm(known.right_from_left.translation))))
+    nearest = round(steps)
+    return nearest if 0 <= nearest <= 8 and abs(steps - nearest) < np.log2(1 + _LOOSE) else None
+
+
+def _matrix(frame: RecordedFrame, known: DepthaiCalibration) -> NDArray[np.float64]:
+    """Return K of a map's pixels: the frame's own, or that of the left camera at the frame's size."""
+    height, width = frame.image.shape
+    return frame.matrix if frame.matrix is not None else known.rig(width, height).reference.matrix
+
+
+def _pair(left: RecordedFrame, right: RecordedFrame, known: DepthaiCalibration, where: Path) -> Rig:
+    height, width = left.image.shape
+    if right.image.shape != (height, width) or right.image.dtype != left.image.dtype:
+        found = f"{right.image.shape[1]} x {right.image.shape[0]} px of {right.image.dtype}"
+        raise InputError(where, "size", found, f"{width} x {height} px of {left.image.dtype}, as the left image")
+    return known.rig(width, height)
+
+
+def _disparity_rig(frame: RecordedFrame, known: DepthaiCalibration) -> Rig:
+    """Return the calibrated pair, rectified as by the device: its rotations, and one K for both."""
+    height, width = frame.image.shape
+    rig = known.rig(width, height)
+    left, right = rig.cameras.values()
+    pair = stereo_rectification(left, right)
+    K = _matrix(frame, known).copy()
+    K[0, 1] = K[1, 0] = 0.0
+    return replace(rig, rectification=replace(pair, matrix_left=K, matrix_right=K))
+
+
+def _depth_rig(frame: RecordedFrame, known: DepthaiCalibration) -> Rig:
+    """Return the rectified camera of the device's depth map; it has no distortion."""
+    height, width = frame.image.shape
+    K = _matrix(frame, known).copy()
+    K[0, 1] = K[1, 0] = 0.0
+    return Rig({"depth": Camera(K, np.zeros(5), width, height)})

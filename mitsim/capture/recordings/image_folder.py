@@ -1,0 +1,179 @@
+"""Read a folder of images of any structured-light rig as a capture.
+
+Signal chain: sensor file -> files of each camera, in order -> images, checked for number, size, bits and colour ->
+:class:`~mitsim.capture.capture.Capture` with the code and the decoder's settings of the sensor file.
+
+Files are ordered by number: ``image_2.png`` comes before ``image_10.png``. The sensor file's ``[pattern]`` describes
+the images; an ``image_sequence`` lists them in any order.
+"""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from characterisation.files.errors import InputError
+from mitsim.capture.capture import Capture
+from mitsim.capture.grey_image import CHANNELS, SUFFIXES, Image, channel_name, is_colour, read_grey
+from mitsim.capture.recordings.image_count import advice
+from mitsim.sensor.camera import Camera
+from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.light_code import LightCode, roles
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.recorded_rig import RecordedRig
+
+
+def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig, channel: int = CHANNELS["green"]) -> Capture:
+    """Read the images of one measurement.
+
+    Without ``[images]`` in the sensor file, a rig of one camera uses all images in the folder. A rig of two cameras
+    uses those in the subfolders named after the cameras, or those whose names begin with the cameras' names. Of colour
+    images one ``channel`` is used.
+
+    Raises
+    ------
+    InputError
+        If the sensor is not a structured-light one, images are missing or too many, or an image cannot be read or
+        differs in size or depth from the sensor file.
+    """
+    folder, rig = Path(folder), sensor if isinstance(sensor, RecordedRig) else RecordedRig.of(sensor)
+    code, decoder = rig.pattern, rig.settings
+    if not isinstance(code, LightCode) or not isinstance(decoder, DecoderSettings):
+        hint = "recordings of an Ensenso are imported without --sensor"
+        raise InputError(f"sensor {rig.name}", "technology", rig.technology, "structured_light", hint)
+    if not folder.is_dir():
+        raise InputError(folder, "", "no such folder", "a folder of images")
+    count = len(roles(code, *rig.projector_size)) + rig.ambient_image
+    both = len(rig.rig.cameras) == 2 and (decoder.triangulate == "cameras" or len(rig.images or {}) == 2)
+    used = list(rig.rig.cameras) if both else list(rig.rig.cameras)[:1]
+    images, names, colour = {}, {}, False
+    for name in used:
+        found = _files(folder, rig, name, len(used))
+        if len(found) != count:
+            raise InputError(
+                folder,
+                f"images of {name}",
+                f"{len(found)}{_ends(found)}",
+                f"{count}, as the pattern of {rig.name}",
+                advice(found, name, code, rig.projector_size, count) if found else _content(folder, used),
+            )
+        images[name] = _stack(found, rig.rig.cameras[name], rig.bits, channel)
+        colour |= is_colour(found[0])
+        names[name] = [path.relative_to(folder).as_posix() for path in found]
+    settings: dict[str, Any] = {
+        "pattern": code.model_dump(),
+        "decoder": decoder.model_dump(),
+        "near_mm": decoder.near_mm,
+        "far_mm": decoder.far_mm,
+        "ambient_image": rig.ambient_image,
+        "imported_from": folder.resolve().name,
+        "files": names,
+        "black_level_dn": rig.black_level,
+        "gamma": rig.gamma,
+    }
+    if colour:
+        settings["channel"] = channel_name(channel)
+    if rig.exposure_s is not None:
+        settings["exposure_s"] = rig.exposure_s
+    if rig.rig.projector is None:
+        settings["projector_size_px"] = list(rig.projector_size)
+    bits = rig.bits
+    if bits is None:
+        bits = max(bits_of(stack) for stack in images.values())
+        if bits > 8:
+            settings["bits_from"] = "the brightest pixel, since the sensor file has no imager.bits"
+    return Capture(
+        sensor=rig.name,
+        technology=rig.technology,
+        source="device",
+        rig=rig.rig,
+        images=images,
+        bits=bits,
+        settings=settings,
+    )
+
+
+def size_of_images(folder: Path) -> tuple[int, int] | None:
+    """Return width and height [px] of the first readable image in a folder or its subfolders; None without one."""
+    if not folder.is_dir():
+        return None
+    for pattern in ("*", "*/*"):
+        for path in sorted(folder.glob(pattern), key=counted):
+            if path.suffix.lower() in SUFFIXES and path.is_file():
+                with suppress(InputError):
+                    image = read_grey(path, green=True)
+                    return image.shape[1], image.shape[0]
+    return None
+
+
+def bits_of(stack: Image) -> int:
+    """Return the bits of a camera from its images: 8 for 8-bit files, else the fewest that hold all levels."""
+    if stack.dtype == np.uint8:
+        return 8
+    return next(bits for bits in (10, 12, 14, 16) if stack.max() < 2**bits)
+
+
+def counted(path: Path) -> tuple[Any, ...]:
+    """Return a key that sorts names with numbers by value."""
+    parts = re.split(r"(\d+)", path.as_posix().lower())
+    return tuple((int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts)
+
+
+def _files(folder: Path, sensor: RecordedRig, camera: str, cameras: int) -> list[Path]:
+    """Return the image files of one camera, in order."""
+    given = (sensor.images or {}).get(camera)
+    if isinstance(given, list):
+        missing = [name for name in given if not (folder / name).is_file()]
+        if missing:
+            raise InputError(folder, missing[0], "no such file", f"the images listed in [images] of {sensor.name}")
+        return [folder / name for name in given]
+    if given is not None:
+        if Path(given).is_absolute() or ".." in Path(given).parts:
+            raise InputError(f"sensor {sensor.name}", f"images.{camera}", repr(given), "a pattern inside the folder")
+        found = [path for path in folder.glob(given) if path.is_file()]
+        if not found:
+            hint = f"the folder has: {', '.join(sorted(path.name for path in folder.iterdir())[:6])}"
+            raise InputError(folder, f"images.{camera}", f"no file that matches {given!r}", "images", hint)
+        return sorted(found, key=counted)
+    inside = folder / camera if cameras > 1 and (folder / camera).is_dir() else folder
+    own = [path for path in inside.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file()]
+    if cameras > 1 and inside == folder:
+        own = [path for path in own if path.name.startswith(camera)]
+    return sorted(own, key=counted)
+
+
+def _stack(files: list[Path], camera: Camera, bits: int | None, channel: int) -> Image:
+    """Return the images (P, H, W) of one camera."""
+    first = read_grey(files[0], channel=channel)
+    out = np.empty((len(files), camera.height, camera.width), first.dtype)
+    for index, path in enumerate(files):
+        image = first if index == 0 else read_grey(path, channel=channel)
+        if image.shape != (camera.height, camera.width):
+            found = f"{image.shape[1]} x {image.shape[0]} px"
+            raise InputError(path, "size", found, f"{camera.width} x {camera.height} px, as the calibration says")
+        if image.dtype != first.dtype:
+            raise InputError(path, "depth", f"{image.itemsize * 8} bits", f"{first.itemsize * 8}, as {files[0].name}")
+        if bits is not None and image.max() > 2**bits - 1:
+            hint = "set imager.bits to the camera's output; levels must begin at bit 0"
+            raise InputError(path, "grey level", image.max(), f"0 to {2**bits - 1}, since imager.bits is {bits}", hint)
+        out[index] = image
+    if bits is not None and bits > 8 * first.itemsize:
+        hint = "set imager.bits to 8, or save the images with 16 bits"
+        raise InputError(files[0], "depth", "8 bits", f"more: imager.bits is {bits}", hint)
+    return out
+
+
+def _ends(found: list[Path]) -> str:
+    return "" if not found else f", {found[0].name} to {found[-1].name}"
+
+
+def _content(folder: Path, cameras: list[str]) -> str:
+    """Describe the content of a folder without images of a camera, and how to name them."""
+    inside = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir())
+    there = f"the folder has: {', '.join(inside[:6])}" if inside else "the folder is empty"
+    ways = f"name subfolders or files after {', '.join(cameras)}, or " if len(cameras) > 1 else ""
+    return f"{there}. {ways}name the files in [images] of the sensor file, or by --images {cameras[0]}='PATTERN'"

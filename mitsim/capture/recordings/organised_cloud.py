@@ -1,0 +1,225 @@
+"""Read organised point clouds in PLY and PCD files as captures.
+
+Signal chain: file -> points on their grid -> axes and unit -> inverse of an Ensenso's ``Link`` -> the camera of the
+grid, fitted or given -> points in the sensor frame [mm], NaN where missing.
+
+A device with a rectified pair outputs its points on the pixels and in the frame of the *rectified* left camera. The
+sensor frame of mitsim is that of the raw first camera. The points are therefore rotated by the rectifying rotation,
+from the ``--link`` file or from a calibration with a rectification.
+
+F needs the number of possible points, so a cloud must keep its grid: WIDTH x HEIGHT of a PCD, the size stated in a PLY,
+or the size of a given camera if the number of points matches. A cloud without a grid is rejected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.checked_files import read_bounded
+from characterisation.files.errors import InputError
+from mitsim.capture.capture import Capture
+from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
+from mitsim.capture.recordings.nxlib_calibration import sensor_from_rectified
+from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of
+from mitsim.capture.recordings.pcd import decode_pcd
+from mitsim.capture.recordings.pinhole_fit import LEAST_POINTS, PINHOLE_RMS_PX, fit_pinhole, off_the_rays
+from mitsim.capture.recordings.ply import decode_ply
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.transforms import Transform
+
+Points = NDArray[np.float32]
+Axes = Literal["opencv", "opengl"]
+
+#: lengths of one unit [mm]
+UNITS_MM = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1000.0}
+
+#: median distance of the points, in the file's numbers, below which the unit is metres. All sensors here measure
+#: between 20 mm and 20 m
+METRES_UNDER = 20.0
+
+#: coordinates beyond this are not measurements [mm]
+FARTHEST_MM = 1e6
+
+#: largest accepted median distance of the points from the pixels of a given camera [px]; assumed
+CAMERA_OFF_PX = 1.0
+
+
+def read_organised_cloud(
+    path: str | Path,
+    *,
+    calibration: str | Path | None = None,
+    unit: str | None = None,
+    axes: Axes = "opencv",
+    link: str | Path | None = None,
+    camera: str | None = None,
+    sensor: str | None = None,
+) -> Capture:
+    """Read one PLY or PCD file.
+
+    Parameters
+    ----------
+    calibration
+        The camera of the grid, see :mod:`mitsim.capture.recordings.calibration_file`; by default a pinhole is fitted. With a
+        rectification, the grid may also be that of the rectified left image, at full or reduced size.
+    unit
+        ``um``, ``mm``, ``cm`` or ``m``; by default metres if the median distance is under :data:`METRES_UNDER`, else
+        millimetres.
+    axes
+        ``opencv``: x right, y down, z forward; ``opengl``: y up and z backward, which is converted.
+    link
+        The ``*_calib.json`` of an Ensenso whose ``Link`` transformed the points. It is inverted, and the points are
+        rotated from the rectified left frame to the sensor frame.
+    camera
+        Name of the camera in the calibration; by default the first.
+    sensor
+        Name of the sensor; by default that of the calibration, or ``point-cloud``.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged or has no grid, or no camera at the origin sees its points on the pixels of the grid.
+    """
+    path = Path(path)
+    points, read_settings, given = _on_grid(path, calibration, camera)
+    settings: dict[str, Any] = {"imported_from": path.name, "axes_of_file": axes} | read_settings
+    points[~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)] = np.nan
+    count = int(np.isfinite(points[..., 0]).sum())
+    if count < LEAST_POINTS:
+        raise InputError(path, "", f"{count} points", f"{LEAST_POINTS} or more")
+    if axes == "opengl":
+        points *= np.array([1, -1, -1], np.float32)
+    settings["unit_of_file"] = unit or _unit_of(points)
+    farthest = float(np.nanmax(np.abs(points))) * UNITS_MM[settings["unit_of_file"]]
+    if farthest > FARTHEST_MM:
+        raise InputError(path, "x, y, z", f"{farthest:.3g} mm", f"up to {FARTHEST_MM:g} mm", "check --unit")
+    points *= np.float32(UNITS_MM[settings["unit_of_file"]])
+    turn = Transform.identity()
+    if link is not None:
+        tree = NxLibTree(read_bounded(Path(link), "an Ensenso's *_calib.json"), str(link))
+        turn, rectified_from_workspace = sensor_from_rectified(tree), link_of(tree)
+        if rectified_from_workspace is not None:
+            points = rectified_from_workspace.points(points).astype(np.float32)
+            settings["link_target"] = str(tree.get("Link/Target") or "")
+            settings["sensor_from_workspace"] = (turn @ rectified_from_workspace).matrix().tolist()
+    rig, found = _seen_by(points, path, given, camera, turn)
+    settings |= found
+    points = rig.reference.sensor_from_camera.points(points).astype(np.float32)
+    if given is not None and given.range_mm is not None:
+        settings |= {"near_mm": given.range_mm[0], "far_mm": given.range_mm[1]}
+    return Capture(
+        sensor=sensor or (given.sensor if given else "") or "point-cloud",
+        technology="point_map",
+        source="device",
+        rig=rig,
+        images={},
+        bits=16,
+        settings=settings,
+        derived={"points": points},
+    )
+
+
+def _on_grid(
+    path: Path, calibration: str | Path | None, camera: str | None
+) -> tuple[Points, dict[str, Any], Calibrated | None]:
+    """Return the points (H, W, 3) as in the file, its own settings, and the given calibration."""
+    data = read_bounded(path, "a PLY or PCD file")
+    hint = "save it organised, a point or NaN for each pixel, or give the camera of its pixels: --calibration"
+    given = None if calibration is None else read_calibration(calibration)
+    if data.startswith(b"ply"):
+        read = decode_ply(data, path)
+        if any(line.startswith("comment mitsim ") for line in read.lines):
+            raise InputError(path, "", "a cloud written by mitsim", "a cloud of another program", "it needs no import")
+        size = read.size
+        if size is None and given is not None:
+            eye = given.rig.reference if camera is None else given.rig.cameras.get(camera, given.rig.reference)
+            size = eye.width, eye.height
+        if size is None or size[0] * size[1] != len(read.points):
+            found = f"{len(read.points)} points without a grid" if size is None else f"{len(read.points)} points"
+            allowed = "an organised cloud" if size is None else f"{size[0]} x {size[1]}, one for each pixel"
+            raise InputError(path, "", found, allowed, hint)
+        return read.points.reshape(size[1], size[0], 3).copy(), {}, given
+    points, header = decode_pcd(data, path)
+    if (
+        points.shape[0] == 1
+        and given is not None
+        and given.rig.reference.width * given.rig.reference.height == (points.shape[1])
+    ):
+        points = points.reshape(given.rig.reference.height, given.rig.reference.width, 3)
+    if points.shape[0] == 1:
+        raise InputError(path, "HEIGHT", "1: a cloud without a grid", "an organised cloud", hint)
+    return points.copy(), {"viewpoint_of_file": header.get("VIEWPOINT", "")}, given
+
+
+def _unit_of(points: Points) -> str:
+    seen = points[np.isfinite(points[..., 0])]
+    return "m" if np.median(np.linalg.norm(seen.astype(float), axis=-1)) < METRES_UNDER else "mm"
+
+
+def _seen_by(
+    points: Points, path: Path, given: Calibrated | None, name: str | None, turn: Transform
+) -> tuple[Rig, dict[str, Any]]:
+    """Return the rig of the camera in whose frame, and on whose view rays, the points (H, W, 3) [mm] lie.
+
+    ``turn`` takes that frame to the sensor frame if the rotation is known.
+    """
+    height, width = points.shape[:2]
+    hint = (
+        "if they are in the frame of a robot or workspace, save them in the camera's, or invert an Ensenso's Link with "
+        "--link; for a lens with distortion give --calibration"
+    )
+    ahead = points[..., 2] > 0
+    if ahead.sum() < 0.5 * np.isfinite(points[..., 2]).sum():
+        raise InputError(
+            path,
+            "z",
+            "points behind the camera: z under 0",
+            "z forward, y down",
+            "if y is up and z backward, use --axes opengl",
+        )
+    if given is not None:
+        off, eye = min(
+            (
+                (off_the_rays(eye.sensor_from_camera.points(points), eye), eye)
+                for eye in _possible_cameras(given, name, (width, height), path, turn)
+            ),
+            key=lambda each: each[0],
+        )
+        if not off <= CAMERA_OFF_PX:
+            found = f"points {off:.3g} px from the view rays of their pixels (median)"
+            allowed = f"up to {CAMERA_OFF_PX:g} px: points in the frame of the calibrated camera"
+            raise InputError(path, "", found, allowed, hint)
+        alone = Rig({name or next(iter(given.rig.cameras)): eye}, given.rig.projector)
+        return alone, {"off_the_rays_px": round(off, 6)}
+    fitted = fit_pinhole(points)
+    if fitted is None or fitted[1] > PINHOLE_RMS_PX:
+        found = "points that match no pinhole at the origin" + (f": {fitted[1]:.3g} px rms" if fitted else "")
+        raise InputError(path, "", found, f"points on the view rays of a pinhole, to {PINHOLE_RMS_PX:g} px", hint)
+    placed = replace(fitted[0], sensor_from_camera=turn)
+    return Rig({"camera": placed}), {"fitted_camera_rms_px": round(fitted[1], 6)}
+
+
+def _possible_cameras(
+    given: Calibrated, name: str | None, size: tuple[int, int], path: Path, turn: Transform
+) -> list[Camera]:
+    """Return the cameras of a calibration that may own a grid of ``size`` (width, height), in the sensor frame.
+
+    These are the camera itself and, for the first camera of a pair with a rectification, its rectified camera. The
+    latter may be scaled as a device scales its maps: fx, fy, cx and cy by the same factor.
+    """
+    eyes, pair = [], given.rig.rectification
+    left = given.rig.reference
+    if pair is not None and (name is None or given.rig.cameras.get(name) is left):
+        scale = size[0] / pair.width
+        if abs(scale * pair.height - size[1]) < 1:  # a side may be rounded
+            place = left.sensor_from_camera @ Transform(pair.rotation_left.T, np.zeros(3))
+            matrix = np.diag([scale, scale, 1.0]) @ pair.matrix_left
+            eyes.append(Camera(matrix, np.zeros(5), *size, sensor_from_camera=place))
+    if not eyes or size == (left.width, left.height):
+        eye = camera_of(given, name, size, path)
+        eyes.append(replace(eye, sensor_from_camera=eye.sensor_from_camera @ turn))
+    return eyes

@@ -1,0 +1,148 @@
+"""Read the files of a recording safely, from a folder or a zip.
+
+A zip is never unpacked to disk, so no name in it can lead out of a folder. Each file is read up to a limit, whatever
+size the archive states, and so is the total.
+"""
+
+from __future__ import annotations
+
+import lzma
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+
+from characterisation.files.checked_files import LARGEST_FILE, is_inside, read_bounded
+from characterisation.files.errors import InputError
+
+#: first and last bytes of an MCAP file (mcap.dev/spec)
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+
+#: largest number of files in one recording
+MOST_FILES = 10_000
+
+#: largest total size read from one recording [bytes]
+LARGEST_RECORDING = 4 * 1024**3
+
+#: depth of nested folders: a sequence, a camera, its files
+_DEEPEST = 3
+
+#: errors of the standard library for a damaged, encrypted or unusual zip
+_DAMAGED = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    struct.error,
+    EOFError,
+    OSError,
+    NotImplementedError,
+    RuntimeError,
+    ValueError,
+)
+
+
+def recorded_names(path: Path, what: str) -> list[str]:
+    """List the files in a folder or zip, down to the third level, with ``/`` between; ``what`` names the expectation.
+
+    Raises
+    ------
+    InputError
+        If it is neither, is damaged, or contains too many files.
+    """
+    if path.is_dir():
+        names = [
+            file.relative_to(path).as_posix()
+            for level in range(_DEEPEST)
+            for file in path.glob("/".join(["*"] * (level + 1)))
+            if file.is_file() and is_inside(file, path)
+        ]
+    else:
+        names = _zipped_names(path, what)
+    if len(names) > MOST_FILES:
+        raise InputError(path, "", f"{len(names)} files", f"up to {MOST_FILES} files")
+    kept = [name for name in names if len(PurePosixPath(name).parts) <= _DEEPEST]
+    return sorted(name for name in kept if not name.startswith("__MACOSX/") and not name.endswith("/"))
+
+
+def recorded_files(path: Path, names: Iterable[str]) -> dict[str, bytes]:
+    """Return the bytes of some files of a folder or zip, by name.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, damaged, encrypted or too large.
+    """
+    out: dict[str, bytes] = {}
+    total = 0
+    try:
+        archive = None if path.is_dir() else zipfile.ZipFile(path)
+        try:
+            for name in names:
+                out[name] = read_bounded(path / name) if archive is None else _member(archive, name, path)
+                total += len(out[name])
+                if total > LARGEST_RECORDING:
+                    raise InputError(path, "size", f"over {total} bytes", f"up to {LARGEST_RECORDING} bytes in all")
+        finally:
+            if archive is not None:
+                archive.close()
+    except InputError:
+        raise
+    except (*_DAMAGED, KeyError) as error:
+        raise _damaged(path, error) from None
+    return out
+
+
+def plain_name(name: str) -> str:
+    """Return a file's name without folders; all but letters, digits, dot, dash and underscore become underscores."""
+    plain = re.sub(r"[^A-Za-z0-9._-]", "_", PurePosixPath(name).name)[-100:]
+    return plain if re.match("[A-Za-z0-9]", plain) else f"x{plain[1:]}"
+
+
+def _zipped_names(path: Path, what: str) -> list[str]:
+    if not path.is_file():
+        raise InputError(path, "", "no such file or folder", what)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.namelist()
+    except _DAMAGED as error:
+        raise _damaged(path, error) from None
+
+
+def _member(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
+    with archive.open(name) as member:
+        data = member.read(LARGEST_FILE + 1)  # the archive may state a wrong size
+    if len(data) > LARGEST_FILE:
+        raise InputError(path, name, f"more than {LARGEST_FILE} bytes", f"up to {LARGEST_FILE} bytes")
+    return data
+
+
+def _damaged(path: Path, error: BaseException) -> InputError:
+    return InputError(path, "", f"a file that cannot be unpacked ({error})", "an undamaged zip without password")
+
+
+def frame_of(given: int | str | None, path: Path, names: list[str] | None = None) -> int | None:
+    """Return the number of a frame given by its number, counted from 0, or by its name.
+
+    ``names`` of the frames in order, if they have any.
+
+    Raises
+    ------
+    InputError
+        If it is neither; the error lists the readable frames.
+    """
+    if given is None or isinstance(given, int) or (given.isascii() and given.isdigit()):
+        if given is not None and names is not None and not int(given) < len(names):
+            raise InputError(path, "--frame", given, _readable(names))
+        return None if given is None else int(given)
+    if names and given in names:
+        return names.index(given)
+    raise InputError(path, "--frame", repr(given), _readable(names) if names else "a number, from 0")
+
+
+def _readable(names: list[str]) -> str:
+    """Return the readable frames in words: their numbers and names."""
+    shown = ", ".join(f"{number} ({name})" for number, name in enumerate(names[:8]))
+    more = f" to {len(names) - 1} ({names[-1]})" if len(names) > 8 else ""
+    return f"{shown}{more}" if names else "no frame"

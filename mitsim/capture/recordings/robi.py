@@ -1,0 +1,194 @@
+"""Read one view of the ROBI data set, shiny metal parts in a bin seen by an Ensenso or a RealSense, as a capture.
+
+Signal chain: ``Scene_N/<sensor>`` folder -> view, by its number in ``list.txt`` -> ``StereoPattern`` pair and the
+device's own ``Depth`` -> cameras of ``cam/<sensor>_LEFT.yml``, ``_RIGHT.yml`` and ``_DEPTH.yml`` -> capture for the
+matcher, with the device's depth and its pose.
+
+The data set (Yang, Gao, Li and Waslander, IROS 2021) contains rectified images. Its reader (ROBI_Toolkit, ``inout.py``)
+computes the disparity of a depth Z as f B / Z - (cx_right - cx_left) + ``disparity_shift``: the images of the RealSense
+are shifted by 78 px. The right camera is therefore read with cx_right reduced by the shift, which makes its images an
+ordinary rectified pair. Depth is in ``depth_unit`` mm per grey level, 0 where missing. The translation of ``cam_pose``
+is assumed to be in mm.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.checked_files import read_bounded
+from characterisation.files.errors import InputError
+from mitsim.capture.capture import Capture
+from mitsim.capture.grey_image import read_grey
+from mitsim.sensor.camera import Camera, Rectification, Rig
+from mitsim.sensor.transforms import Transform
+
+#: required keys of a camera file
+_CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
+
+#: percentiles of the device's depth, and the relative margin of the search range beyond them
+_PERCENTILES, _WIDER = (1.0, 99.0), 0.15
+
+#: tolerance on the orthogonality of a rotation stored with few digits
+_RIGID = 1e-3
+
+
+def is_robi(folder: Path) -> bool:
+    """Return whether a folder has the layout of a sensor's folder of a scene."""
+    return (folder / "list.txt").is_file() and (folder / "StereoPattern").is_dir()
+
+
+def read_robi(
+    folder: str | Path, calibration: str | Path | None = None, *, frame: int | None = None, sensor: str | None = None
+) -> tuple[Capture, list[Path]]:
+    """Read one view, and list its files.
+
+    Parameters
+    ----------
+    folder
+        ``Scene_N/Ensenso`` or ``Scene_N/RealSense``.
+    calibration
+        The folder with ``<sensor>_LEFT.yml`` etc.; by default ``cam`` in one of the parent folders.
+    frame
+        Number of the view in ``list.txt``, counted from 0; required if there are several.
+    sensor
+        Name of the sensor; by default the folder's.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or invalid, or there are several views and none was chosen.
+    """
+    folder = Path(folder)
+    views = read_bounded(folder / "list.txt").decode("utf-8", "replace").split()
+    if not views:
+        raise InputError(folder / "list.txt", "", "no view", "the names of the views, one per line: view_0")
+    if frame is None and len(views) > 1:
+        raise InputError(
+            folder, "views", f"{len(views)}", "one in a capture", f"choose with --frame 0 to {len(views) - 1}"
+        )
+    if frame is not None and not 0 <= frame < len(views):
+        raise InputError(folder, "--frame", frame, f"0 to {len(views) - 1}: views in the order of list.txt")
+    view, where = views[frame or 0], _calibrations(folder, calibration)
+    files = {
+        "left": folder / "StereoPattern" / f"LEFT_{view}.bmp",
+        "right": folder / "StereoPattern" / f"RIGHT_{view}.bmp",
+        "depth": folder / "Depth" / f"DEPTH_{view}.png",
+    }
+    tables = {name: where / f"{folder.name}_{name.upper()}.yml" for name in files}
+    missing = [str(file) for file in (*files.values(), *tables.values()) if not file.is_file()]
+    if missing:
+        raise InputError(
+            folder, "", f"a scene without {', '.join(missing)}", "images, depth and camera files of the view"
+        )
+    numbers = {name: _numbers(path) for name, path in tables.items()}
+    rig = _rig(tables, numbers)
+    images = {name: _image(files[name], rig.cameras[name])[None] for name in ("left", "right")}
+    grey, unit = read_grey(files["depth"]), numbers["depth"].get("depth_unit", float("nan"))
+    if grey.shape != images["left"].shape[1:] or not unit > 0:
+        found = f"{grey.shape[1]} x {grey.shape[0]} pixels of depth, depth_unit {unit:g}"
+        raise InputError(files["depth"], "", found, "as many as the left image, and a unit over 0 mm")
+    depth = np.where(grey > 0, grey * np.float32(unit), np.float32(np.nan)).astype(np.float32)
+    settings: dict[str, Any] = {
+        "view": view,
+        "files": {name: file.name for name, file in files.items()},
+        "projector_on": True,
+        "disparity_shift_px": numbers["depth"].get("disparity_shift", 0.0),
+    }
+    known = depth[np.isfinite(depth)]
+    if len(known):
+        near, far = np.percentile(known, _PERCENTILES)
+        settings |= {"near_mm": float(near) * (1 - _WIDER), "far_mm": float(far) * (1 + _WIDER)}
+    pose_file = folder / "Depth" / f"DEPTH_{view}.json"
+    capture = Capture(
+        sensor=sensor or folder.name,
+        technology="active_stereo",
+        source="device",
+        rig=rig,
+        images=images,
+        settings=settings,
+        world_from_sensor=_pose(pose_file) if pose_file.is_file() else None,
+        derived={"depth": depth},
+    )
+    return capture, [*files.values(), *tables.values(), *([pose_file] if pose_file.is_file() else [])]
+
+
+def _calibrations(folder: Path, given: str | Path | None) -> Path:
+    """Return the folder of the camera files: the given one, else ``cam`` in a parent folder."""
+    if given is not None:
+        return Path(given)
+    above = [parent / "cam" for parent in folder.resolve().parents]
+    found = next((path for path in above if (path / f"{folder.name}_LEFT.yml").is_file()), None)
+    if found is None:
+        raise InputError(
+            folder,
+            "calibration",
+            f"no cam/{folder.name}_LEFT.yml in a parent folder",
+            "the folder cam of the data set's toolkit: --calibration ROBI_Toolkit/cam",
+        )
+    return found
+
+
+def _numbers(path: Path) -> dict[str, float]:
+    """Return the plain numbers of a file of ``key: number`` lines; lists and comments are skipped."""
+    out = {}
+    for line in read_bounded(path).decode("utf-8", "replace").splitlines():
+        key, mark, value = line.partition("#")[0].partition(":")
+        try:
+            if mark:
+                out[key.strip()] = float(value)
+        except ValueError:
+            continue
+    return out
+
+
+def _rig(tables: dict[str, Path], numbers: dict[str, dict[str, float]]) -> Rig:
+    """Return the rectified pair: cameras without distortion, the right one shifted by the baseline."""
+    lost = [f"{tables[name]}: {key}" for name in ("left", "right") for key in _CAMERA_KEYS if key not in numbers[name]]
+    lost += [f"{tables['depth']}: {key}" for key in ("baseline", "depth_unit") if key not in numbers["depth"]]
+    if lost:
+        raise InputError(
+            tables["left"].parent, "", f"camera files without {'; '.join(lost)}", "these keys, in px and mm"
+        )
+    baseline, shift = numbers["depth"]["baseline"], numbers["depth"].get("disparity_shift", 0.0)
+    if not baseline > 0:
+        raise InputError(tables["depth"], "baseline", f"{baseline:g}", "a length over 0 mm")
+    left, right = (_matrix(numbers[name]) for name in ("left", "right"))
+    right[0, 2] -= shift
+    width, height = (int(numbers["left"][key]) for key in ("width", "height"))
+    beside = Transform(np.eye(3), np.array([baseline, 0.0, 0.0]))
+    cameras = {
+        "left": Camera(left, np.zeros(5), width, height),
+        "right": Camera(right, np.zeros(5), width, height, beside),
+    }
+    return Rig(cameras, None, Rectification(left, right, np.eye(3), np.eye(3), baseline, width, height))
+
+
+def _matrix(numbers: dict[str, float]) -> NDArray[np.float64]:
+    return np.array([[numbers["fx"], 0, numbers["cx"]], [0, numbers["fy"], numbers["cy"]], [0, 0, 1.0]])
+
+
+def _image(path: Path, camera: Camera) -> NDArray[np.uint8]:
+    image = read_grey(path)
+    if image.dtype != np.uint8 or image.shape != (camera.height, camera.width):
+        found = f"{image.dtype}, {image.shape[1]} x {image.shape[0]} pixels"
+        raise InputError(path, "", found, f"8 bits, {camera.width} x {camera.height} pixels, as in the camera file")
+    return np.asarray(image, np.uint8)
+
+
+def _pose(path: Path) -> Transform:
+    """Return the pose of the camera in the world, ``cam_pose``."""
+    try:
+        matrix = np.array(json.loads(read_bounded(path))["cam_pose"], float).reshape(4, 4)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(path, "cam_pose", f"invalid data ({error!r})", "16 numbers, rows first") from None
+    turn = matrix[:3, :3]
+    if not np.isfinite(matrix).all() or np.abs(turn @ turn.T - np.eye(3)).max() > _RIGID or np.linalg.det(turn) < 0:
+        raise InputError(path, "cam_pose", "a matrix that is not a rigid motion", "a rotation and a translation")
+    # stored with few digits: use the nearest rotation
+    u, _, vt = np.linalg.svd(turn)
+    return Transform(u @ vt, matrix[:3, 3])

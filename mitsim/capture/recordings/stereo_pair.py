@@ -1,0 +1,115 @@
+"""Read a stereo pair saved as two images, with the calibration of its cameras, as a capture.
+
+Signal chain: images whose names begin with those of the two cameras -> pairs ordered by number -> the chosen pair, the
+green channel of colour images -> capture for the matcher.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from characterisation.files.errors import InputError
+from mitsim.capture.capture import Capture
+from mitsim.capture.grey_image import CHANNELS, SUFFIXES, channel_name, is_colour, read_grey
+from mitsim.capture.recordings.calibration_file import camera_of, read_calibration
+from mitsim.capture.recordings.image_folder import counted, size_of_images
+from mitsim.capture.recordings.recording_files import frame_of
+from mitsim.sensor.camera import Rig
+
+
+def read_stereo_pair(
+    folder: str | Path,
+    calibration: str | Path,
+    *,
+    frame: int | str | None = None,
+    sensor: str | None = None,
+    images: dict[str, str] | None = None,
+    channel: int = CHANNELS["green"],
+) -> Capture:
+    """Read one pair of a folder.
+
+    Parameters
+    ----------
+    folder
+        With images whose names begin with those of the two cameras: ``left_0.png``, ``right_0.png``.
+    calibration
+        Of two cameras, the left one first, see :mod:`mitsim.capture.recordings.calibration_file`.
+    frame
+        Number of the pair, counted from 0, or the name of its left image; required if there are several.
+    sensor
+        Name of the sensor; by default that of the calibration, or ``stereo-pair``.
+    images
+        Patterns of file names for cameras whose images are not named after them.
+    channel
+        Channel of colour images that is used.
+
+    Raises
+    ------
+    InputError
+        If an image is missing or does not fit the calibration, or there are several pairs and none was chosen.
+    """
+    folder = Path(folder)
+    names = list(read_calibration(calibration, size_of_images(folder)).rig.cameras)[:2]
+    if len(names) < 2:
+        raise InputError(calibration, "cameras", ", ".join(names), "two cameras: a stereo pair")
+    files = {name: pair_files(folder, name, (images or {}).get(name)) for name in names}
+    counts = [len(found) for found in files.values()]
+    if counts[0] != counts[1] or counts[0] == 0:
+        found = " and ".join(f"{len(each)} of {name}" for name, each in files.items())
+        hint = f"or name them: --images {names[0]}='cam0_*.png' --images {names[1]}='cam1_*.png'"
+        allowed = "as many of each, named after the camera: left_0.png, right_0.png"
+        raise InputError(folder, "images", found, allowed, hint)
+    known = [file.stem for file in files[names[0]]]
+    if frame is None and counts[0] > 1:
+        raise InputError(
+            folder,
+            "images",
+            f"{counts[0]} pairs",
+            "one in a capture",
+            f"choose with --frame 0 to {counts[0] - 1}, or {known[0]} to {known[-1]}",
+        )
+    number = frame_of(frame, folder, known) or 0
+    chosen = {name: each[number] for name, each in files.items()}
+    levels = {name: read_grey(file, channel=channel) for name, file in chosen.items()}
+    first = levels[names[0]]
+    size = (first.shape[1], first.shape[0])
+    read = read_calibration(calibration, size)
+    for name, image in levels.items():
+        camera_of(read, name, (image.shape[1], image.shape[0]), chosen[name])
+        if image.dtype != first.dtype:
+            raise InputError(chosen[name], "depth", f"{8 * image.itemsize} bits", f"{8 * first.itemsize}, as the left")
+    settings: dict[str, Any] = {"files": {name: file.name for name, file in chosen.items()}}
+    if is_colour(chosen[names[0]]):
+        settings["channel"] = channel_name(channel)
+    if read.notes:
+        settings["warnings"] = list(read.notes)
+    if read.range_mm is not None:
+        settings |= {"near_mm": read.range_mm[0], "far_mm": read.range_mm[1]}
+    return Capture(
+        sensor=sensor or read.sensor or "stereo-pair",
+        technology="active_stereo",
+        source="device",
+        rig=Rig({name: read.rig.cameras[name] for name in names}, read.rig.projector, read.rig.rectification),
+        images={name: np.asarray(image)[None] for name, image in levels.items()},
+        bits=8 * first.itemsize,
+        settings=settings,
+    )
+
+
+def pair_files(folder: Path, camera: str, pattern: str | None = None) -> list[Path]:
+    """Return the images of a camera in a folder, ordered by number: by a name pattern, else by their beginning."""
+    if not folder.is_dir():
+        raise InputError(folder, "", "no such folder", "a folder of images")
+    if pattern is not None:
+        if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
+            raise InputError("--images", "", repr(pattern), "a pattern inside the folder")
+        return sorted((path for path in folder.glob(pattern) if path.is_file()), key=counted)
+    own = [
+        path
+        for path in folder.iterdir()
+        if path.is_file() and path.suffix.lower() in SUFFIXES and path.name.lower().startswith(camera.lower())
+    ]
+    return sorted(own, key=counted)

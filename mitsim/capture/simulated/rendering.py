@@ -1,0 +1,69 @@
+"""Settings of the rendering of a capture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.region_of_interest import Roi
+from mitsim.capture.simulated.indirect_light import IndirectLight
+
+
+@dataclass(frozen=True)
+class IndirectImages:
+    """Interreflections that ``SimulatedSensor.indirect_radiance`` rendered before, for each camera.
+
+    Attributes
+    ----------
+    images
+        (P, h, w) of each camera in its region, before the lens [W / (mm^2 sr)].
+    rois
+        Region of each camera's image.
+    settings
+        Settings with which they were rendered.
+    depth
+        Largest number of surfaces on a light path.
+    """
+
+    images: dict[str, NDArray[np.float32]]
+    rois: dict[str, Roi]
+    settings: IndirectLight
+    depth: int
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """Light paths of a capture.
+
+    Attributes
+    ----------
+    samples
+        Number per pixel.
+    depth
+        Largest number of surfaces on a path.
+    indirect
+        None: interreflections are rendered together with direct light. :class:`IndirectLight`: they are rendered
+        separately and smoothed. :class:`IndirectImages`: they were rendered before, of the same scene from a near pose;
+        their regions and depth apply.
+    """
+
+    samples: int = 16
+    depth: int = 1
+    indirect: IndirectLight | IndirectImages | None = None
+
+    @property
+    def prerendered(self) -> IndirectImages | None:
+        """Interreflections that were rendered before, or None."""
+        return self.indirect if isinstance(self.indirect, IndirectImages) else None
+
+    @property
+    def surfaces(self) -> int:
+        """Largest number of surfaces on a light path."""
+        return self.depth if self.prerendered is None else self.prerendered.depth
+
+    @property
+    def indirect_settings(self) -> IndirectLight | None:
+        """Settings for interreflections that are rendered separately; None if they are not."""
+        return self.indirect.settings if isinstance(self.indirect, IndirectImages) else self.indirect

@@ -1,0 +1,359 @@
+"""Simulate captures.
+
+Signal chain: scene and pose -> speckle of the surfaces -> radiance per camera and image
+(:mod:`mitsim.scene.light_transport.transport`), plus room light -> blur and corner loss of the lens -> exposures by the
+sensor's rule -> grey levels with noise (:mod:`mitsim.capture.simulated.exposing`) ->
+:class:`~mitsim.capture.capture.Capture`.
+
+One seed determines everything: each camera has its own random streams for rendering, speckle and noise. Speckle is one
+draw for all images of a pose. The noise of the imager has a stream for each image.
+
+If only a part of the scene matters, only its region of each image is traced and exposed. Cameras read out a region of
+interest in the same way. The settings of the capture state the region. The rest of the image is missing, not dark, and
+has grey level 0.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.errors import InputError
+from characterisation.files.threads import in_threads
+from characterisation.region_of_interest import Roi
+from mitsim.capture.capture import Capture
+from mitsim.capture.simulated.exposing import LightOnImagers, UnitPatterns, brightest_images, expose_camera
+from mitsim.capture.simulated.indirect_light import IndirectLight, smoothed
+from mitsim.capture.simulated.lens_blur import blur_by_lens
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.surface_speckle import draw_speckle
+from mitsim.scene.light_transport.ambient import has_emitters
+from mitsim.scene.light_transport.light_paths import LightPaths
+from mitsim.scene.light_transport.plain_scene import single_plane
+from mitsim.scene.light_transport.projector_light import Light, ModulatedLight, ProjectedPatterns
+from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
+from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.load import Scene
+from mitsim.scene.ray_casting.camera_rays import CameraRays
+from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.image_formation import converter
+from mitsim.sensor.modulation import AmplitudeModulation
+from mitsim.sensor.noise_sources import Noise
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.roi import roi_around
+from mitsim.sensor.speckle import SpeckleField
+from mitsim.sensor.transforms import Transform
+from mitsim.sensor.vignetting import camera_illumination
+from mitsim.sensor.written_imager import written_imager
+
+#: margin around the required points [px], for the blur of the lens and the window of the matcher
+_MARGIN_PX = 12
+
+#: direct light at 16 samples per pixel
+_DEFAULT = Rendering()
+
+
+class SimulatedSensor:
+    """A sensor on the device, ready for any number of captures of any scene.
+
+    Attributes
+    ----------
+    sensor
+        The sensor.
+    rays
+        Of each camera: rays for light paths, with the true calibration.
+    patterns
+        The projector and its codes.
+    units
+        Fixed patterns of each camera's imager.
+    corner_loss
+        Illumination (H, W) of each camera's image relative to its centre; None without loss.
+    """
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        cameras = sensor.true_rig.cameras
+        self.rays = {name: _camera_rays(sensor, camera) for name, camera in cameras.items()}
+        self._cameras = cameras
+        self.patterns = _light(sensor)
+        self.units = {name: UnitPatterns.of(sensor, index, name) for index, name in enumerate(cameras)}
+        corner = sensor.imager.corner_illumination
+        self.corner_loss = {name: camera_illumination(corner, camera) for name, camera in cameras.items()}
+
+    def pixel_rays(self, camera: str) -> PixelRays:
+        """Return the rays of a camera's pixel centres, with the calibration that this sensor was made with."""
+        return PixelRays.of_camera(self._cameras[camera])
+
+    def recalibrated(self, rig: Rig, unit: int | None = None) -> SimulatedSensor:
+        """Return a sensor of the same type with a calibration close to this one's.
+
+        The patterns of the projector, which need most memory on the device, are shared. Speckle is still drawn for the
+        pixels of this sensor's rig, because a small change does not affect its statistics.
+
+        Parameters
+        ----------
+        rig
+            The calibration.
+        unit
+            Seed of another unit's fixed pattern; None keeps the pattern. It is this unit's pattern, shifted by random
+            rows and columns: pixels are independent, so it is as good as a new draw and faster.
+        """
+        other = copy.copy(self)
+        optics = rig.projector or self.sensor.projector.optics
+        projector = replace(self.sensor.projector, optics=optics)
+        other.sensor = replace(self.sensor, rig=rig, projector=projector)
+        cameras = self.sensor.misaligned(rig).cameras
+        other.rays = {name: self.rays[name].recalibrated(camera) for name, camera in cameras.items()}
+        other.patterns = copy.copy(self.patterns)
+        other.patterns.projector = projector
+        if unit is not None:
+            shifts = np.random.default_rng(unit).integers(1, 10_000, (len(rig.cameras), 2))
+            shift_of = dict(zip(rig.cameras, shifts, strict=True))
+            other.units = {name: patterns.shifted(*shift_of[name]) for name, patterns in self.units.items()}
+        return other
+
+    def indirect_radiance(
+        self,
+        scene: Scene,
+        world_from_sensor: Transform,
+        camera: str,
+        indirect: IndirectLight,
+        *,
+        seed: int,
+        depth: int,
+        roi: Roi | None = None,
+    ) -> NDArray[np.float32]:
+        """Return the radiance (P, h, w) of interreflections alone, smoothed, before the lens [W / (mm^2 sr)].
+
+        One more image has the light of the scene's emitters, if the sensor takes an ambient image or the scene has
+        emitters.
+        """
+        rays = self.rays[camera]
+        roi = roi or rays.whole
+        ambient = self.sensor.ambient_image or has_emitters(scene)
+        if single_plane(scene) is not None:  # a flat coupon does not light itself
+            return np.zeros((self.patterns.count + ambient, roi.height, roi.width), np.float32)
+        paths = LightPaths(indirect.samples, seed, depth, indirect_only=True, with_ambient=ambient)
+        images = trace(scene, rays, self.patterns, world_from_sensor, paths, roi)
+        shape = shapes_met(scene, self.pixel_rays(camera), world_from_sensor)[roi.slices]
+        return smoothed(images, shape, indirect.smoothing_px)
+
+    def radiance(
+        self,
+        scene: Scene,
+        world_from_sensor: Transform,
+        camera: str,
+        rendering: Rendering,
+        *,
+        seed: int,
+        roi: Roi | None = None,
+        speckle: SpeckleField | None = None,
+    ) -> NDArray[np.float32]:
+        """Return the radiance (P, h, w) that reaches a camera's imager [W / (mm^2 sr)].
+
+        If the sensor takes an ambient image, it is the last. ``roi`` is a region of the image, by default all of it.
+        ``speckle`` is that of the region.
+        """
+        rays, ambient_image = self.rays[camera], self.sensor.ambient_image
+        roi = roi or rays.whole
+        separate_ambient = ambient_image or (speckle is not None and has_emitters(scene))
+        indirect, depth = rendering.indirect_settings, rendering.surfaces
+        separate_indirect = indirect is not None and depth > 1
+        paths = LightPaths(rendering.samples, seed, 1 if separate_indirect else depth, with_ambient=separate_ambient)
+        shift = None if speckle is None else speckle.shift
+        images = trace(scene, rays, self.patterns, world_from_sensor, paths, roi, shift)
+        if separate_indirect:
+            assert indirect is not None
+            if rendering.prerendered is not None:
+                indirect_images = rendering.prerendered.images[camera]
+            else:
+                indirect_images = self.indirect_radiance(
+                    scene, world_from_sensor, camera, indirect, seed=seed, depth=depth, roi=roi
+                )
+            images += indirect_images[: len(images)]
+        projected, ambient_images = images[: self.patterns.count], images[self.patterns.count :]
+
+        # in place, because two copies of a large stack need too much memory
+        def apply_lens(image: NDArray[np.float32]) -> None:
+            image[:] = self.apply_lens(image, camera, roi)
+
+        def finish_projected(image: NDArray[np.float32]) -> None:
+            apply_lens(image)
+            if speckle is not None:  # affects the projector's light alone
+                if separate_ambient:
+                    image -= ambient_images[0]
+                image *= speckle.gain
+                if separate_ambient:
+                    image += ambient_images[0]
+
+        for image in ambient_images:
+            apply_lens(image)
+        in_threads(finish_projected, projected)
+        if self.sensor.room is not None:
+            images += self.room_light(scene, world_from_sensor, camera, roi)
+        return images[: self.patterns.count + ambient_image]
+
+    def room_light(self, scene: Scene, world_from_sensor: Transform, camera: str, roi: Roi) -> NDArray[np.float32]:
+        """Return the radiance (h, w) of the sensor file's ``[room]``, after the lens [W / (mm^2 sr)].
+
+        Its gradient is along the axes of the sensor frame at the middle of the working range, the same for all cameras.
+        """
+        relative = room_radiance(scene, directional_albedos(scene), self.pixel_rays(camera), world_from_sensor)[
+            roi.slices
+        ]
+        eye, depth = self.sensor.rig.cameras[camera], float(np.mean(self.sensor.working_range_mm))
+        pixels = np.stack(roi.pixels(), axis=-1).astype(float)
+        rays = eye.sensor_from_camera.directions(eye.rays(pixels))
+        points = eye.centre + rays * ((depth - eye.centre[2]) / rays[..., 2:])
+        return self.apply_lens(np.asarray(relative * self.sensor.room_irradiance(points), np.float32), camera, roi)
+
+    def apply_lens(self, image: NDArray[np.float32], camera: str, roi: Roi) -> NDArray[np.float32]:
+        """Return the image (h, w) of a region, blurred by a camera's lens and darkened toward the corners."""
+        loss = self.corner_loss[camera]
+        out = blur_by_lens(image, self.sensor.imager, self.sensor.rig.cameras[camera], roi)
+        return out if loss is None else np.asarray(out * loss[roi.slices], np.float32)
+
+    def light(
+        self,
+        scene: Scene,
+        world_from_sensor: Transform,
+        *,
+        seed: int,
+        rendering: Rendering = _DEFAULT,
+        around: NDArray[np.floating] | None = None,
+        noise: Noise | None = None,
+    ) -> LightOnImagers:
+        """Return the light on the imagers from one pose, for :meth:`expose`.
+
+        Parameters
+        ----------
+        scene, world_from_sensor, rendering
+            The scene, the pose of the sensor, and the light paths.
+        seed
+            Seed of the rendering, and of the speckle, which belongs to the surface and the pose.
+        around
+            (n, 3) points in the *sensor* frame [mm]: of each image, only their bounding box and 12 px more are read
+            out. The rest has grey level 0. ``settings["read_out"]`` states the region of each camera that has one as
+            [left, top, width, height].
+        noise
+            The sources of noise that are on; all by default.
+
+        Raises
+        ------
+        InputError
+            If the radiance or the exposure is not finite.
+        """
+        noise, sensor, prerendered = noise or Noise(), self.sensor, rendering.prerendered
+        light, rois = {}, {}
+        for index, (name, camera) in enumerate(sensor.rig.cameras.items()):
+            read_out = None if around is None else roi_around(camera, around, _MARGIN_PX)
+            roi = rois[name] = prerendered.rois[name] if prerendered is not None else read_out or self.rays[name].whole
+            render_stream, _, speckle_stream = np.random.SeedSequence([seed, index]).spawn(3)
+            speckle = None
+            if noise.speckle:
+                rng = np.random.default_rng(speckle_stream)
+                speckle = draw_speckle(scene, sensor, camera, self.pixel_rays(name), world_from_sensor, roi, rng)
+            light[name] = self.radiance(
+                scene,
+                world_from_sensor,
+                name,
+                rendering,
+                seed=int(render_stream.generate_state(1)[0]),
+                roi=roi,
+                speckle=speckle,
+            )
+        for name, stack in light.items():
+            self._check_finite(stack, f"camera {name}", "radiance")
+        exposures = sensor.exposure.exposures(brightest_images(sensor, light), sensor.imager.full_well)
+        self._check_finite(np.array(exposures) * sensor.electrons(), "imager", "electrons per radiance")
+        rendered: dict[str, Any] = {"scene": scene.where, "samples_per_pixel": rendering.samples}
+        rendered["light_path_depth"] = rendering.surfaces
+        if rendering.indirect_settings is not None:
+            rendered["indirect_light"] = asdict(rendering.indirect_settings)
+        return LightOnImagers(light, rois, exposures, noise, world_from_sensor, rendered)
+
+    def _check_finite(self, values: NDArray[np.floating], where: str, quantity: str) -> None:
+        """Reject light that is not finite, before it becomes an image of zeros."""
+        if not np.isfinite(values.sum(dtype=np.float64)):
+            raise InputError(
+                f"sensor {self.sensor.name}",
+                where,
+                f"{quantity} that is infinite or not a number",
+                "finite light: check the optics, flux_w and the scene's own emitters",
+            )
+
+    def expose(self, light: LightOnImagers, seed: int) -> Capture:
+        """Expose the imagers to light and return the capture.
+
+        Each seed gives another capture from the same pose, with the same speckle.
+        """
+        noise, sensor, exposures = light.noise, self.sensor, light.exposures
+        images = {}
+        for index, name in enumerate(light.rois):
+            _, noise_stream, _ = np.random.SeedSequence([seed, index]).spawn(3)
+            images[name] = expose_camera(sensor, light, name, self.units[name], noise_stream)
+        settings: dict[str, Any] = {
+            "exposure_s": exposures[0] if len(exposures) == 1 else list(exposures),
+            "exposure_rule": sensor.exposure.rule,
+            "pattern": sensor.pattern.model_dump(mode="json"),
+            **light.rendered,
+            "ambient_image": sensor.ambient_image,
+            "seed": seed,
+            "noise": asdict(noise),
+        }
+        adc = converter(sensor.imager, noise)
+        settings |= {"black_level_dn": adc.black_level, "gamma": adc.gamma}
+        settings |= {"decoder": sensor.settings.model_dump(mode="json"), "imager": written_imager(sensor.imager)}
+        read_out = {
+            name: [roi.left, roi.top, roi.width, roi.height]
+            for name, roi in light.rois.items()
+            if roi != self.rays[name].whole
+        }
+        if read_out:
+            settings["read_out"] = read_out
+        return Capture(
+            sensor=sensor.name,
+            technology=sensor.technology,
+            source="simulated",
+            rig=sensor.rig,
+            images=images,
+            bits=adc.bits,
+            settings=settings,
+            world_from_sensor=light.world_from_sensor,
+        )
+
+    def capture(
+        self,
+        scene: Scene,
+        world_from_sensor: Transform,
+        *,
+        seed: int,
+        rendering: Rendering = _DEFAULT,
+        around: NDArray[np.floating] | None = None,
+        noise: Noise | None = None,
+    ) -> Capture:
+        """Return one capture: :meth:`light`, exposed once.
+
+        The same seed gives the same bytes. Use another seed for each capture. The parameters are those of
+        :meth:`light`.
+        """
+        light = self.light(scene, world_from_sensor, seed=seed, rendering=rendering, around=around, noise=noise)
+        return self.expose(light, seed)
+
+
+def _camera_rays(sensor: Sensor, camera: Camera) -> CameraRays:
+    if sensor.focus_mm is None:
+        return CameraRays(camera)
+    return CameraRays(camera, sensor.pupil_mm(camera), sensor.focus_mm)
+
+
+def _light(sensor: Sensor) -> Light:
+    """Return the light whose code depends on the projector coordinate, or on time for time of flight."""
+    if isinstance(sensor.pattern, AmplitudeModulation):
+        return ModulatedLight(sensor.projector, *sensor.pattern.images())
+    return ProjectedPatterns(sensor.patterns(), sensor.projector)

@@ -1,0 +1,146 @@
+"""Compute the ground truth of each pixel of a simulated camera: geometry, visibility and share of indirect light.
+
+Signal chain: scene and pose -> one ray through the centre of each pixel, with distortion -> surface, its normal, shape
+and position in the projector's image; shadow ray to the projector. Rendering of a white frame -> share of indirect
+light, 1 - direct light / all light, up to a chosen depth.
+
+An average of labels or depths over a pixel is no truth, so the geometry is never filtered.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.scene.light_transport.light_paths import LightPaths
+from mitsim.scene.light_transport.projector_light import ProjectedPatterns
+from mitsim.scene.light_transport.transport import trace
+from mitsim.scene.load import Scene
+from mitsim.scene.ray_casting.raycast import PixelRays, cast
+from mitsim.sensor.transforms import Transform
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth of the (H, W) pixels of one camera.
+
+    Attributes
+    ----------
+    distance, depth
+        (H, W) float32 [mm], along the ray and along the camera's axis; NaN without a surface.
+    normal
+        (H, W, 3) float32, unit, sensor frame, toward the sensor.
+    feature
+        (H, W) int16 index into ``feature_names``; -1 without a surface.
+    feature_names
+        Names of the shapes of the scene.
+    projector
+        (H, W, 2) float32 (column, row) of the projector pixel that looks at the same point, whether or not its light
+        arrives. NaN without a surface, or if the point is behind the projector.
+    lit
+        (H, W) bool: inside the projector's image and not in shadow.
+    indirect
+        (H, W) float32 [1]: share of the light of a white frame that is interreflected; NaN without light.
+    """
+
+    distance: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    feature: NDArray[np.int16]
+    feature_names: tuple[str, ...]
+    projector: NDArray[np.float32]
+    lit: NDArray[np.bool_]
+    indirect: NDArray[np.float32]
+
+
+def true_image(
+    simulated: SimulatedSensor,
+    scene: Scene,
+    world_from_sensor: Transform,
+    camera: str,
+    *,
+    samples: int = 16,
+    depth: int = 3,
+    seed: int = 1,
+) -> Truth:
+    """Return the ground truth of one camera of a simulated sensor.
+
+    ``samples``, ``depth`` and ``seed`` apply to the share of indirect light.
+    """
+    eye, projector = simulated.sensor.rig.cameras[camera], simulated.sensor.projector
+    directions = eye.pixel_directions()
+    surfaces = cast(scene, PixelRays(eye.centre, directions), world_from_sensor, projector.optics.centre[None])
+    points = eye.centre + directions * surfaces.distance[..., None].astype(float)
+    projected = np.full((*surfaces.distance.shape, 2), np.nan)
+    valid = np.isfinite(surfaces.distance)
+    projected[valid] = projector.optics.project(points[valid])
+    edge = np.array([projector.optics.width, projector.optics.height]) - 0.5
+    with np.errstate(invalid="ignore"):
+        inside = np.all((projected > -0.5) & (projected < edge), axis=-1)
+    axis = eye.sensor_from_camera.rotation[:, 2]
+
+    size = (1, projector.optics.height, projector.optics.width)
+    white = ProjectedPatterns(np.ones(size, np.float32), projector)
+
+    def light(surfaces_on_path: int) -> NDArray[np.float32]:
+        lit, ambient = trace(
+            scene,
+            simulated.rays[camera],
+            white,
+            world_from_sensor,
+            LightPaths(samples=samples, seed=seed, depth=surfaces_on_path, with_ambient=True),
+        )
+        return np.asarray(lit - ambient)
+
+    direct, total = light(1), light(depth)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        indirect = np.where(total > 0, 1.0 - direct / total, np.nan)
+    return Truth(
+        distance=surfaces.distance,
+        depth=(surfaces.distance * (directions @ axis)).astype(np.float32),
+        normal=surfaces.normal,
+        feature=surfaces.shape,
+        feature_names=scene.names,
+        projector=projected.astype(np.float32),
+        lit=surfaces.seen[0] & inside,
+        indirect=np.clip(indirect, 0.0, 1.0).astype(np.float32),
+    )
+
+
+def encode_exr(truth: Truth) -> bytes:
+    """Return an OpenEXR image of 32-bit float channels; the header has the names of the features and the units."""
+    channels = {
+        "distance": truth.distance,
+        "Z": truth.depth,
+        "feature": truth.feature,
+        "normal.X": truth.normal[..., 0],
+        "normal.Y": truth.normal[..., 1],
+        "normal.Z": truth.normal[..., 2],
+        "projector.U": truth.projector[..., 0],
+        "projector.V": truth.projector[..., 1],
+        "lit": truth.lit,
+        "indirect": truth.indirect,
+    }
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "features": "\n".join(truth.feature_names),
+        "units": "distance, Z: mm; normal: sensor frame; projector: px; feature: line of `features`, -1 for none",
+    }
+    arrays = {name: np.ascontiguousarray(values, np.float32) for name, values in channels.items()}
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "truth.exr"
+        OpenEXR.File(header, arrays).write(str(file))
+        return file.read_bytes()
+
+
+def read_exr(path: str | Path) -> dict[str, NDArray[np.float32]]:
+    """Return the channels of a ground-truth image by name, (H, W) float32 each."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return {name: np.array(channel.pixels) for name, channel in file.channels().items()}

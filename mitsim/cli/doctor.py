@@ -1,0 +1,150 @@
+"""Check this machine: find packages, libraries and devices, and say how to install missing ones."""
+
+from __future__ import annotations
+
+import ctypes.util
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+from characterisation.files.errors import MissingEnvironmentError
+from mitsim.running.version import __version__
+from mitsim.scene import backend
+
+Verdict = Literal["ok", "missing", "absent"]
+
+_PACKAGES = (
+    "mitsuba",
+    "drjit",
+    "numpy",
+    "scipy",
+    "xarray",
+    "netCDF4",
+    "opencv-contrib-python-headless",
+    "trimesh",
+    "pydantic",
+    "typer",
+    "rich",
+    "jinja2",
+    "matplotlib",
+    "OpenEXR",
+)
+_OPTIONAL = {
+    "pyserial": "pan-tilt tables",
+    "depthai": "Luxonis cameras",
+    "ensenso-nxlib": "Ensenso cameras (with the maker's SDK)",
+    "mcap-protobuf-support": "recordings of DepthAI",
+    "cadquery-ocp-novtk": "mitsim part of STEP files",
+    "pypcd4": "mitsim export to PCD",
+    "pye57": "mitsim export to E57",
+    "mcap-ros2-support": "mitsim export to ROS 2",
+    "rerun-sdk": "mitsim export to Rerun",
+    "pygltflib": "mitsim export to glTF",
+    "usd-core": "mitsim export to USD",
+}
+#: where the newest release is not the right one, or one package is not enough
+_FIXES = {
+    "cadquery-ocp-novtk": 'pip install "cadquery-ocp-novtk<8"',
+    "mcap-protobuf-support": "pip install 'mitsim[recordings]'",
+}
+
+_TRIAL = """
+import sys
+from mitsim.scene import backend
+backend.activate(sys.argv[1])
+dr, mi = backend.dr, backend.mi
+assert abs(float(dr.sum(dr.minimum(dr.arange(mi.Float, 8), 3.0))[0]) - 18.0) < 1e-6
+"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report. ``absent`` things are optional; ``missing`` ones stop mitsim from working."""
+
+    what: str
+    verdict: Verdict
+    detail: str
+    fix: str = ""
+
+
+def examine() -> list[Finding]:
+    """Check everything that mitsim needs or can use."""
+    return [*_software(), *_renderer(), *_optional()]
+
+
+def findings_as_json(findings: list[Finding]) -> list[dict[str, str]]:
+    """Return the findings as values for JSON."""
+    return [asdict(finding) for finding in findings]
+
+
+def _software() -> list[Finding]:
+    out = [
+        Finding("mitsim", "ok", __version__),
+        Finding("python", "ok", f"{platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores"),
+    ]
+    for name in _PACKAGES:
+        version = _version(name)
+        if version:
+            out.append(Finding(name, "ok", version))
+        else:
+            out.append(Finding(name, "missing", "not installed", f"pip install {name}"))
+    return out
+
+
+def _renderer() -> list[Finding]:
+    out = []
+    candidates = backend.find_llvm()
+    for candidate in candidates:
+        detail = f"{candidate.version or 'unknown version'}, {candidate.origin}: {candidate.path}"
+        if candidate.usable:
+            out.append(Finding("libLLVM", "ok", detail))
+        else:
+            out.append(Finding("libLLVM", "absent", f"{detail}: not used, {candidate.fault}", _library_fix(candidate)))
+    devices = backend.cuda_devices()
+    out.append(
+        Finding("GPU", "ok", f"{devices} CUDA device(s)")
+        if devices
+        else Finding("GPU", "absent", "no CUDA device: rendering runs on the CPU")
+    )
+    try:
+        variant = backend.choose_variant()
+    except MissingEnvironmentError as error:
+        return [*out, Finding("renderer", "missing", "no Mitsuba variant can run", str(error))]
+    # in a separate process: a library that aborts ends its process
+    trial = subprocess.run(
+        [sys.executable, "-c", _TRIAL, variant], capture_output=True, text=True, timeout=300, check=False
+    )
+    if trial.returncode == 0:
+        return [*out, Finding("renderer", "ok", f"{variant}, a trial kernel ran")]
+    reason = (trial.stderr.strip().splitlines() or [f"it ended with code {trial.returncode}"])[-1]
+    return [*out, Finding("renderer", "missing", f"{variant} failed: {reason}", backend.HELP)]
+
+
+def _library_fix(candidate: backend.Llvm) -> str:
+    for library in ("libz", "libatomic"):
+        if library in candidate.fault:
+            return f"install {library} (Debian: apt-get install {'zlib1g' if library == 'libz' else 'libatomic1'})"
+    return ""
+
+
+def _optional() -> list[Finding]:
+    out = []
+    for name, use in _OPTIONAL.items():
+        version = _version(name)
+        fix = "" if version else _FIXES.get(name, f"pip install {name}")
+        out.append(Finding(name, "ok" if version else "absent", f"{version or 'not installed'}: for {use}", fix))
+    library = ctypes.util.find_library("NxLib64")
+    detail = library or "not installed: only for live Ensenso cameras; recordings are read without it"
+    out.append(Finding("NxLib", "ok" if library else "absent", detail))
+    return out
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return ""

@@ -1,0 +1,264 @@
+"""Write results as files of other programs: ``mitsim export``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from characterisation.files.errors import InputError
+from mitsim.cli.options import Group, Variant, check_file, check_folder, start
+
+if TYPE_CHECKING:
+    from characterisation.point_cloud import PointCloud
+
+#: file name suffixes that each command accepts
+CLOUD_SUFFIXES = (".ply", ".pcd", ".e57", ".mcap")
+RUN_SUFFIXES = (".glb", ".usda", ".usdc", ".usdz", ".rrd", ".mcap", ".e57")
+RESULT_SUFFIXES = (".qif", ".csv", ".json")
+
+app = typer.Typer(
+    cls=Group,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    help="Write clouds, runs, results and maps in the formats of other programs.",
+)
+
+Views = Annotated[
+    str, typer.Option(help="best (views that are best for a measurement, or have a cloud), all, or numbers: 3,12.")
+]
+
+
+@app.command()
+def cloud(
+    cloud: Annotated[Path, typer.Argument(help="PLY file that mitsim wrote.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(CLOUD_SUFFIXES)}.")],
+    pose: Annotated[
+        Path | None,
+        typer.Option(help="JSON file with world_from_sensor: pose.json of a capture, or statement.json of a run."),
+    ] = None,
+    frame: Annotated[
+        str, typer.Option("--in", help="Frame of the points in PLY and PCD: sensor, or part (needs --pose).")
+    ] = "sensor",
+    unit: Annotated[str, typer.Option(help="Unit of PLY and PCD: mm or m. E57 and MCAP are in metres.")] = "mm",
+) -> None:
+    """Write a cloud with the covariance of every point as PLY, PCD, E57, or a ROS 2 message in MCAP.
+
+    Example: mitsim export cloud runs/two_pillars/clouds/predicted_0012.ply -o cloud.pcd
+    """
+    from characterisation.cloud_files import read_ply
+    from mitsim.report.export.cloud_points import cloud_points
+    from mitsim.report.export.cloud_writers import write_cloud_pcd, write_cloud_ply
+    from mitsim.report.export.e57 import write_e57
+    from mitsim.report.export.ros_bag import Stamped, write_mcap
+    from mitsim.report.export.run_scene import read_pose
+    from mitsim.running.progress import say
+
+    suffix = _suffix(output, CLOUD_SUFFIXES)
+    for option, given, allowed in (("--in", frame, ("sensor", "part")), ("--unit", unit, ("mm", "m"))):
+        if given not in allowed:
+            raise InputError(option, "", repr(given), " or ".join(allowed))
+    known = None if pose is None else read_pose(pose)
+    if frame == "part" and known is None:
+        raise InputError("--in", "", "part, without --pose", "a JSON file with the sensor's pose", "give --pose FILE")
+    read = read_ply(cloud)
+    check_file(output)
+    if suffix == ".e57":
+        write_e57([(cloud.stem, cloud_points(read), known)], output)
+    elif suffix == ".mcap":
+        write_mcap([Stamped("/points", "sensor_optical", cloud_points(read), known)], output)
+    else:
+        points = cloud_points(read, known if frame == "part" else None)
+        points = points.in_metres() if unit == "m" else points
+        if suffix == ".ply":
+            write_cloud_ply(points, output)
+        else:
+            write_cloud_pcd(points, output, known)
+    say(f"cloud: {output}: {_counted(read)}")
+
+
+@app.command()
+def run(
+    folder: Annotated[Path, typer.Argument(help="Folder of a mitsim run.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RUN_SUFFIXES)}.")],
+    views: Views = "best",
+) -> None:
+    """Write part, views and clouds of a run in one frame as glTF, USD, Rerun, MCAP (ROS 2 with tf) or E57.
+
+    glTF and USD hold part and views. MCAP and E57 hold clouds with poses. Rerun holds all of these, and the status of
+    every pixel.
+
+    Example: mitsim export run runs/two_pillars -o two_pillars.rrd
+    """
+    from mitsim.report.export.cloud_points import cloud_points
+    from mitsim.report.export.e57 import write_e57
+    from mitsim.report.export.gltf import write_glb
+    from mitsim.report.export.rerun_recording import write_rrd
+    from mitsim.report.export.ros_bag import Stamped, write_mcap
+    from mitsim.report.export.run_scene import labelled_scans, read_run_scene
+    from mitsim.report.export.usd import write_usd
+    from mitsim.running.progress import say
+
+    suffix = _suffix(output, RUN_SUFFIXES)
+    scene = read_run_scene(folder, views)
+    scans = labelled_scans(scene)
+    if suffix in (".mcap", ".e57") and not scans:
+        raise InputError("--views", "", f"{views}: none of these views has a cloud", "views with clouds", "see clouds/")
+    check_file(output)
+    if suffix == ".glb":
+        write_glb(scene, output)
+    elif suffix == ".rrd":
+        write_rrd(scene, output, folder.resolve().name)
+    elif suffix == ".e57":
+        write_e57([(name, cloud_points(one), view.part_from_sensor) for name, one, view in scans], output)
+    elif suffix == ".mcap":
+        write_mcap(
+            [
+                Stamped(
+                    f"/{view.name}/{name.removeprefix(view.name + '_')}",
+                    f"{view.name}_optical",
+                    cloud_points(one),
+                    view.part_from_sensor,
+                )
+                for name, one, view in scans
+            ],
+            output,
+        )
+    else:
+        write_usd(scene, output)
+    say(f"run: {output}: {len(scene.views)} views, {len(scans)} clouds")
+
+
+@app.command()
+def results(
+    folder: Annotated[Path, typer.Argument(help="Folder of a mitsim run.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RESULT_SUFFIXES)}.")],
+    task: Annotated[Path | None, typer.Option(help="Task TOML file of the run; default: that of its study.")] = None,
+) -> None:
+    """Write the expected uncertainty of every measurement, and the plan of views, as QIF 3.0, CSV or JSON.
+
+    Example: mitsim export results runs/two_pillars -o two_pillars.qif
+    """
+    from mitsim.report.export.qif import write_qif
+    from mitsim.report.export.results import read_results, write_results_csv, write_results_json
+    from mitsim.running.progress import say
+
+    write = {".qif": write_qif, ".csv": write_results_csv, ".json": write_results_json}
+    suffix = _suffix(output, RESULT_SUFFIXES)
+    found = read_results(folder, task)
+    check_file(output)
+    write[suffix](found, output)
+    views = ", ".join(str(number) for number, *_ in found.plan)
+    say(f"results: {output}: {len(found.results)} measurements, planned from view {views}")
+
+
+@app.command()
+def targets(
+    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim score.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
+    robot: Annotated[str, typer.Option(help="Make of the robot: abb, kuka, ur or moveit.")],
+    views: Annotated[
+        str,
+        typer.Option(help="best (the set of the run, or the best view of each measurement), all, or numbers: 3,12."),
+    ] = "best",
+) -> None:
+    """Write views as targets of a robot, in the part frame, in the order and units of its maker.
+
+    Example: mitsim export targets runs/two_pillars --robot kuka -o views.dat
+    """
+    from characterisation.files.atomic_io import atomic_write
+    from mitsim.report.export.robot_targets import ROBOT_FORMATS, read_targets
+    from mitsim.running.progress import say
+
+    if robot not in ROBOT_FORMATS:
+        raise InputError("--robot", "", repr(robot), ", ".join(ROBOT_FORMATS))
+    target_format = ROBOT_FORMATS[robot]
+    if output.suffix.lower() != target_format.suffix:
+        raise InputError(
+            "--output", "", output.name, f"a name that ends in {target_format.suffix}: {target_format.what}"
+        )
+    found, tool = read_targets(folder, views)
+    check_file(output)
+    with atomic_write(output) as file:
+        file.write_text(target_format.write(found, tool), encoding="utf-8")
+    hint = "" if tool == "flange" else "; make the tool frame the sensor frame, or give [views.flange_from_sensor]"
+    say(f"targets: {output}: {len(found)} poses of the {tool} in the part frame{hint}")
+
+
+@app.command("map")
+def map_(
+    map_file: Annotated[
+        str, typer.Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
+    sensor: Annotated[
+        str,
+        typer.Option(
+            help="Sensor of the map, a preset or TOML file; it gives the direction of the baseline. Default: the "
+            "preset."
+        ),
+    ] = "",
+) -> None:
+    """Write a map with a Python module that evaluates it with numpy alone: F and sigma from depth and normals.
+
+    Example: mitsim export map ensenso-n10 -o kernel
+    """
+    from characterisation.maps.performance_map import PerformanceMap
+    from characterisation.maps.shipped import map_path
+    from mitsim.report.export.map_export import write_map_kernel
+    from mitsim.running.progress import say
+    from mitsim.sensor.preset import load_sensor, presets
+
+    loaded = PerformanceMap.load(map_path(map_file))
+    name = str(loaded.data.attrs.get("sensor", ""))
+    if not sensor and name not in presets():
+        raise InputError("--sensor", "", "nothing", f"the TOML file of {name or 'the sensor of the map'}, not a preset")
+    chosen = load_sensor(sensor or name)
+    if chosen.name != name:
+        raise InputError("--sensor", "", chosen.name, f"{name}, the sensor of the map")
+    check_folder(output.absolute().parent, locked=False)
+    write_map_kernel(loaded, output, chosen.measuring_rig.baseline_direction)
+    say(f"kernel: {output / 'sensor_map.py'}, {output / 'map.npz'}: {len(loaded.samples)} surfaces of {name}")
+
+
+@app.command()
+def bop(
+    folder: Annotated[Path, typer.Argument(help="Folder of mitsim render --many.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write; it must not exist.")],
+    split: Annotated[str, typer.Option(help="Name of the split: train, val or test.")] = "train",
+    objects: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--object",
+            help="Pattern of the shapes that form one object: 'pin_1*'. Repeatable; default: all shapes "
+            "are one object.",
+        ),
+    ] = None,
+    variant: Variant = None,
+) -> None:
+    """Write many captures as a BOP data set: images, depth, reasons of missing pixels, masks, poses.
+
+    Example: mitsim export bop captures/bracket -o datasets/bracket
+    """
+    if split not in ("train", "val", "test"):
+        raise InputError("--split", "", repr(split), "train, val or test")
+    start(variant)
+    from mitsim.report.export.bop import find_sources, write_bop
+    from mitsim.running.progress import say
+
+    count = write_bop(find_sources(folder), output, split, objects or ())
+    say(f"data set: {output}: {count} images")
+
+
+def _suffix(output: Path, allowed: tuple[str, ...]) -> str:
+    if output.suffix.lower() not in allowed:
+        raise InputError("--output", "", output.name, f"a name that ends in {', '.join(allowed)}")
+    return output.suffix.lower()
+
+
+def _counted(cloud: PointCloud) -> str:
+    import numpy as np
+
+    known = 0 if cloud.sigma is None else int(np.isfinite(cloud.sigma[cloud.valid]).sum())
+    return f"{int(cloud.valid.sum())} points, {known} of them with a covariance"

@@ -1,0 +1,144 @@
+"""Fit a finish or a sensor to captures: ``mitsim fit``.
+
+``mitsim fit CAPTURES`` is short for ``mitsim fit finish CAPTURES``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mitsim.cli.options import Defines, Group, Seed, Variant, check_file, definitions, start
+
+
+class _FinishByDefault(Group):
+    """A group that runs its first command if the arguments name none."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert ``finish`` before arguments that name no command and do not ask for help."""
+        if args and args[0] not in self.commands and args[0] != "--help":
+            args = ["finish", *args]
+        return list(super().parse_args(ctx, args))
+
+
+app = typer.Typer(
+    cls=_FinishByDefault,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    help="Fit a finish (mitsim fit finish) or a sensor file (mitsim fit sensor) to captures.",
+)
+
+
+def finish(
+    captures: Annotated[list[Path], typer.Argument(help="Capture folders of one flat coupon.")],
+    sensor: Annotated[
+        str | None,
+        typer.Option(help="Name of a preset, or path of a sensor TOML file; default: the preset of the captures."),
+    ] = None,
+    scene: Annotated[
+        Path | None,
+        typer.Option(
+            help="Scene of the coupon, with its size, metal and process; default: the one that the captures name."
+        ),
+    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="JSON file to write.")] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="PNG picture to write: image, model and residual of the view that fits worst.")
+    ] = None,
+    block: Annotated[
+        int | None,
+        typer.Option(
+            min=4,
+            max=128,
+            help="Side of the blocks over which pixels are averaged [px]; default: 8, or 32 for an unknown pattern.",
+        ),
+    ] = None,
+    window: Annotated[
+        tuple[int, int, int, int] | None,
+        typer.Option(
+            metavar="COLUMN ROW WIDTH HEIGHT",
+            help="Window of the first camera's image that shows only the coupon [px]; default: from its pose, or from "
+            "the plane with most points.",
+        ),
+    ] = None,
+    define: Defines = None,
+    variant: Variant = None,
+) -> None:
+    """Estimate the width alpha of a coupon's specular lobe, its equivalent Ra, and the projector's power.
+
+    Example: mitsim fit finish captures/coupon_* --scene scenes/coupon/coupon.xml -o fit.json --figure fit.png
+    """
+    start(variant)
+    from characterisation.files.atomic_io import write_json
+    from characterisation.region_of_interest import Roi
+    from mitsim.report.finish_figure import fit_figure, fit_table, remarks
+    from mitsim.report.style import write_png
+    from mitsim.running.progress import say
+    from mitsim.twin.finish.run import fit_captures
+
+    for file in (output, figure):
+        if file is not None:
+            check_file(file)
+    found = fit_captures(captures, sensor, scene, definitions(define), block, Roi(*window) if window else None)
+    print(fit_table(found), end="")
+    for remark in remarks(found):
+        say(remark)
+    if output is not None:
+        write_json(output, found.numbers())
+        say(f"fit: {output}")
+    if figure is not None:
+        write_png(fit_figure(found), figure, dpi=90)
+        say(f"picture: {figure}")
+
+
+def sensor_(
+    captures: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Capture folders of a flat object, with the projector on unless their settings say otherwise."
+        ),
+    ] = None,
+    sensor: Annotated[str, typer.Option(help="Sensor to start from: a preset or a TOML file.")] = "",
+    output: Annotated[Path, typer.Option("--output", "-o", help="Sensor TOML file to write.")] = Path("my-camera.toml"),
+    off: Annotated[list[Path] | None, typer.Option(help="Capture with the projector off; once for each.")] = None,
+    dark: Annotated[list[Path] | None, typer.Option(help="Capture with all light off; once for each.")] = None,
+    window: Annotated[
+        tuple[int, int, int, int] | None,
+        typer.Option(
+            metavar="COLUMN ROW WIDTH HEIGHT",
+            help="Window of the first camera's image that shows the object [px]; default: the whole image.",
+        ),
+    ] = None,
+    seed: Seed = 1,
+    variant: Variant = None,
+) -> None:
+    """Fit a sensor file to captures of a flat object by your own camera in your own room.
+
+    Estimates room light, projector power, pattern, noise and row error, each with its uncertainty and its captures.
+    A parameter that the captures do not determine keeps its value. Prints a table.
+
+    Example: mitsim fit sensor captures/sheet_* --off captures/no_projector --sensor ensenso-n10 -o my-camera.toml
+    """
+    start(variant)
+    from characterisation.files.errors import InputError
+    from characterisation.region_of_interest import Roi
+    from mitsim.running.progress import say
+    from mitsim.twin.sensor.run import fit_sensor
+    from mitsim.twin.sensor.write import fit_table, write_sensor
+
+    if not sensor:
+        raise InputError("--sensor", "", "none", "the preset of this type of sensor, or a sensor TOML file")
+    if output.suffix != ".toml":
+        raise InputError("--output", "", str(output), "a .toml file")
+    check_file(output)
+    roi = Roi(*window) if window else None
+    found = fit_sensor(captures or [], sensor, off=off or [], dark=dark or [], roi=roi, seed=seed)
+    write_sensor(found, sensor, output)
+    print(fit_table(found), end="")
+    say(f"sensor: {output}, {len(found.estimates)} fitted parameters, {len(found.undetermined)} not determined")
+
+
+app.command(name="finish")(finish)
+app.command(name="sensor")(sensor_)

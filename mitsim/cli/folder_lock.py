@@ -1,0 +1,160 @@
+"""Lock a folder, so that one command at a time writes to it.
+
+The lock is the system's ``flock``: the system releases it when the process ends, for whatever reason. The file
+``.mitsim.lock`` names the process, and other commands print it. The command that locks a folder removes partial files
+of killed processes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import platform
+import re
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+
+from characterisation.files.atomic_io import HOST
+from characterisation.files.errors import InputError
+
+LOCK = ".mitsim.lock"
+
+#: temporary names that :mod:`characterisation.files.atomic_io` writes to, with process and machine
+_LEFT_OVER = re.compile(
+    r"\.(?P<name>.+)\.(?:(?P<pid>\d+)(?:-(?P<host>[0-9a-f]{6}))?\.partial"
+    r"|(?P<kind>partial|old)-(?P<pid2>\d+)-(?P<host2>[0-9a-f]{6})[0-9a-f]*)"
+)
+
+#: age [s] after which a partial file of another machine counts as abandoned; its processes cannot be checked from here
+_STALE_S = 24 * 3600.0
+
+#: folders of a run in which files are written one by one
+_WITHIN = ("", "captures", "clouds", "coupons")
+
+
+def lock_folder(folder: Path) -> Callable[[], None]:
+    """Lock an existing folder and remove abandoned files; return the function that releases it.
+
+    Raises
+    ------
+    InputError
+        If another command has locked it; the message has its process, machine and start time.
+    """
+    handle = _locked(folder)
+    if handle is None:
+        return lambda: None
+    about = {
+        "pid": os.getpid(),
+        "host": platform.node(),
+        "since": f"{datetime.now():%Y-%m-%d %H:%M:%S}",
+        "command": " ".join(sys.argv[1:2]),
+    }
+    os.ftruncate(handle, 0)
+    os.pwrite(handle, json.dumps(about).encode(), 0)
+    remove_partial(folder)
+
+    def release() -> None:
+        with contextlib.suppress(OSError):
+            (folder / LOCK).unlink(missing_ok=True)
+            os.close(handle)
+
+    return release
+
+
+def remove_partial(folder: Path) -> list[Path]:
+    """Remove partial files of dead processes; return the paths removed or restored."""
+    return [path for name in _WITHIN for path in _swept(folder / name)]
+
+
+def remove_partial_beside(path: Path) -> list[Path]:
+    """Remove partial files that dead processes left for one file or folder, and nothing else in its parent folder."""
+    return _swept(path.absolute().parent, path.name)
+
+
+def _swept(place: Path, name: str | None = None) -> list[Path]:
+    gone = []
+    for path in place.iterdir() if place.is_dir() else ():
+        match = _LEFT_OVER.fullmatch(path.name)
+        if match is None or (name is not None and not _is_of(match["name"], name)) or _may_be_alive(path, match):
+            continue
+        if match["kind"] == "old" and not os.path.lexists(place / match["name"]):
+            path.rename(place / match["name"])  # killed between the two steps of a replacement: restore
+        elif path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+        gone.append(path)
+    return gone
+
+
+def _is_of(found: str, name: str) -> bool:
+    """Return whether a partial file is for a name; temporary folders of the system add letters to it."""
+    return found == name or re.fullmatch(re.escape(name) + r"\.[a-z0-9_]{8}", found) is not None
+
+
+def _may_be_alive(path: Path, match: re.Match[str]) -> bool:
+    if (match["host"] or match["host2"] or HOST) == HOST:
+        return _is_alive(int(match["pid"] or match["pid2"]))
+    try:
+        return time.time() - path.stat().st_mtime < _STALE_S
+    except OSError:
+        return True
+
+
+def _locked(folder: Path) -> int | None:
+    """Return a locked handle of the lock file; None if the system cannot lock files."""
+    try:
+        import fcntl
+    except ImportError:
+        return None
+    path = folder / LOCK
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = _holder(handle)
+            os.close(handle)
+            raise InputError(
+                folder,
+                "",
+                f"a folder that {holder} is writing to",
+                "a folder that no other command is writing to",
+                "wait until that command ends, or choose another folder with -o",
+            ) from None
+        except OSError:  # a file system without locks
+            os.close(handle)
+            path.unlink(missing_ok=True)
+            return None
+        with contextlib.suppress(FileNotFoundError):
+            if os.fstat(handle).st_ino == path.stat().st_ino:
+                return handle
+        os.close(handle)  # its holder has just removed it
+
+
+def _holder(handle: int) -> str:
+    try:
+        about = json.loads(os.pread(handle, 4096, 0))
+        return (
+            f"mitsim {str(about['command'])[:40]} (process {int(about['pid'])} on {str(about['host'])[:80]}, "
+            f"since {str(about['since'])[:40]})"
+        )
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return "another mitsim"
+
+
+def _is_alive(pid: int) -> bool:
+    if pid == os.getpid():
+        return True
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        return True
+    return True

@@ -1,0 +1,157 @@
+"""Import recordings of devices and other programs as capture folders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from characterisation.files.errors import InputError
+from mitsim.cli.folder_lock import remove_partial_beside
+
+#: settings of an imported capture that the user should check
+SETTINGS_TO_CHECK = (
+    "image_set",
+    "unit_of_file",
+    "axes_of_file",
+    "fitted_camera_rms_px",
+    "off_the_rays_px",
+    "depth_scale_mm",
+    "measured_from",
+    "baseline_mm",
+    "spec_baseline_mm",
+    "subpixel_bits",
+    "subpixel_bits_from",
+    "bits_from",
+    "channel",
+)
+
+
+def import_(
+    path: Annotated[Path, typer.Argument(help="File or folder that a device or another program saved.")],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="Capture folder to write; default: named after PATH, in the current folder."
+        ),
+    ] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option(help="Sensor that took it, a preset or TOML file; it supplies name, cameras and range."),
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration of the cameras: TOML, JSON, OpenCV's YAML or XML, DepthAI's JSON.")
+    ] = None,
+    kind: Annotated[
+        str | None,
+        typer.Option(
+            "--as",
+            help="Kind of recording: ensenso, depthai, robi, stereo-pair, images, depth, ply or pcd; "
+            "default: detected.",
+        ),
+    ] = None,
+    camera: Annotated[str | None, typer.Option(help="For a depth image or cloud: the name of its camera.")] = None,
+    frame: Annotated[
+        str | None, typer.Option(help="Image set, pair or frame to import: its number, from 0, or its name.")
+    ] = None,
+    images: Annotated[
+        list[str] | None,
+        typer.Option(help="For a folder of images: files of one camera, NAME=PATTERN (left='cam0_*.png'). Repeatable."),
+    ] = None,
+    channel: Annotated[str | None, typer.Option(help="For colour images: red, green or blue; default green.")] = None,
+    exposure: Annotated[float | None, typer.Option(help="Exposure time of every image [s].")] = None,
+    pose: Annotated[
+        Path | None,
+        typer.Option(
+            help="Pose of the sensor: pose.json, or a text file with the 4 x 4 matrix world_from_sensor [mm]."
+        ),
+    ] = None,
+    sample: Annotated[
+        str | None, typer.Option(help="For a coupon: the label of its sample in a campaign (aluminium/ground Ra 0.4).")
+    ] = None,
+    projector: Annotated[str | None, typer.Option(help="State of the projector: on or off.")] = None,
+    depth_range: Annotated[
+        tuple[float, float] | None, typer.Option("--range", help="Nearest and farthest depth to decode [mm].")
+    ] = None,
+    scale: Annotated[
+        float | None, typer.Option(min=1e-6, max=1e4, help="For a depth image: depth per grey level [mm]; default 1.")
+    ] = None,
+    invalid: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="For a depth image: grey level of pixels without depth; default 0."),
+    ] = None,
+    unit: Annotated[
+        str | None,
+        typer.Option(help="Unit of a cloud: um, mm, cm or m; default: m if the median distance is below 20, else mm."),
+    ] = None,
+    axes: Annotated[
+        str | None,
+        typer.Option(help="Axes of a cloud: opencv (y down, z forward) or opengl (y up, z backward); default opencv."),
+    ] = None,
+    link: Annotated[
+        Path | None,
+        typer.Option(
+            help="For a cloud of an Ensenso: its *_calib.json. Its Link (the transform to a workspace) is undone, so "
+            "that points are in the sensor frame."
+        ),
+    ] = None,
+    subpixel_bits: Annotated[
+        int | None,
+        typer.Option(min=0, max=8, help="For a DepthAI disparity: n if its unit is 1/2^n px; default: detected."),
+    ] = None,
+) -> None:
+    """Import a recording of a device or another program as a capture folder; the kind of recording is detected.
+
+    Example: mitsim import recording.zip -o captures/real
+    """
+    from mitsim.capture.folder import is_written, write_capture
+    from mitsim.capture.recordings.recognise import KINDS, ReadOptions, read_recording
+    from mitsim.capture.recordings.recording_files import plain_name
+    from mitsim.running.progress import say
+
+    options = ReadOptions(
+        sensor=sensor,
+        calibration=None if calibration is None else str(calibration),
+        camera=camera,
+        frame=frame,
+        range_mm=depth_range,
+        scale_mm=scale,
+        invalid=invalid,
+        unit=unit,
+        axes=axes,
+        link=None if link is None else str(link),
+        subpixel_bits=subpixel_bits,
+        images=_by_camera(images),
+        channel=channel,
+        exposure_s=exposure,
+        pose=None if pose is None else str(pose),
+        sample=sample,
+        projector=projector,
+    )
+    imported = read_recording(path, options, kind)
+    capture = imported.capture
+    folder = output or Path(plain_name(path.resolve().stem) + "_capture")
+    say(f"{path}: {KINDS[imported.kind].name}, of {capture.sensor}, {capture.technology}, {capture.source}")
+    for name in SETTINGS_TO_CHECK:
+        if name in capture.settings:
+            say(f"  {name}: {capture.settings[name]}")
+    for warning in capture.settings.get("warnings", []):
+        say(f"warning: {warning}")
+    remove_partial_beside(folder)
+    if is_written(capture, folder, imported.originals):
+        say(f"capture: {folder}, finished before")
+        return
+    write_capture(capture, folder, vendor=imported.originals)
+    say(f"capture: {folder}")
+
+
+def _by_camera(given: list[str] | None) -> dict[str, str] | None:
+    """Return the patterns of --images by camera."""
+    out = {}
+    for item in given or []:
+        name, mark, pattern = item.partition("=")
+        if not mark or not name or not pattern:
+            raise InputError("--images", "", repr(item), "NAME=PATTERN, as left='cam0_*.png'")
+        out[name] = pattern
+    return out or None

@@ -1,0 +1,198 @@
+"""Measure in clouds: features in windows, plates of dots, tasks, differences."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from characterisation.files.errors import InputError
+from mitsim.cli.options import Clouds, DecodedAs, Defines, Json, Variant, check_file, definitions, start
+
+if TYPE_CHECKING:
+    from characterisation.tasks.result import Result
+    from mitsim.decode.input_clouds import InputCloud
+
+_WINDOW = "NAME=COLUMN,ROW,WIDTH,HEIGHT"
+
+
+def measure(
+    clouds: Clouds,
+    plane: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar=_WINDOW,
+            help="Flatness, noise and distance of the plane in a window [px]; NAME alone: the whole cloud.",
+        ),
+    ] = None,
+    sphere: Annotated[
+        list[str] | None, typer.Option(metavar=_WINDOW, help="Diameter, noise and distance of the sphere in a window.")
+    ] = None,
+    cylinder: Annotated[
+        list[str] | None,
+        typer.Option(metavar=_WINDOW, help="Diameter, cylindricity and noise of the cylinder in a window."),
+    ] = None,
+    angle: Annotated[
+        list[str] | None, typer.Option(metavar="NAME,NAME", help="Angle between two planes or cylinders, 0 to 90 deg.")
+    ] = None,
+    distance: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME,NAME", help="Distance between planes, cylinders, spheres, or a sphere and a plane [mm]."
+        ),
+    ] = None,
+    dots: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=COLUMN,ROW,WIDTH,HEIGHT,PITCH",
+            help="Spacing of the dots of a plate with known PITCH [mm]; NAME=PITCH: the whole image. Captures only.",
+        ),
+    ] = None,
+    bright_dots: Annotated[bool, typer.Option("--bright-dots", help="The dots are brighter than the plate.")] = False,
+    task: Annotated[Path | None, typer.Option(help="Task TOML file: measure what it defines; needs --scene.")] = None,
+    scene: Annotated[Path | None, typer.Option(help="Scene of the part; it assigns pixels to features.")] = None,
+    pose: Annotated[
+        Path | None,
+        typer.Option(
+            help="Pose of the sensor: pose.json, statement.json, or poses.json with --view; default: that of "
+            "the capture."
+        ),
+    ] = None,
+    view: Annotated[int | None, typer.Option(min=0, help="Number of the view in poses.json.")] = None,
+    correct: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="STATEMENT",
+            help="Subtract the bias in this statement.json, made for the same view, from the values of the task.",
+        ),
+    ] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CLOUD", help="Reference cloud: signed difference of each cloud from it, in the same frame [mm]."
+        ),
+    ] = None,
+    by: Annotated[
+        str,
+        typer.Option(
+            help="Direction of the difference: rays, surface (normal), or auto: rays if both clouds have the same grid."
+        ),
+    ] = "auto",
+    window: Annotated[
+        tuple[int, int, int, int] | None,
+        typer.Option(metavar="COLUMN ROW WIDTH HEIGHT", help="Window of the difference [px]."),
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            help="PNG picture to write: the difference, or the distances and windows; numbered for several clouds."
+        ),
+    ] = None,
+    as_json: Json = False,
+    sensor: DecodedAs = None,
+    define: Defines = None,
+    variant: Variant = None,
+) -> None:
+    """Measure planes, spheres, cylinders, dots or a task in point clouds, or the difference from another cloud.
+
+    For several clouds, also print mean and standard deviation of each measurement. u is the standard uncertainty from
+    the covariance of the fit. The command lists the effects that u does not include. Exit code 1 if a measurement was
+    not possible.
+
+    Example: mitsim measure cloud.ply --plane top=100,50,200,150 --plane side=400,60,90,300 --angle top,side
+    """
+    from characterisation.tasks.result import NOT_INCLUDED, repeatability
+    from mitsim.cli.measure_request import read_request
+    from mitsim.decode.input_clouds import cloud_paths, read_cloud
+    from mitsim.decode.measured_document import measured_document, result_tables, summary
+    from mitsim.running.progress import say
+
+    request = read_request(
+        {"plane": plane or [], "sphere": sphere or [], "cylinder": cylinder or []},
+        {"angle": angle or [], "distance": distance or []},
+        dots or [],
+        bright_dots,
+        against,
+        by,
+        window,
+    )
+    if task is None and (given := _given(scene=scene, pose=pose, view=view, correct=correct)):
+        raise InputError(f"--{given}", "", "no --task", "a task for the scene: --task task.toml")
+    if task is not None and scene is None:
+        raise InputError("--scene", "", "none", "the scene of the task's part: --scene part.xml")
+    if request.empty and task is None and picture is None:
+        allowed = "--plane, --sphere, --cylinder, --dots, --task, --against or --picture"
+        raise InputError("mitsim measure", "", "nothing to measure", allowed, "see mitsim measure --help")
+    if picture is not None:
+        check_file(picture)
+    of_task = None
+    if task is not None and scene is not None:
+        start(variant)
+        of_task = _task(task, scene, pose, view, correct, definitions(define))
+    reference = None if against is None else read_cloud(against, sensor)
+    paths = cloud_paths(clouds)
+    whose: list[tuple[Path, str, str]] = []
+    results: list[list[Result]] = []
+    for number, path in enumerate(paths):
+        if len(paths) > 1:
+            say(f"{path} ({number + 1}/{len(paths)})")
+        one = read_cloud(path, sensor)
+        found, drawn = request.measure(one, reference)
+        if of_task is not None:
+            found += of_task(one)
+        if picture is not None:
+            from mitsim.report.style import write_png
+
+            place = picture if len(paths) == 1 else picture.with_stem(f"{picture.stem}_{number + 1}")
+            write_png(drawn(), place, dpi=100)
+            say(f"picture: {place}")
+        whose.append((path, one.cloud.sensor, one.cloud.source))
+        results.append(found)
+    over = repeatability(results) if len(results) > 1 else []
+    if as_json:
+        print(json.dumps(measured_document(whose, results, over), indent=2, ensure_ascii=False, allow_nan=False))
+    elif request.empty and of_task is None:
+        pass
+    else:
+        print(result_tables(paths, results, over))
+        if any(result.origin == "fit" for found in results for result in found):
+            left_out = "; ".join(NOT_INCLUDED)
+            say(f"u: standard uncertainty (k = 1) from the covariance of the fit; it does not include: {left_out}")
+        if correct is not None:
+            say(f"u of the task: standard uncertainty after correction, including that of the bias, from {correct}")
+    if results and any(results):
+        say(summary(results))
+    if not all(result.possible for found in results for result in found):
+        raise typer.Exit(1)
+
+
+def _given(**options: Any) -> str | None:
+    """Return the name of the first option that was given."""
+    return next((name for name, value in options.items() if value is not None), None)
+
+
+def _task(
+    task: Path, scene: Path, pose: Path | None, view: int | None, correct: Path | None, defined: dict[str, str]
+) -> Any:
+    """Return the function that measures a task in a cloud."""
+    from characterisation.tasks.task_reading import check_features, read_task
+    from mitsim.scene.load import load_scene
+    from mitsim.sensor.preset import load_sensor
+    from mitsim.study.task_measurement import measure_task, read_pose, read_view_statement
+
+    definition = read_task(task)
+    # feature positions do not depend on the finish, so any wavelength serves to load the scene
+    loaded = load_scene(scene, load_sensor("ensenso-n10").wavelength_nm, defined)
+    check_features(definition, task, loaded.names)
+    statement = None if correct is None else read_view_statement(correct)
+    given_pose = None if pose is None else read_pose(pose, view)
+
+    def measured(one: InputCloud) -> list[Result]:
+        world_from_sensor = given_pose or (None if one.capture is None else one.capture.world_from_sensor)
+        if world_from_sensor is None:
+            raise InputError(one.path, "pose", "none", "the pose of the sensor: --pose FILE")
+        return measure_task(one.cloud, definition, loaded, world_from_sensor, statement, one.margin_px)
+
+    return measured

@@ -1,0 +1,247 @@
+"""Read the measurements that the command line requests without a task: windows, plates, a difference.
+
+Signal chain: texts of the options -> windows and plates, checked -> results and a picture of each cloud.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.acceptance.cloud_difference import (
+    Difference,
+    difference_along_rays,
+    difference_to_surface,
+    distribution,
+    same_grid,
+)
+from characterisation.files.documents import checked_name
+from characterisation.files.errors import InputError
+from characterisation.region_of_interest import Roi
+from characterisation.tasks.result import Result, failed
+from characterisation.tasks.windows import PairKind, Shape, WindowPlan, measure_windows, window_slices
+from mitsim.decode.input_clouds import InputCloud
+from mitsim.decode.plate import Plate, image_on_grid, measure_plate
+from mitsim.report.measured_figures import difference_figure, distance_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: directions of a difference: along the view rays, or along the surface normal; ``auto`` depends on the grids
+DIRECTIONS = ("auto", "rays", "surface")
+
+_WINDOW_SYNTAX, _PLATE_SYNTAX = (
+    "NAME=COLUMN,ROW,WIDTH,HEIGHT [px], or NAME alone",
+    "NAME=COLUMN,ROW,WIDTH,HEIGHT,PITCH, or NAME=PITCH [mm]",
+)
+
+
+@dataclass(frozen=True)
+class Request:
+    """Measurements that the options request.
+
+    - ``plan``: features in windows, and angles and distances between them.
+    - ``plates`` of dots by name.
+    - ``by``: direction of a difference, one of :data:`DIRECTIONS`.
+    - ``window`` of the difference [px], None for the whole grid.
+    - ``has_reference``: whether there is a reference cloud for a difference.
+    """
+
+    plan: WindowPlan
+    plates: Mapping[str, Plate]
+    by: str
+    window: Roi | None
+    has_reference: bool
+
+    @property
+    def empty(self) -> bool:
+        """Whether no measurement is requested."""
+        return not (self.plan.features or self.plates or self.has_reference)
+
+    def measure(self, given: InputCloud, reference: InputCloud | None) -> tuple[list[Result], Callable[[], Figure]]:
+        """Return the results of a cloud, and a function that draws its picture.
+
+        ``reference`` is the reference cloud of a difference, None without one.
+
+        Raises
+        ------
+        InputError
+            If a window does not lie in the cloud's grid, or dots are requested of a cloud without images.
+        """
+        cloud = given.cloud
+        results = measure_windows(cloud, self.plan)
+        if self.plates:
+            if given.capture is None or not given.capture.images:
+                raise InputError(
+                    given.path,
+                    "",
+                    "a cloud without images",
+                    "a capture folder, whose images show the dots",
+                    "give the capture folder, which the command decodes: mitsim measure CAPTURE --dots ...",
+                )
+            image = image_on_grid(given.capture, cloud.grid)
+            for name, plate in self.plates.items():
+                results += measure_plate(name, plate, cloud, image)
+        boxes = self._boxes()
+        if reference is None:
+            return results, lambda: distance_figure(cloud, boxes)
+        values = self._difference(given, reference)
+        difference = distribution(values, int(cloud.valid[window_slices(self.window, cloud, "difference")].sum()))
+        return results + _difference_results(difference), lambda: difference_figure(
+            values, difference, boxes, self.window
+        )
+
+    def _difference(self, given: InputCloud, reference: InputCloud) -> NDArray[np.float64]:
+        """Return the difference (H, W) [mm] of a cloud from the reference, NaN outside the window."""
+        cloud, other = given.cloud, reference.cloud
+        rays = self.by == "rays" or (self.by == "auto" and same_grid(cloud.grid, other.grid))
+        values = difference_along_rays(cloud, other) if rays else difference_to_surface(cloud, other)
+        out = np.full(values.shape, np.nan)
+        inside = window_slices(self.window, cloud, "difference")
+        out[inside] = values[inside]
+        return out
+
+    def _boxes(self) -> dict[str, Roi]:
+        windows = {name: window for name, (_, window) in self.plan.features.items()}
+        windows |= {name: plate.window for name, plate in self.plates.items()}
+        return {name: one for name, one in windows.items() if one is not None}
+
+
+def read_request(
+    features: Mapping[str, Sequence[str]],
+    between: Mapping[str, Sequence[str]],
+    plates: Sequence[str],
+    bright: bool,
+    against: Path | None,
+    by: str,
+    window: tuple[int, int, int, int] | None,
+) -> Request:
+    """Read the texts of options into a request.
+
+    Parameters
+    ----------
+    features
+        Texts ``NAME=COLUMN,ROW,WIDTH,HEIGHT`` [px], or ``NAME``, by shape.
+    between
+        Texts ``NAME,NAME`` by kind of measurement.
+    plates
+        Texts ``NAME=COLUMN,ROW,WIDTH,HEIGHT,PITCH`` [px, mm], or ``NAME=PITCH``.
+    bright
+        Whether the dots are brighter than the plate.
+    against
+        Path of the reference cloud of a difference, None without one.
+    by
+        Direction of the difference, one of :data:`DIRECTIONS`.
+    window
+        Window of the difference [px], None for the whole grid.
+
+    Raises
+    ------
+    InputError
+        If a text cannot be read. The error names the option and the allowed form.
+    """
+    named: dict[str, tuple[Shape, Roi | None]] = {}
+    for shape, texts in features.items():
+        for text in texts:
+            name, numbers = parse_numbers(f"--{shape}", text, (0, 4), _WINDOW_SYNTAX)
+            check_unique(f"--{shape}", name, named)
+            named[name] = cast(Shape, shape), parse_window(f"--{shape}", text, numbers, _WINDOW_SYNTAX)
+    pairs: list[tuple[PairKind, str, str]] = []
+    for kind, texts in between.items():
+        for text in texts:
+            names = [one.strip() for one in text.split(",")]
+            if len(names) != 2 or not all(names):
+                raise InputError(f"--{kind}", "", repr(text), "NAME,NAME of two features")
+            pairs.append((cast(PairKind, kind), names[0], names[1]))
+    known: dict[str, Plate] = {}
+    for text in plates:
+        name, numbers = parse_numbers("--dots", text, (1, 5), _PLATE_SYNTAX)
+        check_unique("--dots", name, {**named, **known})
+        if not 0 < numbers[-1] < 1e4:
+            raise InputError("--dots", "", repr(text), f"{_PLATE_SYNTAX}, the pitch over 0 and under 10000")
+        known[name] = Plate(parse_window("--dots", text, numbers[:-1], _PLATE_SYNTAX), numbers[-1], not bright)
+    if by not in DIRECTIONS:
+        raise InputError("--by", "", repr(by), ", ".join(DIRECTIONS))
+    if against is None and (by != "auto" or window is not None):
+        raise InputError("--by" if window is None else "--window", "", "no --against", "--against CLOUD")
+    numbers = [] if window is None else list(map(float, window))
+    region = parse_window("--window", str(window), numbers, "COLUMN ROW WIDTH HEIGHT")
+    plan = WindowPlan(named, pairs)
+    plan.check()
+    return Request(plan, known, by, region, against is not None)
+
+
+def _difference_results(difference: Difference) -> list[Result]:
+    """Return the results of a difference, without uncertainties, because its points are not independent."""
+    result = partial(Result, unit="mm", points=difference.count, points_given=difference.points_given)
+    values = {
+        "mean": difference.mean,
+        "median": difference.median,
+        "standard deviation": difference.deviation,
+        "robust deviation": difference.robust_deviation,
+        "2.5 %": difference.low,
+        "97.5 %": difference.high,
+    }
+    if difference.count < 2:
+        reason = f"only {difference.count} of {difference.points_given} points have a counterpart in the reference"
+        return [
+            failed(f"difference {name}", "mm", reason, difference.count, difference.points_given) for name in values
+        ]
+    return [result(f"difference {name}", value=value) for name, value in values.items()]
+
+
+def parse_numbers(option: str, text: str, counts: tuple[int, ...], allowed: str) -> tuple[str, list[float]]:
+    """Return name and numbers of a text such as ``name=1,2,3``.
+
+    ``counts`` lists how many numbers are allowed; ``allowed`` describes the form of the text.
+
+    Raises
+    ------
+    InputError
+        If the text has another form. The error names the option and the allowed form.
+    """
+    name, _, rest = text.partition("=")
+    try:
+        numbers = [float(one) for one in rest.split(",")] if rest.strip() else []
+    except ValueError:
+        numbers = [float("nan")]
+    if not name.strip() or len(numbers) not in counts or not np.isfinite(numbers).all():
+        raise InputError(option, "", repr(text), allowed)
+    try:
+        return checked_name(name.strip()), numbers
+    except ValueError as error:
+        raise InputError(option, "", repr(name.strip()), str(error)) from None
+
+
+def parse_window(option: str, text: str, numbers: Sequence[float], allowed: str) -> Roi | None:
+    """Return the window of four numbers [px]; no numbers give None, the whole grid.
+
+    Raises
+    ------
+    InputError
+        If the numbers are not whole, a position is negative, or a size is 0.
+    """
+    if not numbers:
+        return None
+    column, row, width, height = (int(one) for one in numbers)
+    if min(column, row) < 0 or min(width, height) < 1 or any(one != int(one) for one in numbers):
+        raise InputError(option, "", repr(text), f"{allowed}: whole pixels, width and height over 0")
+    return Roi(column, row, width, height)
+
+
+def check_unique(option: str, name: str, known: Mapping[str, object]) -> None:
+    """Check that a name is not used yet.
+
+    Raises
+    ------
+    InputError
+        If it is among the ``known`` names.
+    """
+    if name in known:
+        raise InputError(option, "", f"{name!r} a second time", "a different name for each feature")

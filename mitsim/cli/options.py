@@ -1,0 +1,171 @@
+"""Options that commands share, and checks of their values."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from characterisation.files.errors import InputError
+from mitsim.cli.folder_lock import lock_folder, remove_partial_beside
+
+Out = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")]
+OutCloud = Annotated[Path, typer.Option("--output", "-o", help="Point cloud to write, a PLY file.")]
+Scene = Annotated[Path, typer.Argument(help="Scene XML file of the part, in mm.")]
+Variant = Annotated[str | None, typer.Option(help="Mitsuba variant: cuda_ad_mono (GPU) or llvm_ad_mono (CPU).")]
+SensorOption = Annotated[str, typer.Option(help="Name of a preset, or path of a sensor TOML file.")]
+Defines = Annotated[list[str] | None, typer.Option("-D", help="Set a <default> of the scene: name=value. Repeatable.")]
+Position = Annotated[
+    tuple[float, float, float], typer.Option(help="Position of the sensor in the frame of the scene [mm].")
+]
+Target = Annotated[
+    tuple[float, float, float], typer.Option(help="Point that the sensor looks at, in the frame of the scene [mm].")
+]
+Roll = Annotated[float, typer.Option(help="Rotation about the view axis [deg].")]
+Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Random seed; the same seed gives the same result.")]
+
+
+Scheduler = Annotated[
+    str | None,
+    typer.Option(help="Distribute the work to a Dask cluster: the address of its scheduler, tcp://HOST:8786."),
+]
+Processes = Annotated[
+    int,
+    typer.Option(min=0, max=1024, help="Worker processes on this machine; 0: as many as its cores and memory allow."),
+]
+Clouds = Annotated[
+    list[Path],
+    typer.Argument(metavar="CLOUD...", help="Point clouds, capture folders (decoded first), or folders of either."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")]
+DecodedAs = Annotated[str | None, typer.Option(help="Decode captures with the settings of this sensor.")]
+Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are reused.")]
+
+Yes = Annotated[
+    bool, typer.Option("--yes", "-y", help="Characterise finishes that are missing in the map, without asking.")
+]
+
+
+def asking(yes: bool, others: str = "") -> Callable[[str], bool] | None:
+    """Return the function that answers whether a missing finish may be characterised; None if nobody can answer.
+
+    With ``yes`` it always agrees. At a terminal it asks the user once. ``others`` extends the question: it names the
+    other cases that the answer covers.
+    """
+    if yes:
+        return lambda _: True
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        return None
+    answers = list[bool]()
+
+    def ask(question: str) -> bool:
+        if not answers:
+            answers.append(typer.confirm(f"{question}{others}", default=False, err=True))
+        return answers[0]
+
+    return ask
+
+
+class Group(TyperGroup):
+    """A group that lists the whole first sentence of each command in ``--help``. Click would cut it to one line."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of the commands."""
+        named = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        rows = [(name, one.get_short_help_str(limit=1000)) for name, one in named if one and not one.hidden]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
+
+def start(variant: str | None) -> None:
+    """Select the Mitsuba variant; call this before any other import of Mitsuba."""
+    from mitsim.scene import backend
+
+    backend.activate(variant)
+
+
+def pose_of(position: tuple[float, float, float], target: tuple[float, float, float], roll: float, sensor: Any) -> Any:
+    """Return ``world_from_sensor`` of a sensor whose reference camera is at a position and looks at a target."""
+    import numpy as np
+
+    from mitsim.sensor.poses import look_at
+
+    distance = float(np.linalg.norm(np.subtract(position, target)))
+    if not 50 <= distance <= 20000:
+        raise InputError("--position", "", f"{distance:g} mm from the target", "50 to 20000 mm", "give positions in mm")
+    return look_at(position, target, roll_deg=roll, sensor=sensor)
+
+
+def definitions(given: list[str] | None) -> dict[str, str]:
+    """Return the values of -D by name."""
+    out = {}
+    for item in given or []:
+        name, mark, value = item.partition("=")
+        if not mark or not name:
+            raise InputError("-D", "", repr(item), "name=value")
+        out[name] = value
+    return out
+
+
+def check_file(file: Path) -> None:
+    """Check that a file can be written, and create its folder."""
+    check_folder(file.parent, locked=False)
+    if file.is_dir():
+        raise InputError("--output", "", f"the folder {file}", "a file")
+    if file.exists() and not file.is_file():  # an atomic write would replace a device: /dev/null
+        raise InputError("--output", "", f"{file}, a device or a pipe", "a file")
+    remove_partial_beside(file)
+
+
+def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
+    """Check that a folder holds no finished run; ``last`` is the file that a run writes at its end.
+
+    With ``overwrite``, remove that file: an interrupted run must not look finished.
+
+    Raises
+    ------
+    InputError
+        If the file exists and ``overwrite`` is false.
+    """
+    if not (folder / last).exists():
+        return
+    if not overwrite:
+        raise InputError(
+            "--output",
+            "",
+            f"{folder}, a finished run",
+            "a folder without one",
+            "to repeat the run, add --overwrite (it reuses finished trials); to rewrite its page, use mitsim report",
+        )
+    (folder / last).unlink()
+
+
+def check_folder(folder: Path, locked: bool = True) -> None:
+    """Check that a folder can be written, create it, and lock it until the command ends.
+
+    ``locked`` is false for the folder of a single file: other commands may write to that folder at the same time.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("--output", "", f"{folder} ({error.strerror})", "a folder that can be created") from None
+    if not os.access(folder, os.W_OK):
+        raise InputError("--output", "", f"{folder}, which is not writable", "a writable folder")
+    place = folder.resolve()
+    if locked and place not in _locked_folders:
+        _locked_folders[place] = lock_folder(folder)
+
+
+#: folders that the running command has locked, each with the function that releases it
+_locked_folders: dict[Path, Callable[[], None]] = {}
+
+
+def release_folders() -> None:
+    """Release all folders of the command, however it ended."""
+    while _locked_folders:
+        _locked_folders.popitem()[1]()

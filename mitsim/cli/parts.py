@@ -1,0 +1,225 @@
+"""Check a scene before rendering, and make a scene from a CAD file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from characterisation.files.atomic_io import atomic_write
+from mitsim.cli.options import (
+    Defines,
+    Json,
+    Roll,
+    Scene,
+    SensorOption,
+    Target,
+    Variant,
+    check_file,
+    definitions,
+    pose_of,
+    start,
+)
+
+
+def check(
+    scene: Scene,
+    position: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Position of the sensor in the frame of the scene [mm]; default: 45 deg above the part."),
+    ] = None,
+    target: Target = (0.0, 0.0, 0.0),
+    roll: Roll = 0.0,
+    sensor: SensorOption = "ensenso-n10",
+    task: Annotated[Path | None, typer.Option(help="Task TOML file; check that the scene has its features.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="PNG picture to write.")] = None,
+    json: Json = False,
+    html: Annotated[
+        Path | None,
+        typer.Option(help="HTML page to write: edit names, finishes and measurements, then download the files."),
+    ] = None,
+    define: Defines = None,
+    variant: Variant = None,
+) -> None:
+    """List the contents of a scene, warn of likely mistakes, and draw it from the sensor and from above.
+
+    Exit code 1 if a finding is an error.
+
+    Example: mitsim check scenes/two_pillars/two_pillars.xml --task scenes/two_pillars/task.toml -o preview.png
+    """
+    start(variant)
+    import json as json_module
+
+    from mitsim.report.scene_preview import preview_figure
+    from mitsim.report.scene_table import as_data, as_text
+    from mitsim.report.style import write_png
+    from mitsim.running.progress import say
+    from mitsim.scene.authoring.check import findings, read_features
+    from mitsim.scene.first_hits import visible_surfaces
+    from mitsim.scene.inspect import inspect
+    from mitsim.scene.load import load_scene
+    from mitsim.sensor.preset import load_sensor
+    from mitsim.sensor.working_volume import pose_at, usual_place
+
+    chosen = load_sensor(sensor)
+    wanted = read_features(task) if task else None
+    loaded = load_scene(scene, chosen.wavelength_nm, definitions(define))
+    if position is None:
+        place = usual_place(chosen, loaded.centre)
+        pose = pose_at(chosen, place, loaded.centre, roll)
+        seen = [" ".join(f"{round(float(v), 1) + 0.0:g}" for v in point) for point in (place, loaded.centre)]
+        say(f"no position was given: using --position {seen[0]} --target {seen[1]}")
+    else:
+        pose = pose_of(position, target, roll, chosen)
+    facts, visible = inspect(loaded), visible_surfaces(loaded, chosen.rig, pose)
+    found = findings(facts, chosen, pose, visible, position is not None, wanted)
+    if output:
+        check_file(output)
+        write_png(preview_figure(loaded, facts, chosen, pose, visible, list(wanted.features) if wanted else []), output)
+        say(f"picture: {output}")
+    if html:
+        from mitsim.report.author_page import Authored, author_page
+
+        check_file(html)
+        text = author_page(Authored(loaded, facts, chosen, found, task, wanted))
+        with atomic_write(html) as part_of:
+            part_of.write_text(text, encoding="utf-8")
+        say(f"page: {html}")
+    if json:
+        about = {"scene": loaded.where, "sensor": chosen.name, "world_from_sensor": pose.matrix().tolist()}
+        print(json_module.dumps({**about, **as_data(facts, visible, found)}, indent=2))
+    else:
+        print(as_text(facts, visible, found))
+    if any(one.severity == "error" for one in found):
+        raise typer.Exit(1)
+
+
+def part(
+    file: Annotated[Path, typer.Argument(help="STEP file, or a mesh: STL, OBJ, PLY or glTF.")],
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Scene folder to write.")] = None,
+    units: Annotated[
+        str | None, typer.Option(help="Unit of a file that does not state it: mm, m or inch; default mm.")
+    ] = None,
+    metal: Annotated[str | None, typer.Option(help="Metal of all faces; default aluminium.")] = None,
+    process: Annotated[str | None, typer.Option(help="Machining process of all faces; default ground.")] = None,
+    roughness: Annotated[
+        float | None, typer.Option("--Ra", help="Roughness average Ra of all faces [um]; default 0.8.")
+    ] = None,
+    finish: Annotated[
+        str | None,
+        typer.Option(
+            help="Plastic, casting or paint in place of metal, process and Ra: black_plastic, grey_plastic, "
+            "white_plastic, glossy_black_plastic, iron_casting, aluminium_casting, powder_coat, gloss_paint, "
+            "matt_white."
+        ),
+    ] = None,
+    reflectance: Annotated[
+        float | None, typer.Option(help="Diffuse reflectance of a paint or plastic, 0 to 1.")
+    ] = None,
+    gloss: Annotated[float | None, typer.Option(help="Gloss of a paint or plastic at 60 deg [GU].")] = None,
+    angle: Annotated[
+        float,
+        typer.Option(help="For a mesh: neighbouring triangles that meet at less than this angle form one face [deg]."),
+    ] = 20.0,
+    sensor: Annotated[
+        str | None,
+        typer.Option(help="For a STEP file: mesh it to 1/100 of the noise sigma of this sensor (preset or TOML file)."),
+    ] = None,
+    chord: Annotated[
+        float | None, typer.Option(help="For a STEP file: chord error of the mesh [mm]; default 0.01.")
+    ] = None,
+    edit: Annotated[
+        bool,
+        typer.Option(
+            "--edit",
+            help="Serve a page to edit names, finishes and measurements; it saves to the folder. "
+            "FILE may also be the XML file of a scene.",
+        ),
+    ] = False,
+    port: Annotated[int, typer.Option(help="Port of --edit on 127.0.0.1; 0: any free port.")] = 0,
+) -> None:
+    """Convert a STEP file or a mesh to a scene with one named shape per face, and a task with the drawing's dimensions.
+
+    Any finish is possible. If a sensor's map lacks it, `mitsim run` and `mitsim score` can characterise it.
+
+    Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 1.6 --sensor ensenso-n10 --edit
+    """
+    from characterisation.files.errors import InputError
+    from mitsim.running.progress import say
+    from mitsim.scene.authoring.fineness import chord_for
+    from mitsim.scene.authoring.part_folder import Finishing, described, write_part
+    from mitsim.scene.authoring.read_step import CHORD_MM
+
+    if edit and file.suffix.lower() == ".xml":
+        _edit(file, sensor, port)
+        return
+    if output is None:
+        raise InputError("--output", "", "nothing", "a folder to write: -o scenes/NAME")
+    if sensor is not None and chord is not None:
+        raise InputError("--chord", "", f"{chord:g} together with --sensor", "one of the two")
+    fine = chord if chord is not None else chord_for(sensor) if sensor else CHORD_MM
+    if finish is not None:
+        for option, given in (("--metal", metal), ("--process", process), ("--Ra", roughness)):
+            if given is not None:
+                raise InputError(option, "", f"{given} together with --finish", "one of the two")
+    finishing = Finishing(
+        metal or "aluminium", process or "ground", 0.8 if roughness is None else roughness, finish, reflectance, gloss
+    )
+    made = write_part(file, output, units, finishing, angle, fine)
+    for remark in made.remarks:
+        say(remark)
+    for face in made.faces:
+        print(f"{face.name}\t{described(face)}")
+    if made.drawing is not None:
+        say("\n".join(made.drawing.remarks()))
+    say(f"scene: {output / (output.absolute().name + '.xml')}\ntask: {output / 'task.toml'}")
+    if edit:
+        _edit(output / (output.absolute().name + ".xml"), sensor, port)
+
+
+def _edit(scene: Path, sensor: str | None, port: int) -> None:
+    """Serve the editor page of a scene until the user ends it."""
+    start(None)
+    from characterisation.files.errors import InputError
+    from mitsim.report.author_page import Authored, author_page, findings_data
+    from mitsim.report.author_server import AuthorServer
+    from mitsim.running.progress import say
+    from mitsim.scene.authoring.check import findings, read_features
+    from mitsim.scene.first_hits import visible_surfaces
+    from mitsim.scene.inspect import inspect
+    from mitsim.scene.load import load_scene
+    from mitsim.sensor.preset import load_sensor
+    from mitsim.sensor.working_volume import pose_at, usual_place
+
+    chosen, task = load_sensor(sensor or "ensenso-n10"), scene.parent / "task.toml"
+    if not 0 <= port <= 65535:
+        raise InputError("--port", "", port, "0 to 65535")
+
+    def authored() -> Authored:
+        loaded = load_scene(scene, chosen.wavelength_nm)
+        facts = inspect(loaded)
+        pose = pose_at(chosen, usual_place(chosen, loaded.centre), loaded.centre)
+        known = read_features(task) if task.exists() else None
+        found = findings(facts, chosen, pose, visible_surfaces(loaded, chosen.rig, pose), False, known)
+        return Authored(loaded, facts, chosen, found, task if known else None, known)
+
+    authored()  # report errors in the scene before serving the page
+    names = {"scene": scene.name, "task": task.name, "study": "study.toml"}
+    try:
+        server = AuthorServer(
+            scene.parent,
+            names,
+            lambda token: author_page(authored(), token),
+            lambda: findings_data(authored().found),
+            port,
+        )
+    except OSError as error:
+        raise InputError("--port", "", f"{port} ({error})", "a free port, or 0") from None
+    print(server.address, flush=True)
+    say("open this address in a browser on this machine; end with 'Save and finish' there, or Ctrl-C here")
+    try:
+        server.serve()
+    except KeyboardInterrupt:
+        say("ended")
+    say(f"saved {server.saved} times to {scene.parent}")

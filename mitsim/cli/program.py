@@ -1,0 +1,218 @@
+"""The command line: every stage of the pipeline as a command, in the order in which ``--help`` lists them.
+
+Data goes to files or stdout; messages and progress go to stderr. Exit codes: 0 success, 1 a check failed, 2 wrong usage
+or input, 3 the machine lacks something, 130 interrupted. Commands import heavy packages only when they run, so that
+``--help`` is fast.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import signal
+import sys
+import threading
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from characterisation.files.atomic_io import FULL
+from characterisation.files.errors import InputError, MissingEnvironmentError
+from mitsim.cli import (
+    acceptance,
+    calibrations,
+    decode,
+    devices,
+    export,
+    fit,
+    import_recording,
+    machine,
+    maps,
+    measure,
+    parts,
+    render,
+    sheets,
+    studies,
+    validations,
+)
+from mitsim.cli.options import Group, release_folders
+from mitsim.running.progress import be_quiet
+from mitsim.running.version import __version__
+
+
+class Commands(Group):
+    """The commands; each releases its folders when it ends."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the requested command."""
+        try:
+            return super().invoke(ctx)
+        finally:
+            release_folders()
+
+
+app = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="Simulate 3D cameras, characterise them, and find where to place them to measure a part.",
+)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"mitsim {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Do not print progress.")] = False,
+) -> None:
+    be_quiet(quiet)
+
+
+for command in (
+    machine.doctor,
+    studies.run,
+    studies.choose,
+    render.render,
+    parts.check,
+    parts.part,
+    devices.capture,
+    import_recording.import_,
+    decode.decode,
+    measure.measure,
+    acceptance.acceptance,
+    maps.characterise,
+    maps.compare,
+    maps.predict,
+    studies.score,
+    studies.budget,
+    studies.exposures,
+    sheets.datasheet,
+    calibrations.calibrate,
+    studies.report,
+):
+    app.command(name=command.__name__.rstrip("_"))(command)
+app.add_typer(export.app, name="export")
+app.add_typer(fit.app, name="fit")
+app.add_typer(validations.app, name="validate")
+
+
+#: errors of the system for a path that does not exist or may not be read or written
+_OF_THE_USER = frozenset(
+    {
+        errno.ENAMETOOLONG,
+        errno.EACCES,
+        errno.EPERM,
+        errno.EROFS,
+        errno.EISDIR,
+        errno.ENOTDIR,
+        errno.ELOOP,
+        errno.ENOENT,
+        errno.EEXIST,
+        errno.ENOTEMPTY,
+        errno.ENXIO,
+        errno.ETXTBSY,
+        errno.EMFILE,
+    }
+)
+
+
+#: exit code of an interrupted command
+_STOPPED = 130
+
+
+def main() -> None:
+    """Run the command line; errors that users can correct end with a message and an exit code, not a traceback."""
+    _prepare_streams()
+    _stop_as_by_hand()
+    code = 0
+    try:
+        app()
+    except SystemExit as done:
+        code = done.code if isinstance(done.code, int) else 0 if done.code is None else 1
+        if code == _STOPPED:  # typer turns a KeyboardInterrupt into this code
+            _end(_STOPPED, "interrupted; finished work is kept")
+    except InputError as error:
+        code = _end(2, str(error))
+    except MissingEnvironmentError as error:
+        code = _end(3, str(error))
+    except KeyboardInterrupt:
+        code = _end(_STOPPED, "interrupted; finished work is kept")
+    except MemoryError:
+        code = _end(3, "out of memory; finished work is kept")
+    except BrokenPipeError:
+        code = _end(3, "the reader of the output has closed it; finished work is kept")
+    except OSError as error:
+        if error.errno in FULL:
+            code = _end(
+                3,
+                f"{error.filename or 'output'}: cannot be written ({error.strerror}); "
+                "finished work is kept: free some space and run the same command again",
+            )
+        elif error.errno in _OF_THE_USER and error.filename is not None:
+            code = _end(2, f"{error.filename}: found {error.strerror}; allowed: a path that can be read and written")
+        else:
+            raise
+    sys.exit(_flushed(code))
+
+
+def _end(code: int, text: str) -> int:
+    """Print the last message without control characters, and return the exit code."""
+    with suppress(OSError, ValueError):
+        print(f"mitsim: {printable(text)}", file=sys.stderr, flush=True)
+    return code
+
+
+def printable(text: str) -> str:
+    """Return a text with control characters and characters that have no encoding as escapes."""
+    return "".join(
+        one if one == "\n" or (one.isprintable() and not 0xD800 <= ord(one) < 0xE000) else ascii(one)[1:-1]
+        for one in text
+    )
+
+
+def _prepare_streams() -> None:
+    """Make output work in any encoding, for any file name, and with closed streams."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # closed before the start
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - for the whole process
+        elif isinstance(stream, io.TextIOWrapper):
+            with suppress(OSError, ValueError):
+                stream.reconfigure(errors="backslashreplace")
+
+
+def _stop_as_by_hand() -> None:
+    """Handle SIGTERM and SIGHUP as Ctrl-C, which stops devices, unless they have another handler."""
+    if threading.current_thread() is not threading.main_thread():
+        return
+
+    def stop(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, stop)
+
+
+def _flushed(code: int) -> int:
+    """Flush stdout, and report a full disk or a closed pipe here rather than in the interpreter."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError) as error:
+        with suppress(OSError, ValueError):
+            sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - for the rest
+        cause = getattr(error, "strerror", None) or error
+        return code or _end(3, f"standard output: cannot be written ({cause})")
+    return code

@@ -1,0 +1,184 @@
+"""Simulate one capture of a scene, or all captures of a plan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from characterisation.files.errors import InputError
+from mitsim.cli.folder_lock import remove_partial_beside
+from mitsim.cli.options import (
+    Defines,
+    Out,
+    Processes,
+    Roll,
+    Scene,
+    Seed,
+    SensorOption,
+    Target,
+    Variant,
+    check_folder,
+    definitions,
+    pose_of,
+    start,
+)
+
+if TYPE_CHECKING:
+    from mitsim.running.executor import Executor
+    from mitsim.study.many_captures import CommonSettings
+
+
+def render(
+    scene: Scene,
+    output: Out,
+    position: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Position of the sensor in the frame of the scene [mm]; or use --many."),
+    ] = None,
+    target: Target = (0.0, 0.0, 0.0),
+    roll: Roll = 0.0,
+    sensor: SensorOption = "ensenso-n10",
+    seed: Seed = 1,
+    samples: Annotated[int, typer.Option(min=1, max=65536, help="Light paths per pixel.")] = 16,
+    depth: Annotated[
+        int, typer.Option(min=1, max=16, help="Largest number of surfaces on a light path; 1: direct light only.")
+    ] = 3,
+    noise: Annotated[
+        str, typer.Option(help="Noise sources: all, none, a list (shot,read), or all but some (no-speckle).")
+    ] = "all",
+    deviation: Annotated[
+        str,
+        typer.Option(
+            help="Shift the uncertain parameters of the finishes by standard deviations: alpha=1,wide_angle=-1."
+        ),
+    ] = "",
+    truth: Annotated[
+        bool, typer.Option("--truth", help="Also write the true geometry at each pixel, as OpenEXR.")
+    ] = False,
+    many: Annotated[
+        Path | None,
+        typer.Option(
+            help="TOML plan of views and finishes: simulate each one into a folder in OUTPUT; continues an "
+            "interrupted plan."
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="With --many: address of a Dask scheduler whose workers simulate the captures, tcp://HOST:8786."
+        ),
+    ] = None,
+    processes: Processes = 1,
+    define: Defines = None,
+    variant: Variant = None,
+) -> None:
+    """Simulate one capture of a scene, or many of them.
+
+    Example: mitsim render scenes/two_pillars/two_pillars.xml --position 0 -400 300 -o captures/first
+    """
+    if (position is None) == (many is None):
+        raise InputError(
+            "--position",
+            "",
+            "both --position and --many" if many else "neither --position nor --many",
+            "one of them: a position, or a plan",
+        )
+    if (scheduler is not None or processes != 1) and many is None:
+        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
+        raise InputError(option, "", given, "only with --many", "a single capture runs in this process")
+    start(variant)
+    if many is not None:
+        from mitsim.running.executor import executor_of
+        from mitsim.sensor.noise_sources import Noise
+        from mitsim.study.many_captures import CommonSettings
+
+        common = CommonSettings(definitions(define), deviation, seed, samples, depth, Noise.parse(noise), truth)
+        _render_many(many, scene, sensor, common, output, executor_of(scheduler, processes))
+        return
+    assert position is not None
+    from dataclasses import asdict
+    from math import isfinite
+
+    from mitsim.capture.folder import check_free, read_capture, write_capture
+    from mitsim.capture.simulated.render_residual import LIMIT, render_residual
+    from mitsim.capture.simulated.rendering import Rendering
+    from mitsim.capture.simulated.truth import encode_exr, true_image
+    from mitsim.decode import captures as interface
+    from mitsim.running.progress import say
+    from mitsim.scene.surface.scatter import Deviation
+    from mitsim.sensor.noise_sources import Noise
+    from mitsim.study.many_captures import Job, digest_of, origin_of
+
+    chosen, moved = interface.load_sensor(sensor), Deviation.parse(deviation)
+    loaded = interface.load_scene(scene, chosen, definitions(define), deviation=moved)
+    pose = pose_of(position, target, roll, chosen)
+    defined = tuple(sorted(definitions(define).items()))
+    digest = Job(
+        chosen,
+        str(scene),
+        defined,
+        moved,
+        "",
+        0,
+        pose,
+        seed,
+        samples,
+        depth,
+        Noise.parse(noise),
+        truth,
+        origin_of(scene, chosen),
+    ).digest()
+    remove_partial_beside(output)
+    if digest_of(output, "render") == digest:
+        read_capture(output)
+        say(f"capture: {output}, finished before")
+        return
+    check_free(output)
+    capture = interface.render(loaded, chosen, pose, seed=seed, samples=samples, depth=depth, noise=noise)
+    simulated = interface.prepared_sensor(chosen)
+    first = next(iter(chosen.rig.cameras))
+    residual = render_residual(simulated, loaded, pose, first, Rendering(samples, depth), seed=seed)
+    capture.settings["render_residual"] = asdict(residual) if isfinite(residual.noise) else None
+    capture.settings["deviation"] = asdict(moved)
+    capture.settings["render"] = {"digest": digest}
+    known = {}
+    if truth:
+        known = {
+            name: encode_exr(true_image(simulated, loaded, pose, name, samples=samples, depth=max(depth, 3), seed=seed))
+            for name in chosen.rig.cameras
+        }
+    write_capture(capture, output, truth=known)
+    if deviation:
+        finishes = [one for one in loaded.finishes if one and one.scatter]
+        for source in dict.fromkeys(f"{one}: {one.scatter.provenance}" for one in finishes if one.scatter):
+            say(source)
+    say(f"{residual}" + (f"; over {LIMIT}: increase --samples" if residual.worst > LIMIT else ""))
+    say(f"capture: {output}")
+
+
+def _render_many(
+    plan: Path, scene: Path, sensor: str, common: CommonSettings, output: Path, workers: Executor | None
+) -> None:
+    """Simulate the missing captures of a plan, and report their number."""
+    from mitsim.capture.simulated.simulate import SimulatedSensor
+    from mitsim.running.progress import say
+    from mitsim.sensor.preset import load_sensor
+    from mitsim.study.many_captures import in_turn, missing_jobs, read_jobs, render_many, take_job
+
+    chosen = load_sensor(sensor)
+    jobs = read_jobs(plan, scene, chosen, common)
+    check_folder(output)
+    missing = missing_jobs(jobs, output)
+    if len(missing) < len(jobs):
+        say(f"{len(jobs) - len(missing)} of {len(jobs)} captures exist already")
+    if not missing:
+        say(f"captures: {output}: {len(jobs)}, all of them finished before")
+        return
+    if workers is None:
+        taken = in_turn(missing, SimulatedSensor(chosen))
+    else:
+        taken = workers.distribute(missing, lambda job: job, take_job)
+    render_many(taken, output, len(missing))
+    say(f"captures: {output}: {len(jobs)}, {len(missing)} of them new")

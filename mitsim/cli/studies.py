@@ -1,0 +1,334 @@
+"""Commands on a study: run, choose, score, budget, exposures, report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from characterisation.files.errors import InputError
+from mitsim.cli.options import (
+    Out,
+    Overwrite,
+    Processes,
+    Scheduler,
+    Variant,
+    Yes,
+    asking,
+    check_folder,
+    keep_finished,
+    start,
+)
+
+if TYPE_CHECKING:
+    from characterisation.statements.statement import Statement
+    from mitsim.study.run_folder import ViewSetEntry
+
+
+StudyFile = Annotated[Path, typer.Argument(help="Study TOML file: part, task, sensor and views.")]
+PlanExposures = Annotated[
+    bool,
+    typer.Option(
+        "--plan-exposures",
+        help="Plan the exposures of the stated view (see `mitsim exposures`), with the limits in [exposure] of the "
+        "study. Views are screened and compared with the sensor's own exposure.",
+    ),
+]
+ViewNumber = Annotated[int, typer.Option(min=0, help="Number of the view in scores.csv and poses/.")]
+
+
+def run(
+    study: StudyFile,
+    output: Out,
+    minutes: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1,
+            help="Time limit for comparing views by virtual measurements [min]; default: that of the study's [race], "
+            "otherwise none.",
+        ),
+    ] = None,
+    plan: PlanExposures = False,
+    scheduler: Scheduler = None,
+    processes: Processes = 1,
+    overwrite: Overwrite = False,
+    yes: Yes = False,
+    variant: Variant = None,
+) -> None:
+    """Run a study: screen all views, compare the best by virtual measurements, state the uncertainty, write a report.
+
+    Screening predicts uncertainties from the performance map of the sensor. A virtual measurement renders, decodes and
+    measures the part once, with random values of all unknown effects. Exit code 1 if a measurement with a
+    tolerance does not fit it, or the set of views that the study asks for exceeds an uncertainty limit.
+
+    Example: mitsim run scenes/two_pillars/study.toml -o runs/two_pillars
+    """
+    start(variant)
+    from mitsim.report.page import write_report
+    from mitsim.running.executor import executor_of
+    from mitsim.running.progress import say
+    from mitsim.study import read_study, report_lays, with_plan
+    from mitsim.study.run import run_study
+    from mitsim.study.run_folder import read_run
+
+    check_folder(output)
+    chosen = with_plan(read_study(study, ask=asking(yes)), plan)
+    keep_finished(output, overwrite, "run.json")
+    report_lays(chosen)
+    stated = run_study(chosen, output, minutes, executor_of(scheduler, processes))
+    write_report(output)
+    say(f"scores: {output / 'scores.csv'}\nreport: {output / 'report.html'}")
+    _tell_statement(stated, output, read_run(output).about.view_sets)
+
+
+def choose(
+    study: StudyFile,
+    output: Out,
+    sensors: Annotated[
+        str,
+        typer.Option(
+            help="all (presets), or presets and sensor files separated by commas; SENSOR=MAP uses a map of your own."
+        ),
+    ] = "all",
+    minutes: Annotated[float, typer.Option(min=0.1, help="Total time, shared among the sensors [min].")] = 10.0,
+    plan: PlanExposures = False,
+    scheduler: Scheduler = None,
+    processes: Processes = 1,
+    as_json: Annotated[bool, typer.Option("--json", help="Print choice.json in place of the table.")] = False,
+    overwrite: Overwrite = False,
+    yes: Yes = False,
+    variant: Variant = None,
+) -> None:
+    """Choose a sensor for a study: screen all sensors, and compare the promising ones by virtual measurements.
+
+    Finished work is kept: run the same command again to continue. Exit code 1 if no sensor fits every tolerance.
+
+    Example: mitsim choose scenes/two_pillars/tolerances.toml --sensors all -o runs/choice
+    """
+    start(variant)
+    import json
+    import time
+    from dataclasses import replace
+
+    from characterisation.files.atomic_io import write_json
+    from characterisation.statements.verdict_words import fits_all
+    from mitsim.report.choice_page import write_choice_page
+    from mitsim.running.executor import executor_of
+    from mitsim.running.progress import say
+    from mitsim.study import report_lays, with_plan
+    from mitsim.study.choice_document import CHOICE, judged, read_choice
+    from mitsim.study.choose import choose_sensor, read_candidates
+    from mitsim.study.choose.selection import SensorResult
+    from mitsim.study.choose.table import as_text, document
+    from mitsim.study.scene_geometry import write_scene_geometry
+
+    check_folder(output)
+    candidates, excluded = read_candidates(study, [sensors], asking(yes, " (and likewise for every other sensor)"))
+    candidates = [replace(one, study=with_plan(one.study, plan)) for one in candidates]
+    done = read_choice(output)
+    if done is not None and done.finished:
+        keep_finished(output, overwrite, CHOICE)
+    report_lays(candidates[0].study)
+    for one in excluded:
+        say(f"{one.name} is excluded: {one.reason}")
+    if candidates[0].study.file.set is not None:
+        say("[set] of the study is not used: sensors are compared by single views; `mitsim run` chooses the set")
+    began = time.monotonic()
+
+    def report_results(found: list[SensorResult], finished: bool) -> None:
+        known = document(candidates[0].study, found, excluded, time.monotonic() - began, finished)
+        write_json(output / CHOICE, known.model_dump(mode="json"))
+
+    found = choose_sensor(candidates, output, minutes, report_results, executor_of(scheduler, processes))
+    best = found[0].candidate.study
+    write_scene_geometry(output, best.scene, best.sensor)
+    write_choice_page(output)
+    known = read_choice(output)
+    assert known is not None
+    print(json.dumps(known.model_dump(mode="json"), indent=2) if as_json else as_text(known))
+    say(f"page: {output / 'choice.html'}\n{known.words}")
+    if not any(one.status == "stated" and fits_all(judged(one)) for one in known.sensors):
+        raise typer.Exit(1)
+
+
+def budget(
+    study: StudyFile,
+    output: Out,
+    view: ViewNumber,
+    plan: PlanExposures = False,
+    scheduler: Scheduler = None,
+    processes: Processes = 1,
+    yes: Yes = False,
+    variant: Variant = None,
+) -> None:
+    """State the uncertainty of every measurement from one view of a study, with a budget of its sources.
+
+    Exit code 1 if a measurement with a tolerance does not fit it.
+
+    Example: mitsim budget scenes/two_pillars/study.toml --view 12 -o runs/view_12
+    """
+    start(variant)
+    from mitsim.running.executor import executor_of
+    from mitsim.study import with_plan
+    from mitsim.study.programs import open_study, stated_view, study_view
+    from mitsim.study.virtual.stated import write_statement
+
+    check_folder(output)
+    chosen = with_plan(open_study(study, ask=asking(yes)), plan)
+    stated = stated_view(chosen, study_view(chosen, view, "--view"), output, executor_of(scheduler, processes))
+    write_statement(output / "statement.json", stated.document)
+    _tell_statement(stated.statements, output)
+
+
+def exposures(
+    study: StudyFile,
+    output: Out,
+    view: ViewNumber,
+    most: Annotated[
+        int | None, typer.Option(min=1, max=7, help="Largest number of exposures to merge; default: from the study.")
+    ] = None,
+    within: Annotated[
+        float | None,
+        typer.Option(
+            min=0.01,
+            max=1,
+            help="Fraction by which points and uncertainty may miss their limit; default: from the study.",
+        ),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print exposures.json in place of the table.")] = False,
+    variant: Variant = None,
+) -> None:
+    """Find the fewest exposures of one view with which every feature nearly reaches its least possible uncertainty.
+
+    The limits of a feature are the most points and the smallest uncertainty that any exposures reach; --within says how
+    near is enough. The command
+    simulates the light once and decodes sets of exposures. Exit code 1 if a feature that the task needs has too few
+    points at every exposure, or if a limit is not met.
+
+    Example: mitsim exposures scenes/two_pillars/study.toml --view 40 -o runs/exposures
+    """
+    start(variant)
+    import json
+
+    from characterisation.files.atomic_io import write_json
+    from mitsim.running.progress import say
+    from mitsim.study import ExposureTable, read_study
+    from mitsim.study.exposures.exposure_plan import PlanRules
+    from mitsim.study.exposures.planned import (
+        plan_document,
+        plan_in_words,
+        plan_table,
+        plan_view,
+        rendered,
+        write_plan_csv,
+    )
+    from mitsim.study.programs import study_view
+    from mitsim.study.virtual.plan import measurements_of
+    from mitsim.study.virtual.study_unknowns import study_unknowns
+
+    check_folder(output)
+    chosen = read_study(study, mapped=False)  # the view is rendered
+    shown = study_view(chosen, view, "--view")
+    table = chosen.file.exposure or ExposureTable()
+    rules = PlanRules(most or table.most, within or table.within)
+    renderer = rendered(chosen, measurements_of(chosen, study_unknowns(chosen)))
+    plan = plan_view(chosen, renderer, shown, rules)
+    document = plan_document(chosen, plan)
+    write_json(output / "exposures.json", document)
+    write_plan_csv(output / "exposures.csv", plan)
+    print(json.dumps(document, indent=2) if as_json else plan_table(plan))
+    say(f"plan: {output / 'exposures.json'}\n{plan_in_words(plan)}")
+    if plan.unseen or not plan.reached:
+        raise typer.Exit(1)
+
+
+def _tell_statement(stated: Sequence[Statement], output: Path, sets: Sequence[ViewSetEntry] = ()) -> None:
+    """Print the statements, and the result of the sets; exit with code 1 if a tolerance does not fit or a set exceeds
+    a limit.
+    """
+    from characterisation.statements.verdict_words import fits_all, result_in_words
+    from mitsim.report.set_words import with_sets
+    from mitsim.running.progress import say
+    from mitsim.study.virtual.stated import judged, statement_table
+
+    if not stated:
+        say(with_sets("no view can make every measurement: there is no statement", False, sets).words)
+        raise typer.Exit(1)
+    print(statement_table(stated))
+    result = with_sets(result_in_words(judged(stated)), fits_all(judged(stated)), sets)
+    say(f"statement: {output / 'statement.json'}\n{result.words}")
+    if not result.good:
+        raise typer.Exit(1)
+
+
+def score(
+    study: StudyFile,
+    output: Out,
+    top: Annotated[int, typer.Option(min=1, max=10000, help="Number of views to print for each measurement.")] = 10,
+    measurement: Annotated[list[str] | None, typer.Option(help="Print only this measurement. Repeatable.")] = None,
+    map_file: Annotated[
+        str,
+        typer.Option(
+            "--map",
+            metavar="MAP",
+            help="A map.nc file, or the name of a sensor whose map comes with mitsim; default: the map of the study.",
+        ),
+    ] = "",
+    yes: Yes = False,
+    variant: Variant = None,
+) -> None:
+    """Predict the uncertainty of every measurement from each candidate view, without rendering; print the best.
+
+    Example: mitsim score scenes/two_pillars/study.toml -o runs/scores
+    """
+    start(variant)
+    from mitsim.decode.cloud import sensor_geometry
+    from mitsim.maps.campaign.plan import sensor_checksum
+    from mitsim.maps.prediction import Predictor
+    from mitsim.report.best_views import best_views
+    from mitsim.running.progress import say
+    from mitsim.study import read_study, report_lays
+    from mitsim.study.run import claim
+    from mitsim.study.scoring import score_study
+    from mitsim.study.virtual.study_digest import study_digest, with_scene_files
+
+    check_folder(output)
+    chosen = read_study(study, map_file, asking(yes))
+    report_lays(chosen)
+    for name in measurement or ():
+        if name not in chosen.task.measurements:
+            raise InputError("--measurement", "", name, ", ".join(chosen.task.measurements))
+    assert chosen.performance_map is not None
+    claim(output, "score", study_digest(chosen, with_scene_files(sensor_checksum(chosen.sensor), chosen)))
+    geometry = sensor_geometry(chosen.sensor)
+    predictor = Predictor.of_sensor(chosen.sensor, geometry)
+    scores, *_ = score_study(chosen, predictor, chosen.performance_map, output)
+    for name in measurement or chosen.task.measurements:
+        print(best_views(scores, name, top))
+    say(f"scores: {output / 'scores.csv'}\nposes: {output / 'poses'}")
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim choose.")],
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Write one A4 sheet for a quotation or an inspection plan.")
+    ] = False,
+) -> None:
+    """Rewrite the HTML page of a finished run or of a comparison of sensors.
+
+    Example: mitsim report runs/two_pillars --pdf
+    """
+    from mitsim.report.choice_page import write_choice_page
+    from mitsim.report.page import write_report
+    from mitsim.report.sheet import write_sheet
+    from mitsim.running.progress import say
+    from mitsim.study.choice_document import CHOICE
+
+    if pdf:
+        say(f"sheet: {write_sheet(folder)}")
+    elif (folder / CHOICE).exists():
+        say(f"page: {write_choice_page(folder)}")
+    else:
+        say(f"report: {write_report(folder)}")

@@ -1,0 +1,99 @@
+"""Read the clouds to measure, from cloud files, capture folders and recordings.
+
+Signal chain: path -> cloud file of ``mitsim decode``; or capture folder, decoded; or recording that ``mitsim import``
+reads without options, decoded -> cloud, and its capture if there is one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from characterisation.cloud_files import read_ply
+from characterisation.files.errors import InputError
+from characterisation.point_cloud import PointCloud
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import read_capture
+from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+from mitsim.decode.cloud import Settings, capture_cloud, decoder_settings
+from mitsim.decode.noise import known_noise
+from mitsim.sensor.matcher import MatcherSettings
+
+#: suffixes of cloud files that are found in a folder
+_SUFFIXES = (".ply", ".pcd")
+
+#: text that identifies a cloud file of ``mitsim decode``, and the length of the header in which it stands [bytes]
+_MARK, _HEAD = b"\ncomment mitsim ", 4096
+
+
+@dataclass(frozen=True)
+class InputCloud:
+    """A cloud to measure.
+
+    - ``path`` of its file or capture folder.
+    - ``cloud`` in the sensor frame [mm].
+    - ``capture`` that it was decoded from, None for a cloud file of ``mitsim decode``.
+    - ``margin_px``: pixels beside an edge whose points may mix both sides (:func:`margin_of`).
+    """
+
+    path: Path
+    cloud: PointCloud
+    capture: Capture | None
+    margin_px: int = 0
+
+
+def cloud_paths(paths: Iterable[Path]) -> list[Path]:
+    """Return paths of clouds; a folder is replaced by the clouds and captures in it, sorted by name.
+
+    A folder that contains neither is kept.
+    """
+    out: list[Path] = []
+    for path in paths:
+        if not path.is_dir() or (path / "capture.json").exists():
+            out.append(path)
+            continue
+        contained = [
+            one
+            for one in sorted(path.iterdir())
+            if (one / "capture.json").exists() or (one.is_file() and one.suffix.lower() in _SUFFIXES)
+        ]
+        # a folder without them may be a recording as its device saved it
+        out += contained or [path]
+    return out
+
+
+def read_cloud(path: Path, sensor: str | None = None) -> InputCloud:
+    """Read a cloud file, or decode a capture folder or recording.
+
+    ``sensor`` is the preset or sensor file whose settings decode it; by default, those of the capture.
+
+    Raises
+    ------
+    InputError
+        If the path does not exist, or its content cannot be read or decoded.
+    """
+    if path.is_file() and _is_mitsim_ply(path):
+        return InputCloud(path, read_ply(path), None)
+    if (path / "capture.json").exists():
+        capture = read_capture(path)
+    elif path.exists():
+        capture = read_recording(path, ReadOptions()).capture
+    else:
+        raise InputError(
+            path, "", "no such file or folder", "a cloud (.ply, .pcd), a capture folder, or folders of these"
+        )
+    settings, imager = decoder_settings(capture, sensor)
+    cloud = capture_cloud(capture, settings, imager=known_noise(capture, imager))
+    return InputCloud(path, cloud, capture, margin_of(settings))
+
+
+def margin_of(settings: Settings) -> int:
+    """Return the margin beside an edge [px] where points may mix both sides: half a matching block plus 1."""
+    return settings.block_size // 2 + 1 if isinstance(settings, MatcherSettings) else 0
+
+
+def _is_mitsim_ply(path: Path) -> bool:
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    return head.startswith(b"ply\n") and _MARK in head

@@ -1,0 +1,61 @@
+"""Determine the noise of a capture's grey levels, and describe where the sigma of its points comes from.
+
+With a complete ``[imager]``, sigma follows from its gain and read noise. Without one, fringes show their noise
+themselves (:mod:`mitsim.decode.structured_light.measured_noise`). A Gray code has the error of a stripe's width.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from characterisation.point_cloud import PointCloud
+from mitsim.capture.capture import Capture
+from mitsim.decode.cloud import bracket_exposures, capture_pattern
+from mitsim.decode.decoder_registry import projector_size
+from mitsim.decode.grey_levels import MeasuredNoise
+from mitsim.decode.structured_light.measured_noise import measured_noise
+from mitsim.sensor.image_sequence import ImageSequence
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.light_code import GrayCodePhaseShift, LightCode, PhaseShift, axes, has_fringes, roles
+
+
+def known_noise(capture: Capture, imager: Imager | None) -> Imager | MeasuredNoise | None:
+    """Return the imager or, if there is none, the noise that a structured-light capture's fringes show.
+
+    The result is None if neither is available: for a Gray code alone, three steps of one period, or a bracket of
+    exposures.
+    """
+    if imager is not None or capture.technology != "structured_light" or bracket_exposures(capture) is not None:
+        return imager
+    code, size = capture_pattern(capture), projector_size(capture)
+    if not isinstance(code, PhaseShift | GrayCodePhaseShift | ImageSequence):
+        return None
+    image_roles = roles(code, *size)
+    stacks = [stack[: len(image_roles)] for stack in capture.images.values() if len(stack) >= len(image_roles)]
+    return measured_noise(stacks, image_roles, 2.0**capture.bits - 1) if stacks else None
+
+
+def sigma_source(capture: Capture, cloud: PointCloud, noise: Imager | MeasuredNoise | None) -> str:
+    """Return a sentence on the source of a structured-light cloud's sigma, or why it has none; "" for others."""
+    if capture.technology != "structured_light" or not cloud.valid.any():
+        return ""
+    code = capture_pattern(capture)
+    fringes = isinstance(code, LightCode) and any(has_fringes(code, axis) for axis in axes(code))
+    if cloud.sigma is None or not np.isfinite(cloud.sigma[cloud.valid]).any():
+        if not fringes:
+            reason = "the errors of a Gray code between two cameras are not independent between pixels"
+        elif bracket_exposures(capture) is not None:
+            reason = "it is not propagated through merged exposures"
+        else:
+            reason = (
+                "the imager is not described, and the fringes have too few images to measure its noise: decode with "
+                "--sensor and a file with a complete [imager]"
+            )
+        return f"sigma of the points: not known, {reason}"
+    if isinstance(noise, MeasuredNoise) and fringes:
+        level, deviation = noise.at_median_level
+        return (
+            f"sigma of the points: from the contrast of the fringes and the residuals of their fit, "
+            f"{deviation:.2g} DN at a level of {level:.0f}, since the imager is not described"
+        )
+    return "" if noise is not None else "sigma of the points: that of a uniform error over the width of a stripe"

@@ -1,0 +1,1 @@
+"""Performance maps: made from captures of coupons, and used to predict clouds."""

@@ -1,0 +1,259 @@
+"""Take the shots of a campaign and measure them.
+
+Signal chain: shot -> capture, rendered or found in a folder -> cloud of the coupon's part of the image -> metrics of
+its patches -> :class:`~mitsim.maps.campaign.store.Finished`.
+
+A *source* returns the results of a list of shots in any order; the campaign does not depend on the kind of source.
+While one shot is decoded and measured, the next is rendered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from characterisation.coupon.patches import Coupon, measure_patches
+from characterisation.files.errors import InputError
+from characterisation.point_cloud import PointCloud
+from characterisation.region_of_interest import Roi
+from mitsim.capture.calibration import calibration_table
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import read_capture, read_settings_and_pose
+from mitsim.capture.simulated.render_residual import RenderResidual, render_residual, warn_above_limit
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
+from mitsim.decode.depth_range import depths_of, range_warning
+from mitsim.maps.campaign.plan import Campaign, Shot, view_axes
+from mitsim.maps.campaign.store import Finished
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
+
+Item = TypeVar("Item")
+Taken = TypeVar("Taken")
+Made = TypeVar("Made")
+CaptureSource = Callable[[Shot], Capture]
+Source = Callable[[Sequence[Shot]], Iterator[tuple[Shot, Finished]]]
+
+#: number of captures out of range that are named one by one
+NAMED = 5
+
+#: largest relative difference between the distance of a found capture and its planned distance
+DISTANCE_SLACK = 0.05
+
+
+def simulated_source(sensor: SimulatedSensor, samples_per_pixel: int) -> CaptureSource:
+    """Return a source of rendered captures, limited to the coupon's part of the images."""
+    rendering = Rendering(samples_per_pixel)
+
+    def take(shot: Shot) -> Capture:
+        sample, pose = shot.series.sample, shot.sensor_from_coupon
+        around = sample.at(pose).corners()
+        return sensor.capture(sample.scene, pose.inverse(), seed=shot.seed, rendering=rendering, around=around)
+
+    return take
+
+
+def in_turn(take: CaptureSource, campaign: Campaign) -> Source:
+    """Return a source that takes one shot after the other, and measures each while the next is taken."""
+    geometry = sensor_geometry(campaign.sensor)
+
+    def measure(capture: Capture, shot: Shot) -> Finished:
+        return measured(capture, shot, geometry, campaign.sensor, campaign.file.keep_images)
+
+    return lambda shots: one_ahead(shots, take, measure)
+
+
+def one_ahead(
+    items: Iterable[Item], take: Callable[[Item], Taken], finish: Callable[[Taken, Item], Made]
+) -> Iterator[tuple[Item, Made]]:
+    """Yield each item with ``finish(take(item), item)``, in order; one item is finished while the next is taken.
+
+    All items are taken in the caller's thread, as Dr.Jit and devices require. A thread finishes one item and ends. If
+    the caller is stopped or asks for no more items, no further thread starts. If taking an item fails, the item before
+    it is still yielded.
+
+    Meanwhile BLAS uses one thread. Its products are long and narrow here, its threads would wait actively for one
+    another, and the cores are needed for taking.
+    """
+    with threadpool_limits(1, user_api="blas"):
+        before: tuple[Item, Future[Made]] | None = None
+        for item in items:
+            try:
+                taken = take(item)
+            except Exception:
+                if before is not None:
+                    yield before[0], before[1].result()
+                raise
+            ready, before = before, (item, _finish_in_thread(finish, taken, item))
+            del taken
+            if ready is not None:
+                yield ready[0], ready[1].result()
+        if before is not None:
+            yield before[0], before[1].result()
+
+
+def _finish_in_thread(finish: Callable[[Taken, Item], Made], taken: Taken, item: Item) -> Future[Made]:
+    thread = ThreadPoolExecutor(1)
+    try:
+        return thread.submit(finish, taken, item)
+    finally:
+        thread.shutdown(wait=False)
+
+
+def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, keep_images: bool) -> Finished:
+    """Decode a capture of a coupon and measure its patches.
+
+    Pose and calibration are those of the capture, if it has them: a stage stops near its requested position and is read
+    back, and a device has its own calibration. ``geometry`` is that of the sensor's rig.
+    """
+    coupon = shot.series.sample.at(coupon_place(capture, shot))
+    if own_sensor(capture, sensor) is not sensor:
+        geometry = capture_geometry(capture, sensor.settings)
+    patches = measure_patches(coupon_cloud(capture, coupon, geometry, sensor), coupon)
+    if not keep_images:
+        return Finished(patches, capture.source)
+    shown = {
+        "sample": shot.series.sample.label(),
+        "distance_mm": float(shot.series.distance),
+        "normal": [float(component) for component in shot.normal],
+    }
+    return Finished(patches, capture.source, replace(capture, settings={**capture.settings, "coupon": shown}))
+
+
+def coupon_place(capture: Capture, shot: Shot) -> Transform:
+    """Return ``sensor_from_coupon`` of a capture, or that of the plan if the capture has no pose."""
+    world = capture.world_from_sensor
+    return shot.sensor_from_coupon if world is None else world.inverse()
+
+
+def own_sensor(capture: Capture, sensor: Sensor) -> Sensor:
+    """Return the sensor with the calibration of a capture, or the sensor itself if both are the same."""
+    rig = capture.rig
+    if rig is sensor.rig or calibration_table(rig) == calibration_table(sensor.rig):
+        return sensor
+    return replace(sensor, rig=replace(rig, projector=rig.projector or sensor.rig.projector))
+
+
+def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: Sensor) -> PointCloud:
+    """Decode the part of a capture that shows the coupon."""
+    grid = geometry.grid
+    corners = grid.project(coupon.corners())
+    low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])
+    high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, low + 1, [grid.width, grid.height])
+    return capture_cloud(capture, sensor.settings, geometry, Roi.between(*low, *high), sensor.imager)
+
+
+def coupon_residuals(sensor: SimulatedSensor, campaign: Campaign) -> list[RenderResidual]:
+    """Return the render residual of each sample in the reference camera, and warn if it is too large.
+
+    The coupon is rendered at the middle normal of the plan. The first one is often the mirror direction, in which a
+    metal saturates the camera.
+    """
+    camera = next(iter(sensor.sensor.rig.cameras))
+    normals = campaign.file.normals()
+    samples, seed = campaign.file.samples_per_pixel, campaign.file.seed
+    out = []
+    for series in campaign.series:
+        if series.variant is None and series.distance == campaign.distances[0]:
+            pose = campaign.shot(series, normals[len(normals) // 2]).sensor_from_coupon
+            sample, corners = series.sample, series.sample.at(pose).corners()
+            residual = render_residual(
+                sensor, sample.scene, pose.inverse(), camera, Rendering(samples), seed=seed, around=corners
+            )
+            out.append(warn_above_limit(sample.label(), residual))
+    return out
+
+
+def found_shots(folder: str | Path, campaign: Campaign) -> dict[Path, Shot]:
+    """Return the captures of coupons in a folder and its subfolders as shots of a campaign.
+
+    Each capture must name its sample (``settings.coupon.sample``) and have a pose, with the coupon's frame as the
+    world. It belongs to the nearest planned distance.
+
+    Raises
+    ------
+    InputError
+        If there is no capture, or one whose sample or distance is not in the campaign.
+    """
+    folder = Path(folder)
+    places = sorted(path.parent for path in folder.rglob("capture.json"))
+    if not places:
+        raise InputError(folder, "", "no captures", "a folder with captures of coupons")
+    return {place: _found_shot(place, campaign) for place in places}
+
+
+def out_of_range(campaign: Campaign, found: dict[Path, Shot] | None = None) -> list[str]:
+    """Return a warning for each capture whose coupon centre is outside the depth range of the decoder.
+
+    Captures in ``found`` count by their own poses, else planned ones count once for each sample and distance. At most
+    :data:`NAMED` captures have a line each; one more line has the number of the others.
+    """
+    sensor = campaign.sensor
+    facing = np.array([0.0, 0.0, 1.0])
+    planned = {
+        f"{one.sample.label()} at {one.distance:g} mm": campaign.shot(one, facing)
+        for one in campaign.series
+        if one.variant is None
+    }
+    shown = planned if found is None else {str(place): shot for place, shot in found.items()}
+    known = "by the plan" if found is None else "by its pose"
+    lines = []
+    for name, shot in shown.items():
+        coupon = shot.series.sample.at(shot.sensor_from_coupon)
+        places = np.concatenate([coupon.centre[None], coupon.corners()])
+        middle, *depths = depths_of(places, sensor.rig, sensor.settings)
+        if not sensor.settings.near_mm <= middle <= sensor.settings.far_mm:
+            reach = (float(min(depths)), float(max(depths)))
+            lines.append(range_warning(f"{name}: the coupon", reach, sensor.settings, sensor.name, known))
+    if len(lines) > NAMED:
+        lines[NAMED:] = [f"warning: and {len(lines) - NAMED} of {len(shown)} more are outside the range"]
+    return lines
+
+
+def found_source(shots: dict[Path, Shot]) -> CaptureSource:
+    """Return a source of the captures from :func:`found_shots`, which are read when needed."""
+    places = {(shot.series.name, shot.name): place for place, shot in shots.items()}
+    return lambda shot: read_capture(places[shot.series.name, shot.name])
+
+
+def _found_shot(place: Path, campaign: Campaign) -> Shot:
+    sensor, settings, world_from_sensor = read_settings_and_pose(place)
+    if sensor != campaign.sensor.name:
+        raise InputError(place / "capture.json", "sensor", sensor, campaign.sensor.name, "or choose another --sensor")
+    shown = settings.get("coupon")
+    label = shown.get("sample") if isinstance(shown, dict) else None
+    labels = [sample.label() for sample in campaign.samples]
+    if label not in labels:
+        raise InputError(
+            place / "settings.json",
+            "coupon.sample",
+            repr(label),
+            ", ".join(labels),
+            "the label of a sample of the campaign",
+        )
+    if world_from_sensor is None:
+        raise InputError(place / "pose.json", "world_from_sensor", "null", "the pose, in the coupon's frame")
+    pose = world_from_sensor.inverse()
+    distance = float(np.linalg.norm(pose.translation - campaign.sensor.rig.reference.sensor_from_camera.translation))
+    nominal = min(campaign.distances, key=lambda planned: abs(np.log(distance / planned)))
+    if abs(distance / nominal - 1) > DISTANCE_SLACK:
+        known = ", ".join(f"{planned:g}" for planned in campaign.distances)
+        raise InputError(
+            place / "pose.json",
+            "distance",
+            f"{distance:.1f} mm",
+            f"within 5 % of {known} mm",
+            "add this distance to distances_mm",
+        )
+    series = next(
+        s for s in campaign.series if s.variant is None and s.distance == nominal and s.sample.label() == label
+    )
+    axis = campaign.sensor.rig.reference.sensor_from_camera.rotation[:, 2]
+    return Shot(series, view_axes(axis).T @ pose.rotation[:, 2], pose)

@@ -1,0 +1,139 @@
+"""Cache of maps of single finishes that were characterised on request, for this user.
+
+::
+
+    $XDG_CACHE_HOME/mitsim/finishes/     or ~/.cache/mitsim/finishes/
+      0f3a9c1b2d4e5f60.nc    a map of one sample at one distance, named by the digest of all its inputs
+      rates.json             time of a characterisation on this machine [s], by sensor
+
+A file that is damaged, or whose content belongs to another finish, is made again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+from characterisation.files.atomic_io import write_json
+from characterisation.files.checked_files import is_file
+from characterisation.files.errors import InputError
+from characterisation.maps.performance_map import PerformanceMap
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.maps.campaign.one_finish import OneFinish, characterise_finish
+from mitsim.running.progress import say
+
+#: number of captures of a campaign at one distance: mean of twelve, ``python tests/benchmarks/any_finish.py``
+USUAL_CAPTURES = 250
+
+#: captures per second of a campaign on two idle cores, ``python tests/benchmarks/coupon_captures.py --poses 16``; for
+#: any other sensor a low rate is assumed
+RATES = {
+    "david-sls-3": 1.37,
+    "ensenso-n10": 6.18,
+    "ensenso-n35": 0.94,
+    "kinect-v2": 26.6,
+    "oak-d-pro": 18.2,
+    "photoneo-phoxi-s": 0.89,
+    "primesense-carmine-1.09": 8.13,
+    "realsense-d435": 11.9,
+    "zivid-2-m70": 5.44,
+}
+OTHER_RATE = 1.0
+
+#: age [s] after which the folder of a killed process is removed
+_ABANDONED_S = 86400.0
+
+#: attribute of a kept map
+_DIGEST = "finish_digest"
+
+
+def cache_folder() -> Path:
+    """Return the cache folder, according to the XDG base directory specification."""
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    root = Path(given) if given and Path(given).is_absolute() else Path.home() / ".cache"
+    return root / "mitsim" / "finishes"
+
+
+def kept_finish(one: OneFinish, distance: float) -> PerformanceMap | None:
+    """Return the map of a finish at a distance [mm] from the cache, if it is valid; report a damaged file."""
+    digest = one.digest(distance)
+    path = cache_folder() / f"{digest}.nc"
+    if not is_file(path):
+        return None
+    try:
+        found = PerformanceMap.load(path)
+    except InputError as error:
+        say(f"{path} is not valid and is made again: {error.found}")
+        return None
+    if found.data.attrs.get(_DIGEST) != digest or len(found.samples) != 1:
+        say(f"{path} is not valid and is made again: it belongs to another finish")
+        return None
+    return found
+
+
+def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> PerformanceMap:
+    """Characterise a finish at a distance [mm] and keep the map.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be created.
+    MissingEnvironmentError
+        If the disk is full.
+    """
+    folder, digest = cache_folder(), one.digest(distance)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _remove_partial(folder)
+        work = Path(tempfile.mkdtemp(prefix="work-", dir=folder))
+    except OSError as error:
+        raise InputError(
+            folder, "", f"a folder that cannot be created ({error.strerror})", "a writable folder", "set XDG_CACHE_HOME"
+        ) from None
+    began = time.monotonic()
+    try:
+        made = characterise_finish(one, simulated, distance, work)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    made.data.attrs |= {_DIGEST: digest, "seconds": round(time.monotonic() - began, 1)}
+    made.save(folder / f"{digest}.nc", compact=True)
+    return PerformanceMap.load(folder / f"{digest}.nc")  # read back, so that new and cached maps are equal
+
+
+def _remove_partial(folder: Path) -> None:
+    """Remove folders that killed processes left at least a day ago."""
+    for left in folder.glob("work-*"):
+        if time.time() - left.stat().st_mtime > _ABANDONED_S:
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def expected_seconds(one: OneFinish) -> float:
+    """Return the expected time of :func:`made_finish` [s], from earlier runs on this machine."""
+    usual = USUAL_CAPTURES / RATES.get(one.sensor.name, OTHER_RATE)
+    return _rates().get(one.sensor.name, usual) * len(one.turns)
+
+
+def keep_rate(sensor: str, seconds: float) -> None:
+    """Keep the time that a finish took at one distance and one rotation of its coupon [s]."""
+    before = _rates()
+    mean = seconds if sensor not in before else (before[sensor] + seconds) / 2
+    write_json(cache_folder() / "rates.json", {**before, sensor: round(mean, 1)})
+
+
+def _rates() -> dict[str, float]:
+    path = cache_folder() / "rates.json"
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8")) if is_file(path) else {}
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(stored, dict):
+        return {}
+    return {
+        str(name): float(one)
+        for name, one in stored.items()
+        if isinstance(one, int | float) and not isinstance(one, bool) and 0 < one < 1e5
+    }

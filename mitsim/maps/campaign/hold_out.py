@@ -1,0 +1,322 @@
+"""Compare a map with captures at poses that were not used to make it.
+
+Signal chain: random normals and distances in the map's range -> captures of the coupons, as in a campaign -> patches;
+the same coupon predicted from the map -> a cloud -> the same patches ->
+:func:`characterisation.maps.validation.residual_table`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from characterisation.coupon.patch_table import Overall, overall
+from characterisation.coupon.patches import Coupon, measure_patches, patch_residuals
+from characterisation.files.checked_files import read_bounded
+from characterisation.files.documents import read_toml
+from characterisation.files.errors import InputError
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.validation import Pair
+from characterisation.point_cloud import PointCloud
+from mitsim.decode.cloud import Geometry, sensor_geometry
+from mitsim.maps.campaign.acquire import CaptureSource, coupon_cloud, coupon_place, own_sensor, simulated_source
+from mitsim.maps.campaign.coupons import Sample
+from mitsim.maps.campaign.live import LiveCampaign, plan_live
+from mitsim.maps.campaign.orders import Order, order_of, prepared_sensor
+from mitsim.maps.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
+from mitsim.maps.prediction import Predictor, performance
+from mitsim.sensor.preset import Sensor
+
+#: relative extent in |V| of a patch on either side of its middle
+PATCH_REACH = 0.015
+
+#: relative margin of a live stage from the ends of a map's distances, for the extent of a tilted coupon
+LIVE_MARGIN = 0.03
+
+#: relative standard error of sigma above which a pose is repeated, and the largest factor on the repeats
+LARGEST_SIGMA_ERROR, MOST_REPEATS = 0.03, 4
+
+#: [rad]
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+
+#: number of draws, each of all wanted normals, in which the stage must reach enough of them
+DRAWS = 100
+
+
+def random_normals(count: int, largest_deg: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return unit normals (count, 3) in the view frame, each uniform on the cap up to an incidence, in random order.
+
+    The sample is stratified: each ring with a ``count``-th of the cap's area has one normal, and azimuths are about a
+    golden angle apart. Independent normals could all miss the lobe of a polished coupon, a tenth of the cap.
+    """
+    ring = (np.arange(count) + rng.random(count)) / count
+    z = 1.0 - (1.0 - math.cos(math.radians(largest_deg))) * ring
+    turn = (np.arange(count) + rng.random(count) / 2) * GOLDEN_ANGLE + rng.uniform(0.0, 2 * math.pi)
+    across = np.sqrt(1 - z**2)
+    return rng.permutation(np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1))
+
+
+def distances_between(performance_map: PerformanceMap) -> list[float]:
+    """Return the map's distances [mm] and the geometric means between them.
+
+    The distances at both ends are moved slightly inward.
+    """
+    known = performance_map.data["distance"].values.astype(float)
+    if len(known) == 1:
+        return [float(known[0])]
+    # a tilted coupon extends nearer and farther than its middle, and the map ends at the middles of its coupons
+    ends = np.exp(
+        [0.85 * math.log(known[0]) + 0.15 * math.log(known[1]), 0.15 * math.log(known[-2]) + 0.85 * math.log(known[-1])]
+    )
+    middles = np.sqrt(known[1:] * known[:-1])
+    return [float(f"{distance:.4g}") for distance in (ends[0], *sorted([*known[1:-1], *middles]), ends[1])]
+
+
+def held_out_campaign(path: str | Path, sensor: Sensor, performance_map: PerformanceMap) -> Campaign:
+    """Return the coupons of a campaign file at the distances of :func:`distances_between`.
+
+    These replace the distances of the file.
+
+    Raises
+    ------
+    InputError
+        If the map belongs to another sensor, or lacks a sample.
+    """
+    file = read_toml(path, CampaignFile).model_copy(update={"distances_mm": distances_between(performance_map)})
+    campaign = plan_campaign(path, file, sensor)
+    _check_map(campaign, performance_map)
+    return campaign
+
+
+def held_out_live(
+    path: str | Path, file: CampaignFile, sensor: Sensor, performance_map: PerformanceMap
+) -> LiveCampaign:
+    """Return a campaign with a device for comparison with a map, at the stage positions within the map's distances.
+
+    The map may be that of a simulated sensor, which compares the simulation with the device.
+
+    Raises
+    ------
+    InputError
+        If the campaign is not possible, the map belongs to another sensor or lacks a sample, or no position is within
+        its distances.
+    """
+    known = performance_map.data["distance"].values.astype(float)
+    live = plan_live(path, file, sensor, (known.min() * (1 + LIVE_MARGIN), known.max() * (1 - LIVE_MARGIN)))
+    _check_map(live.campaign, performance_map)
+    return live
+
+
+def _check_map(campaign: Campaign, performance_map: PerformanceMap) -> None:
+    """Check that a map belongs to a campaign's sensor, and contains its samples."""
+    map_sensor = str(performance_map.data.attrs.get("sensor"))
+    if map_sensor != campaign.sensor.name:
+        raise InputError("map", "sensor", repr(map_sensor), repr(campaign.sensor.name))
+    for sample in campaign.samples:
+        performance_map.require(sample.finish, sample.roughness, sample.light)
+
+
+def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
+    """Return ``count`` shots of each series of a campaign at random normals that its stage can show.
+
+    Raises
+    ------
+    InputError
+        If the stage shows hardly any of them.
+    """
+    shots = []
+    for number, series in enumerate(campaign.series):
+        if series.variant is not None:
+            continue
+        rng = np.random.default_rng([seed, number])
+        fresh = replace(series, seed=series.seed ^ (seed + 1))
+        normals = np.empty((0, 3))
+        for _ in range(DRAWS):
+            drawn = random_normals(count, campaign.file.largest_deg, rng)
+            normals = np.concatenate([normals, drawn[campaign.reachable(drawn)]])[:count]
+            if len(normals) == count:
+                break
+        else:
+            allowed = f"limits that reach more of the normals up to {campaign.file.largest_deg:g} deg"
+            raise InputError("campaign", "stage.axes", f"{len(normals)} normals in {DRAWS * count} draws", allowed)
+        shots += [campaign.shot(fresh, normal) for normal in normals]
+    return shots
+
+
+def compare(
+    campaign: Campaign, performance_map: PerformanceMap, shots: list[Shot], take: CaptureSource, repeats: int = 1
+) -> Iterator[Pair]:
+    """Take and predict each shot in this process; see :func:`compared`."""
+    prepared = PreparedSensor.of(campaign.sensor)
+    for shot in shots:
+        yield compared(shot, prepared, performance_map, take, repeats)
+
+
+@dataclass(frozen=True)
+class PreparedSensor:
+    """A sensor with its geometry and predictor, for any number of shots."""
+
+    sensor: Sensor
+    geometry: Geometry
+    predictor: Predictor
+
+    @classmethod
+    def of(cls, sensor: Sensor, geometry: Geometry | None = None) -> PreparedSensor:
+        """Prepare a sensor; its geometry may be known already."""
+        geometry = geometry or sensor_geometry(sensor)
+        return cls(sensor, geometry, Predictor.of_sensor(sensor, geometry))
+
+
+def compared(
+    shot: Shot, prepared: PreparedSensor, performance_map: PerformanceMap, take: CaptureSource, repeats: int
+) -> Pair:
+    """Take a shot ``repeats`` times with fresh noise, pool the patches, and predict it as many times.
+
+    With few points sigma is uncertain in both. The shot is then repeated up to :data:`MOST_REPEATS` times as often,
+    until the standard error of sigma is :data:`LARGEST_SIGMA_ERROR` of it. Pose and calibration are those of the first
+    capture, since a stage is read back and a device has its own calibration.
+    """
+    sensor = prepared.sensor
+    repeated = _repeated(shot, MOST_REPEATS * repeats)
+    first = take(repeated[0])
+    sample, pose = shot.series.sample, coupon_place(first, shot)
+    own = own_sensor(first, sensor)
+    if own is not sensor:
+        prepared = PreparedSensor.of(own)
+    coupon = sample.at(pose)
+    predictor = prepared.predictor
+    surfaces = predictor.surfaces(sample.scene, pose.inverse())
+    ideal, labels = predictor.ideal(surfaces), predictor.labels(sample.scene, pose.inverse(), surfaces)
+    fraction, sigma = performance(ideal, sample.scene, performance_map)
+    rng = np.random.default_rng([shot.seed, 1])
+    measured, predicted = list[_Measured](), list[_Measured]()
+    known = np.empty(0, np.int64)  # patches for which the map has a value; all captures have this pose
+    taken = [first]
+    del first
+    for number, one in enumerate(repeated):
+        if number >= repeats and _sigma_is_known(_pooled(measured, known)):
+            break
+        # keep only one capture and cloud at a time; with many pixels they have 100 MB each
+        measured.append(
+            _measure(coupon_cloud(taken.pop() if taken else take(one), coupon, prepared.geometry, sensor), coupon)
+        )
+        predicted.append(_measure(predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng), coupon))
+        if number == 0:
+            known = np.flatnonzero(_known(measured[0].patches, sample, performance_map))
+    return Pair(
+        sample.finish,
+        sample.roughness,
+        shot.series.distance,
+        math.acos(min(1.0, float(shot.normal[2]))),
+        _pooled(measured, known),
+        _pooled(predicted, known),
+        _residuals(measured),
+        _residuals(predicted),
+    )
+
+
+@dataclass(frozen=True)
+class HeldOutOrder:
+    """A held-out shot as plain values. The worker reads the map, which must have this ``digest``."""
+
+    order: Order
+    map_path: str
+    digest: str
+    repeats: int
+
+
+def held_out_orders(campaign: Campaign, shots: list[Shot], map_path: Path, repeats: int) -> list[HeldOutOrder]:
+    """Return an order for each shot."""
+    path = str(map_path.absolute())
+    return [HeldOutOrder(order_of(shot, campaign), path, _digest(path), repeats) for shot in shots]
+
+
+def hold_out_order(held_out: HeldOutOrder) -> Pair:
+    """Take, predict and compare one shot; workers call this function.
+
+    Raises
+    ------
+    InputError
+        If the map is missing, or has another content.
+    """
+    if _digest(held_out.map_path) != held_out.digest:
+        raise InputError(
+            held_out.map_path, "", "another map than on the machine of the command", "the same file on every machine"
+        )
+    sensor = held_out.order.sensor
+    simulated, geometry = prepared_sensor(repr(sensor), sensor)
+    take = simulated_source(simulated, held_out.order.samples_per_pixel)
+    return compared(
+        held_out.order.shot(), _prepared_here(sensor, geometry), _map(held_out.map_path), take, held_out.repeats
+    )
+
+
+@lru_cache(maxsize=8)
+def _digest(path: str) -> str:
+    return hashlib.sha256(read_bounded(Path(path), "a map")).hexdigest()
+
+
+_map = lru_cache(maxsize=2)(PerformanceMap.load)
+
+_prepared: list[PreparedSensor] = []
+
+
+def _prepared_here(sensor: Sensor, geometry: Geometry) -> PreparedSensor:
+    """Return the sensor of this worker with its predictor, made once for a geometry."""
+    if not _prepared or _prepared[0].geometry is not geometry:
+        _prepared[:] = [PreparedSensor.of(sensor, geometry)]
+    return _prepared[0]
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """The patches of a cloud, and the residuals of its points [mm]."""
+
+    patches: xr.Dataset
+    residuals: NDArray[np.float64]
+
+
+def _measure(cloud: PointCloud, coupon: Coupon) -> _Measured:
+    return _Measured(measure_patches(cloud, coupon), patch_residuals(cloud, coupon))
+
+
+def _pooled(measurements: list[_Measured], known: NDArray[np.int64]) -> Overall:
+    return overall(xr.concat([one.patches.isel(patch=known) for one in measurements], "patch"))
+
+
+def _residuals(measurements: list[_Measured]) -> NDArray[np.float64]:
+    return np.concatenate([one.residuals for one in measurements])
+
+
+def _sigma_is_known(found: Overall) -> bool:
+    """Return whether sigma is known well enough, or cannot be estimated at all."""
+    return not found.sigma_error > LARGEST_SIGMA_ERROR * found.sigma
+
+
+def _repeated(shot: Shot, count: int) -> list[Shot]:
+    """Return shots of the same coupon at the same pose, each with its own seed."""
+    seeds = [shot.series.seed + 2**32 * number for number in range(count)]
+    return [replace(shot, series=replace(shot.series, seed=seed)) for seed in seeds]
+
+
+def _known(patches: xr.Dataset, sample: Sample, performance_map: PerformanceMap) -> NDArray[np.bool_]:
+    """Return the patches for which the map has a value over their whole extent.
+
+    A tilted coupon may extend beyond the distances of the map.
+    """
+    across = np.stack([patches["normal_x"].values, patches["normal_y"].values], axis=-1)
+    normals = np.column_stack([across, np.sqrt(np.maximum(1 - (across**2).sum(axis=1), 0))])
+    known = np.ones(len(normals), bool)
+    for reach in (1 - PATCH_REACH, 1 + PATCH_REACH):
+        distance = reach * patches["distance"].values
+        answer = performance_map.query(sample.finish, sample.roughness, distance, normals, sample.light)
+        known &= np.isfinite(answer.fraction)
+    return known

@@ -1,0 +1,94 @@
+"""Shots as orders of plain values, for worker processes on this machine or on a cluster.
+
+Signal chain: shot of a campaign -> order: the sensor, the recipe of the coupon, its pose and seed -> the same shot in
+the worker, whose sensor is prepared once -> capture, measured -> the process that writes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import Geometry, sensor_geometry
+from mitsim.maps.campaign.acquire import Source, measured, simulated_source
+from mitsim.maps.campaign.coupons import CouponRecipe, load_sample
+from mitsim.maps.campaign.plan import Campaign, Series, Shot
+from mitsim.maps.campaign.store import Finished
+from mitsim.running.executor import Executor
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
+
+_sample = lru_cache(maxsize=32)(load_sample)
+
+
+@dataclass(frozen=True)
+class Order:
+    """A shot as plain values."""
+
+    sensor: Sensor
+    recipe: CouponRecipe
+    distance: float
+    normal: tuple[float, float, float]
+    sensor_from_coupon: Transform
+    series_name: str
+    series_seed: int
+    samples_per_pixel: int
+    keep_images: bool
+
+    def shot(self) -> Shot:
+        """Return the ordered shot; its coupon is loaded once in a process."""
+        series = Series(_sample(self.recipe), self.distance, None, self.series_name, self.series_seed)
+        return Shot(series, np.array(self.normal), self.sensor_from_coupon)
+
+
+def worker_source(workers: Executor, campaign: Campaign) -> Source:
+    """Return a source whose shots are taken by workers."""
+
+    def finish(shots: Sequence[Shot]) -> Iterator[tuple[Shot, Finished]]:
+        return workers.distribute(shots, lambda shot: order_of(shot, campaign), take_order)
+
+    return finish
+
+
+def take_order(order: Order) -> Finished:
+    """Take one shot; workers call this function."""
+    simulated, geometry = prepared_sensor(repr(order.sensor), order.sensor)
+    shot = order.shot()
+    capture = simulated_source(simulated, order.samples_per_pixel)(shot)
+    return measured(capture, shot, geometry, order.sensor, order.keep_images)
+
+
+def order_of(shot: Shot, campaign: Campaign) -> Order:
+    """Return a shot of a campaign as an order, with the absolute path of its scene."""
+    recipe, series = shot.series.sample.recipe, shot.series
+    x, y, z = (float(component) for component in shot.normal)
+    return Order(
+        campaign.sensor,
+        replace(recipe, scene=str(Path(recipe.scene).absolute())),
+        series.distance,
+        (x, y, z),
+        shot.sensor_from_coupon,
+        series.name,
+        series.seed,
+        campaign.file.samples_per_pixel,
+        campaign.file.keep_images,
+    )
+
+
+_prepared: dict[str, tuple[SimulatedSensor, Geometry]] = {}
+
+
+def prepared_sensor(key: str, sensor: Sensor) -> tuple[SimulatedSensor, Geometry]:
+    """Return the sensor on this worker's device, prepared once."""
+    if key not in _prepared:
+        from mitsim.scene import backend
+
+        backend.activate(None)
+        _prepared.clear()
+        _prepared[key] = SimulatedSensor(sensor), sensor_geometry(sensor)
+    return _prepared[key]

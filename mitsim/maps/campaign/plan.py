@@ -1,0 +1,375 @@
+"""Plan of a campaign: coupons, distances, orientations and stage.
+
+Signal chain: campaign TOML + sensor -> distances, coupons of each distance, normals in the view frame -> the
+:class:`Series` of each coupon and distance -> :class:`Shot`, each with its own seed and folder.
+
+A shot is identified by its coupon, sensor, distance and normal, not by its number in a plan. A plan that is refined or
+reordered therefore keeps the captures.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from characterisation.coupon.orientations import Refinement, cap_directions
+from characterisation.coupon.view_frame import view_frame
+from characterisation.files.documents import Document, read_toml
+from characterisation.files.errors import InputError
+from characterisation.maps.building import Variant
+from characterisation.stage.angles import Stage
+from mitsim.capture.devices.maker_captures import DeviceTable
+from mitsim.maps.campaign.coupons import VARIANTS, CouponRecipe, Sample, load_sample
+from mitsim.maps.campaign.stage_pose import StageTable
+from mitsim.running.version import __version__
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor_file import MisalignmentTable
+from mitsim.sensor.transforms import Transform
+from mitsim.sensor.working_volume import field_of_view
+
+#: default ratio of neighbouring distances
+DISTANCE_RATIO = 1.6
+
+#: largest size of a coupon as a fraction of the narrower side of the common field of view
+WIDEST_SHARE = 0.9
+
+#: settings of a device without influence on a capture
+_PATIENCE = {"capture_timeout_s", "timeout_s"}
+
+#: increased if the metrics of a capture change, so that kept captures are measured again
+MEASUREMENT_VERSION = 2
+
+
+class SampleEntry(Document):
+    """One coupon: a scene with one flat shape in the plane z = 0, and values for the scene's parameters.
+
+    ``spread``: whether the map includes the uncertainty of its finish.
+    """
+
+    scene: str
+    parameters: dict[str, str | float] = Field(default_factory=dict)
+    spread: bool = False
+
+
+class Band(Document):
+    """Normals up to an incidence, with the density of an icosahedron that is subdivided ``subdivisions`` times."""
+
+    up_to_deg: Annotated[float, Field(gt=0, le=80)]
+    subdivisions: int = Field(ge=0, le=6)
+
+
+class CampaignFile(Document):
+    """A campaign TOML file.
+
+    The default of ``distances_mm`` covers the sensor's range in equal ratios of at most ``distance_ratio``.
+    ``coupon_px`` is the side of a coupon seen face on, in pixels of the reference camera; its scene then needs a
+    parameter ``half_size`` [mm]. ``orientations`` are bands of ascending incidence; ``refine`` makes them denser where
+    F or sigma changes fast. ``stage`` excludes orientations that it cannot reach. ``keep_images`` keeps the images of
+    every capture, not only the metrics. With ``device``, captures are taken with a live camera, of coupons on a live
+    ``stage`` (:mod:`mitsim.maps.campaign.live`).
+    """
+
+    distances_mm: Annotated[list[Annotated[float, Field(ge=100, le=20000)]], Field(min_length=1)] | None = None
+    distance_ratio: float = Field(default=DISTANCE_RATIO, gt=1, le=10)
+    coupon_px: Annotated[float, Field(ge=30, le=5000)] | None = None
+    orientations: Annotated[list[Band], Field(min_length=1)]
+    refine: Refinement | None = None
+    stage: StageTable | None = None
+    device: DeviceTable | None = None
+    samples: Annotated[list[SampleEntry], Field(min_length=1)]
+    samples_per_pixel: int = Field(default=16, ge=1, le=4096)
+    keep_images: bool = False
+    seed: int = Field(default=1, ge=0)
+
+    @field_validator("orientations")
+    @classmethod
+    def _growing(cls, bands: list[Band]) -> list[Band]:
+        edges = [band.up_to_deg for band in bands]
+        if any(b <= a for a, b in itertools.pairwise(edges)):
+            raise ValueError("bands in ascending order of up_to_deg")
+        return bands
+
+    @property
+    def largest_deg(self) -> float:
+        """Return the largest incidence of the map [deg]."""
+        return self.orientations[-1].up_to_deg
+
+    def normals(self) -> NDArray[np.float64]:
+        """Return unit normals (n, 3) in the view frame (z toward the sensor), band by band from the axis outward."""
+        parts, inner = [], -1.0
+        for band in self.orientations:
+            directions = cap_directions(band.subdivisions, math.radians(band.up_to_deg))
+            incidence = np.degrees(np.arccos(np.clip(directions[:, 2], -1, 1)))
+            parts.append(directions[incidence > inner])
+            inner = band.up_to_deg
+        return np.concatenate(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """One sample, or a variant of it, at one nominal distance |V| [mm]; ``name`` is that of its folder."""
+
+    sample: Sample
+    distance: float
+    variant: Variant | None
+    name: str
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One capture of a campaign: the coupon of a series with its ``normal`` (3,) in the view frame."""
+
+    series: Series
+    normal: NDArray[np.float64]
+    sensor_from_coupon: Transform
+
+    @property
+    def name(self) -> str:
+        """Return text such as ``+0.1234-0.0567``: the normal along and across the baseline."""
+        across, along = (round(float(component), 4) + 0.0 for component in self.normal[:2])  # never -0.0
+        return f"{across:+.4f}{along:+.4f}"
+
+    @property
+    def seed(self) -> int:
+        """Return the seed of all random values; the same for a sample and its variants."""
+        place = [round(1e6 * (1.0 + float(component))) for component in self.normal]
+        return int(np.random.SeedSequence([self.series.seed, *place]).generate_state(1)[0])
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A campaign ready to run with one sensor; all ``stages`` must be able to show each of its normals."""
+
+    file: CampaignFile
+    sensor: Sensor
+    distances: tuple[float, ...]
+    series: tuple[Series, ...]
+    stages: tuple[Stage, ...] = ()
+
+    def reachable(self, normals: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which of the normals (n, 3) the stages can show; all of them without a stage."""
+        reached = np.ones(len(normals), bool)
+        for stage in self.stages:
+            reached &= np.isfinite(stage.angles(normals)).all(axis=1)
+        return reached
+
+    @property
+    def exposure_rule(self) -> str:
+        """Return the exposure of its captures in words."""
+        if self.file.device is None:
+            return self.sensor.exposure.rule
+        return f"fixed at {self.file.device.settings.exposure_s:g} s on the {self.file.device.kind} camera"
+
+    @property
+    def samples(self) -> list[Sample]:
+        """Return the samples at the nearest distance, without their variants."""
+        return [one.sample for one in self.series if one.variant is None and one.distance == self.distances[0]]
+
+    def shot(self, series: Series, normal: NDArray[np.float64]) -> Shot:
+        """Return a shot of the coupon of a series with a given normal."""
+        axis = self.sensor.rig.reference.sensor_from_camera
+        pose = coupon_pose(normal, series.distance, axis.rotation[:, 2], axis.translation)
+        return Shot(series, normal, pose)
+
+
+def read_campaign(path: str | Path, sensor: Sensor, distances_mm: list[float] | None = None) -> Campaign:
+    """Read a campaign file, and the coupons that it names (paths relative to it), for one sensor.
+
+    ``distances_mm`` apply if the file has none; without both, the distances cover the sensor's working range.
+
+    Raises
+    ------
+    InputError
+        For anything that would stop the campaign later, including an exposure that follows the scene.
+    """
+    return plan_campaign(path, read_toml(path, CampaignFile), sensor, distances_mm)
+
+
+def plan_campaign(
+    path: str | Path,
+    file: CampaignFile,
+    sensor: Sensor,
+    distances_mm: list[float] | None = None,
+    *,
+    places: Mapping[float, StageTable] | None = None,
+) -> Campaign:
+    """Plan a campaign file that has been read from ``path``.
+
+    ``places`` is for captures with the file's ``device``: its live stage, as calibrated at each distance.
+    """
+    if file.device is not None and places is None:
+        raise InputError(
+            path,
+            "device",
+            f"a live {file.device.kind}",
+            "no device: these captures are simulated",
+            "only campaigns and validations of maps take captures with a device",
+        )
+    stages: tuple[Stage, ...] = () if file.stage is None else (file.stage,)
+    if places is None:
+        check_exposure(sensor)
+        distances = tuple(sorted(set(file.distances_mm or distances_mm or covering(sensor, file.distance_ratio))))
+    else:
+        distances, stages = tuple(sorted(places)), tuple(places.values())
+    calibrations = {distance: str(stage.calibration) for distance, stage in (places or {}).items()}
+    series = [
+        one
+        for index in range(len(file.samples))
+        for distance in distances
+        for one in _series_of(Path(path), file, index, distance, sensor, calibrations.get(distance, ""))
+    ]
+    campaign = Campaign(file, sensor, distances, tuple(series), stages)
+    labels = [sample.label() for sample in campaign.samples]
+    if twice := next((label for label in labels if labels.count(label) > 1), None):
+        raise InputError(
+            path,
+            "samples",
+            f"{twice}, more than once",
+            "one coupon of each finish and Ra",
+            "a map identifies a sample by its finish and Ra",
+        )
+    return campaign
+
+
+def covering(sensor: Sensor, ratio: float = DISTANCE_RATIO) -> list[float]:
+    """Return distances [mm] over a sensor's working range, in equal ratios of at most ``ratio``."""
+    near, far = sensor.working_range_mm
+    steps = math.ceil(math.log(far / near) / math.log(ratio) - 1e-9)
+    return [float(f"{distance:.4g}") for distance in np.geomspace(near, far, steps + 1)]
+
+
+def half_size(sensor: Sensor, distance: float, side_px: float) -> float:
+    """Return half the side [mm] of a coupon that covers ``side_px`` at a distance, within the common field of view."""
+    camera = sensor.rig.reference
+    focal_px = math.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
+    return min(side_px * distance / focal_px, WIDEST_SHARE * min(field_of_view(sensor, distance))) / 2
+
+
+def check_exposure(sensor: Sensor) -> None:
+    """Reject a sensor whose exposure follows the scene.
+
+    Raises
+    ------
+    InputError
+        With the sensor and its rule.
+    """
+    if sensor.exposure.base_s is None:
+        raise InputError(
+            f"sensor {sensor.name}",
+            "exposure.rule",
+            sensor.exposure.rule,
+            "fixed, matt_white",
+            "a map holds for one exposure: with an automatic one, F depends on the rest of the view, "
+            "not only on distance, normal and finish",
+        )
+
+
+def coupon_pose(
+    normal: NDArray[np.float64],
+    distance: float,
+    axis: NDArray[np.float64],
+    eye: NDArray[np.float64] | None = None,
+) -> Transform:
+    """Return ``sensor_from_coupon`` with the coupon's centre on the view axis.
+
+    ``normal`` (3,) is in the view frame (z toward the sensor, x toward the second eye). ``distance`` is |V| [mm].
+    ``axis`` (3,) is the unit view direction in the sensor frame. ``eye`` (3,) is the position of the camera; default
+    the origin.
+    """
+    z = view_axes(axis) @ normal
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    place = axis * distance + (0.0 if eye is None else eye)
+    return Transform(np.stack([x, np.cross(z, x), z], axis=1), place)
+
+
+def view_axes(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the axes of the view frame along a view direction (3,), as columns (3, 3) in the sensor frame."""
+    return view_frame(axis, np.array([1.0, 0.0, 0.0])).T
+
+
+def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sensor: Sensor, place: str) -> list[Series]:
+    entry = file.samples[index]
+    parameters = {name: str(value) for name, value in entry.parameters.items()}
+    if file.coupon_px is not None:
+        parameters["half_size"] = f"{half_size(sensor, distance, file.coupon_px):.4g}"
+    recipe = CouponRecipe(str(path.parent / entry.scene), tuple(sorted(parameters.items())), sensor.wavelength_nm)
+    where = (path, f"samples.{index}.scene")
+    try:
+        sample = load_sample(recipe, where)
+    except InputError as error:
+        if error.field != "half_size":
+            raise
+        raise InputError(
+            *where,
+            entry.scene,
+            "a scene with a parameter half_size [mm], as coupon_px needs",
+            "give the scene <default name='half_size' value='60'/>, or leave out coupon_px",
+        ) from None
+    shown: list[tuple[Variant | None, Sample]] = [(None, sample)]
+    if entry.spread:
+        shown += [(name, load_sample(recipe.moved(deviation), where)) for name, deviation in VARIANTS.items()]
+    made = []
+    for variant, one in shown:
+        name = f"{one.label()} {distance:g}mm".replace("/", "-").replace(" ", "_")
+        if variant is not None and one.origin != sample.origin:
+            name += "_" + "_".join(variant)
+        digest = _digest(file, sensor, one, distance, place)
+        seed = int(_digest(file, sensor, sample, distance, place), 16) % 2**32
+        made.append(Series(one, distance, variant, f"{name}_{digest}", seed))
+    return made
+
+
+def sensor_checksum(sensor: Sensor) -> str:
+    """Return twelve hexadecimal digits of all values of a sensor file, which identify the sensor of a map."""
+    return hashlib.sha256(_written(sensor).encode()).hexdigest()[:12]
+
+
+#: print options of numpy: its defaults with every digit of every value, whatever those of the caller are
+_NUMPY_PRINTS: dict[str, Any] = {
+    "precision": 17,
+    "threshold": sys.maxsize,
+    "linewidth": 75,
+    "edgeitems": 3,
+    "suppress": False,
+    "sign": "-",
+    "floatmode": "maxprec",
+    "formatter": None,
+    "nanstr": "nan",
+    "infstr": "inf",
+    "legacy": False,
+}
+
+
+def _written(sensor: Sensor) -> str:
+    # values of a single unit; a file without them keeps its former checksum, which existing maps have
+    own = [sensor.room, sensor.misalignment, sensor.imager.smoothing_px]
+    lens = sensor.imager.corner_blur_px
+    with np.printoptions(**_NUMPY_PRINTS):
+        said = repr(sensor) + (repr(own) if own != [None, MisalignmentTable(), 0.0] else "")
+        return said + ("" if lens is None else f"corner_blur_px={lens!r}")
+
+
+def _digest(file: CampaignFile, sensor: Sensor, sample: Sample, distance: float, place: str) -> str:
+    """Return twelve hexadecimal digits of everything that determines the captures of a series, except their normals.
+
+    ``place`` is the checksum of a live stage's calibration; connection and limits of the stage are not included.
+    """
+    common = [__version__, MEASUREMENT_VERSION, file.samples_per_pixel, file.keep_images, file.seed]
+    written = [_written(sensor), sample.origin, sample.label(), f"{distance:.6g}"]
+    if file.device is not None:  # campaigns without a device keep their former digest
+        written += [file.device.model_dump_json(exclude={"settings": _PATIENCE}), place]
+    text = json.dumps([*common, *written])
+    return hashlib.sha256(text.encode()).hexdigest()[:12]

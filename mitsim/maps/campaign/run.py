@@ -1,0 +1,250 @@
+"""Run a campaign: take missing captures, refine the orientations, and make the map.
+
+Signal chain: campaign -> shots of the planned normals that the stage can show -> missing ones are taken and kept -> F
+and sigma of each -> more normals between those that differ, repeatedly -> ``samples.nc`` and ``map.nc``.
+
+Kept captures alone determine the next ones. A campaign that is interrupted and run again therefore ends in the same
+map.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import astuple
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from characterisation.coupon.orientations import refine
+from characterisation.coupon.patch_table import overall, patch_table
+from characterisation.files import atomic_io
+from characterisation.files.errors import InputError
+from characterisation.maps.building import SampleTable, build_map
+from characterisation.maps.performance_map import PerformanceMap
+from mitsim.maps.campaign.acquire import Source
+from mitsim.maps.campaign.plan import Campaign, Series, Shot, sensor_checksum
+from mitsim.maps.campaign.store import Finished, read_shot, remove_partial, write_shot
+from mitsim.running.progress import say, track
+from mitsim.running.version import __version__
+
+#: folder of the shots of a campaign
+KEPT = "coupons"
+
+#: number of damaged captures that are named one by one
+NAMED = 10
+
+#: number of captures after which the total time is estimated
+_TIMED = 4
+
+
+def run_campaign(campaign: Campaign, source: Source, folder: str | Path) -> PerformanceMap:
+    """Take every missing shot of a campaign, and make ``samples.nc`` and ``map.nc`` in ``folder``.
+
+    Raises
+    ------
+    InputError
+        If kept data is damaged, or the stage reaches no orientation.
+    MissingEnvironmentError
+        If the disk is full.
+    """
+    file, captures = campaign.file, Path(folder) / KEPT
+    captures.mkdir(parents=True, exist_ok=True)
+    remove_partial(captures)
+    normals = file.normals()
+    reached = campaign.reachable(normals)
+    _report_reach(campaign, normals, reached, Path(folder))
+    wanted = {series: [normals[reached]] for series in campaign.series}
+    done: dict[tuple[str, str], Finished] = {}
+    fresh = dict(wanted)
+    unresolved, level = 0, 0
+    while any(len(part[-1]) for part in fresh.values()):
+        shots = [campaign.shot(series, normal) for series, parts in fresh.items() for normal in parts[-1]]
+        label = "characterise" if level == 0 else f"refine, level {level}"
+        _take_missing(shots, done, source, captures, label)
+        if file.refine is None:
+            break
+        fresh, unresolved = _refined(campaign, wanted, done)
+        level += 1
+    if unresolved:
+        say(f"{unresolved} pairs of neighbouring normals differ by more than the tolerance: raise refine.subdivisions")
+    return _finish(campaign, wanted, done, Path(folder), int((~reached).sum()), unresolved)
+
+
+def measure_captures(campaign: Campaign, shots: Sequence[Shot], source: Source, folder: str | Path) -> PerformanceMap:
+    """Measure existing captures, see :func:`~mitsim.maps.campaign.acquire.found_shots`, and make their map."""
+    captures = Path(folder) / KEPT
+    captures.mkdir(parents=True, exist_ok=True)
+    remove_partial(captures)
+    done: dict[tuple[str, str], Finished] = {}
+    _take_missing(shots, done, source, captures, "measure")
+    shown: dict[Series, list[Shot]] = {}
+    for shot in sorted(shots, key=lambda shot: -shot.normal[2]):
+        shown.setdefault(shot.series, []).append(shot)
+    wanted = {
+        series: [np.array([shot.normal for shot in shown[series]])] for series in campaign.series if series in shown
+    }
+    return _finish(campaign, wanted, done, Path(folder), 0, 0)
+
+
+def _take_missing(
+    shots: Sequence[Shot], done: dict[tuple[str, str], Finished], source: Source, captures: Path, label: str
+) -> None:
+    """Read kept shots, and take and keep the others; a variant without a difference shares its sample's shots."""
+    missing: dict[tuple[str, str], Shot] = {}
+    damaged: list[InputError] = []
+    for shot in shots:
+        key = (shot.series.name, shot.name)
+        if key in done or key in missing:
+            continue
+        try:
+            found = read_shot(captures, shot)
+        except InputError as error:
+            damaged.append(error)
+            continue
+        if found is None:
+            missing[key] = shot
+        else:
+            done[key] = found
+    if damaged:
+        for fault in damaged[1:NAMED]:
+            say(f"mitsim: {fault}")
+        if len(damaged) > NAMED:
+            say(f"mitsim: and {len(damaged) - NAMED} more")
+        raise damaged[0]
+    for shot, finished in track(_with_time(source(list(missing.values())), len(missing)), label, len(missing)):
+        write_shot(captures, shot, finished)
+        done[shot.series.name, shot.name] = Finished(finished.patches, finished.source)
+
+
+def _with_time(taken: Iterable[tuple[Shot, Finished]], count: int) -> Iterator[tuple[Shot, Finished]]:
+    """Pass captures on, and report the expected total time after a few; the first includes compilation."""
+    start = 0.0
+    for number, one in enumerate(taken, 1):
+        if number == 1:
+            start = time.monotonic()
+        elif number == _TIMED and count > 2 * _TIMED:
+            left = (time.monotonic() - start) / (_TIMED - 1) * (count - number)
+            duration = f"{left / 60:.0f} min" if left > 90 else f"{left:.0f} s"
+            say(f"{count} captures: about {duration} from here; a refinement adds to them")
+        yield one
+
+
+def _refined(
+    campaign: Campaign, wanted: dict[Series, list[NDArray[np.float64]]], done: dict[tuple[str, str], Finished]
+) -> tuple[dict[Series, list[NDArray[np.float64]]], int]:
+    """Add normals where a sample needs them, and the same normals for its variants.
+
+    Returns the new normals, and the number of edges that remain rough.
+    """
+    assert campaign.file.refine is not None
+    fresh: dict[Series, list[NDArray[np.float64]]] = {}
+    unresolved = 0
+    added = np.empty((0, 3))
+    for series in campaign.series:  # a sample comes before its variants
+        if series.variant is None:
+            normals = np.concatenate(wanted[series])
+            seen = [astuple(overall(done[series.name, campaign.shot(series, n).name].patches)) for n in normals]
+            fraction, fraction_error, sigma, sigma_error = np.array(seen, float).reshape(-1, 4).T
+            rough = refine(
+                normals,
+                fraction,
+                fraction_error,
+                sigma,
+                sigma_error,
+                campaign.file.refine,
+                math.radians(campaign.file.largest_deg),
+            )
+            added = rough.normals[campaign.reachable(rough.normals)] if len(rough.normals) else rough.normals
+            unresolved += rough.unresolved
+        wanted[series].append(added)
+        fresh[series] = wanted[series]
+    return fresh, unresolved
+
+
+def _report_reach(campaign: Campaign, normals: NDArray[np.float64], reached: NDArray[np.bool_], folder: Path) -> None:
+    """Report which orientations the stage cannot show, and list them in ``unreachable.csv``."""
+    listed = folder / "unreachable.csv"
+    listed.unlink(missing_ok=True)
+    if reached.all():
+        return
+    if not reached.any():
+        raise InputError(
+            "campaign", "stage.axes", "limits that exclude all orientations", "at least one possible orientation"
+        )
+    say(f"{(~reached).sum()} of {len(normals)} orientations are beyond the stage: {listed}")
+    rows = [f"{n[0]:.6f},{n[1]:.6f},{math.degrees(math.acos(min(1.0, n[2]))):.3f}" for n in normals[~reached]]
+    with atomic_io.atomic_write(listed) as partial:
+        partial.write_text("\n".join(["normal_x,normal_y,incidence_deg", *rows]) + "\n", encoding="utf-8")
+
+
+def _finish(
+    campaign: Campaign,
+    wanted: dict[Series, list[NDArray[np.float64]]],
+    done: dict[tuple[str, str], Finished],
+    folder: Path,
+    unreachable: int,
+    unresolved: int,
+) -> PerformanceMap:
+    """Pool the measured patches into the map, in the order of the plan."""
+    tables = []
+    for series, parts in wanted.items():
+        shots = [campaign.shot(series, normal) for normal in np.concatenate(parts)]
+        measured = [done[series.name, shot.name].patches for shot in shots]
+        sample = series.sample
+        patches = joined(measured)
+        tables.append(
+            SampleTable(sample.finish, sample.roughness, series.distance, patches, series.variant, sample.light)
+        )
+    sources = sorted({finished.source for finished in done.values()})
+    attributes = {
+        "name": f"{campaign.sensor.name} map",
+        "sensor": campaign.sensor.name,
+        "sensor_checksum": sensor_checksum(campaign.sensor),
+        "source": ", ".join(sources),
+        "campaign": campaign.file.model_dump_json(exclude_defaults=True),
+        "exposure_rule": campaign.exposure_rule,
+        "wavelength_nm": campaign.sensor.wavelength_nm,
+        "seed": campaign.file.seed,
+        "captures": len(done),
+        "unreachable_orientations": unreachable,
+        "unresolved_edges": unresolved,
+        "software": f"mitsim {__version__}",
+    }
+    performance = build_map(tables, attributes, math.radians(campaign.file.largest_deg))
+    write_netcdf(_all_patches([table for table in tables if table.variant is None]), folder / "samples.nc")
+    performance.save(folder / "map.nc")
+    return performance
+
+
+def joined(tables: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Return the patches of all captures of a series, each with the number of its ``orientation``."""
+    names = [str(name) for name in tables[0].data_vars]
+    columns = {name: np.concatenate([table.variables[name].values for table in tables]) for name in names}
+    columns["orientation"] = np.repeat(np.arange(len(tables)), [table.sizes["patch"] for table in tables])
+    return patch_table(**columns)
+
+
+def _all_patches(tables: list[SampleTable]) -> xr.Dataset:
+    """Join the tables; each patch keeps the number of its sample, whose finish and Ra are coordinates."""
+    samples = list(dict.fromkeys((table.finish, str(table.roughness)) for table in tables))
+    columns: dict[str, list[NDArray[np.generic]]] = {}
+    for table in tables:
+        number = samples.index((table.finish, str(table.roughness)))
+        for name, values in table.patches.data_vars.items():
+            columns.setdefault(str(name), []).append(values.values)
+        columns.setdefault("sample_number", []).append(np.full(table.patches.sizes["patch"], number, np.int16))
+    whole = patch_table(**{name: np.concatenate(parts) for name, parts in columns.items()})
+    return whole.assign_coords(
+        finish=("sample", [finish for finish, _ in samples]),
+        roughness=("sample", [float(ra) for _, ra in samples], {"units": "um", "long_name": "roughness average Ra"}),
+    )
+
+
+def write_netcdf(data: xr.Dataset, path: Path) -> None:
+    """Write a dataset completely or not at all, with compressed numbers."""
+    numbers = [str(name) for name, variable in data.data_vars.items() if variable.dtype.kind in "fi"]
+    atomic_io.write_netcdf(data, path, {name: {"zlib": True, "complevel": 2} for name in numbers})

@@ -1,0 +1,242 @@
+"""Pose of a coupon on a live stage: calibration of the stage as a file, and pose at the angles that were read back.
+
+Signal chain: axes as lines in the sensor's frame and the coupon's pose at zero
+(:mod:`characterisation.stage.calibration`) -> ``stage_calibration.json`` -> motion of the axes by the angles read back,
+applied to the pose at zero -> ``sensor_from_coupon``, its inverse and the covariance of the inverse.
+
+Let r be the rotation vector about the sensor's axes and d the shift of ``sensor_from_coupon`` = (R, t). The inverse
+then rotates by -R^T r and shifts by -R^T ([t] r + d), which transforms the covariance.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+
+from characterisation.coupon.view_frame import view_frame
+from characterisation.files.atomic_io import write_json
+from characterisation.files.checked_files import read_bounded
+from characterisation.files.documents import Document, Name, validate
+from characterisation.files.errors import InputError
+from characterisation.stage.angles import Stage
+from characterisation.stage.calibration import BoardCalibration, CouponCalibration
+from characterisation.stage.turning_axes import LINE_PARAMETERS, TurningAxes, cross_matrix
+from mitsim.capture.calibration import RigidRows, Row3
+from mitsim.capture.devices.stage_connection import StageConnection
+from mitsim.sensor.transforms import Transform
+
+Floats = NDArray[np.float64]
+
+#: largest angle between a direction in ``[stage]`` and the calibrated one [deg]; more indicates another axis, or its
+#: sign
+LARGEST_MISMATCH_DEG = 15.0
+
+
+class StageTable(Stage):
+    """The ``[stage]`` table of a campaign.
+
+    A live stage also has its ``connection`` and its ``calibration``: a file, or one for each of its positions.
+    """
+
+    connection: StageConnection | None = None
+    calibration: str | Annotated[list[str], Field(min_length=1, max_length=20)] | None = None
+
+    @model_validator(mode="after")
+    def _one_stage(self) -> StageTable:
+        if self.connection is None:
+            return self
+        ours, theirs = [axis.name for axis in self.axes], [axis.name for axis in self.connection.axes]
+        if ours != theirs:
+            raise ValueError(f"connection.axes in the order of the stage's: {', '.join(ours)}, not {', '.join(theirs)}")
+        for axis, live in zip(self.axes, self.connection.axes, strict=True):
+            low, high = live.limits_deg
+            if axis.limits_deg[0] < low or axis.limits_deg[1] > high:
+                raise ValueError(f"limits_deg of {axis.name} within those of its connection, {low:g} to {high:g}")
+        return self
+
+
+class AxisLine(Document):
+    """An axis with all angles at zero: a line in the sensor's frame."""
+
+    name: Name
+    direction: Row3
+    point_mm: Row3
+
+
+class StageCalibrationFile(Document):
+    """Content of ``stage_calibration.json``.
+
+    ``covariance`` is that of four parameters for each axis, and of rotation [rad] and shift [mm] of
+    ``sensor_from_coupon`` at zero, as in :class:`~characterisation.stage.calibration.BoardCalibration`; null if
+    unknown.
+    """
+
+    schema_version: Literal[1]
+    axes: Annotated[tuple[AxisLine, ...], Field(min_length=1, max_length=3)]
+    sensor_from_coupon: RigidRows
+    covariance: tuple[tuple[float, ...], ...] | None = None
+
+    @model_validator(mode="after")
+    def _whole(self) -> StageCalibrationFile:
+        if any(np.linalg.norm(axis.direction) < 1e-9 for axis in self.axes):
+            raise ValueError("axes with a non-zero direction")
+        size = LINE_PARAMETERS * len(self.axes) + 6
+        if self.covariance is not None and {len(self.covariance), *map(len, self.covariance)} != {size}:
+            raise ValueError(f"a covariance of {size} x {size}, or null")
+        return self
+
+
+@dataclass(frozen=True)
+class StageCalibration:
+    """A calibrated stage with a coupon: ``names`` of its axes, and ``fit`` of the coupon, whose covariance may be NaN.
+
+    ``where`` is the file that it was read from; ``checksum`` has twelve hexadecimal digits of its content.
+    """
+
+    names: tuple[str, ...]
+    fit: BoardCalibration
+    where: str
+    checksum: str
+
+    def sensor_from_coupon(self, angles: ArrayLike) -> Transform:
+        """Return the coupon's pose at angles (axes,) [rad]."""
+        return Transform.from_matrix(self.fit.poses(np.atleast_2d(np.asarray(angles, float)))[0])
+
+    def world_covariance(self, angles: ArrayLike) -> Floats | None:
+        """Return the covariance (6, 6) of ``world_from_sensor``, None if unknown; the world is the coupon's frame."""
+        if not np.isfinite(self.fit.covariance).all():
+            return None
+        angles = np.atleast_2d(np.asarray(angles, float))
+        pose = Transform.from_matrix(self.fit.poses(angles)[0])
+        back = -pose.rotation.T
+        jacobian = np.block([[back, np.zeros((3, 3))], [back @ cross_matrix(pose.translation), back]])
+        out = jacobian @ self.fit.pose_covariance(angles)[0] @ jacobian.T
+        return np.asarray((out + out.T) / 2)
+
+    def distance(self, eye: Floats) -> float:
+        """Return the distance [mm] of the coupon at zero from the reference camera at ``eye`` (3,) [mm]."""
+        return float(np.linalg.norm(np.asarray(self.fit.zero_pose)[:3, 3] - eye))
+
+    def stage(self, table: StageTable, eye: Floats) -> StageTable:
+        """Return the ``[stage]`` table with the calibrated axes and normal, in the view frame of the coupon.
+
+        ``eye`` (3,) is the position of the reference camera [mm]. The table's ``calibration`` becomes the checksum of
+        this one.
+
+        Raises
+        ------
+        InputError
+            If the table defines other axes.
+        """
+        if tuple(axis.name for axis in table.axes) != self.names:
+            raise InputError(
+                self.where,
+                "axes",
+                ", ".join(self.names),
+                ", ".join(axis.name for axis in table.axes),
+                "the axes of the campaign's [stage], in its order",
+            )
+        zero = self.sensor_from_coupon(np.zeros(len(self.names)))
+        ray = zero.translation - eye
+        view = view_frame(ray / np.linalg.norm(ray), np.array([1.0, 0.0, 0.0]))
+        axes = []
+        for number, (axis, direction) in enumerate(zip(table.axes, self.fit.axes.directions, strict=True)):
+            found = view @ direction
+            apart = math.degrees(math.acos(np.clip(axis.unit() @ found, -1, 1)))
+            if apart > LARGEST_MISMATCH_DEG:
+                raise InputError(
+                    self.where,
+                    f"axes.{number}.direction",
+                    f"{axis.name} {apart:.0f} deg from that of [stage]",
+                    f"up to {LARGEST_MISMATCH_DEG:g} deg",
+                    "another axis, or one that turns the other way: correct [stage], or the gear of its connection",
+                )
+            axes.append(axis.model_copy(update={"direction": tuple(map(float, found))}))
+        normal = tuple(map(float, view @ zero.rotation[:, 2]))
+        return table.model_copy(update={"axes": axes, "normal": normal, "calibration": self.checksum})
+
+
+def write_stage_calibration(
+    path: str | Path,
+    calibration: BoardCalibration | CouponCalibration,
+    names: Sequence[str],
+    *,
+    board_from_coupon: Transform | None = None,
+    centre: ArrayLike | None = None,
+) -> None:
+    """Write a calibration for campaigns, with the coupon's pose at zero.
+
+    Parameters
+    ----------
+    names
+        Names of the axes, as in the campaign's ``[stage]``.
+    board_from_coupon
+        For a calibration with a board: the coupon's middle and axes on the board, z out of the face toward the sensor.
+        Default: the coupon's frame is that of the board.
+    centre
+        For a calibration with a coupon, (3,): its middle at zero in the sensor's frame [mm]. The calibration determines
+        only its plane. The full covariance is unknown and is not written.
+    """
+    covariance: list[list[float]] | None = None
+    if isinstance(calibration, CouponCalibration):
+        if centre is None:
+            raise InputError(
+                "stage calibration", "centre", "none", "the coupon's middle at zero [mm]", "only its plane was found"
+            )
+        plane = calibration.zero_plane
+        place = np.asarray(centre, float)
+        place = place - ((place - plane.point) @ plane.normal) * plane.normal
+        x = np.cross([0.0, 1.0, 0.0], plane.normal)
+        x /= np.linalg.norm(x)
+        zero = Transform(np.stack([x, np.cross(plane.normal, x), plane.normal], axis=1), place)
+    else:
+        board = Transform.from_matrix(calibration.zero_pose)
+        on_board = board_from_coupon or Transform.identity()
+        zero = board @ on_board
+        carried = np.eye(len(calibration.covariance))
+        carried[-3:, -6:-3] = -cross_matrix(board.rotation @ on_board.translation)
+        covariance = (carried @ calibration.covariance @ carried.T).tolist()
+    lines = zip(names, calibration.axes.directions, calibration.axes.points, strict=True)
+    table: dict[str, Any] = {
+        "schema_version": 1,
+        "axes": [{"name": n, "direction": d.tolist(), "point_mm": p.tolist()} for n, d, p in lines],
+        "sensor_from_coupon": zero.matrix().tolist(),
+        "covariance": covariance,
+    }
+    validate(path, json.loads(json.dumps(table)), StageCalibrationFile)
+    write_json(path, table)
+
+
+def read_stage_calibration(path: str | Path) -> StageCalibration:
+    """Read a stage calibration, written by :func:`write_stage_calibration` or by hand.
+
+    Raises
+    ------
+    InputError
+        If it is missing or damaged, with the field.
+    """
+    data = read_bounded(Path(path), "a stage calibration: see docs/how-to/first-capture.md")
+    try:
+        table = json.loads(data.decode())
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, "", f"text that is not JSON ({error})", "a stage calibration") from None
+    if not isinstance(table, dict):
+        raise InputError(path, "", type(table).__name__, "a JSON object")
+    read = validate(path, table, StageCalibrationFile)
+    directions = np.array([axis.direction for axis in read.axes])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    axes = TurningAxes(directions, np.array([axis.point_mm for axis in read.axes]))
+    size = LINE_PARAMETERS * axes.count + 6
+    covariance = np.full((size, size), np.nan) if read.covariance is None else np.array(read.covariance)
+    fit = BoardCalibration(axes, np.array(read.sensor_from_coupon), covariance, np.empty((0, 6)), 1.0, 0)
+    checksum = hashlib.sha256(read.model_dump_json().encode()).hexdigest()[:12]
+    return StageCalibration(tuple(axis.name for axis in read.axes), fit, str(path), checksum)

@@ -1,0 +1,279 @@
+r"""Effect of interreflections on a view, which a map made from flat coupons does not contain.
+
+Signal chain: codes of the projector, reference camera with large pixels -> radiance L_1 of direct light, and L_2 of
+light over two to ``depth`` surfaces -> rho = L_2 / L_1 at every point -> F g(rho), sigma h(rho). For a phase code also:
+fringes -> phase bias (:mod:`mitsim.maps.prediction.multipath_phase_bias`). For time of flight also: correlations -> path
+bias (:mod:`mitsim.maps.prediction.multipath_range_bias`).
+
+Next to a corner of bright metal, such as a plate and a pillar, rho is 1 to 30. The interreflected light carries the
+code of another place. Weak interreflections are a background that reduces the contrast for a matcher,
+
+    h = 1 + rho,
+
+and adds shot noise to a phase, h = sqrt(1 + rho) (EMVA 1288: the variance of a photon signal is its mean). Under strong
+interreflections the other code prevails: the decoder rejects the pixel, or the point is false. The share of points that
+are found at the right place is
+
+    g = 1 / (1 + (rho / r)^k)
+
+with one pair of constants r and k for matchers and one for codes (:func:`losses`). Their file states its source;
+`mitsim validate losses` estimates them. A time-of-flight sensor loses the points that its own decoder rejects.
+
+Not included: the response of a matcher to mirror images of the projector or of a face, and the positions of false
+points.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.documents import Document, read_toml
+from mitsim.capture.simulated.indirect_light import smoothed
+from mitsim.maps.prediction.multipath_phase_bias import amplitude, finest_fringe, fringes, phase_bias
+from mitsim.maps.prediction.multipath_range_bias import path_amplitudes, path_bias, range_bias
+from mitsim.maps.prediction.perturbation import Perturbation, SceneView
+from mitsim.scene.light_transport.light_paths import LightPaths
+from mitsim.scene.light_transport.projector_light import ModulatedLight, ProjectedPatterns
+from mitsim.scene.light_transport.transport import trace_poses
+from mitsim.scene.load import Scene
+from mitsim.scene.ray_casting.camera_rays import CameraRays
+from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
+from mitsim.sensor.camera import Camera
+from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
+from mitsim.sensor.vignetting import camera_illumination
+
+Floats = NDArray[np.float64]
+
+#: number of pixels of the coarse camera, and number of its pixels that a fringe covers at least
+PIXELS, PIXELS_OF_FRINGE = 20_000, 6
+
+#: camera paths and photons per render of interreflections. A phase code has two renders, which
+#: distinguish their noise from a bias. With large pixels photons are efficient: 300 000 remove two thirds of the noise
+#: of 80 000 camera paths
+PATHS, PHOTONS = 180_000, 400_000
+
+#: number of views that are rendered at once: recording a kernel takes about as long as rendering one of them
+TOGETHER = 16
+
+#: standard deviation of the window that averages rho, in pixels of the sensor
+SMOOTHED_PX = 3.0
+
+#: largest factor on a matcher's noise; points that scatter farther are rejected
+NOISIEST = 4.0
+
+
+class Loss(Document):
+    """Constants r, ``half``, and k, ``steepness``, of g(rho), each with its 95 % interval."""
+
+    half: float
+    half_interval: tuple[float, float]
+    steepness: float
+    steepness_interval: tuple[float, float]
+
+
+class Losses(Document):
+    """The data file of g(rho): its cases, the command that wrote it, and the constants."""
+
+    command: str
+    cases: list[str]
+    matched: Loss
+    coded: Loss
+
+
+@cache
+def losses() -> Losses:
+    """Return the constants of g(rho) that come with mitsim."""
+    return read_toml(str(files("mitsim.maps.prediction") / "interreflections.toml"), Losses)
+
+
+@dataclass(frozen=True)
+class Interreflections:
+    """Interreflections at n points: ``rho`` (n,) relative to direct light, NaN without direct light.
+
+    ``displaced`` (n,) is the bias of a phase code [rad] or of a path [mm], ``scattered`` (n,) the standard deviation
+    about it. ``rejected`` (n,) is the share that a time-of-flight decoder rejects. All three are 0 for other sensors.
+    """
+
+    rho: Floats
+    displaced: Floats
+    scattered: Floats
+    rejected: Floats
+
+
+@dataclass(frozen=True)
+class InterreflectionImage:
+    """:class:`Interreflections` of every pixel of a ``camera``, (4, H, W) in the order of its fields."""
+
+    camera: Camera
+    values: Floats
+
+    def at(self, points: NDArray[np.floating]) -> Interreflections:
+        """Return the values of the pixels that show points (n, 3) of the sensor frame.
+
+        Points outside the image have rho NaN, and 0 for the other values.
+        """
+        places = np.nan_to_num(self.camera.project(np.asarray(points, float)), nan=-9)
+        column, row = np.rint(places).astype(int).T
+        inside = (column >= 0) & (row >= 0) & (column < self.camera.width) & (row < self.camera.height)
+        rho, *others = self.values[:, np.where(inside, row, 0), np.where(inside, column, 0)]
+        return Interreflections(np.where(inside, rho, np.nan), *(np.where(inside, one, 0.0) for one in others))
+
+
+class InterreflectionEffect:
+    """Interreflections over up to ``depth`` surfaces for a sensor, prepared for any number of views of any scene.
+
+    ``paths`` of the camera and ``photons`` are numbers per render. ``poses`` are views in the order in which they will
+    be asked for: :data:`TOGETHER` of them are rendered at once, faster and with the same result.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        depth: int = 2,
+        paths: int = PATHS,
+        photons: int = PHOTONS,
+        poses: Sequence[Transform] = (),
+    ) -> None:
+        camera = sensor.rig.reference
+        self.sensor, self.depth, self.photons = sensor, depth, photons
+        self.fringe = finest_fringe(sensor)
+        step = math.sqrt(camera.width * camera.height / PIXELS)
+        if self.fringe is not None:  # the coarse camera must resolve it
+            step = min(step, self.fringe.period * float(camera.matrix[0, 0]) / PIXELS_OF_FRINGE)
+        self.step = max(1, math.floor(step))
+        self.coarse = camera.binned(self.step)
+        self.samples = max(1, round(paths / (self.coarse.width * self.coarse.height)))
+        self.rays = CameraRays(self.coarse)  # a pinhole, since large pixels exceed the blur
+        self.middles = PixelRays.of_camera(self.coarse)
+        self.light = _light(sensor)
+        self.poses, self.ready = list(poses), dict[int, InterreflectionImage]()
+        self.places = {_key(pose): place for place, pose in enumerate(self.poses)}
+
+    def __call__(self, view: SceneView) -> Perturbation:
+        """Return the perturbation of the ideal points of a view."""
+        found = self._rendered_with_next(view.scene, view.world_from_sensor).at(view.ideal.point)
+        rho = np.where(np.isfinite(found.rho), found.rho, 0.0)
+        nothing = Perturbation.none(len(rho))
+        if isinstance(self.sensor.settings, MatcherSettings):
+            noisier = 1 + rho / (1 + rho / (NOISIEST - 1))
+            return Perturbation(found_share(rho, losses().matched), noisier, *_unbiased(nothing))
+        kept, displaced, scattered = found_share(rho, losses().coded), nothing.displaced, nothing.scattered
+        if isinstance(self.sensor.pattern, AmplitudeModulation):
+            kept = 1.0 - found.rejected
+            light_source = self.sensor.projector.optics.centre
+            displaced = range_bias(found.displaced, light_source, view.ideal)
+        elif self.fringe is not None:
+            displaced, scattered = (
+                self.fringe.range_bias(phase, view.ideal) for phase in (found.displaced, found.scattered)
+            )
+        return Perturbation(kept, np.sqrt(1 + rho), displaced, np.abs(scattered), nothing.shared)
+
+    def _rendered_with_next(self, scene: Scene, pose: Transform) -> InterreflectionImage:
+        """Return the image of a view; if it is one of ``poses``, render it together with those that follow."""
+        place = self.places.get(_key(pose))
+        if place is None:
+            return self.render(scene, pose)
+        if place not in self.ready:
+            end = place + TOGETHER
+            if len(self.poses) == end + 1:  # a render of one view would be another kernel
+                end += 1
+            images = self.render_views(scene, self.poses[place:end])
+            self.ready = dict(enumerate(images, place))
+        return self.ready.pop(place)
+
+    def render(self, scene: Scene, world_from_sensor: Transform, seed: int = 1) -> InterreflectionImage:
+        """Render the interreflections in a view."""
+        return self.render_views(scene, [world_from_sensor], seed)[0]
+
+    def render_views(self, scene: Scene, poses: Sequence[Transform], seed: int = 1) -> list[InterreflectionImage]:
+        """Render the interreflections in several views at once; each image is the one that :meth:`render` returns."""
+        given = scene, self.rays, self.light, poses
+        direct = trace_poses(*given, LightPaths(samples=self.samples, seed=seed))
+        indirect = [
+            trace_poses(
+                *given,
+                LightPaths(
+                    samples=self.samples,
+                    seed=2 * seed + half,
+                    depth=self.depth,
+                    photons=self.photons,
+                    indirect_only=True,
+                ),
+            )
+            for half in range(1 if self.fringe is None else 2)
+        ]
+        return [
+            self._image(shapes_met(scene, self.middles, pose), direct[k], [one[k] for one in indirect])
+            for k, pose in enumerate(poses)
+        ]
+
+    def _image(
+        self, shape: NDArray[np.integer], direct: NDArray[np.float32], indirect: Sequence[NDArray[np.float32]]
+    ) -> InterreflectionImage:
+        """Return the interreflections of one view from its direct light and one or two renders of the other light."""
+        code = self.sensor.pattern
+        own = (
+            1 if not isinstance(code, AmplitudeModulation) else code.steps
+        )  # number of images whose mean is the total light
+        white = np.stack([direct[:own].mean(axis=0), np.mean([one[:own].mean(axis=0) for one in indirect], axis=0)])
+        first, other = smoothed(white, shape, SMOOTHED_PX / self.step).astype(float)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rho = np.where(first > 0, other / first, np.nan)
+        displaced, scattered, rejected = np.zeros((3, *rho.shape))
+        if isinstance(code, AmplitudeModulation):
+            assert isinstance(self.sensor.settings, TimeOfFlightSettings)
+            levels = self._levels()
+            displaced, rejected = path_bias(
+                path_amplitudes(direct, code) * levels,
+                path_amplitudes(indirect[0], code) * levels,
+                code,
+                self.sensor.settings,
+                self.sensor.imager,
+                shape,
+                self.step,
+            )
+        elif self.fringe is not None:
+            one, *two = (amplitude(images[1:]) for images in (direct, *indirect))
+            displaced, scattered = phase_bias(one, (two[0], two[1]), shape, self.step)
+        return InterreflectionImage(self.coarse, np.stack([rho, displaced, scattered, rejected]))
+
+    def _levels(self) -> float | Floats:
+        """Return grey levels per radiance [DN / (W mm^-2 sr^-1)] in the shortest exposure, for each pixel (H, W)."""
+        sensor = self.sensor
+        seconds = min(sensor.exposure.exposures(None, sensor.imager.full_well))
+        levels = sensor.electrons() * seconds * sensor.imager.gain
+        loss = camera_illumination(sensor.imager.corner_illumination, self.coarse)
+        return levels if loss is None else np.asarray(levels * loss, float)
+
+
+def _key(pose: Transform) -> bytes:
+    return pose.matrix().tobytes()
+
+
+def _light(sensor: Sensor) -> ProjectedPatterns | ModulatedLight:
+    """Return white light and the patterns from which a phase or a path is measured."""
+    if isinstance(sensor.pattern, AmplitudeModulation):
+        return ModulatedLight(sensor.projector, *sensor.pattern.images())
+    optics = sensor.projector.optics
+    white = np.ones((1, optics.height, optics.width), np.float32)
+    return ProjectedPatterns(np.concatenate([white, fringes(sensor)]), sensor.projector)
+
+
+def _unbiased(nothing: Perturbation) -> tuple[Floats, Floats, Floats]:
+    return nothing.displaced, nothing.scattered, nothing.shared
+
+
+def found_share(rho: Floats, loss: Loss) -> Floats:
+    """Return g(rho), the share of points that are found at the right place."""
+    with np.errstate(over="ignore"):
+        return np.asarray(1 / (1 + (rho / loss.half) ** loss.steepness))

@@ -1,0 +1,130 @@
+"""Look up F and sigma of the ideal points of a view in a map, and derive the statistics of a feature.
+
+Signal chain: ideal points -> F and sigma by distance, normal in the view frame and material of their face -> number and
+mean sigma of a feature's points, or the input of :mod:`characterisation.tasks.covariance`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.maps.noise_structure import noise_structure
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.point_cloud import Status
+from characterisation.tasks.covariance import ExpectedPoints
+from mitsim.maps.prediction.perturbation import Perturbation
+from mitsim.maps.prediction.predictor import Ideal
+from mitsim.scene.load import Scene
+from mitsim.scene.materials import Finish
+from mitsim.sensor.transforms import Transform
+
+
+def performance(
+    ideal: Ideal, scene: Scene, performance_map: PerformanceMap, finish: Finish | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return F and sigma (n,) of every ideal point; 0 and NaN if an eye does not see it, NaN if the map has no answer.
+
+    ``finish`` replaces the finishes of the scene: matt white, to normalise the view score.
+    """
+    fraction = np.full(len(ideal.pixel), np.nan)
+    sigma = np.full(len(ideal.pixel), np.nan)
+    for index, own in enumerate(scene.finishes):
+        used = finish or own
+        mask = (ideal.shape == index) & (ideal.status == Status.VALID)
+        if used is None or not mask.any():
+            continue
+        distance, normal = ideal.distance[mask], ideal.normal[mask]
+        along = None if ideal.along is None else ideal.along[mask]
+        answer = performance_map.query(used.name, used.roughness, distance, normal, used.light, along)
+        fraction[mask], sigma[mask] = answer.fraction, answer.sigma
+    fraction[ideal.status != Status.VALID] = 0.0
+    return fraction, sigma
+
+
+@dataclass(frozen=True)
+class ViewPoints:
+    """Ideal points of a view from a pose, and the ``labels`` (H, W) of the shapes that its rays show.
+
+    Each ray stands for ``thinning`` pixels of the sensor, ``angular_pitch`` [rad] apart.
+    """
+
+    ideal: Ideal
+    labels: NDArray[np.int16]
+    world_from_sensor: Transform
+    thinning: float = 1.0
+    angular_pitch: float = np.nan
+
+
+def expected_points(
+    view: ViewPoints,
+    scene: Scene,
+    shape: int,
+    performance_map: PerformanceMap,
+    perturbation: Perturbation | None = None,
+) -> ExpectedPoints:
+    """Return the predicted points of one shape in the world frame, which is the part frame; one row per possible point.
+
+    Where the map has no noise area, the area is that of independent points, 1/F, and there is no persistent noise.
+    ``perturbation`` holds effects that flat coupons cannot show (:mod:`mitsim.maps.prediction.perturbation`).
+    """
+    ideal, labels, world_from_sensor = view.ideal, view.labels, view.world_from_sensor
+    finish = scene.finishes[shape]
+    mask = (labels.reshape(-1)[ideal.pixel] == shape) & (ideal.status == Status.VALID)
+    if finish is None:
+        mask[:] = False
+    distance, normal = ideal.distance[mask], ideal.normal[mask]
+    place = np.stack(np.divmod(ideal.pixel[mask], labels.shape[1]), axis=-1)
+    unknown = np.full(len(distance), np.nan)
+    fraction, fraction_error, sigma, area, persistent = unknown, unknown, unknown, unknown, unknown
+    displaced = np.zeros(len(distance))
+    if finish is not None and mask.any():
+        along = None if ideal.along is None else ideal.along[mask]
+        answer = performance_map.query(finish.name, finish.roughness, distance, normal, finish.light, along)
+        structure = noise_structure(performance_map, finish.name, finish.roughness, distance, normal, finish.light)
+        fraction, fraction_error, sigma = answer.fraction, answer.fraction_error, answer.sigma
+        area, persistent = structure.area, structure.persistent_share * sigma
+        displaced = np.nan_to_num(structure.bias_share * sigma)
+        if perturbation is not None:
+            fraction, fraction_error = (one * perturbation.kept[mask] for one in (fraction, fraction_error))
+            sigma = np.hypot(sigma * perturbation.noisier[mask], perturbation.scattered[mask])
+            displaced = displaced + perturbation.displaced[mask]
+    possible = np.isfinite(fraction) & (fraction > 0) & np.isfinite(sigma)
+    fraction, sigma = fraction[possible], sigma[possible]
+    return ExpectedPoints(
+        world_from_sensor.points(ideal.point[mask][possible]),
+        ideal.ray[mask][possible] @ world_from_sensor.rotation.T,
+        np.rint(place[possible] * np.sqrt(view.thinning)).astype(np.int64),
+        normal[possible],
+        fraction,
+        np.nan_to_num(fraction_error[possible]),
+        sigma,
+        np.where(np.isfinite(area[possible]), area[possible], 1 / fraction),
+        np.nan_to_num(persistent[possible]),
+        displaced[possible],
+        distance[possible],
+        view.thinning,
+        view.angular_pitch,
+        shared=None if perturbation is None else perturbation.shared[mask][possible],
+    )
+
+
+def feature_statistics(
+    ideal: Ideal,
+    labels: NDArray[np.int16],
+    fraction: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    shapes: list[int],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the expected number of points n and the mean sigma [mm] of each shape, (features,) each; NaN if n is 0.
+
+    The mean of sigma is over the expected points, so each pixel is weighted by its F.
+    """
+    label = labels.reshape(-1)[ideal.pixel]
+    weight = np.where(np.isfinite(sigma), np.nan_to_num(fraction), 0.0)
+    n = np.array([weight[label == shape].sum() for shape in shapes])
+    total = np.array([(weight * np.nan_to_num(sigma))[label == shape].sum() for shape in shapes])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return n, np.where(n > 0, total / n, np.nan)

@@ -1,0 +1,359 @@
+"""Write captures as a data set in the layout of the BOP benchmark, for training on depth images.
+
+Signal chain: capture folders -> cloud of each, with a status for every pixel -> image, depth, status, labels and true
+depth on the pixels of one pinhole camera -> files of BOP (bop_toolkit, docs/bop_datasets_format.md), and additional
+folders for data without a place in BOP.
+
+The camera is the cloud's grid: for a stereo sensor its rectified left image, else its camera without distortion. Each
+pixel takes depth and status from the nearest pixel of the cloud, and grey values by linear interpolation. Nothing is
+filled in: depth is 0 without a point, and ``status`` gives the reason.
+
+An object is a group of the scene's shapes; the other shapes are its surroundings. Without groups it is the whole scene.
+All objects are in the part frame, so all have the same pose: that of the part frame in the camera's.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import json
+import math
+import os
+import shutil
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+from scipy.spatial import ConvexHull
+from scipy.spatial.distance import pdist
+
+from characterisation.files.atomic_io import HOST
+from characterisation.files.errors import InputError
+from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import read_capture
+from mitsim.capture.png import encode_png
+from mitsim.decode.cloud import capture_cloud, capture_geometry, decoder_settings
+from mitsim.report.export.run_scene import sensor_from_grid
+from mitsim.running.progress import track
+from mitsim.running.version import __version__
+from mitsim.scene.load import Scene, load_scene
+from mitsim.scene.ray_casting.raycast import PixelRays, cast, shapes_met
+from mitsim.scene.ray_casting.triangles import triangles
+from mitsim.sensor.transforms import Transform
+
+#: wavelength for loading scenes; only their geometry is used
+_ANY_NM = 550.0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One capture on the pixels of a pinhole camera, (H, W) each.
+
+    - ``grey`` uint8, None if the capture has no images.
+    - ``depth`` [mm] along the axis, NaN without a point; ``status``.
+    - ``shape``: index into the scene's names, -1 for none, and ``true_depth`` [mm], for the ray through the centre of
+      the pixel.
+    - ``camera_from_part``.
+    - ``masks``: silhouette and visible part of each object, (H, W) bool.
+    """
+
+    grid: ViewGrid
+    grey: NDArray[np.uint8] | None
+    depth: NDArray[np.float64]
+    status: NDArray[np.uint8]
+    shape: NDArray[np.int16]
+    true_depth: NDArray[np.float64]
+    camera_from_part: Transform
+    masks: tuple[tuple[NDArray[np.bool_], NDArray[np.bool_]], ...]
+
+
+@dataclass(frozen=True)
+class Source:
+    """A capture folder of ``mitsim render --many``: its finish and view, and its scene."""
+
+    folder: Path
+    finish: str
+    view: int
+    scene: Path
+    parameters: Mapping[str, str]
+
+
+def find_sources(folder: str | Path) -> list[Source]:
+    """Return the captures of ``mitsim render --many`` in a folder, by finish and view.
+
+    Raises
+    ------
+    InputError
+        If there is none, or a scene no longer exists.
+    """
+    found = []
+    for path in sorted(Path(folder).glob("*/view_*/settings.json")):
+        try:
+            many = json.loads(path.read_text(encoding="utf-8"))["many"]
+            scene, view = Path(many["scene"]), int(many["view"])
+            found.append(Source(path.parent, str(many["finish"]), view, scene, dict(many["parameters"])))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            allowed = "a capture taken by mitsim render --many"
+            raise InputError(path, "many", f"unreadable data ({error})", allowed) from None
+        if not scene.is_file():
+            raise InputError(path, "many.scene", f"{scene}, which does not exist", "the scene that was rendered")
+    if not found:
+        raise InputError(folder, "", "no captures", "FINISH/view_NNNN folders, as mitsim render --many writes them")
+    return found
+
+
+def objects_of(names: Sequence[str], patterns: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return the shapes of each object, by patterns such as ``pin_1*``; without patterns, one object of all shapes.
+
+    Raises
+    ------
+    InputError
+        If a pattern matches no shape, or a shape belongs to two objects.
+    """
+    if not patterns:
+        return [tuple(names)]
+    found = [tuple(fnmatch.filter(names, pattern)) for pattern in patterns]
+    for pattern, shapes in zip(patterns, found, strict=True):
+        if not shapes:
+            raise InputError("--object", "", repr(pattern), f"a pattern of shapes: {', '.join(names)}")
+    every = [name for shapes in found for name in shapes]
+    for name in every:
+        if every.count(name) > 1:
+            both = [pattern for pattern, shapes in zip(patterns, found, strict=True) if name in shapes]
+            raise InputError(
+                "--object", "", f"{' and '.join(both)}, which both have {name}", "objects without common shapes"
+            )
+    return found
+
+
+def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train", patterns: Sequence[str] = ()) -> int:
+    """Write a data set atomically, with one BOP scene for each finish, and return the number of images.
+
+    ``patterns`` assign shapes to objects (:func:`objects_of`).
+
+    Raises
+    ------
+    InputError
+        If ``output`` exists, a pattern matches nothing, or a capture cannot be used.
+    """
+    output = Path(output).absolute()
+    if output.exists():
+        raise InputError("--output", "", f"{output}, which exists", "a new folder")
+    output.parent.mkdir(parents=True, exist_ok=True)
+    partial = output.with_name(f".{output.name}.partial-{os.getpid()}-{HOST}{uuid.uuid4().hex[:12]}")
+    finishes = list(dict.fromkeys(one.finish for one in sources))
+    tables: dict[str, dict[str, dict[str, Any]]] = {one: {"camera": {}, "gt": {}, "gt_info": {}} for one in finishes}
+    scenes: dict[str, tuple[Scene, list[Scene]]] = {}
+    camera: dict[str, Any] = {}
+    try:
+        for source in track(sources, "export"):
+            capture = read_capture(source.folder)
+            if source.finish not in scenes:
+                scene = load_scene(source.scene, _ANY_NM, dict(source.parameters))
+                scenes[source.finish] = scene, [scene.only(*names) for names in objects_of(scene.names, patterns)]
+            frame, scale = bop_frame(capture, *scenes[source.finish], source.folder)
+            place = partial / split / f"{finishes.index(source.finish) + 1:06d}"
+            _write_frame(frame, place, len(tables[source.finish]["camera"]), scale, tables[source.finish])
+            camera = camera or _camera_file(frame.grid, scale)
+        for number, finish in enumerate(finishes, 1):
+            for name, table in tables[finish].items():
+                _write_json(partial / split / f"{number:06d}" / f"scene_{name}.json", table)
+        first, objects = scenes[finishes[0]]
+        _write_models(partial / "models", objects)
+        _write_json(partial / "camera.json", camera)
+        _write_json(partial / "statuses.json", {str(one.value): one.name.lower() for one in Status})
+        _write_json(partial / "features.json", {str(k): name for k, name in enumerate(first.names, 1)})
+        _write_json(partial / "finishes.json", {f"{k:06d}": name for k, name in enumerate(finishes, 1)})
+        described = _about(sources, finishes, split, [one.names for one in objects])
+        (partial / "dataset_info.md").write_text(described, encoding="utf-8")
+        partial.rename(output)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return len(sources)
+
+
+def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: str | Path) -> tuple[Frame, float]:
+    """Decode a capture onto the pixels of a pinhole for BOP; also return the scale of its depth images [mm].
+
+    ``objects`` are parts of the scene (:meth:`mitsim.scene.load.Scene.only`).
+
+    Raises
+    ------
+    InputError
+        If the capture has no pose, or cannot be decoded.
+    """
+    if capture.world_from_sensor is None:
+        raise InputError(where, "pose.json", "no pose", "a capture whose pose in the part frame is known")
+    settings, imager = decoder_settings(capture)
+    cloud = capture_cloud(capture, settings, capture_geometry(capture, settings), imager=imager)
+    grid = replace(cloud.grid, normalised=None)
+    depth, status = on_pinhole(cloud, grid)
+    rays, there = PixelRays.of_grid(grid), capture.world_from_sensor
+    seen, met = cast(scene, rays, there, np.zeros((0, 3))), shapes_met(scene, rays, there)
+    masks = tuple(
+        (shapes_met(one, rays, there) >= 0, np.isin(met, [scene.names.index(name) for name in one.names]))
+        for one in objects
+    )
+    along = grid.rays() @ grid.rotation[:, 2]
+    pose = (capture.world_from_sensor @ sensor_from_grid(grid)).inverse()
+    frame = Frame(grid, _grey(capture, grid), depth, status, seen.shape, seen.distance * along, pose, masks)
+    return frame, depth_scale(float(settings.far_mm))
+
+
+def on_pinhole(cloud: PointCloud, grid: ViewGrid) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return depth [mm] and status (H, W) of a cloud on a pinhole's pixels, from the nearest pixels of its grid."""
+    depth = (cloud.points.astype(np.float64) - cloud.grid.origin) @ cloud.grid.rotation[:, 2]
+    if cloud.grid.normalised is None:
+        return depth, cloud.status
+    place = np.rint(cloud.grid.project(grid.origin + 1000.0 * grid.rays()))
+    last = np.array([grid.width, grid.height]) - 1
+    inside = np.asarray(np.isfinite(place).all(-1) & (place >= 0).all(-1) & (place <= last).all(-1))
+    column, row = np.moveaxis(np.where(inside[..., None], place, 0).astype(np.intp), -1, 0)
+    return np.where(inside, depth[row, column], np.nan), np.where(
+        inside, cloud.status[row, column], np.uint8(Status.NO_SURFACE)
+    )
+
+
+def depth_scale(far: float) -> float:
+    """Return the step of a depth image [mm]: the least of (1, 2, 5) x 10^n for which 16 bits reach ``far`` [mm]."""
+    least = far / 65535
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(round(k * power, 12) for k in (1, 2, 5, 10) if k * power >= least * (1 - 1e-12))
+
+
+def _grey(capture: Capture, grid: ViewGrid) -> NDArray[np.uint8] | None:
+    """Return the mean of the reference camera's lit images on the pinhole's pixels, full scale 255."""
+    name, camera = next(iter(capture.rig.cameras.items()))
+    if name not in capture.images or not len(capture.images[name]):
+        return None
+    lit = capture.images[name]
+    if capture.settings.get("ambient_image") and len(lit) > 1:
+        lit = lit[:-1]
+    place = camera.project((camera.centre + 1000.0 * grid.rays()).reshape(-1, 3)).reshape(grid.height, grid.width, 2)
+    mean = lit.mean(axis=0, dtype=np.float64) * 255 / (2**capture.bits - 1)
+    sampled = map_coordinates(mean, [place[..., 1], place[..., 0]], order=1, mode="constant", cval=0.0)
+    return np.asarray(np.rint(np.nan_to_num(sampled)).clip(0, 255), np.uint8)
+
+
+def _write_frame(frame: Frame, place: Path, number: int, scale: float, tables: dict[str, dict[str, Any]]) -> None:
+    name = f"{number:06d}"
+    counts = np.rint(np.nan_to_num(frame.depth) / scale).clip(0, 65535).astype(np.uint16)
+    true = np.rint(np.nan_to_num(frame.true_depth) / scale).clip(0, 65535).astype(np.uint16)
+    images: dict[str, NDArray[Any] | None] = {
+        f"gray/{name}": frame.grey,
+        f"depth/{name}": counts,
+        f"status/{name}": frame.status,
+        f"depth_true/{name}": true,
+        f"feature/{name}": (frame.shape + 1).astype(np.uint16),
+    }
+    for k, (silhouette, visible) in enumerate(frame.masks):
+        images[f"mask/{name}_{k:06d}"] = np.where(silhouette, 255, 0).astype(np.uint8)
+        images[f"mask_visib/{name}_{k:06d}"] = np.where(visible, 255, 0).astype(np.uint8)
+    for path, image in images.items():
+        if image is not None:
+            (place / path).parent.mkdir(parents=True, exist_ok=True)
+            (place / f"{path}.png").write_bytes(encode_png(np.ascontiguousarray(image)))
+    pose, key = frame.camera_from_part, str(number)
+    turn, shift = pose.rotation.ravel().tolist(), pose.translation.tolist()
+    tables["camera"][key] = {
+        "cam_K": _matrix(frame.grid),
+        "depth_scale": scale,
+        "cam_R_w2c": turn,
+        "cam_t_w2c": shift,
+    }
+    numbers = range(1, len(frame.masks) + 1)  # BOP counts objects from 1
+    tables["gt"][key] = [{"cam_R_m2c": turn, "cam_t_m2c": shift, "obj_id": number} for number in numbers]
+    tables["gt_info"][key] = [_info(silhouette, visible, counts > 0) for silhouette, visible in frame.masks]
+
+
+def _info(silhouette: NDArray[np.bool_], visible: NDArray[np.bool_], valid: NDArray[np.bool_]) -> dict[str, Any]:
+    whole, shown = int(silhouette.sum()), int(visible.sum())
+    return {
+        "bbox_obj": _box(silhouette),
+        "bbox_visib": _box(visible),
+        "px_count_all": whole,
+        "px_count_valid": int((silhouette & valid).sum()),
+        "px_count_visib": shown,
+        "visib_fract": shown / whole if whole else 0.0,
+    }
+
+
+def _box(mask: NDArray[np.bool_]) -> list[int]:
+    """Return x, y, width, height of a mask; four times -1 if it is empty."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return [-1, -1, -1, -1]
+    return [int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)]
+
+
+def _matrix(grid: ViewGrid) -> list[float]:
+    return [grid.fx, 0.0, grid.cx, 0.0, grid.fy, grid.cy, 0.0, 0.0, 1.0]
+
+
+def _camera_file(grid: ViewGrid, scale: float) -> dict[str, Any]:
+    return {
+        "cx": grid.cx,
+        "cy": grid.cy,
+        "depth_scale": scale,
+        "fx": grid.fx,
+        "fy": grid.fy,
+        "height": grid.height,
+        "width": grid.width,
+    }
+
+
+def _write_models(folder: Path, objects: Sequence[Scene]) -> None:
+    """Write the triangles of each object [mm], part frame, with normals of its faces; and its box and diameter."""
+    folder.mkdir(parents=True)
+    table: dict[str, Any] = {}
+    for number, one in enumerate(objects, 1):
+        corners = triangles(one)
+        mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
+        written = trimesh.exchange.ply.export_ply(mesh, encoding="ascii", vertex_normal=True)
+        (folder / f"obj_{number:06d}.ply").write_bytes(written)
+        low, size = mesh.bounds[0], np.ptp(mesh.bounds, axis=0)
+        table[str(number)] = {"diameter": _diameter(mesh.vertices)}
+        table[str(number)] |= {f"min_{axis}": float(low[k]) for k, axis in enumerate("xyz")}
+        table[str(number)] |= {f"size_{axis}": float(size[k]) for k, axis in enumerate("xyz")}
+    _write_json(folder / "models_info.json", table)
+
+
+def _diameter(vertices: NDArray[np.float64]) -> float:
+    """Return the largest distance between any two vertices; they lie on the convex hull, or all in a plane."""
+    flat = np.ptp(vertices, axis=0).min() < 1e-9
+    corners = np.unique(vertices, axis=0) if flat else vertices[ConvexHull(vertices).vertices]
+    return float(pdist(corners).max())
+
+
+def _write_json(path: Path, table: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+
+
+def _about(sources: Sequence[Source], finishes: Sequence[str], split: str, objects: Sequence[Sequence[str]]) -> str:
+    listed = "\n".join(f"- `{split}/{k:06d}`: {name}" for k, name in enumerate(finishes, 1))
+    groups = "\n".join(f"- `obj_{k:06d}`: {', '.join(names)}" for k, names in enumerate(objects, 1))
+    return f"""# {sources[0].scene.stem}, simulated by mitsim {__version__}
+
+{len(sources)} images. One folder for each finish:
+
+{listed}
+
+Objects by their shapes, in the part frame (mm):
+
+{groups}
+
+In addition to BOP's files, each folder has:
+
+- `status`: why a pixel has a depth or none: `statuses.json`
+- `feature`: the shape of the scene that a pixel shows: `features.json`; 0 for none
+- `depth_true`: depth of the geometry, on the scale of `depth`
+
+Depth is what the sensor's decoder measured; nothing is filled in. Silhouettes are clipped to the image.
+"""

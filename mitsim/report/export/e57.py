@@ -1,0 +1,113 @@
+"""Write clouds as E57 (ASTM E2807) with pye57: one scan for each view, with its pose.
+
+Lengths are in metres, as the standard requires. Points are in the frame of their scan, and ``pose`` takes them to the
+frame of the file, the part frame. Standard fields are cartesianX, Y, Z, rowIndex and columnIndex. Sigma, covariance and
+feature are fields of an extension with the prefix ``mitsim``, which other readers skip.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import uuid
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from characterisation.files.atomic_io import atomic_write_named
+from mitsim.report.export.cloud_points import COVARIANCE, CloudPoints
+from mitsim.report.export.cloud_writers import about
+from mitsim.report.export.needed import needed
+from mitsim.running.version import __version__
+from mitsim.sensor.transforms import Transform
+
+PREFIX, NAMESPACE = "mitsim", "https://mitsim.invalid/e57/1.0"
+
+
+def write_e57(scans: Sequence[tuple[str, CloudPoints, Transform | None]], path: str | Path) -> None:
+    """Write scans: for each a name, its points, and the pose of their frame in the part frame, None if unknown."""
+    pye57 = needed("pye57", "pye57", f"{path}: E57")
+    with atomic_write_named(path) as file, pye57.E57(str(file), mode="w") as image:
+        image.image_file.extensionsAdd(PREFIX, NAMESPACE)
+        for name, points, pose in scans:
+            _write_scan(image, pye57.libe57, name, points.in_metres(), pose)
+
+
+def _write_scan(image: Any, libe57: Any, name: str, points: CloudPoints, pose: Transform | None) -> None:
+    file = image.image_file
+    scan = libe57.StructureNode(file)
+    table = points.table()
+    guid = uuid.UUID(hashlib.sha256(name.encode() + table.tobytes()).hexdigest()[:32])
+    for key, text in (
+        ("guid", f"{{{guid}}}"),
+        ("name", name),
+        ("description", json.dumps(about(points))),
+        ("sensorModel", points.sensor),
+        ("sensorSoftwareVersion", f"mitsim {__version__}"),
+    ):
+        scan.set(key, libe57.StringNode(file, text))
+    if pose is not None:
+        scan.set("pose", _pose(file, libe57, pose))
+    if len(table):
+        scan.set(
+            "indexBounds",
+            _bounds(
+                file,
+                libe57.IntegerNode,
+                libe57,
+                {"row": table["row"], "column": table["col"], "return": np.zeros(1, int)},
+            ),
+        )
+        scan.set(
+            "cartesianBounds",
+            _bounds(file, libe57.FloatNode, libe57, {axis: table[axis].astype(float) for axis in "xyz"}),
+        )
+    single = libe57.E57_SINGLE
+    prototype, buffers = libe57.StructureNode(file), libe57.VectorSourceDestBuffer()
+    arrays: list[NDArray[Any]] = []  # libe57 keeps only pointers
+    columns: dict[str, tuple[NDArray[Any], Any]] = {
+        f"cartesian{axis.upper()}": (table[axis], libe57.FloatNode(file, 0.0, single)) for axis in "xyz"
+    }
+    columns["rowIndex"] = table["row"], libe57.IntegerNode(file, 0, 0, 65535)
+    columns["columnIndex"] = table["col"], libe57.IntegerNode(file, 0, 0, 65535)
+    for field in ("sigma", *COVARIANCE):
+        columns[f"{PREFIX}:{field}"] = table[field], libe57.FloatNode(file, 0.0, single)
+    columns[f"{PREFIX}:feature"] = table["feature"], libe57.IntegerNode(file, -1, -32768, 32767)
+    for field, (values, node) in columns.items():
+        prototype.set(field, node)
+        arrays.append(np.ascontiguousarray(values))
+        if len(table):
+            buffers.append(libe57.SourceDestBuffer(file, field, arrays[-1], len(table), True, True))
+    vector = libe57.CompressedVectorNode(file, prototype, libe57.VectorNode(file, True))
+    scan.set("points", vector)
+    image.data3d.append(scan)
+    if len(table):
+        writer = vector.writer(buffers)
+        writer.write(len(table))
+        writer.close()
+
+
+def _pose(file: Any, libe57: Any, pose: Transform) -> Any:
+    x, y, z, w = Rotation.from_matrix(pose.rotation).as_quat(canonical=True)
+    out = libe57.StructureNode(file)
+    for key, values in (
+        ("rotation", {"w": w, "x": x, "y": y, "z": z}),
+        ("translation", dict(zip("xyz", pose.translation / 1000, strict=True))),
+    ):
+        node = libe57.StructureNode(file)
+        for name, value in values.items():
+            node.set(name, libe57.FloatNode(file, float(value)))
+        out.set(key, node)
+    return out
+
+
+def _bounds(file: Any, kind: Any, libe57: Any, columns: dict[str, NDArray[Any]]) -> Any:
+    out = libe57.StructureNode(file)
+    for name, values in columns.items():
+        out.set(f"{name}Minimum", kind(file, values.min().item()))
+        out.set(f"{name}Maximum", kind(file, values.max().item()))
+    return out

@@ -1,0 +1,115 @@
+"""Write part, views, frusta, clouds and statuses as a recording (``.rrd``) for the Rerun viewer, with rerun-sdk.
+
+Everything is in mm and in the part frame; entities::
+
+    part                                mesh
+    views/view_0012                     pose of the sensor; best_of, the measurements for which it is the best view
+    views/view_0012/grid                the image grid: a frustum, with its pose in the sensor frame
+    views/view_0012/grid/KIND_status    why each pixel has a point or none; named by the annotation context
+    views/view_0012/KIND                points, coloured by sigma; sigma, and covariance, six numbers for each point
+
+KIND is ``predicted`` or ``rendered``. The frustum is that of a pinhole, even if a lens distorts the grid's rays.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.atomic_io import atomic_write_named
+from characterisation.point_cloud import PointCloud, Status
+from mitsim.report.export.cloud_points import cloud_points
+from mitsim.report.export.gltf import FRUSTUM_MM
+from mitsim.report.export.needed import needed
+from mitsim.report.export.run_scene import RunScene, ShownView
+
+#: colours of the statuses, by number (Tol's "muted" and greys; valid points are dark)
+STATUS_COLOURS = (
+    (51, 34, 136),
+    (221, 221, 221),
+    (136, 204, 238),
+    (204, 102, 119),
+    (221, 204, 119),
+    (17, 119, 51),
+    (170, 68, 153),
+    (153, 153, 51),
+    (136, 34, 85),
+    (68, 170, 153),
+    (120, 120, 120),
+)
+
+_UNKNOWN = (150, 150, 150)
+
+
+def write_rrd(scene: RunScene, path: str | Path, recording: str) -> None:
+    """Write a recording; ``recording`` is its id, which distinguishes it in the viewer."""
+    rerun = needed("rerun", "rerun-sdk", f"{path}: Rerun")
+    with atomic_write_named(path) as file:
+        stream = rerun.RecordingStream("mitsim", recording_id=recording, send_properties=False)
+        stream.save(str(file))
+        stream.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        classes = [(status.value, status.name.lower(), STATUS_COLOURS[status]) for status in Status]
+        stream.log("views", rerun.AnnotationContext(classes), static=True)
+        if scene.part is not None:
+            mesh = rerun.Mesh3D(
+                vertex_positions=scene.part.vertices,
+                triangle_indices=scene.part.faces,
+                vertex_normals=scene.part.vertex_normals,
+                albedo_factor=(180, 180, 185),
+            )
+            stream.log("part", mesh, static=True)
+        for view in scene.views:
+            _log_view(rerun, stream, scene, view)
+        stream.flush()
+        stream.disconnect()
+
+
+def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None:
+    place, pose = f"views/{view.name}", view.part_from_sensor
+    stream.log(
+        place,
+        rerun.Transform3D(translation=pose.translation, mat3x3=pose.rotation),
+        rerun.AnyValues(best_of=list(view.best_of) or [""]),
+        static=True,
+    )
+    grid = scene.grid
+    if grid is not None:
+        pinhole = rerun.Pinhole(
+            focal_length=(grid.fx, grid.fy),
+            principal_point=(grid.cx, grid.cy),
+            width=grid.width,
+            height=grid.height,
+            camera_xyz=rerun.ViewCoordinates.RDF,
+            image_plane_distance=FRUSTUM_MM,
+        )
+        stream.log(
+            f"{place}/grid", rerun.Transform3D(translation=grid.origin, mat3x3=grid.rotation), pinhole, static=True
+        )
+    for kind, cloud in view.clouds.items():
+        stream.log(f"{place}/grid/{kind}_status", rerun.SegmentationImage(cloud.status), static=True)
+        points = cloud_points(cloud)
+        stream.log(
+            f"{place}/{kind}",
+            rerun.Points3D(points.points, colors=_colours(cloud), radii=-1.5),
+            rerun.AnyValues(
+                sigma=points.sigma.astype(np.float32), covariance=points.covariance.astype(np.float32).ravel()
+            ),
+            static=True,
+        )
+
+
+def _colours(cloud: PointCloud) -> NDArray[np.uint8]:
+    """Return colours (n, 3) by ln sigma from its 2nd to its 98th percentile; grey where it is unknown."""
+    sigma = np.full(int(cloud.valid.sum()), np.nan) if cloud.sigma is None else cloud.sigma[cloud.valid].astype(float)
+    out = np.tile(np.array(_UNKNOWN, np.uint8), (len(sigma), 1))
+    known = np.isfinite(sigma) & (sigma > 0)
+    if known.any():
+        level = np.log(sigma[known])
+        low, high = np.percentile(level, [2, 98])
+        share = np.clip((level - low) / max(high - low, 1e-9), 0, 1)
+        out[known] = (255 * matplotlib.colormaps["viridis"](share)[:, :3]).astype(np.uint8)
+    return out

@@ -1,0 +1,183 @@
+"""Tabulate the results of a run: the expectation of every measurement from the chosen view; as CSV and JSON.
+
+Signal chain: ``run.json``, ``statement.json``, task -> a :class:`Result` for every measurement -> CSV, JSON, or QIF
+(:mod:`mitsim.report.export.qif`).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from characterisation.files.atomic_io import atomic_write, write_json
+from characterisation.files.documents import read_toml
+from characterisation.files.errors import InputError
+from characterisation.tasks.task_file import Task
+from characterisation.tasks.task_reading import read_task
+from mitsim.report.statement_section import StatedMeasurement
+from mitsim.running.version import __version__
+from mitsim.sensor.transforms import Transform
+from mitsim.study import StudyFile
+from mitsim.study.run_folder import Run, read_run
+
+
+@dataclass(frozen=True)
+class Result:
+    """Expected result of one measurement, in its ``unit`` (mm or deg); missing numbers are None.
+
+    ``expected`` is the mean value for a perfect part, nominal + ``bias``. ``low`` to ``high`` contain 95 % of the
+    values. ``uncertainty`` is the standard deviation about the mean (k = 1). ``verdict`` compares them with the
+    tolerance: it states whether the sensor is good enough, and nothing about a real part.
+    """
+
+    measurement: str
+    kind: str
+    features: tuple[str, ...]
+    unit: str
+    nominal: float
+    tolerance: float | tuple[float, float] | None
+    view: int
+    expected: float | None
+    bias: float | None
+    bias_uncertainty: float | None
+    uncertainty: float | None
+    low: float | None
+    high: float | None
+    trials: int
+    without_value: float
+    verdict: str
+
+
+@dataclass(frozen=True)
+class RunResults:
+    """Results of a run, its task, and the views of its plan: number, pose and measurements of each."""
+
+    results: tuple[Result, ...]
+    task: Task
+    sensor: str
+    study: str
+    source: str
+    plan: tuple[tuple[int, Transform, tuple[str, ...]], ...]
+
+
+def read_results(folder: str | Path, task_file: str | Path | None = None) -> RunResults:
+    """Read the results of a finished run.
+
+    The plan is the run's set of views, if it has one, in which every view measures everything; else the stated view.
+
+    Parameters
+    ----------
+    task_file
+        The task TOML; None uses the one named in the run's study.
+
+    Raises
+    ------
+    InputError
+        If the folder is not a run, has no statement, or the task is missing or a different one.
+    """
+    run = read_run(folder)
+    if run.statement is None:
+        raise InputError(Path(folder) / "statement.json", "", "no such file", "a run with a statement")
+    task = read_task(_task_path(run) if task_file is None else task_file)
+    if list(task.measurements) != list(run.about.measurements):
+        raise InputError(
+            task_file or _task_path(run),
+            "measurements",
+            ", ".join(task.measurements),
+            f"{', '.join(run.about.measurements)}: the task of the run",
+            "give the run's own: --task FILE",
+        )
+    view = run.statement.view
+    results = tuple(_result(name, task, run.statement.measurements[name], view) for name in task.measurements)
+    numbers = run.about.view_sets[0].views if run.about.view_sets else [view]
+    known = [int(number) for number in run.scores["view"].values]
+    poses = run.scores["world_from_sensor"].values
+    plan = tuple(
+        (number, Transform.from_matrix(poses[known.index(number)]), tuple(task.measurements)) for number in numbers
+    )
+    return RunResults(results, task, run.about.sensor, run.about.study, run.statement.measured_by, plan)
+
+
+def write_results_csv(found: RunResults, path: str | Path) -> None:
+    """Write one row for every measurement; missing numbers are empty fields."""
+    out = io.StringIO()
+    rows = [
+        asdict(one) | {"features": " ".join(one.features), "tolerance": _in_a_field(one.tolerance)}
+        for one in found.results
+    ]
+    writer = csv.DictWriter(out, list(Result.__dataclass_fields__), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with atomic_write(path) as file:
+        file.write_text(out.getvalue(), encoding="utf-8")
+
+
+def _in_a_field(tolerance: float | tuple[float, float] | None) -> object:
+    """Format a tolerance as a field of CSV: lower and upper deviation with a space between."""
+    return " ".join(map(repr, tolerance)) if isinstance(tolerance, tuple) else tolerance
+
+
+def write_results_json(found: RunResults, path: str | Path) -> None:
+    """Write the results and the plan as JSON."""
+    plan: list[dict[str, Any]] = [
+        {"view": number, "part_from_sensor": pose.matrix().tolist(), "measurements": list(names)}
+        for number, pose, names in found.plan
+    ]
+    results = [asdict(one) for one in found.results]
+    write_json(
+        path,
+        {
+            "schema_version": 1,
+            "software": f"mitsim {__version__}",
+            "sensor": found.sensor,
+            "study": found.study,
+            "measured_by": found.source,
+            "coverage_probability": 0.95,
+            "results": results,
+            "plan": plan,
+        },
+    )
+
+
+def _result(name: str, task: Task, stated: StatedMeasurement, view: int) -> Result:
+    asked = task.measurements[name]
+    low, high = (None if end is None else asked.nominal + end for end in stated.interval)
+    return Result(
+        name,
+        asked.kind,
+        asked.features,
+        asked.unit,
+        asked.nominal,
+        asked.tolerance,
+        view,
+        None if stated.bias is None else asked.nominal + stated.bias,
+        stated.bias,
+        stated.bias_uncertainty,
+        stated.standard_uncertainty,
+        low,
+        high,
+        stated.trials,
+        stated.without_value,
+        stated.verdict,
+    )
+
+
+def _task_path(run: Run) -> Path:
+    study = Path(run.about.study)
+    if not study.is_file():
+        raise InputError(
+            run.folder / "run.json",
+            "study",
+            f"{study}, which does not exist",
+            "a readable study",
+            "give the task: --task FILE",
+        )
+    path = study.parent / read_toml(study, StudyFile).task
+    if not path.is_file():
+        raise InputError(
+            study, "task", f"{path}, which does not exist", "a readable task", "give the task: --task FILE"
+        )
+    return path

@@ -1,0 +1,168 @@
+"""Read the three-dimensional content of a run folder: the part, views, their image grids and clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from characterisation.cloud_files import read_ply
+from characterisation.files.checked_files import read_json_object
+from characterisation.files.errors import InputError
+from characterisation.point_cloud import PointCloud, ViewGrid
+from mitsim.sensor.transforms import Transform
+from mitsim.study.run_folder import Run, read_run
+
+#: kinds of clouds of a run, by the first word of their file's name
+KINDS = ("predicted", "rendered")
+
+
+@dataclass(frozen=True)
+class ShownView:
+    """A candidate view: its number, its pose, its clouds by kind, and the measurements for which it is the best."""
+
+    number: int
+    part_from_sensor: Transform
+    clouds: dict[str, PointCloud]
+    best_of: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Return the name, such as ``view_0012``."""
+        return f"view_{self.number:04d}"
+
+
+@dataclass(frozen=True)
+class RunScene:
+    """Part [mm, part frame], views, and the image ``grid`` of every view, None without a cloud."""
+
+    part: trimesh.Trimesh | None
+    views: tuple[ShownView, ...]
+    grid: ViewGrid | None
+    sensor: str
+
+
+def read_run_scene(folder: str | Path, views: str = "best") -> RunScene:
+    """Read the three-dimensional content of a finished run.
+
+    Parameters
+    ----------
+    views
+        ``best``: views with clouds and best views of a measurement; ``all``; or numbers, ``3,12``.
+
+    Raises
+    ------
+    InputError
+        If the folder is not a run, or a view does not exist.
+    """
+    run = read_run(folder)
+    known = [int(number) for number in run.scores["view"].values]
+    chosen = chosen_views(run, views)
+    poses = run.scores["world_from_sensor"].values
+    shown = []
+    for number in chosen:
+        clouds = {kind: _read_own(run, kind, number) for kind in KINDS if run.has(_cloud_name(kind, number))}
+        best_of = tuple(name for name, best in run.about.leaders.items() if best == number)
+        pose = Transform.from_matrix(poses[known.index(number)])
+        shown.append(ShownView(number, pose, clouds, best_of))
+    grids = [cloud.grid for view in shown for cloud in view.clouds.values()]
+    if not grids and run.clouds:
+        grids = [run.predicted(run.clouds[0]).grid]
+    return RunScene(run.part(), tuple(shown), grids[0] if grids else None, run.about.sensor)
+
+
+def chosen_views(run: Run, views: str) -> list[int]:
+    """Return the view numbers selected by ``best``, ``all`` or a list of numbers, ascending.
+
+    Raises
+    ------
+    InputError
+        If the selection is none of these, or a view does not exist.
+    """
+    known = [int(number) for number in run.scores["view"].values]
+    if views == "best":
+        with_cloud = [number for number in known if any(run.has(_cloud_name(kind, number)) for kind in KINDS)]
+        return sorted({*with_cloud, *run.about.leaders.values()})
+    return numbers_of(views, known)
+
+
+def numbers_of(views: str, known: Sequence[int]) -> list[int]:
+    """Return the view numbers selected by ``all`` or a comma-separated list, ascending.
+
+    Raises
+    ------
+    InputError
+        If the selection is neither, or a view does not exist.
+    """
+    if views == "all":
+        return sorted(known)
+    allowed = f"best, all, or comma-separated numbers of views from {min(known)} to {max(known)}"
+    try:
+        chosen = sorted({int(word) for word in views.split(",")})
+    except ValueError:
+        raise InputError("--views", "", repr(views), allowed) from None
+    if unknown := [number for number in chosen if number not in known]:
+        raise InputError("--views", "", unknown[0], allowed)
+    return chosen
+
+
+def read_pose(path: str | Path) -> Transform:
+    """Read ``world_from_sensor``, 4 x 4 by rows [mm], from a JSON file: ``pose.json``, ``statement.json``.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it is not a rigid motion.
+    """
+    allowed = "world_from_sensor, 4 x 4 by rows, rigid [mm]"
+    try:
+        table = read_json_object(Path(path), f"JSON with {allowed}")
+        matrix = np.array(table["world_from_sensor"], float)
+    except InputError:
+        raise
+    except (ValueError, TypeError) as error:
+        raise InputError(path, "", f"a file that cannot be read ({error})", f"JSON with {allowed}") from None
+    except KeyError:
+        raise InputError(path, "world_from_sensor", "nothing", allowed) from None
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError(path, "world_from_sensor", table["world_from_sensor"], allowed)
+    turn = matrix[:3, :3]
+    if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
+        raise InputError(path, "world_from_sensor", "a matrix that is not a rotation", allowed)
+    return Transform.from_matrix(matrix)
+
+
+def frustum(grid: ViewGrid, depth: float) -> tuple[NDArray[np.float64], list[tuple[int, int]]]:
+    """Return apex and corners (5, 3) of a grid's view pyramid, in grid coordinates, and its 8 edges.
+
+    The corners lie at ``depth`` along the axis, at the outer corners of the corner pixels of the pinhole.
+    """
+    x = (np.array([-0.5, grid.width - 0.5]) - grid.cx) / grid.fx
+    y = (np.array([-0.5, grid.height - 0.5]) - grid.cy) / grid.fy
+    corners = [(x[0], y[0], 1.0), (x[1], y[0], 1.0), (x[1], y[1], 1.0), (x[0], y[1], 1.0)]
+    places = depth * np.array([(0.0, 0.0, 0.0), *corners])
+    return places, [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
+
+
+def sensor_from_grid(grid: ViewGrid) -> Transform:
+    """Return the pose of a grid in the sensor frame."""
+    return Transform(grid.rotation, grid.origin)
+
+
+def labelled_scans(scene: RunScene) -> Sequence[tuple[str, PointCloud, ShownView]]:
+    """Return all clouds of all views, each with a name such as ``view_0012_predicted``."""
+    return [(f"{view.name}_{kind}", cloud, view) for view in scene.views for kind, cloud in view.clouds.items()]
+
+
+def _cloud_name(kind: str, number: int) -> str:
+    return f"clouds/{kind}_{number:04d}.ply"
+
+
+def _read_own(run: Run, kind: str, number: int) -> PointCloud:
+    name = _cloud_name(kind, number)
+    run.check(name)
+    return read_ply(run.folder / name)

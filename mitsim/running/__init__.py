@@ -1,0 +1,1 @@
+"""How the program runs: worker processes, progress, tables and numbers for readers, the version."""

@@ -1,0 +1,246 @@
+"""Distribute work to the workers of a Dask cluster.
+
+Each order is sent to a worker as plain values, and its result is returned; only this process writes to a folder.
+Workers may join, leave and die during the work: the order of a dead worker goes to another. All workers need this build
+of mitsim (:mod:`mitsim.running.build`). It is compared before anything is sent, and again with every order, since
+workers may join later. They must see the scenes at the same paths, and run one thread each (``dask worker ADDRESS
+--nthreads 1``). The same kind of processor gives the same bytes as one machine.
+
+Everyone with access to a Dask scheduler can run code as the user of every worker and client. ``tls://`` with Dask's own
+configuration (``distributed.comm.tls`` in its YAML files or environment) restricts the access.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from characterisation.files.checked_files import is_file
+from characterisation.files.errors import InputError, MissingEnvironmentError
+from mitsim.running.build import differences, own_build
+from mitsim.running.progress import say
+
+Item = TypeVar("Item")
+Plain = TypeVar("Plain")
+Result = TypeVar("Result")
+
+#: orders that wait at each worker: enough to keep it busy, few enough to lose little at a stop
+AHEAD = 3
+
+#: number of workers that may die with one order before it is given up
+DEATHS = 5
+
+#: time limit for the answer of the scheduler [s]
+CONNECT_TIMEOUT_S = 10
+
+#: time without any worker after which a campaign ends [s]; the queue of a cluster may take minutes to start one
+NO_WORKER_S = 600
+
+#: time between messages about missing workers [s]
+REPORT_EVERY_S = 30
+
+#: time between checks for finished orders [s]
+_POLL_S = 0.02
+
+_ADDRESS = re.compile(r"(?:(tcp|tls)://)?(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):([0-9]{1,5})")
+
+
+class Cluster:
+    """The workers of a Dask scheduler, as an :class:`mitsim.running.executor.Executor`.
+
+    Raises
+    ------
+    InputError
+        If the address is not valid.
+    MissingEnvironmentError
+        If ``distributed`` is not installed, certificates are missing, or no scheduler answers.
+    """
+
+    def __init__(self, address: str) -> None:
+        self.address, self.client = address, connected(address)
+        # an unclosed client looks for its scheduler forever, in its own thread
+        weakref.finalize(self, self.client.close).atexit = False  # Dask closes it at the end of the process
+
+    def distribute(
+        self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
+    ) -> Iterator[tuple[Item, Result]]:
+        """Yield items with the results of their orders, as they are finished; orders and results are plain values.
+
+        Raises
+        ------
+        InputError
+            If a worker raises it.
+        MissingEnvironmentError
+            If there are no workers for :data:`NO_WORKER_S`, a worker has another build of mitsim, or any other error
+            occurs there.
+        """
+        from distributed import as_completed
+
+        if not items:
+            return
+        own = own_build()
+        _compare_builds(self.client, self.address, own)
+        waiting = list(reversed(items))
+        running = as_completed(loop=self.client.loop)
+        of: dict[object, Item] = {}
+        watch = _Watch(self.client, self.address)
+
+        def send() -> None:
+            room = AHEAD * max(sum(self.client.ncores().values()), 1)
+            while waiting and len(of) < room:
+                item = waiting.pop()
+                future = self.client.submit(_of_same_build, own, work, order(item), pure=False, retries=DEATHS)
+                of[future.key] = item
+                running.add(future)
+
+        try:
+            send()
+            while of:
+                finished = running.next_batch(block=False)
+                if not finished:
+                    watch.check()
+                    time.sleep(_POLL_S)
+                for future in finished:
+                    yield of.pop(future.key), _result(future, self.address)
+                    send()
+        finally:
+            self.client.cancel(list(running.futures))
+
+
+def connected(address: str) -> Any:
+    """Return a client of the Dask scheduler at an address.
+
+    Raises
+    ------
+    InputError
+        If the address is not valid.
+    MissingEnvironmentError
+        If ``distributed`` is not installed, certificates are missing, or no scheduler answers.
+    """
+    match = _ADDRESS.fullmatch(address)
+    if match is None or not 0 < int(match[2]) < 65536:
+        raise InputError(
+            "--scheduler", "", repr(address), "tcp://HOST:PORT or tls://HOST:PORT, as dask scheduler prints"
+        )
+    try:
+        import dask
+        from distributed import Client
+    except ImportError:
+        raise MissingEnvironmentError(
+            "--scheduler needs Dask, which is not installed: pip install 'mitsim[cluster]'"
+        ) from None
+    if match[1] == "tls":
+        _check_certificates(address, dask.config.get("distributed.comm.tls", {}))
+    try:
+        return Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
+    except Exception as error:  # Dask raises many types for networks and certificate files
+        raise MissingEnvironmentError(
+            f"--scheduler {address}: no scheduler answers there ({_in_a_line(error)}); start one with: dask scheduler"
+        ) from None
+
+
+def _check_certificates(address: str, named: dict[str, Any]) -> None:
+    """Reject a configuration of Dask without the files that TLS needs."""
+    client = named.get("client") or {}
+    files = {"ca-file": named.get("ca-file"), "client.cert": client.get("cert"), "client.key": client.get("key")}
+    missing = [
+        f"{key} ({value})" if value else key for key, value in files.items() if not value or not is_file(str(value))
+    ]
+    if missing:
+        raise MissingEnvironmentError(
+            f"--scheduler {address}: Dask has no certificates: its configuration distributed.comm.tls has no file as "
+            + ", ".join(missing)
+        )
+
+
+def _result(future: Any, address: str) -> Any:
+    try:
+        done = future.result()
+    except InputError:
+        raise
+    except Exception as error:  # any error of a worker or the network
+        raise MissingEnvironmentError(
+            f"--scheduler {address}: a capture failed there ({_in_a_line(error)}); finished "
+            "work is kept: repair the cluster, and run the same command again"
+        ) from None
+    if isinstance(done, OtherBuild):
+        raise _other_build(address, done.worker, done.differences)
+    return done
+
+
+@dataclass(frozen=True)
+class OtherBuild:
+    """Answer of a worker, in place of a result, if its build differs from that of the order."""
+
+    worker: str
+    differences: str
+
+
+def _of_same_build(build: dict[str, str], work: Callable[[Plain], Result], order: Plain) -> Result | OtherBuild:
+    """Work on an order if this process has the build of the order; workers call this function."""
+    from distributed import get_worker
+
+    if found := differences(build, own_build()):
+        return OtherBuild(str(get_worker().address), found)
+    return work(order)
+
+
+def _compare_builds(client: Any, address: str, own: dict[str, str]) -> None:
+    """Wait for a worker, and compare the builds of all workers."""
+    watch = _Watch(client, address)
+    while not client.ncores():
+        watch.check()
+        time.sleep(_POLL_S)
+    try:
+        builds = client.run(own_build, on_error="return")
+    except Exception as error:  # a worker without this function, or a network error
+        raise MissingEnvironmentError(f"--scheduler {address}: {_in_a_line(error)}") from None
+    for worker, build in builds.items():
+        if isinstance(build, OSError):
+            continue  # the worker died meanwhile
+        differing = differences(own, build) if isinstance(build, dict) else f"no known build ({_in_a_line(build)})"
+        if differing:
+            raise _other_build(address, worker, differing)
+
+
+def _other_build(address: str, worker: str, found: str) -> MissingEnvironmentError:
+    return MissingEnvironmentError(
+        f"--scheduler {address}: the worker {worker} has {found}: its captures would differ; install the same mitsim "
+        "there, and run the same command again"
+    )
+
+
+class _Watch:
+    """Watches for a time without workers: reports it from time to time, and finally raises an error."""
+
+    def __init__(self, client: Any, address: str) -> None:
+        self.client, self.address = client, address
+        self.since = self.reported = self.checked = time.monotonic()
+        self.alone = False
+
+    def check(self) -> None:
+        now = time.monotonic()
+        if now - self.checked < 1.0 and self.alone:
+            return
+        self.checked = now
+        if self.client.ncores():
+            self.alone = False
+            return
+        if not self.alone:
+            self.alone, self.since, self.reported = True, now, now - REPORT_EVERY_S
+        if now - self.since > NO_WORKER_S:
+            raise MissingEnvironmentError(
+                f"--scheduler {self.address}: no workers in {NO_WORKER_S:g} s; start some with: "
+                f"dask worker {self.address} --nthreads 1; finished work is kept"
+            )
+        if now - self.reported >= REPORT_EVERY_S:
+            self.reported = now
+            say(f"{self.address}: no workers yet, waiting up to {NO_WORKER_S - (now - self.since):.0f} s")
+
+
+def _in_a_line(error: BaseException) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"

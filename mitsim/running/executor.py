@@ -1,0 +1,199 @@
+"""Distribute independent orders to processes on this machine or to the workers of a Dask scheduler.
+
+Signal chain: items -> orders, which are plain values -> each is worked on separately, anywhere and in any sequence ->
+items with results, as they are finished. Campaigns, many captures, virtual measurements, data sheets, validations of
+views and comparisons of sensors all use it.
+
+A result depends on its order alone, so the whole is the same for any number of workers. The caller keeps each result
+before it asks for the next, so a stop loses only the orders in work. A dead worker is replaced and its orders are
+repeated, at most :data:`DEATHS` times in a row.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from characterisation.files.errors import InputError, MissingEnvironmentError
+from characterisation.files.threads import usable_cores
+from mitsim.running.progress import say, track
+
+Item = TypeVar("Item")
+Plain = TypeVar("Plain")
+Result = TypeVar("Result")
+
+#: memory of a worker [bytes]: the largest value in docs/explanation/scale.md
+MEMORY = 2 << 30
+
+#: orders that wait for each process, so that none is idle
+AHEAD = 2
+
+#: number of processes that may die in a row without any finished order
+DEATHS = 5
+
+
+class Executor(Protocol):
+    """Distributes work: :class:`Pool`, or :class:`mitsim.running.cluster.Cluster`."""
+
+    def distribute(
+        self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
+    ) -> Iterator[tuple[Item, Result]]:
+        """Yield items with the results of ``work``, a module-level function, on their orders, as they are finished.
+
+        Raises
+        ------
+        InputError
+            If a worker raises it.
+        MissingEnvironmentError
+            If no worker is left.
+        """
+
+
+def executor_of(scheduler: str | None, processes: int = 1) -> Executor | None:
+    """Return the workers of a scheduler, or processes on this machine; None if only this process works.
+
+    ``processes`` of 0 means as many as cores and memory allow.
+
+    Raises
+    ------
+    InputError
+        If both are given, or the address of the scheduler is not valid.
+    MissingEnvironmentError
+        If no scheduler answers.
+    """
+    if scheduler is not None:
+        if processes != 1:
+            raise InputError("--processes", "", processes, "not with --scheduler", "its workers are processes")
+        from mitsim.running.cluster import Cluster
+
+        return Cluster(scheduler)
+    count = fitting_processes() if processes == 0 else processes
+    return None if count == 1 else Pool(count)
+
+
+def fitting_processes() -> int:
+    """Return the number of workers for this machine: one per core and per :data:`MEMORY`; one on a CUDA device."""
+    from mitsim.scene.backend import cuda_devices
+
+    if cuda_devices():
+        return 1  # one process uses the whole device
+    return max(1, min(usable_cores(), available_memory() // MEMORY))
+
+
+def available_memory() -> int:
+    """Return the available memory [bytes] of the machine, or of the container of this process."""
+    found = [8 << 30]
+    with contextlib.suppress(OSError, ValueError, StopIteration):
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        found = [1024 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))]
+    with contextlib.suppress(OSError, ValueError):
+        group = Path("/sys/fs/cgroup")
+        limit, used = (int((group / f"memory.{name}").read_text(encoding="ascii")) for name in ("max", "current"))
+        found.append(max(limit - used, 0))
+    return min(found)
+
+
+class Pool:
+    """Processes on this machine, each with its share of the cores."""
+
+    def __init__(self, processes: int) -> None:
+        self.processes = processes
+        self._pool: ProcessPoolExecutor | None = None
+
+    def distribute(
+        self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
+    ) -> Iterator[tuple[Item, Result]]:
+        """Yield items with the results of ``work`` on their orders, as they are finished.
+
+        Raises
+        ------
+        InputError
+            If a worker raises it.
+        MissingEnvironmentError
+            If processes die repeatedly.
+        """
+        waiting, deaths = deque(items), 0
+        while waiting:
+            running: dict[Future[Result], Item] = {}
+            try:
+                pool = self._ready()
+                while waiting or running:
+                    while waiting and len(running) < AHEAD * self.processes:
+                        running[pool.submit(work, order(waiting[0]))] = waiting[0]
+                        waiting.popleft()
+                    for future in wait(running, return_when=FIRST_COMPLETED).done:
+                        result = future.result()
+                        deaths = 0
+                        yield running.pop(future), result
+            except BrokenProcessPool:
+                self._pool = None
+                waiting.extendleft(reversed(running.values()))
+                deaths += 1
+                if deaths > DEATHS:
+                    raise MissingEnvironmentError(
+                        f"--processes {self.processes}: {deaths} of them died in a row, maybe for lack of memory; "
+                        "finished work is kept: use fewer, and run the same command again"
+                    ) from None
+                say("a worker process died; its work is repeated")
+            finally:
+                for future in running:
+                    future.cancel()
+
+    def close(self) -> None:
+        """End the processes after their current orders."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
+
+    def _ready(self) -> ProcessPoolExecutor:
+        if self._pool is None:
+            from mitsim.scene import backend
+
+            threads = max(1, usable_cores() // self.processes)
+            context = multiprocessing.get_context("spawn")  # a forked process with Dr.Jit's threads hangs
+            self._pool = ProcessPoolExecutor(
+                self.processes, context, _start_worker, (threads, os.getpid(), backend.active())
+            )
+        return self._pool
+
+
+def _start_worker(threads: int, parent: int, variant: str | None) -> None:
+    """Set up a worker process: limit its threads, and ignore Ctrl-C, which the parent handles."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _end_with_parent(parent)
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = str(threads)
+    from mitsim.scene import backend
+
+    backend.activate(variant)  # with as many threads
+
+
+def _end_with_parent(parent: int) -> None:
+    """End this process if the parent is killed (Linux)."""
+    if sys.platform == "linux":
+        import ctypes
+
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+    if os.getppid() != parent:
+        raise SystemExit(0)
+
+
+def results_of(
+    orders: Sequence[Plain], work: Callable[[Plain], Result], workers: Executor | None, label: str
+) -> list[Result]:
+    """Return the results of orders, in their sequence, from workers or this process; progress goes to stderr."""
+    if workers is None:
+        return [work(one) for one in track(orders, label)]
+    made = workers.distribute(range(len(orders)), orders.__getitem__, work)
+    found = dict(track(made, label, len(orders)))
+    return [found[number] for number in range(len(orders))]

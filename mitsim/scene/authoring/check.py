@@ -1,0 +1,364 @@
+"""Find problems in a scene before it is rendered, and advise on each.
+
+Signal chain: facts about the shapes (:mod:`mitsim.scene.inspect`), what a sensor sees from one pose, the nominal
+geometry of a task -> findings.
+
+- An *error* cannot work: a feature of the task without a shape, an inside-out part.
+- A *warning* gives results that the author does not expect.
+- A *note* is information.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from characterisation.files.documents import Document, read_toml
+from characterisation.files.errors import nearest
+from characterisation.tasks.decision_table import Decision
+from characterisation.tasks.evaluation import Feature, Measurement, read_task
+from mitsim.scene.authoring.face import surface_distance
+from mitsim.scene.first_hits import VisibleSurfaces
+from mitsim.scene.inspect import SceneFacts, ShapeFacts
+from mitsim.scene.mesh_facts import MeshFacts
+from mitsim.scene.surface.processes import PROCESSES
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
+from mitsim.sensor.working_volume import depth, eyes_of, field_of_view, in_image, in_working_volume
+
+Severity = Literal["error", "warning", "note"]
+
+#: largest distance of nominal geometry from the shape's surface [mm]; beyond the second it is an error
+NOMINAL_MM, MISTAKE_MM = 0.05, 1.0
+
+#: a part of fewer pixels at the middle of the working range probably has another unit
+SMALL_PX = 40
+
+#: a border shorter than this share of the shape's diagonal is that of a hole, else that of a face
+_HOLE = 0.5
+
+#: share of slivers without area above which they are reported; a fine mesh of a curved face has a few
+_SLIVERS = 0.01
+
+#: edges closer than this share of the part's size close one another; number of neighbours searched
+_CLOSED, _NEIGHBOURS = 1e-4, 16
+
+#: up to this number of back-side pixels are rays through the seam of two faces
+_CRACK_PX = 10
+
+#: shapes whose triangles Mitsuba itself makes
+_STOCK = ("rectangle", "disk", "cube", "sphere", "cylinder")
+
+_UNITS = {"inches": 25.4, "metres": 1000.0}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One finding: its severity, the shape or feature it is about ("" for the scene), the problem and the advice."""
+
+    severity: Severity
+    about: str
+    what: str
+    advice: str
+
+    def __str__(self) -> str:
+        about = f"{self.about}: " if self.about else ""
+        return f"{self.severity}: {about}{self.what}. {self.advice}"
+
+
+class TaskFeatures(Document):
+    """A task TOML that may have no measurements yet."""
+
+    features: dict[str, Feature]
+    measurements: dict[str, Measurement] = Field(default_factory=dict)
+    decision: Decision = Decision()
+
+
+def read_features(path: str | Path) -> TaskFeatures:
+    """Read a task, with or without measurements.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be used, or a measurement does not fit its features.
+    """
+    task = read_toml(path, TaskFeatures)
+    if task.measurements:
+        read_task(path)
+    return task
+
+
+def findings(
+    facts: SceneFacts,
+    sensor: Sensor,
+    pose: Transform,
+    visible: VisibleSurfaces,
+    posed: bool,
+    task: TaskFeatures | None = None,
+) -> list[Finding]:
+    """Return all findings, the most severe first.
+
+    ``posed``: whether the author chose the pose; then shapes outside the working volume are reported.
+    """
+    measured = set(task.features) if task else set()
+    found: list[Finding] = []
+    borders = open_borders(facts)
+    for number, shape in enumerate(facts.shapes):
+        if shape.emitter:
+            continue
+        found += _named(shape)
+        found += _material(shape, shape.name in measured)
+        found += _mesh(shape, borders[number])
+        found += _facing(shape, number, visible)
+        if posed:
+            found += _placed(shape, number, sensor, pose, visible)
+    found += _whole(facts, sensor, sum(len(one) for one in borders))
+    if task:
+        found += _task(facts, task)
+    order = ("error", "warning", "note")
+    return sorted(found, key=lambda one: order.index(one.severity))
+
+
+def _named(shape: ShapeFacts) -> Iterator[Finding]:
+    if not shape.named:
+        yield Finding(
+            "warning",
+            shape.name,
+            f"a {shape.kind} without an id; mitsim chose this name, and it may change",
+            f'Write <shape type="{shape.kind}" id="...">: a task names features by id',
+        )
+
+
+def _material(shape: ShapeFacts, measured: bool) -> Iterator[Finding]:
+    severity: Severity = "error" if measured else "warning"
+    if shape.delta:
+        what = f"a {shape.bsdf} only mirrors or refracts: black under a point-like projector"
+        yield Finding(severity, shape.name, what, "Use machined_metal, or a rough BSDF")
+    elif shape.finish is None:
+        what = f"the BSDF {shape.bsdf} has no finish, so no performance map covers it"
+        advice = "Use machined_metal, gloss_paint, powder_coat or matt_white; as it is, it occludes but gives no points"
+        yield Finding(severity, shape.name, what, advice)
+    else:
+        name, roughness = shape.finish.name.partition("/")[2], shape.finish.roughness
+        process = PROCESSES.get(name)
+        if process is not None and (roughness < process.usual[0] or roughness > process.usual[1]):
+            advice = (
+                f"{name.capitalize()} metal usually has {process.usual[0]:g} to {process.usual[1]:g} um: "
+                "check process and unit on the drawing"
+            )
+            yield Finding("warning", shape.name, f"Ra {roughness:g} um is unusual for {name}", advice)
+    u, v = shape.alpha
+    if abs(u - v) > 0.01 * (u + v) and shape.mesh is not None and not shape.mesh.texture:
+        what = f"a lay (alpha {u:.3g} along u, {v:.3g} along v) on a mesh without u, v: its direction is arbitrary"
+        advice = "Export the mesh with texture coordinates; mitsim part writes them for planes and cylinders"
+        yield Finding("warning", shape.name, what, advice)
+
+
+def _mesh(shape: ShapeFacts, border: NDArray[np.float64]) -> Iterator[Finding]:
+    mesh = shape.mesh
+    if mesh is None or shape.kind in _STOCK:
+        return
+    if mesh.duplicate or mesh.degenerate > _SLIVERS * len(mesh.triangles):
+        what = f"{mesh.degenerate} triangles without area, {mesh.duplicate} duplicates"
+        yield Finding("warning", shape.name, what, "Clean the mesh: mitsim part leaves them out")
+    if mesh.nonmanifold_edges:
+        yield Finding(
+            "warning",
+            shape.name,
+            f"{mesh.nonmanifold_edges} edges belong to more than two triangles",
+            "Remove inner walls, or make one shape of each touching body",
+        )
+    holes = _holes(mesh, border)
+    if holes:
+        yield Finding(
+            "warning",
+            shape.name,
+            f"not watertight: {holes} open edges",
+            "Close the holes (trimesh.repair.fill_holes), or light passes through them",
+        )
+
+
+def open_borders(facts: SceneFacts) -> list[NDArray[np.float64]]:
+    """Return the open edges (k, 2, 3) [mm] of each shape that no other edge closes.
+
+    Edges close one another within :data:`_CLOSED` of the part's size. The faces of a part are meshed separately: their
+    edges meet within a CAD program's tolerance, not vertex by vertex.
+    """
+    borders = [
+        np.empty((0, 2, 3)) if one.mesh is None or one.emitter else one.mesh.open_edge_ends for one in facts.shapes
+    ]
+    every = np.concatenate(borders) if borders else np.empty((0, 2, 3))
+    if len(every) < 2:
+        return borders
+    limit = max(NOMINAL_MM / 5, _CLOSED * float(np.linalg.norm(facts.bounds[1] - facts.bounds[0])))
+    middles = every.mean(axis=1)
+    near = cKDTree(middles).query(middles, k=min(_NEIGHBOURS, len(every)))[1]
+    start, along = every[near, 0], every[near, 1] - every[near, 0]
+    share = np.einsum("ijk,ijk->ij", middles[:, None] - start, along) / np.maximum((along**2).sum(-1), 1e-30)
+    foot = start + np.clip(share, 0, 1)[..., None] * along
+    apart = np.linalg.norm(foot - middles[:, None], axis=-1)
+    apart[near == np.arange(len(every))[:, None]] = np.inf
+    still = apart.min(axis=1) > limit
+    ends = np.cumsum([0, *(len(one) for one in borders)])
+    return [one[still[a:b]] for one, a, b in zip(borders, ends, ends[1:], strict=False)]
+
+
+def _holes(mesh: MeshFacts, border: NDArray[np.float64]) -> int:
+    """Count the open edges that bound a hole, which has a short border; that of an open face surrounds the face."""
+    if not len(border):
+        return 0
+    size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    _, corner = np.unique(np.round(border.reshape(-1, 3) / (1e-6 * size)), axis=0, return_inverse=True)
+    ends = corner.reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(int(ends.max()) + 1,) * 2)
+    _, loop = connected_components(graph, directed=False)
+    of_edge = loop[ends[:, 0]]
+    around = np.bincount(of_edge, np.linalg.norm(border[:, 1] - border[:, 0], axis=1))
+    return int((around[of_edge] < _HOLE * size).sum())
+
+
+def _facing(shape: ShapeFacts, number: int, visible: VisibleSurfaces) -> Iterator[Finding]:
+    """Yield findings about faces whose black back side is visible."""
+    if shape.two_sided:
+        return
+    turn = 'Reverse its triangles, or write <boolean name="flip_normals" value="true"/>'
+    mesh, mine = shape.mesh, visible.shape == number
+    if mesh is not None and mesh.closed and mesh.volume < 0:
+        what = f"inward normals: a closed mesh of {mesh.volume:.4g} mm^3, black from outside"
+        yield Finding("error", shape.name, what, turn)
+    elif shape.front_hits + shape.back_hits == 0:
+        what = "visible from nowhere: it lies inside the part, or is very small"
+        yield Finding("note", shape.name, what, "Leave it out if it is not needed")
+    elif shape.front_hits < 0.02 * shape.back_hits:
+        what = "inward normals: only its black back is visible, from all directions"
+        yield Finding("error", shape.name, what, turn)
+    elif mine.sum() > _CRACK_PX and not visible.front[mine].any():
+        what = "shows only its black back in this view"
+        yield Finding("warning", shape.name, what, f"{turn}; or look from the other side")
+
+
+def _placed(
+    shape: ShapeFacts, number: int, sensor: Sensor, pose: Transform, visible: VisibleSurfaces
+) -> Iterator[Finding]:
+    """Yield findings about shapes that the chosen pose cannot measure."""
+    mine = visible.shape == number
+    if not len(shape.points) or (mine.any() and not visible.front[mine].any()):
+        return  # another finding reports a visible back
+    points, normals = pose.inverse().points(shape.points), pose.inverse().directions(shape.normals)
+    facing = np.einsum("ij,ij->i", normals, sensor.rig.reference.centre - points) > 0
+    if not (facing.any() or shape.two_sided):
+        what = "faces away from the sensor in this pose"
+        yield Finding("note", shape.name, what, "Look from another side if it is measured")
+        return
+    shown = points if shape.two_sided else points[facing]
+    share = float(in_working_volume(sensor, shown).mean())
+    if share == 0:
+        what = f"outside the working volume in this pose: {_why_outside(sensor, shown)}"
+        yield Finding("warning", shape.name, what, "Move the sensor")
+        return
+    if share < 0.99:
+        what = f"{100 * share:.0f} % of the facing area lies in the working volume: {_why_outside(sensor, shown)}"
+        yield Finding("note", shape.name, what, "Move the sensor if the rest is measured")
+    if not (mine & visible.seen_by_all).any():
+        why = "another camera or the projector does not see it" if mine.any() else "other faces occlude it"
+        what = f"cameras and projector see no point in common: {why}"
+        yield Finding("warning", shape.name, what, "Look from another side if it is measured")
+
+
+def _why_outside(sensor: Sensor, points: np.ndarray) -> str:
+    near, far = sensor.working_range_mm
+    along = depth(sensor, points)
+    reasons = []
+    if along.min() < near or along.max() > far:
+        reasons.append(f"{along.min():.0f} to {along.max():.0f} mm deep, the sensor works from {near:g} to {far:g} mm")
+    reasons += [
+        f"not {'wholly ' if in_image(eye, points).any() else ''}in the image of the {name}"
+        for name, eye in eyes_of(sensor).items()
+        if not in_image(eye, points).all()
+    ]
+    return "; ".join(reasons)
+
+
+def _whole(facts: SceneFacts, sensor: Sensor, open_edges: int) -> Iterator[Finding]:
+    """Yield findings about size, units, gaps and light of the whole scene."""
+    yield from _size(sorted((facts.bounds[1] - facts.bounds[0]).tolist(), reverse=True), sensor)
+    parts = [shape for shape in facts.shapes if not shape.emitter]
+    cut = all(shape.kind not in _STOCK for shape in parts)
+    each_closed = all(shape.mesh is not None and shape.mesh.closed for shape in parts)
+    if facts.merged_mesh is not None and cut and open_edges and not each_closed:
+        what = f"all meshes together are not closed ({open_edges} open edges)"
+        advice = "Correct if only one side of the part is modelled: light passes through the openings"
+        yield Finding("note", "", what, advice)
+    if facts.emitters:
+        known = [flux for _, flux in facts.emitters if np.isfinite(flux)]
+        kinds = ", ".join(sorted({kind for kind, _ in facts.emitters}))
+        total = f", {sum(known):.3g} W in all" if known else ""
+        rest = f", {len(facts.emitters) - len(known)} without a flux" if len(known) < len(facts.emitters) else ""
+        what = f"ambient light, {len(facts.emitters)} emitter{'s'[: len(facts.emitters) > 1]} ({kinds}{total}{rest})"
+        advice = f"It is added to every image; the projector emits {sensor.projector.flux:g} W"
+        yield Finding("note", "", what, advice)
+
+
+def _size(sizes: list[float], sensor: Sensor) -> Iterator[Finding]:
+    """Yield findings about a part in the wrong unit or larger than the view; ``sizes`` [mm], the largest first."""
+    near, far = sensor.working_range_mm
+    middle = (near + far) / 2
+    pixel = middle / float(sensor.rig.reference.matrix[0, 0])
+    if sizes[0] < SMALL_PX * pixel:
+        largest = 3 * field_of_view(sensor, far)[0]
+        guesses = [
+            f"if it was modelled in {unit} it is {factor * sizes[0]:.4g} mm: scale by {factor:g}"
+            for unit, factor in _UNITS.items()
+            if SMALL_PX * pixel <= factor * sizes[0] <= largest
+        ]
+        what = f"the part is {sizes[0]:.4g} mm across, {sizes[0] / pixel:.0f} px at {middle:g} mm"
+        yield Finding("warning", "", what, f"Lengths are mm; {'; '.join(guesses) or 'check the unit of the file'}")
+    view = sorted(field_of_view(sensor, near), reverse=True)
+    if sizes[0] > view[0] or sizes[1] > view[1]:
+        part = " x ".join(f"{size:.0f}" for size in sizes)
+        what = f"the part is {part} mm, the common view at {near:g} mm is {view[0]:.0f} x {view[1]:.0f} mm"
+        unit = "; or its unit is not mm" if sizes[0] > 10 * view[0] else ""
+        yield Finding("warning", "", what, f"Increase the distance, or plan several views{unit}")
+
+
+def _task(facts: SceneFacts, task: TaskFeatures) -> Iterator[Finding]:
+    names = [shape.name for shape in facts.shapes]
+    if not task.measurements:
+        yield Finding("note", "task", "it has no measurements yet", "Add a [measurements.NAME] before a study")
+    for name, feature in task.features.items():
+        if not feature.shaped:
+            continue  # it is derived from others
+        if name not in names:
+            hint = nearest(name, names)
+            advice = f"D{hint[1:]}" if hint else f"The shapes are: {', '.join(names)}"
+            yield Finding("error", name, "a feature of the task without a shape in the scene", advice)
+        else:
+            yield from _nominal(facts.shapes[names.index(name)], feature)
+
+
+def _nominal(shape: ShapeFacts, feature: Feature) -> Iterator[Finding]:
+    """Yield a finding if the nominal geometry of a task does not lie on the shape of that name."""
+    surface = feature.nominal()
+    corners = shape.points if shape.mesh is None else shape.mesh.vertices
+    worst = float(np.abs(surface_distance(surface, corners)).max(initial=0.0))
+    if worst > NOMINAL_MM:
+        severity: Severity = "error" if worst > MISTAKE_MM else "warning"
+        what = f"the shape is up to {worst:.3g} mm off the nominal {feature.kind} of the task"
+        advice = "All errors would be measured from there: correct point_mm, direction or radius_mm"
+        yield Finding(severity, shape.name, what, advice)
+    elif shape.mesh is not None:
+        middles = shape.mesh.vertices[shape.mesh.triangles].mean(axis=1)
+        sag = float(np.abs(surface_distance(surface, middles)).max(initial=0.0))
+        if sag > NOMINAL_MM:
+            what = f"facets deviate by up to {sag:.2g} mm from the nominal {feature.kind}"
+            advice = "Mesh the part more finely: this is an error of the part, not of the sensor"
+            yield Finding("warning", shape.name, what, advice)

@@ -1,0 +1,259 @@
+"""Convert the dimensions and tolerances of a drawing to measurements of a task, and list those without one.
+
+Signal chain: dimensions and tolerances with the numbers of their faces (:mod:`mitsim.scene.authoring.product_information`) ->
+faces by name -> a measurement if the task has its kind for these features, else a sentence with the reason.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
+from characterisation.tasks.definitions import (
+    axis_distance,
+    plane_angle,
+    plane_axis_angle,
+    plane_distance,
+    point_plane_distance,
+)
+from mitsim.scene.authoring.drawn_characteristics import Dimension, GeometricTolerance, ProductInformation, Target
+from mitsim.scene.authoring.drawn_zones import Side, zones
+from mitsim.scene.authoring.face import Face
+
+#: difference between the drawing and its own model above which it is reported [mm, deg]
+_AGREE = 0.005
+
+#: measurements of two kinds of feature, and the kind that comes first
+_FIRST = {"plane_axis_angle": "plane", "point_plane_distance": "sphere"}
+
+
+@dataclass(frozen=True)
+class DrawnMeasurement:
+    """A measurement in a task's terms, the number of its entity in the file, and remarks about it."""
+
+    kind: str
+    features: tuple[str, ...]
+    nominal: float
+    unit: str
+    tolerance: float | tuple[float, float] | None
+    number: int
+    remarks: tuple[str, ...] = ()
+
+    def keys(self) -> dict[str, Any]:
+        """Return the keys of the task."""
+        keys: dict[str, Any] = {
+            "kind": self.kind,
+            "features": list(self.features),
+            "nominal": round(self.nominal, 6) + 0.0,
+            "unit": self.unit,
+        }
+        if isinstance(self.tolerance, tuple):
+            keys["tolerance"] = [round(end, 6) + 0.0 for end in self.tolerance]
+        elif self.tolerance is not None:
+            keys["tolerance"] = round(self.tolerance, 6)
+        return keys
+
+
+@dataclass
+class DrawnTask:
+    """Content of a drawing: measurements by name, names of the faces of each datum, and items left out.
+
+    ``middles``: the mid-planes of two sides that measurements use, by name.
+    """
+
+    measurements: dict[str, DrawnMeasurement] = field(default_factory=dict)
+    datums: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    middles: dict[str, Side] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
+
+    def datum_of(self, name: str) -> str:
+        """Return the letters of the datums on a face."""
+        return ", ".join(letter for letter, faces in self.datums.items() if name in faces)
+
+    def remarks(self) -> list[str]:
+        """Return a summary of the drawing for the user."""
+        lines = [f"The file's own dimensions and tolerances: {len(self.measurements)} measurements."]
+        lines += [f"Datum {letter}: {', '.join(faces) or 'no face'}." for letter, faces in self.datums.items()]
+        if self.left_out:
+            lines += ["Not converted:", *(f"  {one}" for one in self.left_out)]
+        return lines
+
+
+def drawn_task(information: ProductInformation, faces: Sequence[Face]) -> DrawnTask:
+    """Convert a drawing: measurements for all that a task supports, sentences for the rest."""
+    builder = _TaskBuilder(faces)
+    builder.task.datums = {letter: tuple(f.name for f in builder.faces(t)) for letter, t in information.datums.items()}
+    for dimension in information.dimensions:
+        builder.dimension(dimension)
+    for tolerance in information.tolerances:
+        builder.tolerance(tolerance)
+    for letter, target in information.datums.items():
+        if not builder.task.datums[letter]:
+            builder.task.left_out.append(f"datum {letter}: it is {_what(target)}")
+    builder.task.left_out += information.unread
+    return builder.task
+
+
+def _what(target: Target) -> str:
+    return f"on {', '.join(target.others)}, no face" if target.others else "on no face of the part"
+
+
+class _TaskBuilder:
+    """Builds a task; finds faces by the numbers of their entities."""
+
+    def __init__(self, faces: Sequence[Face]) -> None:
+        self.task = DrawnTask()
+        self.by_name = {face.name: face for face in faces}
+        self.by_entity: dict[int, list[Face]] = defaultdict(list)
+        for face in faces:
+            for number in face.entities:
+                self.by_entity[number].append(face)
+
+    def faces(self, target: Target) -> list[Face]:
+        """Return the faces of a target, each once: halves of a bore are one face."""
+        return list({face.name: face for number in target.faces for face in self.by_entity.get(number, ())}.values())
+
+    def add(self, name: str, measurement: DrawnMeasurement) -> None:
+        """Add a measurement under a unique name."""
+        base, count = name, 1
+        while name in self.task.measurements:
+            count += 1
+            name = f"{base}_{count}"
+        self.task.measurements[name] = measurement
+
+    def dimension(self, one: Dimension) -> None:
+        """Convert a size or a location."""
+        described = f"#{one.number} {one.kind}" + (f" {one.nominal:g}" if one.nominal is not None else "")
+        first, second = self.faces(one.first), self.faces(one.second) if one.second else []
+        on = f" of {', '.join(f.name for f in [*first, *second])}" if first or second else ""
+
+        def left_out(why: str) -> None:
+            self.task.left_out.append(f"{described}{on}: {why}")
+
+        if one.nominal is None:
+            return left_out("it has no value in the file")
+        if not first or (one.second is not None and not second):
+            return left_out(f"it is {_what(one.first if not first else one.second or Target())}")
+        remarks = list(one.notes)
+        tolerance = _deviations(one)
+        made: list[tuple[str, str, tuple[Face, ...], float]] = []
+        if one.second is None:
+            made = self._sizes(one, first)
+        else:
+            kind, value = _between(first[0], second[0], one.angular) if len(first) == len(second) == 1 else ("", 0.0)
+            if kind:
+                short = "angle" if one.angular else "distance"
+                made = [(f"{first[0].name}_to_{second[0].name}_{short}", kind, (first[0], second[0]), value)]
+        if not made:
+            return left_out("a task has no such measurement between such faces")
+        for name, kind, members, model in made:
+            nominal = one.nominal
+            allowed = tolerance
+            if one.angular and kind != "cone_angle" and nominal > 90:  # a task has angles between lines, 0 to 90 deg
+                nominal = 180.0 - nominal
+                allowed = (-tolerance[1], -tolerance[0]) if isinstance(tolerance, tuple) else tolerance
+            said = list(remarks)
+            if abs(nominal - model) > _AGREE:
+                said.append(f"the drawing states {nominal:g}, the model has {model:.6g}")
+            ordered = members[::-1] if kind in _FIRST and members[0].kind != _FIRST[kind] else members
+            unit = "deg" if one.angular else "mm"
+            self.add(
+                name,
+                DrawnMeasurement(kind, tuple(f.name for f in ordered), nominal, unit, allowed, one.number, tuple(said)),
+            )
+        return None
+
+    def _sizes(self, one: Dimension, faces: list[Face]) -> list[tuple[str, str, tuple[Face, ...], float]]:
+        """Return the sizes of faces: of each round face, or the distance or angle of two planes."""
+        planes = [face for face in faces if isinstance(face.surface, Plane)]
+        if one.angular:
+            cones = [f for f in faces if isinstance(f.surface, Cone)]
+            if cones and len(cones) == len(faces):
+                return [(f"{f.name}_angle", "cone_angle", (f,), 2 * _half_angle(f)) for f in cones]
+        elif len(planes) == len(faces) == 2:
+            kind, value = _between(faces[0], faces[1], False)
+            return [(f"{faces[0].name}_to_{faces[1].name}_distance", kind, (faces[0], faces[1]), value)] if kind else []
+        elif all(isinstance(face.surface, Cylinder | Sphere) for face in faces):
+            kind = "radius" if "radius" in one.kind else "diameter" if "diameter" in one.kind else ""
+            if kind:
+                scale = 1 if kind == "radius" else 2
+                return [(f"{f.name}_{kind}", kind, (f,), scale * _radius(f)) for f in faces]
+        if one.angular and len(planes) == len(faces) == 2:
+            kind, value = _between(faces[0], faces[1], True)
+            return [(f"{faces[0].name}_to_{faces[1].name}_angle", kind, (faces[0], faces[1]), value)]
+        return []
+
+    def tolerance(self, one: GeometricTolerance) -> None:
+        """Convert a geometric tolerance."""
+        faces = self.faces(one.target)
+        frame = f" |{'|'.join(one.datums)}" if one.datums else ""
+        described = f"#{one.number} {one.kind}{f' {one.zone:g}' if one.zone is not None else ''}{frame}"
+        on = f" of {', '.join(f.name for f in faces)}" if faces else ""
+        if one.zone is None or one.zone <= 0:
+            self.task.left_out.append(f"{described}{on}: it has no zone in the file")
+            return
+        if not faces:
+            self.task.left_out.append(f"{described}{on}: it is {_what(one.target)}")
+            return
+        datums = {letter: [self.by_name[name] for name in names] for letter, names in self.task.datums.items()}
+        made = zones(one, faces, datums)
+        for zone in made.found:
+            for side in (zone.of, *zone.datums):
+                if side.derived:
+                    self.task.middles[side.name] = side
+            features = (zone.of.name, *(datum.name for datum in zone.datums))
+            said = (*one.notes, *zone.remarks)
+            name = f"{zone.of.name}_{zone.kind}"
+            self.add(name, DrawnMeasurement(zone.kind, features, 0.0, "mm", one.zone, one.number, said))
+            self.task.left_out += [f"{described} of {zone.of.name}: {remark}" for remark in zone.remarks]
+        self.task.left_out += [f"{described}{f' of {name}' if name else on}: {why}" for name, why in made.left_out]
+
+
+def _deviations(one: Dimension) -> float | tuple[float, float] | None:
+    """Return the tolerance of a task: one number if both deviations are equal, else the lower and the upper one."""
+    if one.limits is None or one.nominal is None:
+        return None
+    low, high = one.limits[0] - one.nominal, one.limits[1] - one.nominal
+    if not low < high:
+        return None
+    alike = abs(high + low) <= 1e-9 * max(abs(high), abs(low), 1.0)
+    return (high - low) / 2 if alike else (low, high)
+
+
+def _radius(face: Face) -> float:
+    assert isinstance(face.surface, Cylinder | Sphere)
+    return face.surface.radius
+
+
+def _half_angle(face: Face) -> float:
+    assert isinstance(face.surface, Cone)
+    return float(np.rad2deg(face.surface.half_angle))
+
+
+def _between(first: Face, second: Face, angular: bool) -> tuple[str, float]:
+    """Return kind and model value of a distance [mm] or an angle [deg] between two faces; an empty kind if none."""
+    one, other = first.surface, second.surface
+    if angular:
+        if isinstance(one, Plane) and isinstance(other, Plane):
+            return "plane_angle", float(np.rad2deg(plane_angle(one, other)))
+        if isinstance(one, Cylinder | Cone) and isinstance(other, Plane):
+            one, other = other, one
+        if isinstance(one, Plane) and isinstance(other, Cylinder | Cone):
+            return "plane_axis_angle", float(np.rad2deg(plane_axis_angle(one, other)))
+        return "", 0.0
+    if isinstance(one, Plane) and isinstance(other, Plane) and abs(float(one.normal @ other.normal)) > 0.9999:
+        return "plane_distance", plane_distance(one, other, nominal=(one, other))
+    if isinstance(one, Cylinder | Cone) and isinstance(other, Cylinder | Cone):
+        return "axis_distance", axis_distance(one, other)
+    if isinstance(one, Sphere) and isinstance(other, Sphere):
+        return "point_distance", float(np.linalg.norm(one.centre - other.centre))
+    if isinstance(one, Plane) and isinstance(other, Sphere):
+        one, other = other, one
+    if isinstance(one, Sphere) and isinstance(other, Plane):
+        return "point_plane_distance", point_plane_distance(one, other)
+    return "", 0.0

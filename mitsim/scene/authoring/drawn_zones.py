@@ -1,0 +1,164 @@
+"""Convert geometric tolerances of a drawing to the zones of a task: their kind, their features and their datums.
+
+Signal chain: a tolerance, its faces and the faces of its datums -> the toleranced face, or mid-plane of two sides, of
+each zone -> kind of measurement and names of the datums, or a sentence with the reason why there is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
+from characterisation.tasks.places import mid_plane
+from characterisation.tasks.zones import Datum, frame_fault
+from mitsim.scene.authoring.drawn_characteristics import GeometricTolerance
+from mitsim.scene.authoring.face import Face
+
+#: two sides belong to a slot or a web if their normals are opposite within this cosine
+_OPPOSITE = -0.9999
+
+
+@dataclass(frozen=True)
+class Side:
+    """A toleranced feature or a datum: a face, or the mid-plane of two sides, with its ``name`` in the task."""
+
+    name: str
+    surface: Plane | Cylinder | Cone | Sphere
+    of: tuple[Face, ...]
+
+    @property
+    def derived(self) -> bool:
+        """Return whether it is a mid-plane."""
+        return len(self.of) == 2
+
+
+@dataclass(frozen=True)
+class Zone:
+    """A measurement of a zone: its kind, its feature, its datums in order, and remarks."""
+
+    kind: str
+    of: Side
+    datums: tuple[Side, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+
+@dataclass
+class Zones:
+    """The zones of one tolerance, and reasons for faces without one: (name of the face or "", reason)."""
+
+    found: list[Zone] = field(default_factory=list)
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+
+
+def middle(faces: Sequence[Face]) -> Side | None:
+    """Return the mid-plane of the two sides of a slot or a web; None for other faces."""
+    if len(faces) != 2:
+        return None
+    first, second = (face.surface for face in faces)
+    if not isinstance(first, Plane) or not isinstance(second, Plane):
+        return None
+    outward = [face.surface.normal * (1 if face.convex else -1) for face in faces if isinstance(face.surface, Plane)]
+    if outward[0] @ outward[1] > _OPPOSITE:
+        return None
+    return Side(f"middle_of_{faces[0].name}", mid_plane(first, second), tuple(faces))
+
+
+def zones(one: GeometricTolerance, faces: Sequence[Face], datum_faces: Mapping[str, Sequence[Face]]) -> Zones:
+    """Return the zones of a tolerance on ``faces``; ``datum_faces`` by the letter of their datum."""
+    out = Zones()
+    datums = [_side(datum_faces.get(letter, ())) for letter in one.datums]
+    both = middle(faces) if one.kind in ("position", "symmetry") else None
+    held = [both] if both is not None else [_side([face]) or face for face in faces]
+    if one.kind == "surface profile" and one.datums and len(faces) > 1 and "all around" in one.notes:
+        out.left_out.append(("", "all around: it applies to its faces together, and a task has zones of single faces"))
+        return out
+    for side in held:
+        if isinstance(side, Face):
+            out.left_out.append((side.name, "a task has no such tolerance for such a face"))
+            continue
+        zone = _zone(one, side, datums)
+        if isinstance(zone, Zone):
+            out.found.append(zone)
+        else:
+            out.left_out.append((side.name, zone))
+    return out
+
+
+def _side(faces: Sequence[Face]) -> Side | None:
+    """Return one face that a task supports, or the mid-plane of two; None for anything else."""
+    if len(faces) == 1 and isinstance(surface := faces[0].surface, Plane | Cylinder | Cone | Sphere):
+        return Side(faces[0].name, surface, tuple(faces))
+    return middle(faces)
+
+
+def _zone(one: GeometricTolerance, side: Side, datums: Sequence[Side | None]) -> Zone | str:
+    """Return the zone of one side, or the reason why a task has none."""
+    surface = side.surface
+    flat, axis = isinstance(surface, Plane), isinstance(surface, Cylinder | Cone)
+    match one.kind:
+        case "flatness" if flat:
+            return Zone("flatness", side)
+        case "cylindricity" if isinstance(surface, Cylinder):
+            return Zone("cylindricity", side)
+        case "surface profile" if flat and not one.datums:
+            return Zone("flatness", side, (), ("a profile of a plane without datums is its flatness (ISO 1660)",))
+        case "surface profile" if flat:
+            frame = _frame(one, datums)
+            if isinstance(frame, str):
+                return f"a profile needs a complete datum frame: {frame}"
+            return Zone("position", side, frame, ("a profile of a plane in a datum frame is its position",))
+        case "parallelism" | "perpendicularity" if flat or axis:
+            return _oriented(one, one.kind, side, datums)
+        case "angularity" if flat:
+            return _oriented(one, "angularity", side, datums)
+        case "coaxiality" | "concentricity" if axis:
+            found = _oriented(one, "coaxiality", side, datums)
+            if isinstance(found, Zone) and isinstance(found.datums[0].surface, Plane):
+                return f"its datum {found.datums[0].name} has no axis"
+            return found
+        case "symmetry" if side.derived or axis:
+            found = _oriented(one, "symmetry", side, datums)
+            if isinstance(found, Zone) and not isinstance(found.datums[0].surface, Plane):
+                return f"its datum {found.datums[0].name} is not a plane"
+            return found
+        case "position":
+            frame = _frame(one, datums)
+            if not isinstance(frame, str):
+                return Zone("position", side, frame)
+            if not one.datums:
+                return Zone("position", side, (), ("without datums: relative to the pose of the part",))
+            said = f"{'|'.join(one.datums)} are not a datum frame of a task ({frame}): relative to the pose of the part"
+            return Zone("position", side, (), (said,))
+    return "a task has no such tolerance for such a face"
+
+
+def _oriented(one: GeometricTolerance, kind: str, side: Side, datums: Sequence[Side | None]) -> Zone | str:
+    """Return a zone with one datum, a plane or an axis."""
+    datum = datums[0] if datums else None
+    if datum is None:
+        return f"its datum {'|'.join(one.datums)} is not one face"
+    if isinstance(datum.surface, Sphere):
+        return f"its datum {datum.name} is neither a plane nor has an axis"
+    if datum.name == side.name:
+        return f"its datum {datum.name} is the face itself"
+    more = (f"only its first datum {one.datums[0]} is used",) if len(datums) > 1 else ()
+    return Zone(kind, side, (datum,), more)
+
+
+def _frame(one: GeometricTolerance, datums: Sequence[Side | None]) -> tuple[Side, ...] | str:
+    """Return three datums that define a frame, or the condition that is not met."""
+    known = [datum for datum in datums if datum is not None]
+    surfaces: list[Datum] = [datum.surface for datum in known if not isinstance(datum.surface, Sphere)]
+    if len(one.datums) != 3 or len(surfaces) != 3 or len({datum.name for datum in known}) != 3:
+        return "three datums that are planes or axes"
+    return frame_fault(surfaces) or tuple(known)
+
+
+def middle_outline(side: Side, spread: np.ndarray) -> np.ndarray:
+    """Project places (k, 3) [mm] of a side's outline onto its mid-plane."""
+    surface = side.surface
+    assert isinstance(surface, Plane)
+    return np.asarray(spread - np.outer((spread - surface.point) @ surface.normal, surface.normal))

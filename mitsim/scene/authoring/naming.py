@@ -1,0 +1,208 @@
+"""Name faces descriptively: ``top``, ``bore_12mm_left``, ``chamfer_30deg``.
+
+Signal chain: faces -> the name in the CAD file, if a person wrote one -> else the kind of the face with its size -> for
+equal names, the position -> for names that are still equal, a number by z, y, x.
+
+Names depend on geometry alone. A file that is read again, or exported with its entities in another order, gives the
+same names. Left and right are -x and +x, front and back -y and +y, bottom and top -z and +z, seen from the front with z
+up.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
+from mitsim.scene.authoring.face import Face, Floats, Torus
+
+#: names of directions along x, y, z: (minus, plus)
+SIDES = (("left", "right"), ("front", "back"), ("bottom", "top"))
+
+#: a plane faces an axis within this cosine: 0.5 deg
+_ALONG = float(np.cos(np.deg2rad(0.5)))
+
+#: largest width of a chamfer as a share of the part's diagonal
+_CHAMFER_SHARE = 0.08
+
+#: a cylinder that spans more than this angle is a bore or a boss, else a fillet [rad]
+_ROUND = np.deg2rad(200.0)
+
+#: positions differ if their distance exceeds this share of the part's size along that axis
+_APART = 0.02
+
+#: placeholders of CAD programs for faces without a name
+_NO_NAME = re.compile(r"(none|null|unnamed|advanced_?face|face|surface|shape|body|solid|\W)*[\d\W_]*", re.IGNORECASE)
+
+_LONGEST = 60
+
+
+def with_names(faces: Sequence[Face]) -> list[Face]:
+    """Return the faces with descriptive, unique names; planes first, then round faces, then the rest, by size."""
+    if not faces:
+        return []
+    corners = np.concatenate([face.vertices for face in faces])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    parts = _part_names(faces)
+    groups = defaultdict(list)
+    for number, face in enumerate(faces):
+        groups[parts[number] + (_given(face) or described_name(face, low, high))].append(number)
+    names: dict[int, str] = {}
+    for base, members in groups.items():
+        for number, suffix in zip(members, _distinguished([faces[n] for n in members], high - low), strict=True):
+            names[number] = base + suffix
+    return _in_order([replace(face, name=name) for face, name in zip(faces, _unique(names, faces), strict=True)])
+
+
+def _unique(names: dict[int, str], faces: Sequence[Face]) -> list[str]:
+    """Return unique names by number of the face; different groups may have produced equal names."""
+    taken: dict[str, int] = {}
+    out: dict[int, str] = {}
+    for number in sorted(names, key=lambda one: (names[one], _place(faces[one]).round(4).tolist()[::-1])):
+        name = names[number]
+        while name in taken:
+            taken[names[number]] += 1
+            name = f"{names[number]}_{taken[names[number]]}"
+        taken[name] = 1
+        out[number] = name
+    return [out[number] for number in range(len(faces))]
+
+
+def _in_order(faces: list[Face]) -> list[Face]:
+    kinds = ("plane", "cylinder", "cone", "sphere", "torus", "face")
+    return sorted(faces, key=lambda one: (kinds.index(one.kind), -round(one.area, 4), one.name))
+
+
+def _given(face: Face) -> str:
+    """Return the name in the CAD file if a person wrote it: it contains a word and is not the program's counter."""
+    name = face.drawn_name
+    return "" if _NO_NAME.fullmatch(name) or not re.search(r"[^\W\d_]{2}", name) else identifier(name)
+
+
+def identifier(name: str) -> str:
+    """Return a name valid in files, XML and TOML: letters, digits, dash and underscore, a letter first."""
+    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_-")[:_LONGEST]
+    return plain if re.match(r"[A-Za-z]", plain) else f"face_{plain}".rstrip("_")
+
+
+def _part_names(faces: Sequence[Face]) -> list[str]:
+    """Return a prefix such as ``lid_`` for each face of an assembly's part; empty for a single body."""
+    bodies = {face.body: face.part for face in faces}
+    if len(bodies) == 1:
+        return [""] * len(faces)
+    middles = {b: np.concatenate([f.vertices for f in faces if f.body == b]).mean(axis=0).round(3) for b in bodies}
+    order = sorted(bodies, key=lambda body: (bodies[body], middles[body].tolist()))
+    names: dict[int, str] = {}
+    for body in order:
+        name = identifier(bodies[body] or "part")
+        alike = [one for one in order if identifier(bodies[one] or "part") == name]
+        names[body] = name if len(alike) == 1 else f"{name}_{alike.index(body) + 1}"
+    return [f"{names[face.body]}_" for face in faces]
+
+
+def described_name(face: Face, low: Floats, high: Floats) -> str:
+    """Return the kind of a face with its size, for a part that spans ``low`` to ``high`` (3,) [mm]."""
+    surface, part = face.surface, float(np.linalg.norm(high - low))
+    if isinstance(surface, Plane):
+        return _plane_name(face, surface, low, high)
+    if isinstance(surface, Cylinder):
+        if round_angle(face, surface.axis, surface.point) > _ROUND:
+            return f"{'boss' if face.convex else 'bore'}_{size(2 * surface.radius)}mm"
+        return f"{'round' if face.convex else 'fillet'}_r{size(surface.radius)}mm"
+    if isinstance(surface, Cone):
+        angle = np.rad2deg(2 * surface.half_angle)
+        if not face.convex:
+            return f"countersink_{angle:.0f}deg"
+        narrow = np.ptp((face.vertices - surface.point) @ surface.axis) < _CHAMFER_SHARE * part
+        return f"chamfer_{angle / 2:.0f}deg" if narrow else f"cone_{angle:.0f}deg"
+    if isinstance(surface, Sphere):
+        return f"{'ball' if face.convex else 'seat'}_{size(2 * surface.radius)}mm"
+    if isinstance(surface, Torus):
+        return f"{'round' if face.convex else 'fillet'}_r{size(surface.tube)}mm"
+    return "freeform" if face.normals is not None else "face"
+
+
+def _plane_name(face: Face, surface: Plane, low: Floats, high: Floats) -> str:
+    along = int(np.argmax(np.abs(surface.normal)))
+    if abs(surface.normal[along]) >= _ALONG:
+        up = bool(surface.normal[along] > 0)
+        at = float(face.vertices[:, along].mean())
+        name = SIDES[along][up]
+        if abs(at - (high if up else low)[along]) < 1e-3 * max(float(high[along] - low[along]), 1.0):
+            return name
+        return f"{name}_at_{'xyz'[along]}{size(at)}mm"
+    off = float(np.rad2deg(np.arccos(np.abs(surface.normal).max())))
+    extent = np.sort(_extents(face, surface))
+    narrow = extent[0] < _CHAMFER_SHARE * float(np.linalg.norm(high - low))
+    upright = abs(surface.normal[2]) < np.sqrt(1 - _ALONG**2)  # like the sides of a hexagonal nut
+    return f"{'chamfer' if narrow else 'side' if upright else 'slope'}_{off:.0f}deg"
+
+
+def _extents(face: Face, surface: Plane) -> Floats:
+    """Return length and width [mm] of a plane face along its own principal directions."""
+    local = face.vertices - face.vertices.mean(axis=0)
+    _, _, directions = np.linalg.svd(local, full_matrices=False)
+    return np.asarray(np.ptp(local @ directions[:2].T, axis=0))
+
+
+def round_angle(face: Face, axis: Floats, point: Floats) -> float:
+    """Return the angle about an axis that a face spans [rad]: 2 pi less the largest gap between its vertices."""
+    first = np.eye(3)[np.argmin(np.abs(axis))]
+    first = first - (first @ axis) * axis
+    local = face.vertices - point
+    angle = np.sort(np.arctan2(local @ np.cross(axis, first), local @ first))
+    gaps = np.diff(np.append(angle, angle[0] + 2 * np.pi))
+    steps = len(face.vertices)
+    gap = float(gaps.max())
+    return 2 * np.pi if gap < max(np.deg2rad(50.0), 4 * np.pi / steps) else 2 * np.pi - gap
+
+
+def size(value: float) -> str:
+    """Format a length for a name: to 0.01 mm, with an underscore as decimal point (``12_5``)."""
+    text = f"{value:.2f}".rstrip("0").rstrip(".")
+    return ("0" if text in ("-0", "") else text).replace(".", "_")
+
+
+def _place(face: Face) -> Floats:
+    """Return the position of a face: the centre of its box, on its axis if it has one."""
+    middle = (face.vertices.min(axis=0) + face.vertices.max(axis=0)) / 2
+    if isinstance(face.surface, Cylinder | Cone):
+        point, axis = face.surface.point, face.surface.axis
+        middle = point + ((middle - point) @ axis) * axis
+    return np.asarray(middle)
+
+
+def _distinguished(faces: list[Face], extent: Floats) -> list[str]:
+    """Return suffixes that distinguish faces with equal descriptions: sides if sufficient, else numbers by z, y, x."""
+    if len(faces) == 1:
+        return [""]
+    places = np.array([_place(face) for face in faces])
+    spread = np.ptp(places, axis=0)
+    far = spread > np.maximum(_APART * extent, 1e-3)
+    words: list[list[str]] = [[] for _ in faces]
+    for along in (2, 1, 0):
+        if far[along] and _form_two_clusters(places[:, along]):
+            middle = (places[:, along].max() + places[:, along].min()) / 2
+            for word, place in zip(words, places, strict=True):
+                word.append(SIDES[along][bool(place[along] > middle)])
+    suffixes = ["".join(f"_{one}" for one in word) for word in words]
+    out: dict[int, str] = {}
+    groups = defaultdict(list)
+    for number, suffix in enumerate(suffixes):
+        groups[suffix].append(number)
+    for suffix, members in groups.items():
+        order = sorted(members, key=lambda one: (places[one].round(3) + 0.0).tolist()[::-1])
+        for count, number in enumerate(order, 1):
+            out[number] = suffix if len(members) == 1 else f"{suffix}_{count}"
+    return [out[number] for number in range(len(faces))]
+
+
+def _form_two_clusters(values: Floats) -> bool:
+    """Return whether numbers form two clusters with a gap, so that sides distinguish them; a row of holes does not."""
+    ordered = np.sort(values)
+    gaps = np.diff(ordered)
+    return bool(gaps.max() > 0.45 * (ordered[-1] - ordered[0]))

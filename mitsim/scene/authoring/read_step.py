@@ -1,0 +1,244 @@
+"""Read the faces of a STEP file with their exact surfaces, instead of estimates from a mesh.
+
+Signal chain: STEP -> OpenCASCADE in a separate process (:mod:`mitsim.scene.authoring.step_worker`) -> faces with their exact
+surfaces -> faces of one body that lie on one surface and share an edge joined (CAD divides a bore into two halves) ->
+names from the file's text.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+import tempfile
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
+from characterisation.files.errors import InputError
+from mitsim.scene.authoring import step_worker
+from mitsim.scene.authoring.face import (
+    Face,
+    Floats,
+    Ints,
+    Surface,
+    Torus,
+    outward_normals,
+    same_surface,
+    surface_distance,
+)
+from mitsim.scene.authoring.part21 import read_step_text
+
+#: default mesh of STEP without a sensor: distance from the true surface [mm], and angle between facets [rad]. The angle
+#: only keeps small round faces round, since the normals are exact
+CHORD_MM, BEND = 0.01, 0.2
+
+#: halves of one surface agree within this [mm]; a CAD program's own tolerance is 1e-3 to 1e-5
+ONE_SURFACE_MM = 1e-3
+
+#: finest mesh [mm]; finer ones exceed every sensor, and single precision for a part of a metre
+FINEST_MM = 1e-4
+
+_SECONDS = 3600
+_INSTALL = 'pip install "cadquery-ocp-novtk<8" (or "mitsim[step]"), or save the part as STL'
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Faces of a STEP file, remarks about their processing, and whether they bound closed bodies."""
+
+    faces: list[Face]
+    remarks: list[str]
+    closed: bool
+
+
+def step_installed() -> bool:
+    """Return whether STEP files can be read in this installation."""
+    return importlib.util.find_spec("OCP") is not None
+
+
+def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
+    """Read the faces of a STEP file, in mm, meshed to ``chord_mm``.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, contains no faces, or the required library is not installed.
+    """
+    path = Path(path)
+    if not step_installed():
+        raise InputError(path, "", "a STEP file, which needs OpenCASCADE", "an STL, PLY or OBJ file", _INSTALL)
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "faces.npz"
+        command = [
+            sys.executable,
+            step_worker.__file__,
+            str(path),
+            str(out),
+            repr(max(chord_mm / 2, FINEST_MM)),  # OpenCASCADE exceeds the requested value by a factor of up to 2
+            repr(BEND),
+        ]
+        try:
+            done = subprocess.run(command, capture_output=True, timeout=_SECONDS, check=False)
+        except subprocess.TimeoutExpired:
+            raise InputError(path, "", "a part that cannot be meshed within an hour", "a simpler one") from None
+        if b"ImportError" in done.stderr or b"ModuleNotFoundError" in done.stderr:
+            found = "a STEP file, and an unsupported version of OpenCASCADE"
+            raise InputError(path, "", found, "an STL, PLY or OBJ file", _INSTALL)
+        if done.returncode != 0 or not out.exists():
+            raise InputError(path, "", "a file that OpenCASCADE cannot read", "a STEP file (AP203, AP214 or AP242)")
+        with np.load(out) as data:
+            text = json.loads(data["text"].tobytes())
+            arrays = {key: data[key] for key in ("vertices", "normals", "triangles")}
+    names = _names(path)
+    faces, vertex, triangle = [], 0, 0
+    for record in text["faces"]:
+        points, corners = record["counts"]
+        here, there = slice(vertex, vertex + points), slice(triangle, triangle + corners)
+        vertex, triangle = vertex + points, triangle + corners
+        face = _face(record, arrays["vertices"][here], arrays["normals"][here], arrays["triangles"][there])
+        faces.append(replace(face, drawn_name=names.get(record["entity"], "")))
+    joined = _joined(faces)
+    remarks = []
+    if len(joined) < len(faces):
+        remarks.append(f"{len(faces)} faces in the file, {len(joined)} after those of one surface were joined")
+    if text["lost"]:
+        remarks.append(f"{text['lost']} faces could not be meshed and are left out")
+    bodies = len({face.body for face in faces})
+    if bodies > 1:
+        remarks.append(f"{bodies} bodies, each with its own faces")
+    closed = all(record["closed"] for record in text["faces"])
+    if not closed:
+        remarks.append("the file has surfaces that bound no solid: mitsim check reports visible backs")
+    return Drawn(joined, remarks, closed)
+
+
+def _names(path: Path) -> dict[int, str]:
+    """Return the names of the faces by the number of their entity."""
+    found = {}
+    text = read_step_text(path)
+    for entity in text.all("ADVANCED_FACE", "FACE_SURFACE"):
+        values = entity.of("ADVANCED_FACE", "FACE_SURFACE")
+        if values and isinstance(values[0], str):
+            found[entity.number] = values[0].strip()
+    return found
+
+
+def _face(record: dict[str, Any], vertices: Floats, normals: Floats, triangles: Ints) -> Face:
+    """Make one face from the worker's data."""
+    surface = _surface(record, vertices)
+    convex, deviation, sag = True, float("nan"), float("nan")
+    if surface is not None:
+        facing = np.einsum("ij,ij->i", outward_normals(surface, vertices), normals).sum()
+        if isinstance(surface, Plane):
+            surface = Plane(surface.point, surface.normal if facing > 0 else -surface.normal)
+        else:
+            convex = bool(facing > 0)
+        deviation, sag = _distances(surface, vertices, triangles)
+    colour = record["colour"]
+    return Face(
+        "",
+        vertices,
+        triangles,
+        surface,
+        convex,
+        deviation,
+        sag,
+        normals,
+        record["part"],
+        record["body"],
+        None if colour is None else (colour[0], colour[1], colour[2]),
+        (record["entity"],) if record["entity"] else (),
+        "",
+        frozenset(record["edges"]),
+    )
+
+
+def _distances(surface: Surface, vertices: Floats, triangles: Ints) -> tuple[float, float]:
+    middles = vertices[triangles].mean(axis=1)
+    one, other = (float(np.abs(surface_distance(surface, points)).max()) for points in (vertices, middles))
+    return one, other
+
+
+def _surface(record: dict[str, Any], vertices: Floats) -> Surface | None:
+    """Return the surface in a task's terms: points on the face's own section of an axis."""
+    if record["kind"] == "freeform":
+        return None
+    point, axis = np.array(record["point"]), np.array(record["axis"])
+    axis = axis / np.linalg.norm(axis)
+    if record["kind"] == "plane":
+        return Plane(vertices.mean(axis=0) - ((vertices.mean(axis=0) - point) @ axis) * axis, axis)
+    if record["kind"] == "sphere":
+        return Sphere(point, record["radius"])
+    if record["kind"] == "cone":
+        half = record["half_angle"]
+        if half < 0:
+            axis, half = -axis, -half
+        along = (vertices - point) @ axis
+        wide = float(along.max())
+        return Cone(point + wide * axis, axis, record["radius"] + wide * float(np.tan(half)), half)
+    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+    if record["kind"] == "torus":
+        return Torus(point, axis, record["radius"], record["tube"])
+    return Cylinder(point + float(((vertices - point) @ axis).min()) * axis, axis, record["radius"])
+
+
+def _joined(faces: list[Face]) -> list[Face]:
+    """Join faces of one body that share an edge and lie on one surface."""
+    owners = defaultdict(list)
+    for number, face in enumerate(faces):
+        for edge in face.edges:
+            owners[face.part, face.body, edge].append(number)
+    root = list(range(len(faces)))
+
+    def top(number: int) -> int:
+        while root[number] != number:
+            number = root[number]
+        return number
+
+    for shared in owners.values():
+        for other in shared[1:]:
+            first, second = top(shared[0]), top(other)
+            if first != second and same_surface(faces[shared[0]], faces[other], ONE_SURFACE_MM):
+                root[max(first, second)] = min(first, second)
+    groups = defaultdict(list)
+    for number in range(len(faces)):
+        groups[top(number)].append(faces[number])
+    return [_as_one(members) for members in groups.values()]
+
+
+def _as_one(members: list[Face]) -> Face:
+    """Join the parts of one surface to one face."""
+    if len(members) == 1:
+        return members[0]
+    start = np.cumsum([0, *(len(one.vertices) for one in members)])
+    vertices = np.concatenate([one.vertices for one in members])
+    triangles = np.concatenate([one.triangles + at for one, at in zip(members, start, strict=False)])
+    surface = members[0].surface
+    assert surface is not None  # only faces with a surface are joined
+    if isinstance(surface, Cylinder):
+        along = float(((vertices - surface.point) @ surface.axis).min())
+        surface = Cylinder(surface.point + along * surface.axis, surface.axis, surface.radius)
+    elif isinstance(surface, Plane):
+        middle = vertices.mean(axis=0)
+        surface = Plane(middle - ((middle - surface.point) @ surface.normal) * surface.normal, surface.normal)
+    deviation, sag = _distances(surface, vertices, triangles)
+    normals = np.concatenate([one.normals for one in members if one.normals is not None])
+    return replace(
+        members[0],
+        vertices=vertices,
+        triangles=triangles,
+        surface=surface,
+        deviation=deviation,
+        sag=sag,
+        normals=normals,
+        entities=tuple(sorted(number for one in members for number in one.entities)),
+        colour=next((one.colour for one in members if one.colour), None),
+        drawn_name=next((one.drawn_name for one in members if one.drawn_name), ""),
+        edges=frozenset().union(*(one.edges for one in members)),
+    )

@@ -1,0 +1,182 @@
+"""Segment a mesh of a part into its faces, and recognise planes, cylinders and spheres.
+
+Signal chain: triangles [mm] -> vertices merged, degenerate triangles removed -> neighbours joined if the angle between
+them is small (or if the CAD file states one face) -> the surface of each piece (:mod:`mitsim.scene.authoring.recognise`) ->
+neighbours on one surface joined (CAD divides a cylinder in two) -> names by kind and area.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from characterisation.files.errors import InputError
+from mitsim.scene.authoring.face import Face, Floats, Ints, same_surface
+from mitsim.scene.authoring.recognise import recognised
+
+#: largest number of faces; a mesh with more is a scan or noise, not a machined part
+LARGEST_COUNT = 1000
+
+#: vertices closer than this are merged [mm]
+MERGE_MM = 1e-4
+
+#: largest angle between the normals of triangles of one plane [deg]
+_FLAT_DEG = 0.2
+
+#: a flat patch is separated from a piece without a surface if it has this share of its area. The facets of a round
+#: surface differ by less than the joining angle of 20 deg, so there are 18 or more of them, each 5.6 % or less
+_FLAT_SHARE = 0.10
+
+
+@dataclass(frozen=True)
+class SegmentedMesh:
+    """A part divided into faces, and remarks about the processing for the user."""
+
+    faces: list[Face]
+    remarks: list[str]
+
+
+def segment_mesh(
+    vertices: Floats, triangles: Ints, angle_deg: float = 20.0, drawn: Ints | None = None, where: str = "mesh"
+) -> SegmentedMesh:
+    """Segment a mesh into faces.
+
+    Parameters
+    ----------
+    vertices, triangles
+        (n, 3) [mm] and (m, 3).
+    angle_deg
+        Neighbouring triangles with a smaller angle between them belong to one face.
+    drawn
+        (m,) CAD face of each triangle, if known; it takes precedence over the angle.
+    where
+        Name of the mesh in messages.
+
+    Raises
+    ------
+    InputError
+        If no triangle has an area, or there are more than :data:`LARGEST_COUNT` faces.
+    """
+    mesh = trimesh.Trimesh(vertices, triangles, process=False)
+    mesh.merge_vertices(digits_vertex=round(-np.log10(MERGE_MM)), merge_tex=True, merge_norm=True)
+    kept = mesh.nondegenerate_faces(height=1e-9) & mesh.unique_faces()
+    remarks = [f"{int((~kept).sum())} degenerate or duplicate triangles left out"] if not kept.all() else []
+    if not kept.any():
+        raise InputError(where, "", "only triangles without area", "a mesh of the part's surface")
+    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces[kept], process=False)
+    drawn = None if drawn is None else np.asarray(drawn)[kept]
+    mesh, turned = _outside_out(mesh)
+    remarks += turned
+
+    pairs, bend = mesh.face_adjacency, np.degrees(mesh.face_adjacency_angles)
+    joined = bend < angle_deg if drawn is None else drawn[pairs[:, 0]] == drawn[pairs[:, 1]]
+    pieces = _components(pairs[joined], np.arange(len(mesh.faces)))
+    if len(pieces) > LARGEST_COUNT:
+        hint = f"raise --angle from {angle_deg:g} deg if round surfaces were meshed coarsely; scans are not supported"
+        raise InputError(where, "", f"{len(pieces)} faces", f"at most {LARGEST_COUNT}", hint)
+    if drawn is None:
+        pieces = [part for piece in pieces for part in _without_flats(mesh, piece, pairs, bend, angle_deg)]
+    faces = [recognised(mesh, piece) for piece in pieces]
+    pieces, faces = _joined(mesh, pieces, faces, pairs)
+    return SegmentedMesh(_named(faces), remarks)
+
+
+def _outside_out(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, list[str]]:
+    """Orient the normals of every closed body outward; open bodies stay and are reported."""
+    remarks, triangles = [], mesh.faces.copy()
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)  # type: ignore[no-untyped-call]
+        triangles = mesh.faces.copy()
+        remarks.append("triangles of mixed winding made consistent")
+    bodies = _components(mesh.face_adjacency, np.arange(len(triangles)))
+    open_bodies, inward = 0, 0
+    for body in bodies:
+        one = trimesh.Trimesh(mesh.vertices, triangles[body], process=False)
+        if not one.is_watertight:
+            open_bodies += 1
+        elif one.volume < 0 and not _inside_another(mesh, body, bodies):
+            triangles[body] = triangles[body][:, ::-1]
+            inward += 1
+    if inward:
+        remarks.append(f"{inward} of {len(bodies)} bodies had inward normals: turned outward")
+    if open_bodies:
+        what = "the mesh is" if len(bodies) == 1 else f"{open_bodies} of {len(bodies)} bodies are"
+        remarks.append(f"{what} not closed, so the outward direction is unknown: mitsim check reports visible backs")
+    return trimesh.Trimesh(mesh.vertices, triangles, process=False), remarks
+
+
+def _inside_another(mesh: trimesh.Trimesh, body: Ints, bodies: list[Ints]) -> bool:
+    """Return whether a body's box lies within that of another: a cavity, whose normals correctly point into it."""
+    mine = mesh.vertices[mesh.faces[body]].reshape(-1, 3)
+    for other in bodies:
+        if other is body:
+            continue
+        box = mesh.vertices[mesh.faces[other]].reshape(-1, 3)
+        if (mine.min(0) > box.min(0)).all() and (mine.max(0) < box.max(0)).all():
+            return True
+    return False
+
+
+def _components(pairs: NDArray[np.integer], members: Ints) -> list[Ints]:
+    """Return connected sets of triangles (numbers in ``members``), where ``pairs`` (k, 2) are neighbours."""
+    place = np.full(int(members.max(initial=-1)) + 1, -1)
+    place[members] = np.arange(len(members))
+    inside = pairs[(pairs < len(place)).all(axis=1)]
+    inside = place[inside]
+    inside = inside[(inside >= 0).all(axis=1)]
+    graph = coo_matrix((np.ones(len(inside), bool), (inside[:, 0], inside[:, 1])), shape=(len(members),) * 2)
+    _, label = connected_components(graph, directed=False)
+    order = np.argsort(label, kind="stable")
+    return np.split(members[order], np.flatnonzero(np.diff(label[order])) + 1) if len(members) else []
+
+
+def _without_flats(
+    mesh: trimesh.Trimesh, piece: Ints, pairs: NDArray[np.integer], bend: Floats, angle_deg: float
+) -> list[Ints]:
+    """Separate large flat patches from a piece without a surface, to which a fillet joins them."""
+    if recognised(mesh, piece).surface is not None:
+        return [piece]
+    area = mesh.area_faces
+    patches = _components(pairs[bend < _FLAT_DEG], piece)
+    flats = [patch for patch in patches if area[patch].sum() > _FLAT_SHARE * area[piece].sum()]
+    if not flats:
+        return [piece]
+    rest = np.setdiff1d(piece, np.concatenate(flats))
+    return [*flats, *_components(pairs[bend < angle_deg], rest)]
+
+
+def _joined(
+    mesh: trimesh.Trimesh, pieces: list[Ints], faces: list[Face], pairs: NDArray[np.integer]
+) -> tuple[list[Ints], list[Face]]:
+    """Join neighbours that lie on one surface."""
+    owner = np.empty(len(mesh.faces), int)
+    for number, piece in enumerate(pieces):
+        owner[piece] = number
+    neighbours = np.unique(np.sort(owner[pairs], axis=1), axis=0)
+    same = [(a, b) for a, b in neighbours.tolist() if a != b and same_surface(faces[a], faces[b])]
+    if not same:
+        return pieces, faces
+    groups = _components(np.array(same), np.arange(len(pieces)))
+    merged = [np.concatenate([pieces[number] for number in group]) for group in groups]
+    again = [
+        faces[group[0]] if len(group) == 1 else recognised(mesh, piece)
+        for group, piece in zip(groups, merged, strict=True)
+    ]
+    return merged, again
+
+
+def _named(faces: list[Face]) -> list[Face]:
+    """Name faces by kind, the largest first: plane_1, plane_2, cylinder_1."""
+    out, count = [], {"plane": 0, "cylinder": 0, "sphere": 0, "face": 0}
+    kinds = list(count)
+    for face in sorted(
+        faces, key=lambda one: (kinds.index(one.kind), -round(one.area, 6), one.vertices.mean(0).tolist())
+    ):
+        count[face.kind] += 1
+        out.append(replace(face, name=f"{face.kind}_{count[face.kind]}"))
+    return out

@@ -1,0 +1,172 @@
+"""Describe how a material scatters at one wavelength, and the uncertainty of that description."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Literal
+
+from characterisation.files.errors import InputError, nearest
+from mitsim.scene.surface.coherence import lobe_numbers
+from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN
+
+#: direction of the marks on a face: along its u, along its v, or none
+Lay = Literal["u", "v", "none"]
+
+#: width of the specular part, from form error and waviness of a real face. An ideal mirror would appear black under a
+#: point-like projector. Assumed
+ALPHA_FORM = 0.005
+
+
+#: one-sigma factor of a surface's reflectance. Handbooks of optical constants differ by about 5 % in the reflectance of
+#: one evaporated metal. Oxide, alloy and dirt add to that, and paint is specified no better. Assumed
+REFLECTANCE_FACTOR = 1.05
+
+#: largest reflectance of any surface [1]
+LARGEST_REFLECTANCE = 0.99
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Scattering of the light that a surface reflects, at one wavelength. Shares are [1].
+
+    The share ``wide_angle`` of the reflected light is scattered as by a matt surface. Of the rest, the share A is in a
+    narrow lobe and the remainder in a lobe of alpha_u, alpha_v, whose share ``beckmann`` is Beckmann and the rest GGX.
+    A grows with the angle of incidence (:meth:`coherent_at`).
+
+    Parameters
+    ----------
+    phase_variance
+        Variance g of the phase at normal incidence [rad^2] in A = exp(-g); infinite if A is 0 at every angle.
+    alpha_u, alpha_v
+        Width of the incoherent lobe along u and v in Beckmann's sense: sqrt(2) times the rms slope. NaN if there is
+        no such lobe.
+    beckmann
+        Share of Beckmann in the incoherent lobe.
+    height_um
+        Rq that determines coherence and speckle [um]; NaN if light is scattered in the volume.
+    wide_angle, wide_angle_range
+        Share of all reflected light at wide angles; and its one-sigma range, low and high.
+    alpha_factor
+        One-sigma factor of alpha: it lies between alpha / factor and alpha x factor.
+    provenance
+        Source of alpha, in words.
+    lay
+        Direction of the marks.
+    energy_factor
+        Factors on the GGX and the Beckmann lobe that compensate the energy lost by single scattering.
+    coherent_alpha
+        Width of the coherent part along u and v.
+    correlation_um
+        Lateral scale l of the heights [um]; NaN if not needed.
+    depolarising
+        Whether the wide-angle light was scattered inside the material (paint, white) and is therefore depolarised.
+    """
+
+    phase_variance: float
+    alpha_u: float
+    alpha_v: float
+    beckmann: float
+    height_um: float
+    wide_angle: float
+    wide_angle_range: tuple[float, float]
+    alpha_factor: float
+    provenance: str
+    lay: Lay = "none"
+    energy_factor: tuple[float, float] = (1.0, 1.0)
+    coherent_alpha: tuple[float, float] = (ALPHA_FORM, ALPHA_FORM)
+    correlation_um: float = float("nan")
+    depolarising: bool = False
+
+    @property
+    def coherent(self) -> float:
+        """Return the share A [1] of the specular light that is coherent, at normal incidence."""
+        return self.coherent_at(0.0)
+
+    def coherent_at(self, incidence: float) -> float:
+        """Return the share A [1] of the specular light that is coherent, at ``incidence`` [rad]."""
+        return math.exp(-self.phase_variance * math.cos(incidence) ** 2)
+
+    @property
+    def lobe_numbers(self) -> tuple[float, float, float]:
+        """Return the coefficients [1] of the factor that conserves the lobe's energy where A changes across it.
+
+        See :mod:`mitsim.scene.surface.coherence`.
+        """
+        return lobe_numbers(self.phase_variance, self.alpha_u, self.alpha_v, self.beckmann, self.energy_factor)
+
+    @property
+    def ggx_alpha(self) -> tuple[float, float]:
+        """Return the widths (u, v) of the GGX lobe with the same median slope as the Beckmann lobe."""
+        return GGX_PER_BECKMANN * self.alpha_u, GGX_PER_BECKMANN * self.alpha_v
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Deviation of the unknown properties of a finish from their best estimates, in standard deviations.
+
+    - ``alpha``: multiplies the width of the lobe by its one-sigma factor to this power.
+    - ``wide_angle``: the wide-angle share at the low end of its range at -1, at the high end at +1, interpolated and
+      extrapolated geometrically.
+    - ``reflectance``: multiplies all reflected light by :data:`REFLECTANCE_FACTOR` to this power.
+    """
+
+    alpha: float = 0.0
+    wide_angle: float = 0.0
+    reflectance: float = 0.0
+
+    @classmethod
+    def parse(cls, text: str, where: str = "--deviation") -> Deviation:
+        """Parse a deviation as on a command line: ``alpha=1,wide_angle=-1``; properties not named stay at 0.
+
+        Raises
+        ------
+        InputError
+            For an unknown name (it suggests the nearest), a name given twice, or an invalid or too large number.
+        """
+        known, given = [field.name for field in fields(cls)], dict[str, float]()
+        for word in filter(None, (word.strip() for word in text.split(","))):
+            name, mark, value = (part.strip() for part in word.partition("="))
+            if name not in known:
+                raise InputError(where, "", repr(name), ", ".join(known), nearest(name, known))
+            if name in given:
+                raise InputError(where, name, "two values", "one")
+            allowed = f"a number of standard deviations from {-LARGEST_DEVIATION:g} to {LARGEST_DEVIATION:g}"
+            try:
+                given[name] = float(value)
+            except ValueError:
+                found = repr(value) if mark else "nothing"
+                raise InputError(where, name, found, allowed, f"write {name}=1") from None
+            if not abs(given[name]) <= LARGEST_DEVIATION:
+                raise InputError(where, name, value, allowed)
+        return cls(**given)
+
+    def width(self, alpha: float, factor: float) -> float:
+        """Return a lobe's alpha [1] after the deviation; ``factor`` is its one-sigma factor."""
+        return float(alpha * factor**self.alpha)
+
+    def reflected(self, reflectance: float) -> float:
+        """Return the factor [1] on the reflected light of a surface; the product with ``reflectance`` stays below 1."""
+        most = max(LARGEST_REFLECTANCE / reflectance, 1.0)
+        return float(min(REFLECTANCE_FACTOR**self.reflectance, most))
+
+    def share(self, share: float, ends: tuple[float, float]) -> float:
+        """Return a wide-angle share [1] after the deviation; ``ends`` are its one-sigma range, low and high."""
+        if share <= 0:
+            return share
+        ratio = ends[1] / share if self.wide_angle > 0 else share / ends[0]
+        return float(min(share * ratio**self.wide_angle, 1.0))
+
+    def provenance_of(self, provenance: str, factor: float, ends: tuple[float, float]) -> str:
+        """Return the source of alpha and the deviations applied; exactly known properties do not deviate."""
+        moved = [f"alpha {self.alpha:+g}"] if self.alpha and factor != 1 else []
+        moved += [f"wide angle {self.wide_angle:+g}"] if self.wide_angle and ends[0] != ends[1] else []
+        moved += [f"reflectance {self.reflectance:+g}"] if self.reflectance else []
+        return f"{provenance}; {' and '.join(moved)} sigma" if moved else provenance
+
+
+#: largest deviation; the prior is not meaningful beyond
+LARGEST_DEVIATION = 3.0
+
+#: every finish at its best estimate
+NOMINAL = Deviation()

@@ -1,0 +1,172 @@
+"""Compute the covariance of a calibration: one bundle adjustment of all eyes and poses, linearised at the nominal rig.
+
+Signal chain: rig, board and views -> Jacobian J of the observations, their covariance, and sensitivities to errors of
+the board -> normal matrix -> covariance of the rig's parameters.
+
+The observations are x = f(theta, poses) of the board's corners in every eye. The estimate minimises the unweighted sum
+of squares, as OpenCV's does. With observation errors e of covariance Sigma, and common errors k of the board with
+sensitivities G = df/dk,
+
+    d theta = (J^T J)^-1 J^T (e + G k)        cov = (J^T J)^-1 (J^T Sigma J + J^T G K G^T J) (J^T J)^-1
+
+The block of the rig's parameters is the marginal covariance over the poses. For equal independent noise it is
+sigma^2 (J^T J)^-1, and its block that of the Schur complement (Triggs et al., Bundle adjustment - a modern synthesis,
+2000, sections 6 and 9; Hartley and Zisserman, Multiple View Geometry, 2nd ed., appendix 6). The errors k are not
+estimated ("consider" parameters: Bierman, Factorization Methods, 1977, chapter VIII). More poses do not average them
+out, since every pose sees the same board.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.rig_parameters import MATRIX_NAMES, POSE_NAMES, distortion_names, parameter_names
+from mitsim.sensor.transforms import Transform
+from mitsim.study.calibration.board import Board
+
+Floats = NDArray[np.float64]
+
+#: columns of OpenCV's Jacobian after rotation, translation and fx fy cx cy: the coefficients
+_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """One pose of the board: ``sensor_from_board``; ``corners`` (n,) that all eyes see; noise of an observation.
+
+    ``camera_px``: one sigma of each coordinate of a corner in a camera. ``coordinate_px``: additional one sigma of the
+    projector's coordinates.
+    """
+
+    sensor_from_board: Transform
+    corners: NDArray[np.intp]
+    camera_px: float
+    coordinate_px: float = 0.0
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """A bundle adjustment linearised at the true parameters.
+
+    - ``names`` (p,) of the rig's parameters; six of each pose follow (a rotation about the board's origin, then a
+      translation, both in the sensor frame).
+    - ``normal``: J^T J (q, q); ``noise``: J^T Sigma J (q, q); ``board``: J^T G (q, m); ``board_sigma`` (m,).
+    """
+
+    names: tuple[str, ...]
+    normal: Floats
+    noise: Floats
+    board: Floats
+    board_sigma: Floats
+
+    def response(self) -> tuple[Floats, Floats]:
+        """Return (J^T J)^-1 (q, q), and the effect of board errors on all parameters, (J^T J)^-1 J^T G (q, m)."""
+        scale = 1 / np.sqrt(np.diag(self.normal))
+        inverse = np.linalg.inv(self.normal * np.outer(scale, scale)) * np.outer(scale, scale)
+        return inverse, inverse @ self.board
+
+    def covariance(self) -> Floats:
+        """Return the covariance of the rig's parameters (p, p) from noise and board together."""
+        count = len(self.names)
+        inverse, moved = self.response()
+        spread = moved[:count] * self.board_sigma
+        return np.asarray(inverse[:count] @ self.noise @ inverse[:count].T + spread @ spread.T)
+
+
+def linearise(rig: Rig, eyes: Mapping[str, Camera], board: Board, views: Sequence[BoardView]) -> Linearised:
+    """Linearise the bundle adjustment of some eyes of a rig, the reference camera first, at its nominal values."""
+    projector = "projector" in eyes
+    names = tuple(name for name in parameter_names(rig, projector) if name.rpartition(".")[0] in eyes)
+    modes, sigma = board.imperfections()
+    size = len(names) + 6 * len(views)
+    normal, noise = np.zeros((size, size)), np.zeros((size, size))
+    shared = np.zeros((size, len(modes)))
+    for number, view in enumerate(views):
+        first = len(names) + 6 * number
+        own = [*range(len(names)), *range(first, first + 6)]
+        jacobian, by_point = view_jacobian(eyes, names, view.sensor_from_board, board.corners[view.corners])
+        covariance = observation_covariance(eyes, by_point, view)
+        place = view.sensor_from_board
+        shifts = np.einsum("ij,mnj->mni", place.rotation, modes[:, view.corners])
+        to_board = np.einsum("neak,mnk->neam", by_point, shifts)
+        part = jacobian.reshape(len(view.corners), -1, len(own))  # groups all coordinates of a corner
+        normal[np.ix_(own, own)] += np.einsum("nop,noq->pq", part, part)
+        weighted = np.einsum("nor,nrq->noq", covariance, part)
+        noise[np.ix_(own, own)] += np.einsum("nop,noq->pq", part, weighted)
+        shared[own] += np.einsum("nop,nom->pm", part, to_board.reshape(len(view.corners), -1, len(modes)))
+    return Linearised(names, normal, noise, shared, sigma)
+
+
+def eye_jacobian(eye: Camera, points: Floats) -> tuple[Floats, Floats]:
+    """Return derivatives of pixels of points (n, 3) in the sensor frame: by the points (n, 2, 3), by the optics.
+
+    The latter, (n, 2, 4 + c), are in the order of ``MATRIX_NAMES`` and :func:`distortion_names`.
+    """
+    local = np.ascontiguousarray(eye.sensor_from_camera.inverse().points(points)).reshape(-1, 1, 3)
+    zero, count = np.zeros(3), len(points)
+    if eye.model == "fisheye":
+        _, raw = cv2.fisheye.projectPoints(local, zero, zero, eye.matrix, eye.distortion.reshape(-1, 1))
+        by_local, optics = raw[:, 11:14], raw[:, :8]
+    else:
+        _, raw = cv2.projectPoints(local, zero, zero, eye.matrix, eye.distortion)
+        chosen = [_ORDER.index(name) for name in distortion_names(eye)]
+        by_local, optics = raw[:, 3:6], raw[:, [6, 7, 8, 9, *(10 + index for index in chosen)]]
+    by_point = by_local.reshape(count, 2, 3) @ eye.sensor_from_camera.rotation.T
+    return np.asarray(by_point), np.asarray(optics.reshape(count, 2, -1))
+
+
+def homographies(first: Floats, second: Floats, place: Transform) -> Floats:
+    """Return the derivatives of a second eye's pixels by those of a first on the board's plane, (n, 2, 2).
+
+    ``first`` and ``second`` (n, 2, 3) are the derivatives of the two eyes' pixels by the point.
+    """
+    plane = place.rotation[:, :2]
+    return np.asarray((second @ plane) @ np.linalg.inv(first @ plane))
+
+
+def view_jacobian(
+    eyes: Mapping[str, Camera], names: tuple[str, ...], place: Transform, corners: Floats
+) -> tuple[Floats, Floats]:
+    """Return the derivatives of the pixels of corners (n, 3) in the board's frame, in every eye.
+
+    They are by the rig's parameters and the six of the pose ``sensor_from_board``, (n, eyes, 2, p + 6), and by the
+    point in the sensor frame, (n, eyes, 2, 3).
+    """
+    points = place.points(corners)
+    arms = points - place.translation
+    jacobian = np.zeros((len(points), len(eyes), 2, len(names) + 6))
+    by_point = np.empty((len(points), len(eyes), 2, 3))
+    for number, (name, eye) in enumerate(eyes.items()):
+        moves, optics = eye_jacobian(eye, points)
+        by_point[:, number] = moves
+        own = [names.index(f"{name}.{what}") for what in (*MATRIX_NAMES, *distortion_names(eye))]
+        jacobian[:, number][:, :, own] = optics
+        if number:
+            pose = [names.index(f"{name}.{what}") for what in POSE_NAMES]
+            # in the frame of R exp(w) a point x is rotated by exp(-w): dx = x cross w
+            local = moves @ eye.sensor_from_camera.rotation
+            seen = eye.sensor_from_camera.inverse().points(points)
+            jacobian[:, number][:, :, pose[:3]] = np.cross(local, seen[:, None])
+            jacobian[:, number][:, :, pose[3:]] = -moves
+    jacobian[..., -6:-3] = np.cross(arms[:, None, None], by_point)
+    jacobian[..., -3:] = by_point
+    return jacobian, by_point
+
+
+def observation_covariance(eyes: Mapping[str, Camera], by_point: Floats, view: BoardView) -> Floats:
+    """Return the covariance of all coordinates of each corner, (n, 2 eyes, 2 eyes); ``by_point`` (n, eyes, 2, 3)."""
+    count = len(by_point)
+    out = np.zeros((count, 2 * len(eyes), 2 * len(eyes)))
+    out[:, range(2 * len(eyes)), range(2 * len(eyes))] = view.camera_px**2
+    if "projector" in eyes:
+        turned = homographies(by_point[:, 0], by_point[:, 1], view.sensor_from_board)
+        crossed = view.camera_px**2 * turned
+        out[:, 2:4, 0:2], out[:, 0:2, 2:4] = crossed, np.swapaxes(crossed, 1, 2)
+        out[:, 2:4, 2:4] = crossed @ np.swapaxes(turned, 1, 2) + view.coordinate_px**2 * np.eye(2)
+    return out

@@ -1,0 +1,319 @@
+"""Calibrate a real rig: from the corners of a board seen at several poses to the rig and its covariance.
+
+Signal chain: corners in every eye (for a projector, the decoded coordinates at the camera's corners) -> each eye alone,
+by OpenCV, as a start -> all eyes and poses in one weighted adjustment, with general properties of lenses as a prior ->
+noise of camera and projector from the residuals, iterated -> covariance: noise and prior, and errors of the board.
+
+The adjustment minimises r^T Sigma^-1 r + (theta - theta_0)^T P (theta - theta_0). With the normal matrix
+N = J^T Sigma^-1 J + P, board errors k of covariance K and G = df/dk,
+
+    cov = N^-1 + N^-1 J^T Sigma^-1 G K G^T Sigma^-1 J N^-1
+
+(Triggs et al., Bundle adjustment - a modern synthesis, 2000; "consider" covariance of Bierman 1977, as
+:mod:`mitsim.study.calibration.bundle`). A few poses do not determine all parameters of a lens: without a prior the weakest
+coefficients diverge. A projector's coordinates are read at the camera's corners, so their errors are correlated with
+the camera's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from characterisation.files.errors import InputError
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.rig_covariance import RigCovariance
+from mitsim.sensor.rig_parameters import eyes as all_eyes
+from mitsim.sensor.rig_parameters import moved, parameter_names, parameter_values
+from mitsim.sensor.transforms import Transform
+from mitsim.study.calibration.board import Board
+from mitsim.study.calibration.bundle import BoardView, homographies, observation_covariance, view_jacobian
+
+Floats = NDArray[np.float64]
+
+#: One sigma of the prior of any lens, *assumed*: principal point of a camera, and of a projector along columns and
+#: along rows (projectors shift their image), relative to the size; fx / fy; distortion.
+_CAMERA_MIDDLE, _PROJECTOR_MIDDLE, _ASPECT = (0.05, 0.05), (0.05, 0.5), 0.005
+_DISTORTION: Mapping[str, float] = {"k1": 0.2, "k2": 0.2, "p1": 0.002, "p2": 0.002, "k3": 1e-3}
+_ROUNDS = 4
+#: limits of the adjustment: number of steps; last step, in squared standard uncertainties, and its gain; damping
+_MOST_STEPS, _SMALL_STEP, _SMALL_GAIN, _STUCK = 300, 1e-4, 1e-9, 1e9
+#: least number of poses: two views of a plane leave the focal length to the prior
+LEAST_POSES = 3
+
+
+@dataclass(frozen=True)
+class RecordedBoard:
+    """A board at one pose: ``corners`` (n,) of :attr:`Board.corners`, and their pixels (n, 2) by eye."""
+
+    corners: NDArray[np.intp]
+    pixels: Mapping[str, Floats]
+
+
+@dataclass(frozen=True)
+class RecordedCalibration:
+    """Result of a calibration: ``rig``, ``places`` sensor_from_board of the poses, ``covariance``, observation noise.
+
+    ``camera_px`` (poses,) of a corner in a camera, ``coordinate_px`` (poses,) the projector's additional part, 0
+    without one; one sigma each. They differ between poses: a tilted board is out of focus, and its stripes are wider.
+    """
+
+    rig: Rig
+    places: list[Transform]
+    covariance: RigCovariance
+    camera_px: Floats
+    coordinate_px: Floats
+
+
+def calibrate_recorded(
+    boards: Sequence[RecordedBoard],
+    board: Board,
+    sizes: Mapping[str, tuple[int, int]],
+    source: str,
+    *,
+    own_units: bool = False,
+) -> RecordedCalibration:
+    """Calibrate a rig of perspective eyes (cameras and a projector).
+
+    Parameters
+    ----------
+    boards
+        One for each pose; every eye has the same corners.
+    sizes
+        Width and height [px] of every eye, the reference camera first; a projector is named ``projector``.
+    source
+        Source text for the covariance's file.
+    own_units
+        Lengths are in the board's own squares, so the covariance excludes the error of its scale.
+
+    Raises
+    ------
+    InputError
+        If there are too few poses, or the adjustment does not converge.
+    """
+    if len(boards) < LEAST_POSES:
+        raise InputError("boards", "", f"{len(boards)} poses", f"{LEAST_POSES} or more, tilted against one another")
+    rig, places = _start(boards, board, sizes)
+    noise = np.tile([0.1, 0.1 if "projector" in sizes else 0.0], (len(boards), 1))
+    for _ in range(_ROUNDS):
+        rig, places, normal = _adjusted(rig, places, boards, board, noise, rig_prior(rig, sizes))
+        noise = _noise(rig, places, boards, board, normal)
+    adjusted = _Adjustment(rig, places, noise, normal)
+    covariance = _covariance(adjusted, boards, board, source, own_units)
+    return RecordedCalibration(rig, places, covariance, *noise.T)
+
+
+@dataclass(frozen=True)
+class _Adjustment:
+    """An adjusted rig, its places sensor_from_board, ``noise`` (poses, 2) [px] and ``normal`` matrix (q, q)."""
+
+    rig: Rig
+    places: list[Transform]
+    noise: Floats
+    normal: Floats
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Prior of the rig's parameters ``names``: ``rows`` (m, p) times them is ``values`` (m,) +- ``sigma``."""
+
+    names: tuple[str, ...]
+    rows: Floats
+    values: Floats
+    sigma: Floats
+
+
+def rig_prior(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> Prior:
+    """Return the prior of any camera and projector: central principal point, square pixels, little distortion."""
+    names = parameter_names(rig)
+    rows, values, sigma = [], [], []
+
+    def known(parts: Mapping[str, float], value: float, spread: float) -> None:
+        row = np.zeros(len(names))
+        for name, weight in parts.items():
+            row[names.index(name)] = weight
+        rows.append(row)
+        values.append(value)
+        sigma.append(spread)
+
+    optics = all_eyes(rig)
+    for eye, (width, height) in sizes.items():
+        middle = _PROJECTOR_MIDDLE if eye == "projector" else _CAMERA_MIDDLE
+        known({f"{eye}.principal_x_px": 1.0}, (width - 1) / 2, middle[0] * width)
+        known({f"{eye}.principal_y_px": 1.0}, (height - 1) / 2, middle[1] * height)
+        focal = float(optics[eye].matrix[0, 0])
+        known({f"{eye}.focal_x_px": 1.0, f"{eye}.focal_y_px": -1.0}, 0.0, _ASPECT * focal)
+        for name, spread in _DISTORTION.items():
+            known({f"{eye}.{name}": 1.0}, 0.0, spread)
+    return Prior(names, np.array(rows), np.array(values), np.array(sigma))
+
+
+def _start(
+    boards: Sequence[RecordedBoard], board: Board, sizes: Mapping[str, tuple[int, int]]
+) -> tuple[Rig, list[Transform]]:
+    """Return rig and poses by OpenCV, eye by eye: one focal length, central principal point, no distortion."""
+    flags = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_USE_INTRINSIC_GUESS
+    flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+    found: dict[str, tuple[Floats, list[Transform]]] = {}
+    for eye, (width, height) in sizes.items():
+        free = 0 if eye == "projector" else cv2.CALIB_FIX_PRINCIPAL_POINT
+        points = [board.corners[each.corners].astype(np.float32) for each in boards]
+        pixels = [each.pixels[eye].astype(np.float32).reshape(-1, 1, 2) for each in boards]
+        tries = []
+        for share in (0.6, 1.0, 1.6, 2.5):
+            guess = np.array([[share * width, 0, (width - 1) / 2], [0, share * width, (height - 1) / 2], [0, 0, 1.0]])
+            tries.append(cv2.calibrateCamera(points, pixels, (width, height), guess, np.zeros(5), flags=flags | free))
+        _, matrix, _, turns, shifts = min(tries, key=lambda one: one[0])
+        found[eye] = (
+            np.asarray(matrix, np.float64),
+            [
+                Transform(Rotation.from_rotvec(turn.ravel()).as_matrix(), np.asarray(shift, np.float64).ravel())
+                for turn, shift in zip(turns, shifts, strict=True)
+            ],
+        )
+    reference = next(iter(sizes))
+    places = found[reference][1]
+    cameras = {}
+    for eye, (width, height) in sizes.items():
+        apart = [one @ other.inverse() for one, other in zip(places, found[eye][1], strict=True)]
+        turn = Rotation.from_matrix([each.rotation for each in apart]).mean().as_matrix()
+        place = Transform(turn, np.median([each.translation for each in apart], axis=0))
+        place = Transform.identity() if eye == reference else place
+        cameras[eye] = Camera(found[eye][0], np.zeros(5), width, height, place)
+    projector = cameras.pop("projector", None)
+    return Rig(cameras, projector), places
+
+
+def _adjusted(
+    rig: Rig,
+    places: list[Transform],
+    boards: Sequence[RecordedBoard],
+    board: Board,
+    noise: Floats,
+    prior: Prior,
+) -> tuple[Rig, list[Transform], Floats]:
+    """Minimise the weighted squares over rig and poses by Levenberg-Marquardt; also return the normal matrix (q, q)."""
+    count, damping = len(prior.names), 1e-3
+    cost, normal, gradient = _normal(rig, places, boards, board, noise, prior)
+    for _ in range(_MOST_STEPS):
+        scale = 1 / np.sqrt(np.diag(normal))
+        scaled = normal * np.outer(scale, scale)
+        step = scale * np.linalg.solve(scaled + damping * np.eye(len(scale)), scale * gradient)
+        tried_rig = moved(rig, prior.names, step[:count])
+        tried = [
+            Transform(Rotation.from_rotvec(turn[:3]).as_matrix() @ place.rotation, place.translation + turn[3:])
+            for turn, place in zip(step[count:].reshape(-1, 6), places, strict=True)
+        ]
+        new = _normal(tried_rig, tried, boards, board, noise, prior)
+        if new[0] > cost * (1 + 1e-12):
+            damping *= 4
+            if damping > _STUCK:
+                return rig, places, normal
+            continue
+        gained = cost - new[0]
+        rig, places, damping = tried_rig, tried, max(damping / 3, 1e-12)
+        cost, normal, gradient = new
+        if gained < _SMALL_GAIN * cost and float(step @ normal @ step) < _SMALL_STEP:
+            return rig, places, normal
+    raise InputError(
+        "boards", "", f"an adjustment that does not converge in {_MOST_STEPS} steps", "poses that determine it"
+    )
+
+
+def _normal(
+    rig: Rig,
+    places: list[Transform],
+    boards: Sequence[RecordedBoard],
+    board: Board,
+    noise: Floats,
+    prior: Prior,
+) -> tuple[float, Floats, Floats]:
+    """Return weighted sum of squares, normal matrix (q, q) and gradient (q,) for the rig, then six of each pose."""
+    count = len(prior.names)
+    size = count + 6 * len(places)
+    normal, gradient = np.zeros((size, size)), np.zeros(size)
+    weighted = prior.rows / prior.sigma[:, None]
+    off = (prior.values - prior.rows @ parameter_values(rig, prior.names)) / prior.sigma
+    normal[:count, :count], gradient[:count] = weighted.T @ weighted, weighted.T @ off
+    cost = float(off @ off)
+    for number, (place, recorded, own_noise) in enumerate(zip(places, boards, noise, strict=True)):
+        jacobian, by_point, left = _residuals(rig, place, recorded, board, prior.names)
+        whiten = _whitening(rig, place, recorded, by_point, own_noise)
+        flat = np.einsum("nij,njk->nik", whiten, jacobian.reshape(len(left), -1, count + 6)).reshape(-1, count + 6)
+        white = np.einsum("nij,nj->ni", whiten, left).ravel()
+        own = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]
+        normal[np.ix_(own, own)] += flat.T @ flat
+        gradient[own] += flat.T @ white
+        cost += float(white @ white)
+    return cost, normal, gradient
+
+
+def _residuals(
+    rig: Rig, place: Transform, recorded: RecordedBoard, board: Board, names: tuple[str, ...]
+) -> tuple[Floats, Floats, Floats]:
+    """Return derivatives of the pixels of one pose, (n, eyes, 2, p + 6), (n, eyes, 2, 3), residuals (n, 2 eyes)."""
+    optics, corners = all_eyes(rig), board.corners[recorded.corners]
+    jacobian, by_point = view_jacobian(optics, names, place, corners)
+    at = place.points(corners)
+    left = np.concatenate([recorded.pixels[name] - eye.project(at) for name, eye in optics.items()], axis=1)
+    return jacobian, by_point, left
+
+
+def _whitening(rig: Rig, place: Transform, recorded: RecordedBoard, by_point: Floats, noise: Floats) -> Floats:
+    covariance = observation_covariance(all_eyes(rig), by_point, BoardView(place, recorded.corners, *map(float, noise)))
+    return np.linalg.inv(np.linalg.cholesky(covariance))
+
+
+def _noise(rig: Rig, places: list[Transform], boards: Sequence[RecordedBoard], board: Board, normal: Floats) -> Floats:
+    """Return the noise of a camera's corner and the projector's part, (poses, 2), from residuals and freedom."""
+    out, names, optics = [], parameter_names(rig), list(all_eyes(rig))
+    count = sum(2 * len(optics) * len(recorded.corners) for recorded in boards)
+    lost = count / max(count - len(normal), 1)
+    for place, recorded in zip(places, boards, strict=True):
+        _, by_point, left = _residuals(rig, place, recorded, board, names)
+        camera, own = [], [np.zeros(1)]
+        for index, eye in enumerate(optics):
+            part = left[:, 2 * index : 2 * index + 2]
+            if eye == "projector":
+                turned = homographies(by_point[:, 0], by_point[:, index], place)
+                own = [part - np.einsum("nij,nj->ni", turned, left[:, :2])]
+            else:
+                camera.append(part)
+        out.append([np.mean(np.concatenate(camera) ** 2), np.mean(np.concatenate(own) ** 2)])
+    return np.sqrt(np.array(out) * lost)
+
+
+def _covariance(
+    adjusted: _Adjustment, boards: Sequence[RecordedBoard], board: Board, source: str, own_units: bool
+) -> RigCovariance:
+    rig, places, noise, normal = adjusted.rig, adjusted.places, adjusted.noise, adjusted.normal
+    names = parameter_names(rig)
+    count = len(names)
+    modes, sigma = board.imperfections()
+    if own_units:
+        sigma = np.concatenate([[0.0], sigma[1:]])  # the first is the scale
+    shared = np.zeros((len(normal), len(modes)))
+    for number, (place, recorded, own_noise) in enumerate(zip(places, boards, noise, strict=True)):
+        jacobian, by_point, left = _residuals(rig, place, recorded, board, names)
+        whiten = _whitening(rig, place, recorded, by_point, own_noise)
+        shifts = np.einsum("ij,mnj->mni", place.rotation, modes[:, recorded.corners])
+        moves = np.einsum("neak,mnk->neam", by_point, shifts).reshape(len(left), -1, len(modes))
+        flat = np.einsum("nij,njk->nik", whiten, jacobian.reshape(len(left), -1, count + 6))
+        own = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]
+        shared[own] += np.einsum("nip,nim->pm", flat, np.einsum("nij,njm->nim", whiten, moves))
+    scale = 1 / np.sqrt(np.diag(normal))
+    inverse = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
+    spread = (inverse @ shared)[:count] * sigma
+    details: dict[str, str | float] = {
+        "board": str(board),
+        "poses": float(len(places)),
+        "corners": float(sum(len(b.corners) for b in boards)),
+        "corner_noise_px": float(noise[:, 0].max()),
+        "coordinate_noise_px": float(noise[:, 1].max()),
+    }
+    return RigCovariance(names, inverse[:count, :count] + spread @ spread.T, source, details)

@@ -1,0 +1,177 @@
+"""Simulate calibrations: draw corner errors, and estimate the rig from the corners with OpenCV.
+
+Signal chain: board and views -> corners with random errors -> OpenCV's estimate of each eye -> joint adjustment ->
+errors over their stated sigma.
+
+They verify the stated covariance: the errors of many estimates must lie inside its intervals at the stated rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from characterisation.files.errors import InputError
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.rig_parameters import distortion_names, moved, parameter_differences, parameter_names
+from mitsim.sensor.rig_parameters import eyes as all_eyes
+from mitsim.sensor.transforms import Transform
+from mitsim.study.calibration.board import Board
+from mitsim.study.calibration.bundle import BoardView, eye_jacobian, homographies, view_jacobian
+
+Floats = NDArray[np.float64]
+
+#: termination of OpenCV's estimate of one eye, which is only a start; that of its tutorials
+_COARSE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 1e-6)
+#: largest number of steps of the joint adjustment, and its final step: norm over all observations [px]
+_MOST_STEPS, _SMALL_STEP_PX = 30, 1e-5
+#: factor on the focal lengths of OpenCV's initial guess: a data sheet's accuracy
+_START_OFF = 1.01
+
+
+@dataclass(frozen=True)
+class SimulatedCorners:
+    """Observations of a calibration: for each pose, nominal board points and their pixels by eye, (n, 2) each."""
+
+    points: list[Floats]
+    pixels: dict[str, list[Floats]]
+
+
+def simulate_corners(
+    eyes: Mapping[str, Camera], board: Board, views: Sequence[BoardView], rng: np.random.Generator
+) -> SimulatedCorners:
+    """Draw one board and the errors of all its corners, by the model of :func:`mitsim.study.calibration.bundle.linearise`."""
+    modes, sigma = board.imperfections()
+    true = board.corners + np.einsum("m,mni->ni", sigma * rng.standard_normal(len(sigma)), modes)
+    pixels: dict[str, list[Floats]] = {name: [] for name in eyes}
+    for view in views:
+        points = view.sensor_from_board.points(true[view.corners])
+        errors: list[Floats] = []
+        for name, eye in eyes.items():
+            own = view.camera_px * rng.standard_normal((len(points), 2))
+            if name == "projector":  # read at the position of the corner found by the camera
+                first = eye_jacobian(next(iter(eyes.values())), points)[0]
+                turned = homographies(first, eye_jacobian(eye, points)[0], view.sensor_from_board)
+                own = np.einsum("nij,nj->ni", turned, errors[0])
+                own += view.coordinate_px * rng.standard_normal(own.shape)
+            errors.append(own)
+            pixels[name].append(eye.project(points) + own)
+    return SimulatedCorners([board.corners[view.corners] for view in views], pixels)
+
+
+def estimate(rig: Rig, eyes: Mapping[str, Camera], corners: SimulatedCorners) -> tuple[Rig, list[Transform]]:
+    """Estimate the rig and the board's poses from corners: each eye by OpenCV, then all together.
+
+    ``cv2.calibrateCamera`` of each eye gives the start. The damped steps of ``cv2.stereoCalibrate`` stop 1 to 3 sigma
+    short of the minimum after 200 of them, because the parameters are strongly correlated. The joint adjustment is
+    therefore Gauss-Newton, with the derivatives of ``cv2.projectPoints``.
+
+    Raises
+    ------
+    InputError
+        For fisheye lenses, for which OpenCV finds no such start; or if the adjustment does not converge.
+    """
+    if any(eye.model == "fisheye" for eye in eyes.values()):
+        raise InputError("--check", "", "a fisheye lens", "perspective lenses", "leave --check out")
+    points = [each.astype(np.float32) for each in corners.points]
+    started, poses = {}, {}
+    for name, eye in eyes.items():
+        guess = eye.matrix.copy()
+        guess[[0, 1], [0, 1]] *= _START_OFF
+        pixels = [each.astype(np.float32).reshape(-1, 1, 2) for each in corners.pixels[name]]
+        _, matrix, distortion, turns, shifts = cv2.calibrateCamera(
+            points,
+            pixels,
+            (eye.width, eye.height),
+            guess,
+            np.zeros(14 if len(eye.distortion) > 5 else 5),
+            flags=_flags(eyes),
+            criteria=_COARSE,
+        )
+        found = np.asarray(distortion, np.float64).reshape(-1)
+        started[name] = replace(eye, matrix=np.asarray(matrix, np.float64), distortion=found)
+        poses[name] = [
+            Transform(Rotation.from_rotvec(turn.ravel()).as_matrix(), np.asarray(shift, np.float64).ravel())
+            for turn, shift in zip(turns, shifts, strict=True)
+        ]
+    reference = next(iter(eyes))
+    for name in list(eyes)[1:]:
+        apart = [one @ other.inverse() for one, other in zip(poses[reference], poses[name], strict=True)]
+        turn = Rotation.from_matrix([each.rotation for each in apart]).mean().as_matrix()
+        place = Transform(turn, np.median([each.translation for each in apart], axis=0))
+        started[name] = replace(started[name], sensor_from_camera=eyes[reference].sensor_from_camera @ place)
+    places = [eyes[reference].sensor_from_camera @ pose for pose in poses[reference]]
+    cameras = {name: started.get(name, camera) for name, camera in rig.cameras.items()}
+    return _adjusted(replace(rig, cameras=cameras, projector=started.get("projector", rig.projector)), places, corners)
+
+
+def _adjusted(rig: Rig, places: list[Transform], corners: SimulatedCorners) -> tuple[Rig, list[Transform]]:
+    """Minimise the sum of squares of all residuals over the rig and the board's poses by Gauss-Newton."""
+    names = tuple(
+        n for n in parameter_names(rig, "projector" in corners.pixels) if n.rpartition(".")[0] in corners.pixels
+    )
+    count = len(names)
+    for _ in range(_MOST_STEPS):
+        optics = {name: eye for name, eye in all_eyes(rig).items() if name in corners.pixels}
+        size = count + 6 * len(places)
+        normal, gradient = np.zeros((size, size)), np.zeros(size)
+        for number, (place, board) in enumerate(zip(places, corners.points, strict=True)):
+            jacobian, _ = view_jacobian(optics, names, place, board)
+            at = place.points(board)
+            left = np.stack([corners.pixels[name][number] - eye.project(at) for name, eye in optics.items()], axis=1)
+            own = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]
+            flat = jacobian.reshape(-1, count + 6)
+            normal[np.ix_(own, own)] += flat.T @ flat
+            gradient[own] += flat.T @ left.reshape(-1)
+        scale = 1 / np.sqrt(np.diag(normal))
+        step = scale * np.linalg.solve(normal * np.outer(scale, scale), scale * gradient)
+        rig = moved(rig, names, step[:count])
+        turns = step[count:].reshape(-1, 6)
+        places = [
+            Transform(Rotation.from_rotvec(turn[:3]).as_matrix() @ place.rotation, place.translation + turn[3:])
+            for turn, place in zip(turns, places, strict=True)
+        ]
+        # change of all observations in the step: root of the sum of squares [px]
+        if float(step @ normal @ step) < _SMALL_STEP_PX**2:
+            return rig, places
+    raise InputError(
+        "--check", "", f"an adjustment that does not converge in {_MOST_STEPS} steps", "poses that determine it"
+    )
+
+
+def _flags(eyes: Mapping[str, Camera]) -> int:
+    """Return the flags for OpenCV to estimate exactly the coefficients of the nominal models."""
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS
+    used = {name for eye in eyes.values() for name in distortion_names(eye)}
+    for member, flag in (
+        ("k4", cv2.CALIB_RATIONAL_MODEL),
+        ("s1", cv2.CALIB_THIN_PRISM_MODEL),
+        ("tx", cv2.CALIB_TILTED_MODEL),
+    ):
+        flags |= flag if member in used else 0
+    return int(flags)
+
+
+def coverage(
+    rig: Rig,
+    eyes: Mapping[str, Camera],
+    board: Board,
+    views: Sequence[BoardView],
+    stated: Mapping[str, float],
+    count: int,
+    rng: np.random.Generator,
+) -> Floats:
+    """Return errors over sigma of ``count`` simulated calibrations, (count, n), each from its own stream.
+
+    ``stated`` is the sigma of the n parameters by their names.
+    """
+    names, sigma, rows = list(stated), np.array(list(stated.values())), []
+    for stream in rng.spawn(count):
+        found, _ = estimate(rig, eyes, simulate_corners(eyes, board, views, stream))
+        rows.append(parameter_differences(rig, found, names) / sigma)
+    return np.array(rows)

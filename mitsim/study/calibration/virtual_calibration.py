@@ -1,0 +1,172 @@
+"""Calibrate a sensor virtually: board, poses, corner noise and bundle adjustment give the covariance of its rig.
+
+Signal chain: board and poses -> corner noise at their distances -> bundle adjustment, linearised -> covariance of the
+rig -> accuracy of rigs drawn from it, with and without drift.
+
+The decoder determines which eyes are calibrated:
+
+- active stereo, and structured light matched between two cameras: the cameras;
+- a camera and a code, or a stored image: camera and projector;
+- time of flight: the camera, and offset and scale of the path, fitted to the distances of the same board.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.errors import InputError
+from mitsim.sensor.camera import Camera
+from mitsim.sensor.drift import Drift, with_drift
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.rig_covariance import RigCovariance
+from mitsim.sensor.rig_parameters import PATH_NAMES
+from mitsim.study.calibration.accuracy import Accuracy, accuracy
+from mitsim.study.calibration.board import Board, board_poses, default_board
+from mitsim.study.calibration.bundle import BoardView, Linearised, linearise
+from mitsim.study.calibration.corner_noise import coordinate_noise, corner_noise
+
+Floats = NDArray[np.float64]
+
+#: default number of poses; calibration handbooks recommend 15 to 25
+POSES = 20
+#: number of rigs drawn for the accuracy
+_DRAWS = 400
+
+
+@dataclass(frozen=True)
+class VirtualCalibration:
+    """Inputs and results of a virtual calibration.
+
+    ``covariance`` and ``accuracy`` are of the calibration alone, ``accuracy_drifted`` includes ``drift`` since then.
+    """
+
+    sensor: Sensor
+    eyes: dict[str, Camera]
+    board: Board
+    views: list[BoardView]
+    covariance: RigCovariance
+    drift: Drift
+    accuracy: Accuracy
+    accuracy_drifted: Accuracy
+
+
+def calibrated_eyes(sensor: Sensor) -> dict[str, Camera]:
+    """Return the cameras, and as ``projector`` the projector if the decoder uses it, reference camera first."""
+    rig = sensor.measuring_rig
+    seen = dict(rig.cameras)
+    if len(seen) == 1 and sensor.technology in ("structured_light", "reference_stereo"):
+        assert rig.projector is not None
+        seen["projector"] = rig.projector
+    return seen
+
+
+def sensor_drift(sensor: Sensor) -> Drift:
+    """Return the drift by a sensor's own file, and by the default change of its temperature."""
+    return replace(sensor.unknowns.calibration.drift(), temperature_k=Drift.temperature_k)
+
+
+def calibrate(
+    sensor: Sensor, board: Board | None = None, poses: int = POSES, seed: int = 1, drift: Drift | None = None
+) -> VirtualCalibration:
+    """Calibrate a sensor virtually.
+
+    ``board`` None is :func:`default_board` at the middle of the working range; ``drift`` None is
+    :func:`sensor_drift`. Equal seeds give equal results.
+
+    Raises
+    ------
+    InputError
+        If the number of poses is not 6 to 300, or all eyes together see too little of the board.
+    """
+    if not 6 <= poses <= 300:
+        raise InputError("--poses", "", poses, "6 to 300")
+    eyes = calibrated_eyes(sensor)
+    middle = float(np.sqrt(np.prod(sensor.working_range_mm)))
+    board = board or default_board(sensor.rig.reference, middle)
+    views = board_views(sensor, eyes, board, poses, seed)
+    linear = linearise(sensor.measuring_rig, eyes, board, views)
+    names, matrix = linear.names, linear.covariance()
+    if sensor.technology == "time_of_flight":
+        names, matrix = (*names, *PATH_NAMES), _with_path(linear, board, views)
+    covariance = RigCovariance(names, matrix, _source(sensor, board, views), _details(board, views))
+    drift = drift or sensor_drift(sensor)
+    rng = np.random.default_rng(seed)
+    alone = accuracy(sensor, eyes, covariance, _DRAWS, rng)
+    drifted = accuracy(sensor, eyes, with_drift(covariance, sensor.rig, drift), _DRAWS, rng)
+    numbers = {f"calibration_{key}": value for key, value in alone.numbers().items()}
+    numbers |= {f"with_drift_{key}": value for key, value in drifted.numbers().items() if key not in ("middle_mm",)}
+    numbers |= {f"drift_{key}": value for key, value in drift.numbers().items()}
+    covariance = replace(covariance, details=dict(covariance.details) | numbers)
+    return VirtualCalibration(sensor, eyes, board, views, covariance, drift, alone, drifted)
+
+
+def board_views(sensor: Sensor, eyes: Mapping[str, Camera], board: Board, poses: int, seed: int) -> list[BoardView]:
+    """Return the board's poses, each with the noise of its corners, interpolated between five distances."""
+    places = board_poses(board, eyes, sensor.working_range_mm, poses)
+    focal = sensor.rig.reference.matrix[0, 0]
+    distances = np.array([np.linalg.norm(place.translation - sensor.rig.reference.centre) for place, _ in places])
+    known = np.geomspace(distances.min(), distances.max(), 5)
+    camera = [corner_noise(sensor, d, board.square_mm * focal / d, seed).sigma for d in known]
+    coordinate = [
+        coordinate_noise(sensor, d, board.square_mm * focal / d, seed) if "projector" in eyes else 0.0 for d in known
+    ]
+    return [
+        BoardView(place, corners, float(np.interp(d, known, camera)), float(np.interp(d, known, coordinate)))
+        for (place, corners), d in zip(places, distances, strict=True)
+    ]
+
+
+def _with_path(linear: Linearised, board: Board, views: list[BoardView]) -> Floats:
+    """Return the covariance of the rig's parameters and of offset and scale of the path, (p + 2, p + 2).
+
+    The path is fitted to the board's distances from the camera's calibration: a straight line through the mean distance
+    of each pose. Its noise averages out over the thousands of pixels of a board and is neglected. Deviations from a
+    straight line (wiggling, the delay of a pixel) are errors of the sensor, not of the calibration, and are excluded.
+    """
+    count = len(linear.names)
+    inverse, moved = linear.response()
+    modes, _ = board.imperfections()
+    by_pose, by_board, distances = [], [], []
+    for number, view in enumerate(views):
+        place = view.sensor_from_board
+        points = place.points(board.corners[view.corners])
+        rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+        row = np.zeros(len(inverse))
+        first = count + 6 * number
+        row[first : first + 3] = np.cross(points - place.translation, rays).mean(axis=0)
+        row[first + 3 : first + 6] = rays.mean(axis=0)
+        by_pose.append(row)
+        # the calibration uses the nominal board at its estimated pose; the true one is also bent and scaled
+        by_board.append(-np.einsum("ni,ij,mnj->m", rays, place.rotation, modes[:, view.corners]) / len(points))
+        distances.append(np.linalg.norm(points, axis=1).mean())
+    fit = np.linalg.pinv(np.stack([np.ones(len(views)), np.array(distances)], axis=1))
+    # errors of the rig are true minus nominal, those of the path reported minus true: opposite signs
+    rows = np.concatenate([np.eye(count, len(inverse)), -(fit @ np.array(by_pose))])
+    noise = rows @ inverse
+    shared = rows @ moved
+    shared[count:] -= fit @ np.array(by_board)
+    shared *= linear.board_sigma
+    return np.asarray(noise @ linear.noise @ noise.T + shared @ shared.T)
+
+
+def _source(sensor: Sensor, board: Board, views: list[BoardView]) -> str:
+    return f"virtual calibration: {sensor.name}, board of {board}, {len(views)} poses"
+
+
+def _details(board: Board, views: list[BoardView]) -> dict[str, str | float]:
+    camera, coordinate = [view.camera_px for view in views], [view.coordinate_px for view in views]
+    out: dict[str, str | float] = {
+        "board": str(board),
+        "board_scale_sigma": board.made.scale,
+        "poses": float(len(views)),
+        "corners": float(sum(len(view.corners) for view in views)),
+        "corner_noise_least_px": min(camera),
+        "corner_noise_most_px": max(camera),
+    }
+    if max(coordinate) > 0:
+        out["coordinate_noise_px"] = max(coordinate)
+    return out

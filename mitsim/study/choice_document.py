@@ -1,0 +1,159 @@
+"""Read and write ``choice.json``: which of several sensors measures best.
+
+A cell is one measurement by one sensor. It says whether it rests on a statement (virtual measurements) or on the
+screening alone.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import ConfigDict, Field, model_validator
+
+from characterisation.files.checked_files import read_json_object
+from characterisation.files.documents import Document, validate
+from characterisation.statements.verdict_words import Judged
+
+#: name of the file in the folder
+CHOICE = "choice.json"
+
+
+class _Loose(Document):
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+
+class ComparedMeasurement(_Loose):
+    """One measurement: its tolerance as in the task, and its decision rule in words."""
+
+    unit: str
+    nominal: float
+    tolerance: float | tuple[float, float] | None
+    rule: str
+    features: list[str]
+
+    @property
+    def tolerance_size(self) -> float | None:
+        """Return half the interval that conforms, or the width of the zone; None without a tolerance."""
+        if isinstance(self.tolerance, tuple):
+            return (self.tolerance[1] - self.tolerance[0]) / 2
+        return self.tolerance
+
+
+class CellEntry(_Loose):
+    """One measurement by one sensor from ``view``, in the measurement's unit; null without a value.
+
+    ``by`` is ``statement`` or ``screening``, or ``none`` if no view can make the measurement. ``demand`` is the figure
+    that the decision rule limits to 1. Without a tolerance it is the uncertainty relative to that of the best sensor.
+    """
+
+    by: Literal["statement", "screening", "none"]
+    view: int | None
+    uncertainty: float | None
+    bias: float | None
+    share_of_tolerance: float | None
+    demand: float | None
+    demand_interval: tuple[float, float] | None
+    verdict: Literal["fits", "no tolerance", "not decided", "does not fit", "undecidable"]
+    fits_corrected: bool
+    accepted: tuple[float | None, float] | None
+    needed: float | None
+    false_accept: float | None
+    false_reject: float | None
+    trials: int
+    without_value: float
+
+
+_Row = tuple[float, float, float, float]
+
+
+class PoseEntry(_Loose):
+    """Pose of the sensor: number of the view, angles [deg], |V| [mm], and the 4 x 4 matrix in the part frame."""
+
+    view: int
+    azimuth_deg: float
+    elevation_deg: float
+    roll_deg: float
+    standoff_mm: float
+    world_from_sensor: tuple[_Row, _Row, _Row, _Row]
+
+
+class CaptureEntry(_Loose):
+    """Effort of one capture: images, exposures of each [s], total exposure time [s] without readout."""
+
+    images: int
+    exposures_s: list[float]
+    seconds: float
+
+
+class SensorEntry(_Loose):
+    """One sensor of the table; ``ratio`` is the largest demand of its measurements, null if one cannot be made.
+
+    ``status`` is ``stated`` (virtual measurements), ``screened`` (screening only: far from fitting, or out of time) or
+    ``excluded``; ``why`` gives the reason. ``poses`` starts with the view for all measurements.
+    """
+
+    name: str
+    given: str
+    status: Literal["stated", "screened", "excluded"]
+    why: str
+    ratio: float | None
+    fits: int
+    words: str
+    poses: list[PoseEntry] = Field(default_factory=list)
+    capture: CaptureEntry | None = None
+    measurements: dict[str, CellEntry] = Field(default_factory=dict)
+    map_digest: str = ""
+
+
+class ChoiceDocument(_Loose):
+    """``choice.json``; ``sensors`` are sorted, best first."""
+
+    schema_version: Literal[1]
+    mitsim: str
+    study: str
+    scene: str
+    seed: int
+    words: str
+    finished: bool
+    seconds: float
+    measurements: dict[str, ComparedMeasurement]
+    sensors: list[SensorEntry]
+
+    @model_validator(mode="after")
+    def _of_all(self) -> ChoiceDocument:
+        for one in self.sensors:
+            if one.status != "excluded" and set(one.measurements) != set(self.measurements):
+                raise ValueError(f"sensor {one.name} must have exactly one cell for each measurement")
+        return self
+
+
+def read_choice(folder: Path) -> ChoiceDocument | None:
+    """Read ``choice.json`` of a folder; return None if there is none.
+
+    Raises
+    ------
+    InputError
+        If the file is not a valid choice document.
+    """
+    path = folder / CHOICE
+    if not path.exists():
+        return None
+    return validate(path, read_json_object(path), ChoiceDocument)
+
+
+def judged(entry: SensorEntry) -> list[Judged]:
+    """Return the verdicts of a sensor, for their summary in words."""
+    nan = float("nan")
+    return [
+        Judged(
+            name,
+            "",
+            cell.verdict,
+            nan if cell.uncertainty is None else cell.uncertainty,
+            nan if cell.needed is None else cell.needed,
+            cell.fits_corrected,
+            cell.without_value,
+        )
+        for name, cell in entry.measurements.items()
+    ]

@@ -1,0 +1,132 @@
+"""Read the sensors to compare: presets and user files, each with the study adapted to that sensor.
+
+Signal chain: list of names and files -> study with each sensor and its map -> sensors to compare, and excluded ones
+with the reason.
+
+A study names one sensor. Part, task, unknowns and views of the study hold for every other sensor too. Each sensor uses
+its own map. Distances of the study are used only if they are possible for the sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from characterisation.files.documents import read_toml
+from characterisation.files.errors import InputError
+from mitsim.maps.campaign.missing_finishes import Ask
+from mitsim.sensor.preset import presets
+from mitsim.study import CharacterisationTable, Study, StudyFile, open_study
+
+#: means every preset
+ALL_PRESETS = "all"
+
+
+@dataclass(frozen=True)
+class CandidateSensor:
+    """A sensor to compare: its ``name`` in the table, the ``given`` text of the user, and the ``study`` for it."""
+
+    name: str
+    given: str
+    study: Study
+
+
+@dataclass(frozen=True)
+class Excluded:
+    """A sensor that cannot be compared, with the reason."""
+
+    name: str
+    given: str
+    reason: str
+
+
+def read_candidates(
+    path: str | Path, sensors: Sequence[str], ask: Ask | None = None
+) -> tuple[list[CandidateSensor], list[Excluded]]:
+    """Open a study for each of the sensors.
+
+    Parameters
+    ----------
+    sensors
+        ``all`` for every preset, the name of a preset, or the path of a sensor TOML file. ``=MAP`` after a name or path
+        selects a map: a file, or a sensor whose map comes with mitsim. Paths are relative to the working folder.
+    ask
+        Answers whether finishes that a sensor's map lacks may be characterised now; None if nobody can answer.
+
+    Raises
+    ------
+    InputError
+        If the study cannot be read, a sensor is unknown or named twice, or no sensor can be compared.
+    """
+    path = Path(path)
+    file = read_toml(path, StudyFile)
+    candidates, excluded = list[CandidateSensor](), list[Excluded]()
+    for given in _each(sensors):
+        opened = _open_candidate(path, file, given, ask)
+        if isinstance(opened, Excluded):
+            excluded.append(opened)
+            continue
+        if opened.name in {one.name for one in candidates}:
+            raise InputError("--sensors", "", f"{opened.name} twice", "sensors of different names")
+        candidates.append(opened)
+    if not candidates:
+        raise InputError(
+            "--sensors", "", "; ".join(one.reason for one in excluded), "at least one sensor that can measure the study"
+        )
+    return candidates, excluded
+
+
+def _each(sensors: Sequence[str]) -> list[str]:
+    out = list[str]()
+    for given in (part.strip() for one in sensors for part in one.split(",")):
+        out += presets() if given == ALL_PRESETS else [given] if given else []
+    if not out:
+        raise InputError("--sensors", "", "nothing", f"{ALL_PRESETS}, or a list of {', '.join(presets())} and files")
+    if twice := next((one for one in out if out.count(one) > 1), None):
+        raise InputError("--sensors", "", f"{twice} twice", "each sensor once")
+    return out
+
+
+def _open_candidate(path: Path, file: StudyFile, given: str, ask: Ask | None) -> CandidateSensor | Excluded:
+    sensor, _, map_name = given.partition("=")
+    own = sensor.endswith(".toml")
+    if not own and sensor not in presets():
+        raise InputError("--sensors", "", sensor, f"{', '.join(presets())}, or a sensor TOML")
+    same = sensor == file.sensor and not map_name
+    table = (
+        file
+        if same
+        else file.model_copy(
+            update={
+                "sensor": str(Path(sensor).resolve()) if own else sensor,
+                "characterisation": CharacterisationTable(),
+            }
+        )
+    )
+    study, first = _open_or_error(path, table, map_name, ask)
+    if study is None and _has_distance(file) and not same:
+        free = file.views.model_copy(update={"standoff_mm": None, "standoffs_mm": None})
+        study, _ = _open_or_error(path, table.model_copy(update={"views": free}), map_name, ask)
+    if study is None:
+        assert first is not None
+        return Excluded(Path(sensor).stem, given, str(first))
+    if study.performance_map is None:
+        reason = "its study has a campaign instead of a map: run it, and give its map as SENSOR=MAP"
+        return Excluded(study.sensor.name, given, reason)
+    return CandidateSensor(study.sensor.name, given, replace(study, path=path))
+
+
+def _has_distance(file: StudyFile) -> bool:
+    return file.views.standoff_mm is not None or file.views.standoffs_mm is not None
+
+
+def _open_or_error(
+    path: Path, file: StudyFile, map_name: str, ask: Ask | None
+) -> tuple[Study | None, InputError | None]:
+    try:
+        return open_study(path, file, map_name or None, ask), None
+    except InputError as error:
+        if Path(str(error.where)).name == Path(file.task).name:
+            raise  # an error in the task concerns every sensor
+        return None, error

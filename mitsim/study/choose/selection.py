@@ -1,0 +1,364 @@
+"""Compare sensors: screen all of them, and measure the promising ones until every verdict is clear or time is over.
+
+Signal chain: sensors -> scores of all views of each sensor (kept in its folder) -> order by the worst measurement ->
+exclusion of sensors whose demand is far too large -> for the others a short race -> a statement from the view that is
+best for all measurements, with as many trials as its verdicts need -> a statement from a measurement's own best view,
+where the common view does not suffice -> more trials for the leader -> ``choice.json``.
+
+Screening includes noise and calibration, but not finish, interreflections at edges and false points. It is therefore
+more often too small than too large, and a sensor is excluded if even the screened demand of its best view exceeds
+:data:`LARGEST_DEMAND`.
+
+Finished work is on the disk, so an interrupted command continues. The sensors are measured one after the other, and the
+memory of each is released before the next.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from characterisation.files.datasets import Schema, Variable, read_dataset
+from characterisation.files.errors import InputError
+from characterisation.statements.decision import demand, tolerance_of
+from characterisation.statements.statement import Statement
+from characterisation.tasks.task_file import Task
+from mitsim.maps.campaign.run import write_netcdf
+from mitsim.running.executor import Executor
+from mitsim.running.progress import say
+from mitsim.sensor.exposure import PlannedExposure
+from mitsim.study import StatementTable
+from mitsim.study.choose.candidates import CandidateSensor
+from mitsim.study.exposures.planned import exposed_for
+from mitsim.study.virtual.mapped import MappedMeasurements
+from mitsim.study.virtual.plan import map_digest, measurements_of, trial_digest
+from mitsim.study.virtual.race import ALL, Raced, RaceRules, TrialRunner, run_race
+from mitsim.study.virtual.rendered import RenderedMeasurements
+from mitsim.study.virtual.screening import screen
+from mitsim.study.virtual.spread_out import spread_over
+from mitsim.study.virtual.stated import state_view, statement_document, write_statement
+from mitsim.study.virtual.study_unknowns import study_unknowns
+from mitsim.study.virtual.trials import TrialFolder
+from mitsim.study.virtual.world import Unknowns
+from mitsim.views.view_scores import screening_risk
+
+Floats = NDArray[np.float64]
+
+#: demand by screening, relative to the limit of the decision rule, above which a sensor is not measured
+LARGEST_DEMAND = 3.0
+
+#: number of views raced for each measurement, trials of each view, and trials at the start of a statement
+SHORTLIST, RACE_TRIALS, FIRST_TRIALS = 3, 8, 24
+
+#: number of trials from which the 95 % interval follows from order statistics, for any distribution
+SURE_TRIALS = 80
+
+#: a measurement's own best view is stated if its risk in the race is below this fraction of the common view's risk
+_WORTH_STATING = 0.8
+
+#: fraction of a sensor's time that its race may take
+_RACE_SHARE = 0.4
+
+#: equally likely values of a standard normal distribution, for a screened u
+_NORMAL = norm.ppf((np.arange(400) + 0.5) / 400)
+
+
+@dataclass
+class SensorResult:
+    """Results of a sensor so far.
+
+    ``screened`` (measurement,) is the demand of the best view by screening, ``screened_u`` its uncertainty,
+    ``screened_view`` its number. ``unpromising`` excludes the sensor from measurement. ``stated`` holds statements
+    by view number; the view that is best for all measurements comes first. ``planned`` holds the exposures of these
+    views, if the study asks for them.
+    """
+
+    candidate: CandidateSensor
+    unknowns: Unknowns
+    scores: xr.Dataset
+    screened: Floats
+    screened_u: Floats
+    screened_view: NDArray[np.int64]
+    unpromising: bool = False
+    stated: dict[int, list[Statement]] = field(default_factory=dict)
+    raced: Raced | None = None
+    planned: dict[int, PlannedExposure] = field(default_factory=dict)
+
+    @property
+    def ratio(self) -> float:
+        """Return the largest demand of the measurements, each from its best view; infinite if one is impossible."""
+        best = [math.inf if row is None else row[1] for row in self.best()] if self.stated else self.screened.tolist()
+        return max(best, default=math.inf)
+
+    def best(self) -> list[tuple[int, float, Statement] | None]:
+        """Return view, demand and statement of least demand for each measurement; None without a value."""
+        out = list[tuple[int, float, Statement] | None]()
+        for m in range(len(self.screened)):
+            rows = [(view, _demand(some[m]), some[m]) for view, some in self.stated.items()]
+            rows = [row for row in rows if math.isfinite(row[1])]
+            out.append(min(rows, key=lambda row: row[1]) if rows else None)
+        return out
+
+
+def _demand(one: Statement) -> float:
+    """Return the demand of the decision rule; without a tolerance the root mean square error."""
+    value = one.root_mean_square if one.decided is None else one.decided.demand
+    return value if math.isfinite(value) else math.inf
+
+
+def choose_sensor(
+    candidates: list[CandidateSensor],
+    folder: Path,
+    minutes: float,
+    report_results: Callable[[list[SensorResult], bool], None],
+    workers: Executor | None = None,
+) -> list[SensorResult]:
+    """Screen, race and state sensors; return them, best first.
+
+    After each sensor, ``report_results`` receives the results so far and whether they are final.
+    """
+    end = time.monotonic() + 60 * minutes
+    found = list[SensorResult]()
+    for number, candidate in enumerate(candidates, 1):
+        found.append(_screened(candidate, folder / candidate.name))
+        _say(found, f"{number} of {len(candidates)} screened", end)
+    promising = _promising(found)
+    report_results(_ordered(found), False)
+    for place, one in enumerate(promising):
+        left = end - time.monotonic()
+        if left <= 0 and place:
+            say(f"choose: time is over; {len(promising) - place} sensors are judged by screening alone")
+            break
+        _measure_sensor(one, folder / one.candidate.name, max(left, 1.0) / (len(promising) - place), workers)
+        _say(found, f"{place + 1} of {len(promising)} sensors measured", end)
+        report_results(_ordered(found), False)
+    leader = _ordered(found)[0]
+    if leader.stated and time.monotonic() < end:
+        _refine_leader(leader, folder / leader.candidate.name, end, workers)
+    report_results(_ordered(found), True)
+    return _ordered(found)
+
+
+def _promising(found: list[SensorResult]) -> list[SensorResult]:
+    """Return the sensors worth a virtual measurement, best first: at least one if any sensor can measure at all."""
+    tolerances = any(one.tolerance is not None for one in found[0].candidate.study.task.measurements.values())
+    order = sorted(found, key=lambda one: one.ratio if tolerances else _mean_demand(one))
+    least = 1.0 if tolerances else _mean_demand(order[0])
+    for place, one in enumerate(order):
+        worst = one.ratio if tolerances else _mean_demand(one)
+        one.unpromising = not math.isfinite(worst) or (place > 0 and worst > LARGEST_DEMAND * least)
+    return [one for one in order if not one.unpromising]
+
+
+def _mean_demand(one: SensorResult) -> float:
+    """Return the geometric mean of the screened demands; without tolerances there is no other common scale."""
+    return float(np.exp(np.mean(np.log(one.screened)))) if np.isfinite(one.screened).all() else math.inf
+
+
+def _ordered(found: list[SensorResult]) -> list[SensorResult]:
+    return sorted(found, key=sort_key)
+
+
+def sort_key(one: SensorResult) -> tuple[bool, float]:
+    """Return the key that sorts measured sensors before screened ones, each by its worst measurement.
+
+    Without tolerances the key is the mean logarithm of the demands.
+    """
+    measurements = one.candidate.study.task.measurements.values()
+    tolerances = any(measurement.tolerance is not None for measurement in measurements)
+    if tolerances:
+        return not one.stated, one.ratio
+    rows = [math.inf if row is None else row[1] for row in one.best()] if one.stated else one.screened.tolist()
+    return not one.stated, float(np.mean(np.log(rows)))
+
+
+def _screened(candidate: CandidateSensor, folder: Path) -> SensorResult:
+    """Return the scores of all views, from the folder if they are there."""
+    study, path = candidate.study, folder / "scores.nc"
+    folder.mkdir(parents=True, exist_ok=True)
+    unknowns = study_unknowns(study)
+    digest = trial_digest(study, unknowns, f"screening {study.file.score.light_path_depth} {map_digest(study)}")
+    scores = _kept(path, digest)
+    if scores is None:
+        from mitsim.decode.cloud import sensor_geometry
+        from mitsim.maps.prediction import Predictor
+
+        assert study.performance_map is not None
+        predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
+        say(f"choose: {candidate.name}, {len(study.views)} views")
+        scores, _ = screen(study, predictor, study.performance_map, unknowns)
+        scores.attrs["digest"] = digest
+        write_netcdf(scores, path)
+        gc.collect()
+    u = scores["predicted_uncertainty"].transpose("measurement", "view").values
+    able = scores["uncertainty_possible"].transpose("measurement", "view").values.astype(bool) & (u > 0)
+    best = np.where(able, screening_risk(scores), np.inf).argmin(axis=1)
+    least = np.take_along_axis(np.where(able, u, np.inf), best[:, None], axis=1)[:, 0]
+    demands = [
+        _screened_demand(study.task, name, float(size))
+        for name, size in zip(study.task.measurements, least, strict=True)
+    ]
+    screened_view = scores["view"].values[best].astype(np.int64)
+    return SensorResult(candidate, unknowns, scores, np.array(demands), least, screened_view)
+
+
+_OF_A_VIEW = ("measurement", "view")
+_SCORES = Schema(
+    "scores of all views of a sensor",
+    {
+        "view": Variable(("view",), "whole", 0, 1e9),
+        "measurement": Variable(("measurement",), "text"),
+        "predicted_uncertainty": Variable(_OF_A_VIEW, gaps=True),
+        "chance": Variable(_OF_A_VIEW, "number", 0, 1),
+        "uncertainty_possible": Variable(_OF_A_VIEW, "truth"),
+        "tolerance": Variable(("measurement",), gaps=True),
+    },
+    names=("view", "measurement"),
+)
+
+
+def _kept(path: Path, digest: str) -> xr.Dataset | None:
+    try:
+        scores = read_dataset(path, _SCORES)
+    except InputError:
+        return None
+    return scores if scores.attrs.get("digest") == digest else None
+
+
+def screened_errors(u: float) -> Floats:
+    """Return errors that represent a screened uncertainty: normal, without bias."""
+    return np.asarray(u * _NORMAL)
+
+
+def _screened_demand(task: Task, name: str, u: float) -> float:
+    tolerance = tolerance_of(task, name)
+    if not math.isfinite(u):
+        return math.inf
+    return u if tolerance is None else demand(screened_errors(u), tolerance)
+
+
+@dataclass
+class _Workspace:
+    """Everything that virtual measurements of a sensor need."""
+
+    candidate: CandidateSensor
+    unknowns: Unknowns
+    virtual_measurements: RenderedMeasurements | MappedMeasurements
+    runner: TrialRunner
+    trials: TrialFolder
+    digest: str
+    folder: Path
+    planned: dict[int, PlannedExposure] = field(default_factory=dict)
+
+    def state(self, view: int, count: int) -> list[Statement]:
+        study = self.candidate.study
+        chosen = next(one for one in study.views if one.number == view)
+        exposed = exposed_for(study, chosen, self.virtual_measurements, self.runner, self.digest, self.folder)
+        if exposed.planned is not None:
+            self.planned[view] = exposed.planned
+        trials = exposed.trials(study, self.folder, self.trials)
+        return state_view(study, chosen, exposed.runner, trials, self.unknowns, StatementTable(trials=count, pairs=0))
+
+
+def _prepared(one: SensorResult, folder: Path, workers: Executor | None) -> _Workspace:
+    candidate, study, unknowns = one.candidate, one.candidate.study, one.unknowns
+    virtual_measurements = measurements_of(study, unknowns)
+    runner = spread_over(workers, study, unknowns, virtual_measurements)
+    digest = trial_digest(study, unknowns, runner.source)
+    trials = TrialFolder(folder / "trials", digest, list(study.task.measurements))
+    return _Workspace(candidate, unknowns, virtual_measurements, runner, trials, digest, folder)
+
+
+def _measure_sensor(one: SensorResult, folder: Path, seconds: float, workers: Executor | None) -> None:
+    """Race and state one sensor in approximately ``seconds``."""
+    began = time.monotonic()
+    study, workspace = one.candidate.study, _prepared(one, folder, workers)
+    table = study.file.race
+    rules = RaceRules(
+        min(SHORTLIST, table.shortlist), min(RACE_TRIALS, table.trials), table.margin, 0.9, _RACE_SHARE * seconds
+    )
+    one.raced = run_race(study.views, one.scores, workspace.runner, workspace.trials, rules)
+    if not len(one.raced.views):
+        return
+    view, most = one.raced.leader(ALL), study.file.statement.trials
+    count = min(FIRST_TRIALS, most)
+    while True:
+        one.stated[view] = workspace.state(view, count)
+        for number in _own_views(one, list(study.task.measurements), view):
+            if time.monotonic() - began > seconds:
+                break
+            one.stated[number] = workspace.state(number, count)
+        if time.monotonic() - began > seconds or count >= most or not _is_undecided(one):
+            break
+        count = min(2 * count, most)
+    _write(one, workspace, folder, view)
+    del workspace
+    gc.collect()
+
+
+def _say(found: list[SensorResult], done: str, end: float) -> None:
+    """Print the progress and the leading sensor."""
+    first = _ordered(found)[0]
+    names = list(first.candidate.study.task.measurements)
+    stated = [math.inf if row is None else row[1] for row in first.best()]
+    rows: list[float] = stated if first.stated else first.screened.tolist()
+    worst = int(np.argmax(rows))
+    by = "measured" if first.stated else "by the screening"
+    measurement = first.candidate.study.task.measurements[names[worst]]
+    size = f"{rows[worst]:.2g}"
+    unit = "times the limit" if measurement.tolerance else measurement.unit
+    demand_in_words = f"{size} {unit} ({names[worst]})"
+    left = max(0.0, end - time.monotonic())
+    say(f"choose: {done}; {first.candidate.name} leads {by}, at worst {demand_in_words}; {left:.0f} s left")
+
+
+def _is_undecided(one: SensorResult) -> bool:
+    """Return whether more trials could change a verdict."""
+    return any(row is not None and row[2].verdict == "not decided" for row in one.best())
+
+
+def _own_views(one: SensorResult, names: list[str], view: int) -> list[int]:
+    """Return best views of measurements that do not fit from the common view and have a lower risk elsewhere."""
+    assert one.raced is not None
+    out = list[int]()
+    place = int(np.flatnonzero(one.raced.views == view)[0])
+    for name, known in zip(names, one.stated[view], strict=True):
+        standing = one.raced.standings[name]
+        better = standing.risk[standing.leader] < _WORTH_STATING * standing.risk[place]
+        if known.verdict not in ("fits", "no tolerance") and better:
+            out.append(one.raced.leader(name))
+    return list(dict.fromkeys(out))
+
+
+def _refine_leader(leader: SensorResult, folder: Path, end: float, workers: Executor | None) -> None:
+    """Add trials of the leader up to the number in the study, as long as there is time."""
+    workspace = _prepared(leader, folder, workers)
+    most = leader.candidate.study.file.statement.trials
+    used = {row[0] for row in leader.best() if row is not None}
+    while time.monotonic() < end:
+        behind = [view for view in used if leader.stated[view] and leader.stated[view][0].trials < most]
+        if not behind:
+            break
+        view = min(behind, key=lambda number: leader.stated[number][0].trials)
+        leader.stated[view] = workspace.state(view, min(leader.stated[view][0].trials + 40, most))
+    _write(leader, workspace, folder, next(iter(leader.stated)))
+
+
+def _write(one: SensorResult, workspace: _Workspace, folder: Path, view: int) -> None:
+    study = one.candidate.study
+    one.planned.update(workspace.planned)
+    chosen = next(known for known in study.views if known.number == view)
+    document: dict[str, Any] = statement_document(
+        study, chosen, one.stated[view], workspace.unknowns, workspace.runner.source, one.planned.get(view)
+    )
+    write_statement(folder / "statement.json", document)

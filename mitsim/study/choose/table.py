@@ -1,0 +1,288 @@
+"""Tabulate the comparison of sensors: for the terminal, and as the document behind the pages.
+
+Signal chain: sensors with screened and stated results, and excluded sensors -> a cell for every measurement of every
+sensor -> ``choice.json`` and lines of text, best sensor first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from characterisation.statements.decision import WORDS, decide, tolerance_of
+from characterisation.statements.statement import Statement
+from characterisation.statements.verdict_words import Judged, result_in_words
+from mitsim.running.text_table import aligned
+from mitsim.running.version import __version__
+from mitsim.sensor.exposure import PlannedExposure
+from mitsim.sensor.modulation import AmplitudeModulation
+from mitsim.sensor.preset import Sensor
+from mitsim.study import Study
+from mitsim.study.choice_document import (
+    CaptureEntry,
+    CellEntry,
+    ChoiceDocument,
+    ComparedMeasurement,
+    PoseEntry,
+    SensorEntry,
+    judged,
+)
+from mitsim.study.choose.candidates import Excluded
+from mitsim.study.choose.selection import LARGEST_DEMAND, SensorResult, screened_errors
+from mitsim.study.virtual.plan import map_digest
+
+
+def document(
+    study: Study, found: Sequence[SensorResult], excluded: Sequence[Excluded], seconds: float, finished: bool
+) -> ChoiceDocument:
+    """Return all results, best sensor first; ``study`` is the study of any of the sensors."""
+    task = study.task
+    named_measurements = {
+        name: ComparedMeasurement(
+            unit=one.unit,
+            nominal=one.nominal,
+            tolerance=one.tolerance,
+            features=list(one.features),
+            rule="" if one.tolerance is None else WORDS[task.decision_of(name).rule],
+        )
+        for name, one in task.measurements.items()
+    }
+    sensors = [_sensor(one) for one in found]
+    if all(one.tolerance is None for one in named_measurements.values()):
+        sensors = _relative(sensors)
+    sensors = [one.model_copy(update={"words": words(one, named_measurements)}) for one in sensors]
+    sensors += [_excluded(one) for one in excluded]
+    return ChoiceDocument(
+        schema_version=1,
+        mitsim=__version__,
+        study=str(study.path),
+        scene=study.scene.where,
+        seed=study.file.seed,
+        words=sentence(sensors),
+        finished=finished,
+        seconds=round(seconds, 1),
+        measurements=named_measurements,
+        sensors=sensors,
+    )
+
+
+def sentence(sensors: Sequence[SensorEntry]) -> str:
+    """Return one line: the best sensor, and its result."""
+    able = [one for one in sensors if one.status != "excluded"]
+    if not able or not able[0].measurements:
+        return "no sensor can measure this"
+    best = able[0]
+    others = sum(one.ratio is not None and one.ratio <= 1 and one.status == "stated" for one in able[1:])
+    more = f"; so do{'es' if others == 1 else ''} {others} other{'' if others == 1 else 's'}" if others else ""
+    toleranced = any(cell.verdict != "no tolerance" for cell in best.measurements.values())
+    all_fit = best.ratio is not None and best.ratio <= 1
+    return f"{best.name}: {best.words}" + (more if toleranced and all_fit else "")
+
+
+def words(one: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) -> str:
+    """Return the result of a sensor in one line."""
+    verdicts = [replace(each, unit=named_measurements[each.name].unit) for each in judged(one)]
+    if all(each.verdict == "no tolerance" for each in verdicts):
+        if one.ratio is None:
+            return "not every measurement can be made"
+        least = f"{one.ratio:.2g} times the least uncertainty of all sensors at worst"
+        return least if one.ratio > 1 else "the least uncertainty of all sensors in every measurement"
+    return _screened_words(verdicts) if one.status == "screened" else result_in_words(verdicts)
+
+
+def _screened_words(verdicts: Sequence[Judged]) -> str:
+    return f"by screening alone: {result_in_words(verdicts)}"
+
+
+def as_text(choice: ChoiceDocument) -> str:
+    """Return the table of sensors and measurements, with a legend."""
+    names = list(choice.measurements)
+    head = ("sensor", "fits", "worst", "capture", *names)
+    rows = [head]
+    for one in choice.sensors:
+        if one.status == "excluded":
+            continue
+        toleranced = sum(choice.measurements[name].tolerance is not None for name in names)
+        rows.append(
+            (
+                one.name + ("" if one.status == "stated" else " *"),
+                f"{one.fits} of {toleranced}" if toleranced else "-",
+                "-" if one.ratio is None else f"{one.ratio:.2g}",
+                "-" if one.capture is None else f"{1e3 * one.capture.seconds:.0f} ms",
+                *(_cell(one.measurements[name], choice.measurements[name]) for name in names),
+            )
+        )
+    lines = aligned(rows)
+    lines.append("")
+    lines.append(
+        "cells: standard uncertainty, view, verdict; worst: demand of the decision rule, at most 1 if everything fits"
+    )
+    if any(one.status == "screened" for one in choice.sensors):
+        lines.append(f"* by screening alone: its demand there is above {LARGEST_DEMAND:g}, or time was over")
+    lines += [f"{one.name} is excluded: {one.why}" for one in choice.sensors if one.status == "excluded"]
+    return "\n".join(lines)
+
+
+_SIGNS = {"fits": "fits", "does not fit": "no", "undecidable": "undecidable", "not decided": "?", "no tolerance": ""}
+
+
+def _cell(cell: CellEntry, measurement: ComparedMeasurement) -> str:
+    if cell.uncertainty is None:
+        return "none"
+    return f"{cell.uncertainty:.2g} {measurement.unit} ({cell.view}) {_SIGNS[cell.verdict]}".rstrip()
+
+
+def _excluded(one: Excluded) -> SensorEntry:
+    return SensorEntry(
+        name=one.name, given=one.given, status="excluded", why=one.reason, ratio=None, fits=0, words=one.reason
+    )
+
+
+def _sensor(one: SensorResult) -> SensorEntry:
+    study = one.candidate.study
+    names = list(study.task.measurements)
+    rows = one.best() if one.stated else [None] * len(names)
+    cells = {name: _stated(rows[m]) if one.stated else _screened(one, m, name) for m, name in enumerate(names)}
+    views = list(dict.fromkeys([*one.stated, *(cell.view for cell in cells.values() if cell.view is not None)]))
+    used = {cell.view for cell in cells.values()}
+    ratio = one.ratio
+    return SensorEntry(
+        name=one.candidate.name,
+        given=one.candidate.given,
+        status="stated" if one.stated else "screened",
+        why="" if one.stated else "out by far" if one.unpromising else "time was over",
+        ratio=ratio if math.isfinite(ratio) else None,
+        words="",
+        fits=sum(cell.verdict == "fits" and cell.by == "statement" for cell in cells.values()),
+        poses=[_pose(study, number) for number in views if number in used or number == next(iter(one.stated), None)],
+        capture=capture_entry(study.sensor, one.planned.get(next(iter(one.stated), -1))),
+        measurements=cells,
+        map_digest=map_digest(study),
+    )
+
+
+def _stated(row: tuple[int, float, Statement] | None) -> CellEntry:
+    if row is None:
+        return _NOTHING
+    view, demand, one = row
+    decided = one.decided
+    interval = None if decided is None else _finite(decided.demand_interval)
+    return CellEntry(
+        by="statement",
+        view=view,
+        uncertainty=one.standard_uncertainty,
+        bias=one.bias,
+        share_of_tolerance=one.share_of_tolerance,
+        demand=demand,
+        demand_interval=interval,
+        verdict=one.verdict,
+        fits_corrected=decided is not None and decided.fits_corrected,
+        accepted=None if decided is None else _interval(decided.accepted),
+        needed=None if decided is None else _number(decided.needed),
+        false_accept=None if decided is None else decided.false_accept,
+        false_reject=None if decided is None else decided.false_reject,
+        trials=one.trials,
+        without_value=one.without_value,
+    )
+
+
+_NOTHING = CellEntry(
+    by="none",
+    view=None,
+    uncertainty=None,
+    bias=None,
+    share_of_tolerance=None,
+    demand=None,
+    demand_interval=None,
+    verdict="undecidable",
+    fits_corrected=False,
+    accepted=None,
+    needed=None,
+    false_accept=None,
+    false_reject=None,
+    trials=0,
+    without_value=1.0,
+)
+
+
+def _screened(found: SensorResult, m: int, name: str) -> CellEntry:
+    """Return a cell from screening; its verdict is decided only if the demand exceeds :data:`LARGEST_DEMAND`."""
+    u, tolerance = float(found.screened_u[m]), tolerance_of(found.candidate.study.task, name)
+    if not math.isfinite(u):
+        return _NOTHING.model_copy(update={"verdict": "no tolerance"}) if tolerance is None else _NOTHING
+    decided = None if tolerance is None else decide(screened_errors(u), tolerance)
+    demand = float(found.screened[m])
+    clear = decided is not None and demand > LARGEST_DEMAND
+    return CellEntry(
+        by="screening",
+        view=int(found.screened_view[m]),
+        uncertainty=u,
+        bias=None,
+        share_of_tolerance=None if tolerance is None else 1.96 * u / tolerance.size,
+        demand=demand,
+        demand_interval=None,
+        fits_corrected=False,
+        accepted=None,
+        false_accept=None,
+        false_reject=None,
+        trials=0,
+        verdict="no tolerance" if decided is None else decided.verdict if clear else "not decided",
+        needed=None if decided is None else _number(decided.needed),
+        without_value=0.0,
+    )
+
+
+def _relative(sensors: Sequence[SensorEntry]) -> list[SensorEntry]:
+    """Express demands as multiples of the least demand of all measured sensors, for tasks without tolerances."""
+    known = [one for one in sensors if one.status == "stated"] or list(sensors)
+    least = {
+        name: min((one.measurements[name].demand or math.inf for one in known), default=math.inf)
+        for name in (sensors[0].measurements if sensors else ())
+    }
+    out = list[SensorEntry]()
+    for one in sensors:
+        cells = {
+            name: cell if cell.demand is None else cell.model_copy(update={"demand": cell.demand / least[name]})
+            for name, cell in one.measurements.items()
+        }
+        ratios = [cell.demand for cell in cells.values()]
+        worst = None if any(ratio is None for ratio in ratios) else max(ratio for ratio in ratios if ratio is not None)
+        out.append(one.model_copy(update={"measurements": cells, "ratio": worst}))
+    return out
+
+
+def _pose(study: Study, number: int) -> PoseEntry:
+    view = next(one for one in study.views if one.number == number)
+    return PoseEntry(
+        view=number,
+        azimuth_deg=view.azimuth_deg,
+        elevation_deg=view.elevation_deg,
+        roll_deg=view.roll_deg,
+        standoff_mm=view.standoff,
+        world_from_sensor=view.world_from_sensor.matrix().tolist(),
+    )
+
+
+def capture_entry(sensor: Sensor, planned: PlannedExposure | None = None) -> CaptureEntry:
+    """Return images and exposures of one capture; the time is exposure time, without readout and transfer."""
+    pattern = sensor.pattern
+    images = pattern.count if isinstance(pattern, AmplitudeModulation) else len(sensor.patterns())
+    images += sensor.ambient_image
+    own = sensor.exposure.exposures(None, float(sensor.imager.full_well))
+    exposures = own if planned is None else planned.exposures_s
+    return CaptureEntry(images=images, exposures_s=list(exposures), seconds=images * float(np.sum(exposures)))
+
+
+def _interval(ends: tuple[float, float] | None) -> tuple[float | None, float] | None:
+    return None if ends is None else (_number(ends[0]), ends[1])
+
+
+def _finite(ends: tuple[float, float]) -> tuple[float, float] | None:
+    return ends if all(map(math.isfinite, ends)) and ends[1] < 1e30 else None
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,342 @@
+"""Find the fewest exposures that bring every feature of a view to its limits of points and uncertainty u.
+
+Signal chain: single exposures, from the sensor's own to shorter and longer ones of the device -> greedy sets of several
+exposures that together recover most points -> the best of these, decoded again with other noise -> limits of each
+feature: its most points and its smallest u -> fewest exposures that reach all limits within a share, the shortest of
+equally few -> result of the first exposure, of the first two, and so on, with new noise.
+
+The projector keeps its full power, unless the shortest exposure of the device is too bright. A lower power would only
+require a longer exposure, in which the room adds more light.
+
+The predicted points of a set are those that at least one of its exposures recovers alone. Sets that could reach the
+limits are decoded. The best of many noisy results is biased. So the search uses few noise samples, and the decision
+more samples of independent noise. A set misses a limit of u only if the difference exceeds twice its standard error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.sensor.exposure import PlannedExposure
+from mitsim.study.exposures.exposure_sweep import ExposureResult, FeatureResult
+
+#: ratio of neighbouring single exposures, and their largest ratio to the sensor's own exposure
+STEP, LARGEST_RATIO = math.sqrt(2.0), 64.0
+
+#: least power of a projector in a plan [1]; *assumed*, since no maker of the presets states one
+LEAST_POWER = 0.1
+
+#: a sweep ends after this number of exposures with, on every feature, at most this share of its best number of points
+STOP_STEPS, STOP_SHARE = 3, 0.3
+
+#: number of sets of one size that are decoded, and how many of them take part in the decision
+TRIED, FINALISTS = 8, 5
+
+#: numbers of the independent noise of the search, of the decision, and of the reported results
+SEARCH, DECISION, REPORT = 0, 1, 2
+
+#: number of noise samples of each
+DRAWS = {SEARCH: 2, DECISION: 6, REPORT: 6}
+
+
+@dataclass(frozen=True)
+class PlanRules:
+    """Rules of a plan: at most ``most`` exposures; ``within`` is the share by which a limit may be missed [1]."""
+
+    most: int = 3
+    within: float = 0.1
+
+
+@dataclass(frozen=True)
+class ExposurePlan:
+    """Planned exposures of one ``view``, and their results.
+
+    - ``exposure``: the planned exposures and power.
+    - ``added``: exposure [s], and the result of it with all before it, the most useful first; with new noise.
+    - ``own``: result of the sensor's own exposure rule, with the same noise.
+    - ``limits``: most points and smallest u of every feature that can be measured.
+    - ``reached``: whether the plan reached all limits when it was chosen.
+    - ``unseen``: features with too few points at every exposure.
+    - ``sets_tried``: number of decoded sets, single exposures included.
+    """
+
+    view: int
+    exposure: PlannedExposure
+    added: tuple[tuple[float, ExposureResult], ...]
+    own: ExposureResult
+    limits: dict[str, FeatureResult]
+    reached: bool
+    unseen: tuple[str, ...]
+    sets_tried: int
+
+
+class _Results:
+    """Results with one noise, each computed once: call it with a set of exposures. ``known`` has all of them."""
+
+    def __init__(self, evaluate: Callable[[PlannedExposure, int, int], ExposureResult], noise: int) -> None:
+        self.evaluate, self.noise, self.known = evaluate, noise, dict[PlannedExposure, ExposureResult]()
+
+    def __call__(self, exposure: PlannedExposure) -> ExposureResult:
+        if exposure not in self.known:
+            self.known[exposure] = self.evaluate(exposure, self.noise, DRAWS[self.noise])
+        return self.known[exposure]
+
+
+def plan_exposures(
+    evaluate: Callable[[PlannedExposure, int, int], ExposureResult],
+    own: PlannedExposure,
+    limits_s: tuple[float, float],
+    rules: PlanRules,
+    dimmable: bool = True,
+    view: int = 0,
+) -> ExposurePlan:
+    """Plan the exposures of one view.
+
+    Parameters
+    ----------
+    evaluate
+        Function of a set of exposures, the number of the noise and the number of its samples, which returns the result.
+    own
+        The sensor's own exposures, from which the search starts.
+    limits_s
+        Shortest and longest exposure of the device [s].
+    rules
+        Largest number of exposures, and the share by which a limit may be missed.
+    dimmable
+        Whether the power may be lowered if the shortest exposure is too bright.
+    view
+        Number of the view, for the plan.
+    """
+    search, decision, report = (_Results(evaluate, noise) for noise in (SEARCH, DECISION, REPORT))
+    singles = _sweep(search, own, limits_s, dimmable)
+    names = list(singles[0].features)
+    full_power = [one for one in singles if one.exposure.power == 1.0]
+    # with half of the exposures, the greedy search finds other sets
+    sets = [_greedy_sets(search, start, names, rules.most) for start in (full_power, full_power[::2])]
+    first_limits = _measurable(_limits(list(search.known.values()), names))
+    for exposure in {
+        own,
+        *(one.exposure for one in _nearest(singles, first_limits)),
+        *(one for results in sets for one in results),
+    }:
+        decision(exposure)
+    limits = _measurable(_limits(list(decision.known.values()), names))
+    chosen, reached = (
+        _fewest_exposures(search, decision, full_power, limits, rules) if limits else (decision(own), False)
+    )
+    added = []
+    for prefix in _by_usefulness(decision, chosen.exposure, limits or _limits([chosen], names)):
+        added.append((prefix[-1], report(PlannedExposure(tuple(sorted(prefix)), chosen.exposure.power))))
+    unseen = tuple(name for name in names if name not in limits)
+    return ExposurePlan(
+        view, chosen.exposure, tuple(added), report(own), limits, reached, unseen, len(search.known | decision.known)
+    )
+
+
+def shortfall(one: ExposureResult, limits: dict[str, FeatureResult]) -> float:
+    """Return by which share a result misses its limits, 0 if it reaches them all.
+
+    It is the largest value, over all features, of n_limit / n - 1 and of u / (u_limit (1 + 2 e)) - 1. Here n is the
+    number of points, and e is the relative standard error of u / u_limit from the finite number of noise samples.
+    """
+    worst = 0.0
+    for name, limit in limits.items():
+        known = one.features[name]
+        missing_points = limit.points / known.points - 1 if known.points > 0 else math.inf
+        allowance = 2 * math.hypot(known.error, limit.error)
+        worst = max(worst, missing_points, known.u / limit.u / (1 + allowance) - 1)
+    return worst
+
+
+def _sweep(
+    search: _Results, own: PlannedExposure, limits_s: tuple[float, float], dimmable: bool
+) -> list[ExposureResult]:
+    """Return the results of single exposures, shortest first.
+
+    The sweep goes from the sensor's own exposure to longer and to shorter ones. It ends if every feature has been found
+    and further exposures recover too few points, or at the limits of the device.
+    """
+    middle = math.exp(np.mean(np.log(own.exposures_s)))
+    shortest, longest = limits_s
+    best: dict[str, float] = {}
+    found = [search(PlannedExposure((middle,)))]
+
+    def is_useful(one: ExposureResult) -> bool:
+        for name, known in one.features.items():
+            best[name] = max(best.get(name, 0.0), known.points if math.isfinite(known.u) else 0.0)
+        return any(known.points > STOP_SHARE * best[name] > 0 for name, known in one.features.items())
+
+    is_useful(found[0])
+    steps = math.floor(math.log(LARGEST_RATIO) / math.log(STEP))
+    for direction in (1, -1):
+        useless_steps = 0
+        for k in range(1, steps + 1):
+            exposure = _feasible_exposure(middle * STEP ** (direction * k), shortest, longest, dimmable)
+            if exposure is None:
+                break
+            one = search(exposure)
+            found.append(one)
+            useless_steps = 0 if is_useful(one) else useless_steps + 1
+            if useless_steps >= STOP_STEPS and all(best.values()):
+                break
+            if exposure.exposures_s[0] >= longest:
+                break
+    unique = {one.exposure: one for one in found}
+    return sorted(unique.values(), key=_product)
+
+
+def _feasible_exposure(seconds: float, shortest: float, longest: float, dimmable: bool) -> PlannedExposure | None:
+    """Return a single exposure with this product of time [s] and power, if possible at full power.
+
+    It is the longest exposure if the product is larger. It is None if the product is too small.
+    """
+    if seconds >= longest:
+        return PlannedExposure((longest,))
+    if seconds >= shortest:
+        return PlannedExposure((_rounded(seconds),))
+    power = seconds / shortest
+    return PlannedExposure((shortest,), float(f"{power:.2g}")) if dimmable and power >= LEAST_POWER else None
+
+
+def _rounded(seconds: float) -> float:
+    """Return an exposure [s] rounded to three significant digits, so that a user can type it in."""
+    return float(f"{seconds:.3g}")
+
+
+def _product(one: ExposureResult) -> float:
+    """Return total exposure times power [s]."""
+    return one.exposure.seconds * one.exposure.power
+
+
+def _greedy_sets(
+    search: _Results, singles: Sequence[ExposureResult], names: Sequence[str], most: int
+) -> list[PlannedExposure]:
+    """Decode sets of two to ``most`` single exposures, and return them.
+
+    Each set adds to the one before it the exposure with which the worst feature has the largest share of its points.
+    """
+    chosen, sets = list[ExposureResult](), list[PlannedExposure]()
+    possible = {name: float(_union(singles, name).sum()) for name in names}
+    recovered = [name for name in names if possible[name] > 0]
+    for size in range(1, min(most, len(singles)) + 1):
+        unused = [one for one in singles if one not in chosen]
+        chosen.append(
+            max(
+                unused,
+                key=lambda one: min(
+                    (_union([*chosen, one], name).sum() / possible[name] for name in recovered), default=0.0
+                ),
+            )
+        )
+        if size > 1:
+            sets.append(_merged_set(chosen))
+            search(sets[-1])
+    return sets
+
+
+def _union(results: Sequence[ExposureResult], name: str) -> NDArray[np.bool_]:
+    """Return the mask of the possible points of a feature that any of the results recovered."""
+    return np.asarray(np.any([one.recovered[name] for one in results], axis=0))
+
+
+def _merged_set(results: Sequence[ExposureResult]) -> PlannedExposure:
+    """Return the set of several single exposures at full power."""
+    return PlannedExposure(tuple(sorted(one.exposure.exposures_s[0] for one in results)))
+
+
+def _limits(results: Sequence[ExposureResult], names: Sequence[str]) -> dict[str, FeatureResult]:
+    """Return the most points and the smallest u of every feature, which may be of different results."""
+    out = {}
+    for name in names:
+        rows = [one.features[name] for one in results]
+        most = max(rows, key=lambda row: row.points)
+        least = min(rows, key=lambda row: row.u)
+        out[name] = FeatureResult(most.points, most.fraction, least.u, least.scatter, least.error)
+    return out
+
+
+def _measurable(limits: dict[str, FeatureResult]) -> dict[str, FeatureResult]:
+    """Return the limits of those features that can be measured at some exposure."""
+    return {name: one for name, one in limits.items() if math.isfinite(one.u)}
+
+
+def _nearest(results: Sequence[ExposureResult], limits: dict[str, FeatureResult]) -> list[ExposureResult]:
+    """Return the :data:`FINALISTS` results with the smallest shortfall."""
+    return sorted(results, key=lambda one: (shortfall(one, limits), one.exposure.seconds))[:FINALISTS]
+
+
+def _fewest_exposures(
+    search: _Results,
+    decision: _Results,
+    full_power: Sequence[ExposureResult],
+    limits: dict[str, FeatureResult],
+    rules: PlanRules,
+) -> tuple[ExposureResult, bool]:
+    """Return the result with the fewest exposures that reaches the limits, and True; of equally few, the shortest.
+
+    If no set reaches them, return the one with the fewest exposures of those that come nearly as close as the best, and
+    False.
+    """
+    for size in range(1, rules.most + 1):
+        if size > 1:
+            candidates = [search(exposure) for exposure in _candidate_sets(full_power, size, limits, rules.within)]
+            for one in _nearest(candidates, limits):
+                decision(one.exposure)
+        sufficient = [
+            one
+            for one in decision.known.values()
+            if len(one.exposure.exposures_s) == size and shortfall(one, limits) <= rules.within
+        ]
+        if sufficient:
+            return min(sufficient, key=lambda one: one.exposure.seconds), True
+    least = min(shortfall(one, limits) for one in decision.known.values())
+    near = [one for one in decision.known.values() if shortfall(one, limits) <= least + rules.within]
+    return min(near, key=lambda one: (len(one.exposure.exposures_s), one.exposure.seconds)), False
+
+
+def _candidate_sets(
+    full_power: Sequence[ExposureResult], size: int, limits: dict[str, FeatureResult], within: float
+) -> list[PlannedExposure]:
+    """Return sets of a size that are predicted to recover enough points, the shortest first; then the closest ones."""
+    sets = list[tuple[float, float, PlannedExposure]]()
+    for results in combinations(full_power, size):
+        share = min(float(_union(results, name).sum()) / limit.points for name, limit in limits.items())
+        sets.append((share, sum(one.exposure.seconds for one in results), _merged_set(results)))
+    sufficient = sorted((one for one in sets if one[0] >= 1 / (1 + within)), key=lambda one: one[1])
+    if len(sufficient) < TRIED:  # too few sets are predicted to: add those that come closest
+        sufficient += sorted((one for one in sets if one[0] < 1 / (1 + within)), key=lambda one: -one[0])
+    return [one[2] for one in sufficient[:TRIED]]
+
+
+def _by_usefulness(
+    search: _Results, exposure: PlannedExposure, limits: dict[str, FeatureResult]
+) -> list[tuple[float, ...]]:
+    """Return sets of one, two and more of a plan's exposures; each adds the exposure that helps most."""
+    remaining, chosen, out = list(exposure.exposures_s), list[float](), list[tuple[float, ...]]()
+    while remaining:
+        if len(remaining) == 1:
+            best = remaining[0]
+        else:
+            best = min(
+                remaining,
+                key=lambda seconds: _shortage(
+                    search(PlannedExposure(tuple(sorted([*chosen, seconds])), exposure.power)), limits
+                ),
+            )
+        remaining.remove(best)
+        chosen.append(best)
+        out.append(tuple(chosen))
+    return out
+
+
+def _shortage(one: ExposureResult, limits: dict[str, FeatureResult]) -> tuple[float, float]:
+    """Return the number of features without u, and minus the mean share of the points at the limits."""
+    without = sum(not math.isfinite(one.features[name].u) for name in limits)
+    shares = [one.features[name].points / max(limits[name].points, 1.0) for name in limits]
+    return float(without), -float(np.mean(shares))

@@ -1,0 +1,316 @@
+"""Plan the exposures of a study's views, store the plans, and make virtual measurements with them.
+
+Signal chain: study and view -> plan (:mod:`mitsim.study.exposures.exposure_plan`), or the exposures that the study gives ->
+``exposures/view_0012.json`` -> the same virtual measurements with these exposures, and separate trials.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from pydantic import ConfigDict, Field
+
+from characterisation.files.atomic_io import atomic_write, write_json
+from characterisation.files.checked_files import read_json_object
+from characterisation.files.documents import Document, validate
+from characterisation.files.errors import InputError
+from mitsim.running.progress import say
+from mitsim.running.text_table import aligned
+from mitsim.sensor.exposure import PlannedExposure
+from mitsim.study import ExposureTable, Study
+from mitsim.study.exposures.exposure_plan import ExposurePlan, PlanRules, plan_exposures
+from mitsim.study.exposures.exposure_sweep import ExposureResult, ExposureSweep
+from mitsim.study.virtual.mapped import MappedMeasurements
+from mitsim.study.virtual.race import TrialRunner
+from mitsim.study.virtual.rendered import RenderedMeasurements
+from mitsim.study.virtual.trials import TrialFolder
+from mitsim.views import View
+
+#: default exposure limits of a sensor file [s], which are not those of a device
+_NO_LIMITS = (1e-9, 1e3)
+
+#: version of the planning rules; a stored plan of another version is not used
+PLAN_VERSION = 1
+
+
+@runtime_checkable
+class Exposable(Protocol):
+    """Virtual measurements whose exposure can be set."""
+
+    def exposed_as(self, planned: PlannedExposure | None) -> TrialRunner:
+        """Return the same measurements with other exposures; None is the sensor's own rule."""
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """Virtual measurements of one view with their exposures.
+
+    - ``runner``: makes the trials.
+    - ``digest``: identifies everything that determines them.
+    - ``planned``: exposures, None for the sensor's own rule.
+    """
+
+    runner: TrialRunner
+    digest: str
+    planned: PlannedExposure | None
+
+    def trials(self, study: Study, folder: Path, own: TrialFolder) -> TrialFolder:
+        """Return the folder of the trials: ``own`` for the sensor's own exposure, otherwise one inside ``folder``."""
+        if self.planned is None:
+            return own
+        return TrialFolder(folder / "planned_trials", self.digest, list(study.task.measurements))
+
+
+def exposed_for(
+    study: Study,
+    view: View,
+    measurements: RenderedMeasurements | MappedMeasurements,
+    runner: TrialRunner,
+    digest: str,
+    folder: Path,
+) -> Exposed:
+    """Return the virtual measurements of a view with the exposures of the study: see :func:`planned_for`.
+
+    Parameters
+    ----------
+    measurements
+        The measurements of this process, with which exposures are planned.
+    runner
+        The same measurements, in this process or spread over several; it makes the trials.
+    digest
+        Identifies everything but the exposures that determines a trial.
+    folder
+        Keeps the plans.
+    """
+    planned = planned_for(study, view, measurements, digest, folder)
+    if planned is None:
+        return Exposed(runner, digest, None)
+    assert isinstance(runner, Exposable)  # planned_for rejects a map
+    return Exposed(runner.exposed_as(planned), with_exposure(digest, planned), planned)
+
+
+class _StoredPlan(Document):
+    """The keys of a stored plan that virtual measurements need."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+    digest: str
+    exposures_s: list[float] = Field(min_length=1, max_length=7)
+    power: float = Field(gt=0, le=1)
+
+
+def planned_for(
+    study: Study, view: View, measurements: RenderedMeasurements | MappedMeasurements, digest: str, folder: Path
+) -> PlannedExposure | None:
+    """Return the exposures of a view's captures: those of the study, or planned ones; None for the sensor's own rule.
+
+    A plan in ``folder`` with the same ``digest`` is used again.
+
+    Raises
+    ------
+    InputError
+        If the measurements are drawn from a map, which holds only for the exposure that it was made with. Also if the
+        sensor cannot take or merge the exposures of the study.
+    """
+    table = study.file.exposure
+    if table is None:
+        return None
+    renderer = rendered(study, measurements)
+    if table.exposures_s is not None:
+        given = PlannedExposure(tuple(sorted(table.exposures_s)), table.power)
+        _check_given(study, given, table)
+        return given
+    rules = PlanRules(table.most, table.within)
+    path = plan_path(folder, view.number)
+    digest_of_plan = with_exposure(digest, None, asdict(rules))
+    if path.exists():
+        try:
+            stored = validate(path, read_json_object(path), _StoredPlan)
+        except InputError:
+            stored = None
+        if stored is not None and stored.digest == digest_of_plan:
+            return PlannedExposure(tuple(stored.exposures_s), stored.power)
+    plan = plan_view(study, renderer, view, rules)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, plan_document(study, plan) | {"digest": digest_of_plan})
+    say(f"view {view.number}: {plan_in_words(plan)}")
+    return plan.exposure
+
+
+def plan_view(study: Study, renderer: RenderedMeasurements, view: View, rules: PlanRules) -> ExposurePlan:
+    """Plan the exposures of one view; its light is traced once."""
+    policy = study.sensor.exposure
+    if policy.limits_s == _NO_LIMITS:
+        say(f"{study.sensor.name} states no exposure limits: any exposure is allowed")
+    own = PlannedExposure(policy.exposures(None, float(study.sensor.imager.full_well)))
+    sweep = ExposureSweep(renderer, view)
+    if not study.sensor.merges_exposures:
+        say(f"{study.sensor.name} cannot merge exposures: the plan has one exposure")
+        rules = PlanRules(1, rules.within)
+    return plan_exposures(sweep.evaluate, own, policy.limits_s, rules, sweep.dimmable, view.number)
+
+
+def rendered(study: Study, measurements: RenderedMeasurements | MappedMeasurements) -> RenderedMeasurements:
+    """Return the virtual measurements, if they are rendered.
+
+    Raises
+    ------
+    InputError
+        If they are drawn from a map.
+    """
+    if not isinstance(measurements, RenderedMeasurements):
+        raise InputError(
+            study.path,
+            "exposure",
+            "exposures, and measurements that are drawn from a map",
+            "rendered measurements",
+            'a map holds only for the exposure that it was made with: set measure.by = "render"',
+        )
+    return measurements
+
+
+def _check_given(study: Study, given: PlannedExposure, table: ExposureTable) -> None:
+    """Check that a sensor can take and merge the exposures of a study; raise an InputError if not."""
+    shortest, longest = study.sensor.exposure.limits_s
+    for seconds in given.exposures_s:
+        if not shortest <= seconds <= longest:
+            raise InputError(
+                study.path,
+                "exposure.exposures_s",
+                f"{seconds:g} s",
+                f"{shortest:g} to {longest:g} s",
+                f"these are the limits of {study.sensor.name}",
+            )
+    if len(given.exposures_s) > 1 and not study.sensor.merges_exposures:
+        raise InputError(
+            study.path,
+            "exposure.exposures_s",
+            f"{len(given.exposures_s)} exposures",
+            "one",
+            f"{study.sensor.name} cannot merge exposures",
+        )
+
+
+def plan_path(folder: Path, view: int) -> Path:
+    """Return the path of the plan of a view in a folder."""
+    return folder / "exposures" / f"view_{view:04d}.json"
+
+
+def with_exposure(digest: str, planned: PlannedExposure | None, more: Any = None) -> str:
+    """Return the digest of trials with their exposures: 16 hexadecimal digits of a SHA-256."""
+    content = repr([PLAN_VERSION, digest, None if planned is None else asdict(planned), more])
+    return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+def plan_document(study: Study, plan: ExposurePlan) -> dict[str, Any]:
+    """Return a plan as JSON values; the keys are in docs/reference/formats/exposures.md."""
+    return {
+        "schema_version": 1,
+        "study": str(study.path),
+        "sensor": study.sensor.name,
+        "view": plan.view,
+        "exposures_s": list(plan.exposure.exposures_s),
+        "power": plan.exposure.power,
+        "reached": plan.reached,
+        "limits_s": list(study.sensor.exposure.limits_s),
+        "sets_tried": plan.sets_tried,
+        "unseen": list(plan.unseen),
+        "limits": {
+            name: {"points": one.points, "fraction": one.fraction, "u_mm": _number(one.u)}
+            for name, one in plan.limits.items()
+        },
+        "own": _result_values(plan.own),
+        "added": [{"exposure_s": seconds} | _result_values(result) for seconds, result in plan.added],
+    }
+
+
+def _result_values(result: ExposureResult) -> dict[str, Any]:
+    return {
+        "exposures_s": list(result.exposure.exposures_s),
+        "features": {
+            name: {"points": round(one.points, 1), "fraction": round(one.fraction, 4), "u_mm": _number(one.u)}
+            for name, one in result.features.items()
+        },
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(f"{value:.4g}") if math.isfinite(value) else None
+
+
+def plan_table(plan: ExposurePlan) -> str:
+    """Return a plan as a table of text: the exposures to set, and the result that each adds."""
+    names = list(plan.own.features)
+    head = ("capture", "exposure [ms]", "power", *(f"{name}: points, F, u [um]" for name in names))
+    rows = [
+        head,
+        ("sensor's own", *_settings_text(plan.own.exposure), *(_feature_text(plan.own, name) for name in names)),
+    ]
+    for k, (seconds, result) in enumerate(plan.added):
+        step_name = "1" if k == 0 else f"and {k + 1}, merged"
+        rows.append(
+            (
+                step_name,
+                f"{1e3 * seconds:.3g}",
+                f"{100 * plan.exposure.power:.0f} %",
+                *(_feature_text(result, name) for name in names),
+            )
+        )
+    limit = [
+        f"{one.points:.0f}  {one.fraction:.2f}  {1e3 * one.u:.1f}" if (one := plan.limits.get(name)) else "not reached"
+        for name in names
+    ]
+    rows.append(("limit", "", "", *limit))
+    return "\n".join(aligned(rows))
+
+
+def write_plan_csv(path: Path, plan: ExposurePlan) -> None:
+    """Write a plan as a CSV file, with one row for each feature of each step."""
+    lines = ["step,exposure_ms,power,feature,points,fraction,u_mm"]
+    steps = [("own", ";".join(f"{1e3 * one:.4g}" for one in plan.own.exposure.exposures_s), plan.own, 1.0)]
+    steps += [
+        (str(k), f"{1e3 * seconds:.4g}", result, plan.exposure.power)
+        for k, (seconds, result) in enumerate(plan.added, 1)
+    ]
+    for step, exposure, result, power in steps:
+        for name, one in result.features.items():
+            u = f"{one.u:.4g}" if math.isfinite(one.u) else ""
+            lines.append(f"{step},{exposure},{power:g},{name},{one.points:.1f},{one.fraction:.4f},{u}")
+    with atomic_write(path) as file:
+        file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def exposure_in_words(planned: PlannedExposure) -> str:
+    """Return exposures in words, such as ``0.82 and 3.3 ms, merged, at full power``."""
+    times = [f"{1e3 * seconds:.3g}" for seconds in planned.exposures_s]
+    several = f"{', '.join(times[:-1])} and {times[-1]} ms, merged" if len(times) > 1 else f"{times[0]} ms"
+    power = "full power" if planned.power == 1 else f"{100 * planned.power:.0f} % of the power"
+    return f"{several}, at {power}"
+
+
+def plan_in_words(plan: ExposurePlan) -> str:
+    """Return one line: the exposures to set, and whether they reach all limits."""
+    if not plan.limits:
+        return f"no exposure gives enough points on any feature that the task needs: {', '.join(plan.unseen)}"
+    count = len(plan.exposure.exposures_s)
+    text = f"expose {exposure_in_words(plan.exposure)}: "
+    if plan.reached:
+        text += "every feature" if not plan.unseen else "every other feature"
+        text += f" is at its limit with {count} exposure{'s' if count > 1 else ''}"
+    else:
+        text += "not all limits are reached, and no other set that was tried comes much closer"
+    return text + (f"; too few points from this view at any exposure: {', '.join(plan.unseen)}" if plan.unseen else "")
+
+
+def _settings_text(planned: PlannedExposure) -> tuple[str, str]:
+    return ", ".join(f"{1e3 * one:.3g}" for one in planned.exposures_s), f"{100 * planned.power:.0f} %"
+
+
+def _feature_text(result: ExposureResult, name: str) -> str:
+    one = result.features[name]
+    u = f"{1e3 * one.u:.1f}" if math.isfinite(one.u) else "-"
+    return f"{one.points:.0f}  {one.fraction:.2f}  {u}"

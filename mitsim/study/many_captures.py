@@ -1,0 +1,272 @@
+"""Many captures of one scene: every view of a table with every finish, each in its own folder.
+
+Signal chain: plan file, scene, sensor -> jobs (finish, view) with a seed each -> captures, in this process or on a
+cluster -> a capture folder for each, written completely or not at all. A repeated command makes the missing captures.
+The settings of an existing capture must have the digest of its job.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from characterisation.files.documents import Document, read_toml
+from characterisation.files.errors import InputError
+from mitsim.capture.folder import write_packed
+from mitsim.capture.packed_files import packed
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.capture.simulated.truth import encode_exr, true_image
+from mitsim.maps.campaign.orders import prepared_sensor
+from mitsim.maps.campaign.plan import sensor_checksum
+from mitsim.running.progress import track
+from mitsim.running.version import __version__
+from mitsim.scene.load import Scene, load_scene
+from mitsim.scene.ray_casting.triangles import triangles
+from mitsim.scene.surface.scatter import Deviation
+from mitsim.sensor.noise_sources import Noise
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
+from mitsim.views import ViewsTable, candidate_views
+from mitsim.views.standoffs import chosen_standoffs
+
+#: pattern of partial folders of killed processes
+_LEFT_OVER = ".view_*.partial-*"
+
+
+class ManyFinish(Document):
+    """One finish of the part: ``<default>`` values of the scene, and the deviation from its best estimate."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=100)]
+    parameters: dict[str, str | float] = Field(default_factory=dict)
+    deviation: str = ""
+
+
+class ManyFile(Document):
+    """A plan TOML of ``mitsim render --many``; ``captures`` pairs of view and finish are drawn, by default all."""
+
+    views: ViewsTable
+    finishes: list[ManyFinish] = Field(default=[ManyFinish(name="as_drawn")], min_length=1)
+    captures: Annotated[int, Field(ge=1)] | None = None
+
+    @field_validator("finishes")
+    @classmethod
+    def _named_once(cls, finishes: list[ManyFinish]) -> list[ManyFinish]:
+        names = [one.name for one in finishes]
+        if len(set(names)) < len(names):
+            raise ValueError("different names, since each finish has a folder of its name")
+        return finishes
+
+
+@dataclass(frozen=True)
+class Job:
+    """One capture as plain values, for any worker with this version of mitsim and access to the scene.
+
+    ``origin`` is a digest of the sensor, the scene's XML and the files that it names.
+    """
+
+    sensor: Sensor
+    scene: str
+    parameters: tuple[tuple[str, str], ...]
+    deviation: Deviation
+    finish: str
+    view: int
+    world_from_sensor: Transform
+    seed: int
+    samples: int
+    depth: int
+    noise: Noise
+    truth: bool
+    origin: str
+
+    @property
+    def place(self) -> Path:
+        """Return its folder, relative to the output."""
+        return Path(self.finish) / f"view_{self.view:04d}"
+
+    def digest(self) -> str:
+        """Return the SHA-256 of everything that determines the capture: its origin, and the values of the job."""
+        own = [
+            __version__,
+            self.origin,
+            self.parameters,
+            asdict(self.deviation),
+            self.finish,
+            self.view,
+            self.world_from_sensor.matrix().round(9).tolist(),
+            self.seed,
+            self.samples,
+            self.depth,
+            asdict(self.noise),
+            self.truth,
+        ]
+        return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class CommonSettings:
+    """Settings of all captures; a finish may replace ``parameters`` and ``deviation``."""
+
+    parameters: dict[str, str]
+    deviation: str
+    seed: int
+    samples: int
+    depth: int
+    noise: Noise
+    truth: bool
+
+
+def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, common: CommonSettings) -> list[Job]:
+    """All jobs of a plan, finish by finish, views from the zenith down.
+
+    Raises
+    ------
+    InputError
+        If the plan or the scene is not valid with any of the finishes, or no view is possible.
+    """
+    file = read_toml(plan, ManyFile)
+    jobs: list[Job] = []
+    origin = ""
+    for index, finish in enumerate(file.finishes):
+        parameters = common.parameters | {name: str(value) for name, value in finish.parameters.items()}
+        deviation = Deviation.parse(finish.deviation or common.deviation, f"{plan}: finishes.{finish.name}")
+        loaded = load_scene(scene, sensor.wavelength_nm, parameters, deviation)
+        origin = origin or origin_of(Path(scene), sensor)
+        radius = float(np.linalg.norm(loaded.bounds[1] - loaded.bounds[0])) / 2
+        standoffs = chosen_standoffs(plan, file.views, sensor, radius)
+        found = candidate_views(file.views, sensor, standoffs, loaded.centre, triangles(loaded), where=plan)
+        for view in found.views:
+            (seed,) = np.random.SeedSequence([common.seed, index, view.number]).generate_state(1)
+            jobs.append(
+                Job(
+                    sensor,
+                    str(Path(scene).absolute()),
+                    tuple(sorted(parameters.items())),
+                    deviation,
+                    finish.name,
+                    view.number,
+                    view.world_from_sensor,
+                    int(seed),
+                    common.samples,
+                    common.depth,
+                    common.noise,
+                    common.truth,
+                    origin,
+                )
+            )
+    if file.captures is None or file.captures >= len(jobs):
+        return jobs
+    drawn = np.random.default_rng(common.seed).choice(len(jobs), file.captures, replace=False)
+    return [jobs[number] for number in sorted(drawn)]
+
+
+def missing_jobs(jobs: Sequence[Job], output: str | Path) -> list[Job]:
+    """Return the jobs without a finished folder, and remove partial folders of killed processes.
+
+    Raises
+    ------
+    InputError
+        If a folder holds the capture of another job.
+    """
+    output = Path(output)
+    missing = []
+    for job in jobs:
+        folder = output / job.place
+        if not folder.exists():
+            missing.append(job)
+        elif digest_of(folder) != job.digest():
+            raise InputError(
+                folder,
+                "",
+                "a capture made of another scene, sensor or plan",
+                "one of this plan, or none",
+                "choose another folder with -o, or remove this one",
+            )
+    for finish in {job.finish for job in jobs}:
+        for half in (output / finish).glob(_LEFT_OVER):
+            shutil.rmtree(half, ignore_errors=True)
+    return missing
+
+
+def render_many(taken: Iterable[tuple[Job, dict[str, bytes]]], output: str | Path, total: int) -> None:
+    """Write captures as they are finished, with a progress bar; each one completely or not at all."""
+    for job, files in track(taken, "render", total):
+        folder = Path(output) / job.place
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        write_packed(files, folder)
+
+
+def in_turn(jobs: Sequence[Job], simulated: SimulatedSensor) -> Iterator[tuple[Job, dict[str, bytes]]]:
+    """Take captures in this process, one after another."""
+    for job in jobs:
+        yield job, _taken(job, simulated)
+
+
+def take_job(job: Job) -> dict[str, bytes]:
+    """Take and pack one capture; workers call this function. Packing takes time, but reduces the size to a fifth."""
+    simulated, _ = prepared_sensor(repr(job.sensor), job.sensor)
+    return _taken(job, simulated)
+
+
+def _taken(job: Job, simulated: SimulatedSensor) -> dict[str, bytes]:
+    """Return the files of a capture's folder, on request with the truth of its cameras as OpenEXR."""
+    scene = _scene(job.scene, job.sensor.wavelength_nm, job.parameters, job.deviation)
+    rendering = Rendering(job.samples, job.depth)
+    capture = simulated.capture(scene, job.world_from_sensor, seed=job.seed, rendering=rendering, noise=job.noise)
+    capture.settings["deviation"] = asdict(job.deviation)
+    capture.settings["many"] = {
+        "digest": job.digest(),
+        "scene": job.scene,
+        "parameters": dict(job.parameters),
+        "finish": job.finish,
+        "view": job.view,
+    }
+    truth: dict[str, bytes] = {}
+    if job.truth:
+        truth = {
+            name: encode_exr(
+                true_image(
+                    simulated,
+                    scene,
+                    job.world_from_sensor,
+                    name,
+                    samples=job.samples,
+                    depth=max(job.depth, 3),
+                    seed=job.seed,
+                )
+            )
+            for name in job.sensor.rig.cameras
+        }
+    return packed(capture, job.place, truth=truth)
+
+
+@lru_cache(maxsize=1)  # jobs come finish by finish, and materials of scenes that are kept are part of every kernel
+def _scene(path: str, wavelength_nm: float, parameters: tuple[tuple[str, str], ...], deviation: Deviation) -> Scene:
+    return load_scene(path, wavelength_nm, dict(parameters), deviation)
+
+
+def origin_of(scene: Path, sensor: Sensor) -> str:
+    """Return the digest of a sensor, of a scene's XML, and of the files next to it that its values name."""
+    text = scene.read_bytes()
+    named = {match.decode("utf-8", "replace") for match in re.findall(rb'value="([^"]+)"', text)}
+    files = sorted(path for name in named if (path := scene.parent / name).is_file())
+    parts = [sensor_checksum(sensor).encode(), text, *(path.read_bytes() for path in files)]
+    return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()
+
+
+def digest_of(folder: Path, command: str = "many") -> Any:
+    """Return the digest of the job whose capture a folder holds; None without a job of ``command``."""
+    try:
+        return json.loads((folder / "settings.json").read_text(encoding="utf-8"))[command]["digest"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

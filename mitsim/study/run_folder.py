@@ -1,0 +1,319 @@
+"""Read and check the folder of a run before anything is drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import trimesh
+import xarray as xr
+from pydantic import ConfigDict, Field
+
+from characterisation.cloud_files import read_ply
+from characterisation.files.checked_files import read_json_object
+from characterisation.files.datasets import Schema, Variable, read_dataset
+from characterisation.files.documents import Document, validate
+from characterisation.files.errors import InputError
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.point_cloud import PointCloud
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import read_capture
+from mitsim.report.statement_section import StatementDocument, read_statement
+from mitsim.scene.surface.lay import LayLeftOut
+from mitsim.study.run_files import check_own
+
+_MADE_BY = "a folder made by mitsim run"
+
+_AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"
+_BY_VIEW, _BY_FEATURE, _VIEW = ("measurement", "view"), ("view", "feature"), ("view",)
+_ALL = {"measurement": Variable(("measurement",), "text"), "view": Variable(_VIEW, "whole", 0, 1e9)}
+
+_SCORES = Schema(
+    "scores of a run",
+    {
+        "predicted_uncertainty": Variable(_BY_VIEW, low=0.0, high=1e12, gaps=True),
+        "chance": Variable(_BY_VIEW, low=0.0, high=1.0, gaps=True),
+        "uncertainty_possible": Variable(_BY_VIEW, "truth"),
+        "possible": Variable(_BY_VIEW, "truth"),
+        "uncertainty_rank": Variable(_BY_VIEW, "whole", 1, 1e9),
+        "rank": Variable(_BY_VIEW, "whole", 1, 1e9),
+        "limit": Variable(_BY_VIEW, "text"),
+        "limiting_feature": Variable(_BY_VIEW, "text"),
+        "V_m": Variable(_BY_VIEW, low=0.0, high=1e12),
+        "tolerance": Variable(("measurement",), gaps=True),
+        "n": Variable(_BY_FEATURE, low=0.0, high=1e12),
+        "n_only_white": Variable(_BY_FEATURE, low=0.0, high=1e12),
+        "mean_sigma": Variable(_BY_FEATURE, low=0.0, high=1e12, gaps=True),
+        "R_f": Variable(_BY_FEATURE, low=0.0, high=1e12),
+        "roll_deg": Variable(_VIEW, low=-720, high=720),
+        "elevation_deg": Variable(_VIEW, low=-90.1, high=90.1),
+        "azimuth_deg": Variable(_VIEW, low=-720, high=720),
+        "standoff_mm": Variable(_VIEW, low=0, high=1e6),
+        "direction": Variable(("view", "xyz"), low=-1.001, high=1.001),
+        "world_from_sensor": Variable(("view", "i", "j"), low=-1e9, high=1e9),
+        "measured_risk": Variable(_BY_VIEW, low=0.0, high=1e12, gaps=True, needed=False),
+        "trials": Variable(_BY_VIEW, "whole", 0, 1e9, needed=False),
+        "final_rank": Variable(_BY_VIEW, "whole", 1, 1e9, needed=False),
+        "feature": Variable(("feature",), "text"),
+        **_ALL,
+    },
+    {
+        "view": (1, 1_000_000),
+        "measurement": (1, 10_000),
+        "feature": (1, 10_000),
+        "i": (4, 4),
+        "j": (4, 4),
+        "xyz": (3, 3),
+    },
+    ("measurement", "view", "feature"),
+    _AGAIN,
+)
+_ERRORS = Variable(("measurement", "view", "repeat"), gaps=True)
+_CHECKS = Schema(
+    "checks of a run",
+    {"value": _ERRORS, "error": _ERRORS, **_ALL},
+    {"repeat": (0, 1_000_000)},
+    ("measurement", "view"),
+    _AGAIN,
+)
+_PATCHES = Schema(
+    "patches of a campaign",
+    {
+        "normal_x": Variable(("patch",), low=-1.001, high=1.001),
+        "normal_y": Variable(("patch",), low=-1.001, high=1.001),
+        "sample_number": Variable(("patch",), "whole", 0, 100_000),
+        "finish": Variable(("sample",), "text"),
+        "roughness": Variable(("sample",), low=0.0, high=1e6, gaps=True),
+    },
+    hint=_AGAIN,
+)
+
+
+class MeasurementEntry(Document):
+    """Entry of a measurement in ``run.json``; ``kind`` and ``tolerance`` as in the task."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+    nominal: float
+    unit: str
+    features: list[str]
+    kind: str = ""
+    tolerance: float | tuple[float, float] | None = None
+
+
+class ResidualEntry(Document):
+    """Quality of the renders in ``run.json``, in units of the sensor's noise [1]; ``outliers`` is a share of pixels."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+    noise: float
+    quadrature: float
+    outliers: float
+
+
+class ConfirmedEntry(Document):
+    """Result of one measurement from virtual measurements of a whole set of views."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+    unit: str
+    trials: int
+    without_value: float
+    bias: float | None
+    standard_uncertainty: float | None
+
+
+class TriedEntry(Document):
+    """A set of views that was measured, and its largest ratio of error to limit; None without a value."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+    views: list[int]
+    excess: float | None = None
+
+
+class ViewSetEntry(Document):
+    """Set of views that together keep limits, given for each measurement in its unit.
+
+    ``exact`` is true if no smaller set keeps the limits. ``feasible`` is false for a limit that even all views together
+    miss. ``joined`` describes how the views are combined. ``confirmed`` holds the virtual measurements of the whole
+    set, ``tried`` all sets that were measured.
+    """
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+    limits: dict[str, float]
+    views: list[int]
+    uncertainty: dict[str, float | None] = Field(default_factory=dict)
+    feasible: dict[str, bool] = Field(default_factory=dict)
+    exact: bool = False
+    joined: str = "joined as if their poses were exact"
+    confirmed: dict[str, ConfirmedEntry] = Field(default_factory=dict)
+    tried: list[TriedEntry] = Field(default_factory=list)
+
+
+class RunDocument(Document):
+    """``run.json``, as far as a report needs it; other keys are ignored."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+    schema_version: Literal[1]
+    mitsim: str
+    study: str
+    scene: str
+    sensor: str
+    source: str
+    map_source: str = ""
+    exposure_rule: str
+    seed: int
+    checked_views: list[int]
+    raced_views: int = 0
+    race_trials: int = 0
+    race_decided: bool = False
+    leaders: dict[str, int] = Field(default_factory=dict)
+    confidence: dict[str, float] = Field(default_factory=dict)
+    light_path_depth: int
+    score_light_path_depth: int = 1
+    render_residual: ResidualEntry | None = None
+    features: dict[str, str]
+    lay: dict[str, LayLeftOut] = Field(default_factory=dict)
+    measurements: dict[str, MeasurementEntry]
+    view_sets: list[ViewSetEntry] = Field(default_factory=list)
+    seconds: dict[str, float] = Field(default_factory=dict)
+    python: str = ""
+    machine: str = ""
+    cores: int | None = None
+    files: dict[str, str] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run that has been read; ``patches`` is None if the run used an existing map."""
+
+    folder: Path
+    about: RunDocument
+    performance_map: PerformanceMap
+    patches: xr.Dataset | None
+    scores: xr.Dataset
+    checks: xr.Dataset
+    statement: StatementDocument | None
+
+    @property
+    def measurements(self) -> list[str]:
+        """Return the names of the measurements, in the order of the task."""
+        return [str(name) for name in self.scores["measurement"].values]
+
+    @property
+    def checked(self) -> list[int]:
+        """Return the numbers of the views with images and a decoded cloud, the best of all first."""
+        return list(self.about.checked_views)
+
+    @property
+    def clouds(self) -> list[int]:
+        """Return the numbers of the views with a predicted cloud, ascending."""
+        return [int(view) for view in self.scores["view"].values if self.has(f"clouds/predicted_{int(view):04d}.ply")]
+
+    def has(self, name: str) -> bool:
+        """Return whether a file belongs to this run: ``run.json`` names it, or it exists and ``run.json`` is old and
+        names none.
+        """
+        return name in self.about.files if self.about.files else (self.folder / name).exists()
+
+    def _cloud_path(self, kind: str, view: int) -> Path:
+        return self.folder / "clouds" / f"{kind}_{view:04d}.ply"
+
+    def part(self) -> trimesh.Trimesh | None:
+        """Return the part's surface [mm], part frame; None if the run has no ``part.ply``."""
+        if not self.has("part.ply"):
+            return None
+        self.check("part.ply")
+        return _mesh(self.folder / "part.ply")
+
+    def check(self, name: str) -> None:
+        """Check a file against its digest in ``run.json``; raise :class:`InputError` if they differ."""
+        check_own(self.folder, self.about.files, [name])
+
+    def predicted(self, view: int) -> PointCloud:
+        """Return the cloud of a view that the map predicts."""
+        self.check(f"clouds/predicted_{view:04d}.ply")
+        return read_ply(self._cloud_path("predicted", view))
+
+    def decoded(self, view: int) -> PointCloud:
+        """Return the cloud of a checked view, decoded from its rendered images."""
+        path = self._cloud_path("rendered", view)
+        self.check(f"clouds/rendered_{view:04d}.ply")
+        cloud, grid = read_ply(path), self.predicted(view).grid
+        if (cloud.grid.height, cloud.grid.width) != (grid.height, grid.width):
+            found = f"{cloud.grid.height} x {cloud.grid.width} pixels"
+            raise InputError(path, "grid", found, f"{grid.height} x {grid.width}, as the predicted cloud")
+        return cloud
+
+    def capture(self, view: int) -> Capture:
+        """Return the images of a checked view."""
+        self.check(f"captures/view_{view:04d}/capture.json")
+        return read_capture(self.folder / "captures" / f"view_{view:04d}")
+
+
+def read_run(folder: str | Path) -> Run:
+    """Read the folder of a finished run; captures and clouds are read on request.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, damaged or does not belong to the others; the message names the file.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(folder, "", "no such folder", _MADE_BY)
+    about = _read_about(folder / "run.json")
+    own = about.files
+    check_own(folder, own, ("map.nc", "samples.nc", "scores.nc", "checks.nc", "statement.json"))
+    performance_map = PerformanceMap.load(folder / "map.nc")
+    sampled = "samples.nc" in own if own else (folder / "samples.nc").exists()
+    patches = read_dataset(folder / "samples.nc", _PATCHES) if sampled else None
+    if patches is not None and (patches["sample_number"].values >= patches.sizes["sample"]).any():
+        raise InputError(folder / "samples.nc", "sample_number", "a number without a sample", "numbers of the samples")
+    scores = read_dataset(folder / "scores.nc", _SCORES)
+    least = scores.attrs.get("minimum_points", 0)
+    if not isinstance(least, (int, np.integer)) or not 0 <= least < 2**40:
+        raise InputError(folder / "scores.nc", "minimum_points", repr(least)[:80], "a whole number of points")
+    checks = read_dataset(folder / "checks.nc", _CHECKS)
+    for name, data in (("scores.nc", scores), ("checks.nc", checks)):
+        found = [str(measurement) for measurement in data["measurement"].values]
+        if found != list(about.measurements):
+            allowed = f"{', '.join(about.measurements)}, as in run.json"
+            raise InputError(folder / name, "measurement", ", ".join(found), allowed)
+    seen = {str(feature) for feature in scores["feature"].values}
+    for name, entry in about.measurements.items():
+        if absent := sorted(set(entry.features) - seen):
+            allowed = "features of scores.nc"
+            raise InputError(folder / "run.json", f"measurements.{name}.features", absent[0], allowed)
+    unknown = sorted(set(checks["view"].values.tolist()) - set(scores["view"].values.tolist()))
+    if unknown:
+        raise InputError(folder / "checks.nc", "view", unknown[0], "views of scores.nc")
+    for i, chosen in enumerate(about.view_sets):
+        if missing := sorted(set(chosen.views) - set(scores["view"].values.tolist())):
+            raise InputError(folder / "run.json", f"view_sets[{i}].views", missing[0], "views of scores.nc")
+    for name in ("possible", "uncertainty_possible"):
+        scores[name] = scores[name].astype(bool)  # netCDF has no booleans
+    stated = "statement.json" in own or not own
+    statement = read_statement(folder / "statement.json") if stated else None
+    return Run(folder, about, performance_map, patches, scores, checks, statement)
+
+
+def _read_about(path: Path) -> RunDocument:
+    table = read_json_object(path, _MADE_BY, "mitsim run writes it last: let the run finish")
+    return validate(path, table, RunDocument)
+
+
+def _mesh(path: Path) -> trimesh.Trimesh | None:
+    if not path.exists():
+        return None
+    try:
+        mesh = trimesh.load(path, process=False)
+    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:  # as trimesh has it
+        raise InputError(path, "", f"a file that cannot be read ({error})", "a mesh as PLY") from None
+    if (
+        not isinstance(mesh, trimesh.Trimesh)
+        or not len(mesh.faces)
+        or not np.isfinite(mesh.vertices).all()
+        or not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices)
+    ):
+        raise InputError(path, "", "no triangles, or bad vertices", "a mesh as PLY")
+    return mesh

@@ -1,0 +1,106 @@
+"""Score all candidate views with the performance map, and choose the fewest views that keep limits of uncertainty.
+
+Signal chain: study, map -> score of every view (:mod:`mitsim.study.virtual.screening`) -> fewest views that measure together
+(:mod:`characterisation.scores.task_sets`) -> ``scores.csv``, ``scores.nc``, ``poses/``, ``part.ply``.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+import xarray as xr
+from scipy.spatial.transform import Rotation
+
+from characterisation.files.atomic_io import atomic_write
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.scores.joining import pose_covariance
+from characterisation.scores.task_sets import SetJoining, choose_set
+from characterisation.scores.view_score import write_scores
+from characterisation.scores.view_sets import ViewSet
+from characterisation.tasks.evaluation import InputQuantity
+from mitsim.maps.campaign.run import write_netcdf
+from mitsim.maps.prediction import Predictor
+from mitsim.running.progress import say
+from mitsim.scene.ray_casting.triangles import triangles
+from mitsim.study import Study
+from mitsim.study.scene_geometry import write_scene_geometry
+from mitsim.study.view_sets.confirmed_set import Search, joining_in_words
+from mitsim.study.virtual.screening import screen
+from mitsim.study.virtual.world import Unknowns
+from mitsim.views import write_views
+
+
+def score_study(
+    study: Study,
+    predictor: Predictor,
+    performance_map: PerformanceMap,
+    folder: Path,
+    unknowns: Unknowns | None = None,
+) -> tuple[xr.Dataset, ViewSet | None, Search]:
+    """Score all views, choose a set if the study asks for one, and write ``scores``, ``poses`` and ``part.ply``.
+
+    ``unknowns``: see :func:`~mitsim.study.virtual.screening.screen`. Returns the scores, the set, and the function that finds
+    a set for other limits.
+    """
+    write_views(folder / "poses", study.candidates, study.file.views, study.sensor.name)
+    scores, inputs = screen(study, predictor, performance_map, unknowns)
+    search = partial(_set_within, study, inputs)
+    chosen = _chosen_set(study, search)
+    write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")
+    write_netcdf(scores, folder / "scores.nc")
+    write_scene_geometry(folder, study.scene, study.sensor)
+    with atomic_write(folder / "part.ply") as file:
+        corners = triangles(study.scene)
+        mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=True)
+        file.write_bytes(trimesh.exchange.ply.export_ply(mesh))
+    return scores, chosen, search
+
+
+def _set_within(study: Study, inputs: list[dict[InputQuantity, Any]], limits: dict[str, float]) -> ViewSet:
+    """Return the fewest views that keep the limits according to the map."""
+    table = study.file.set
+    assert table is not None
+    joining = SetJoining(
+        pose_covariance(*table.pose_known), np.asarray(study.scene.centre, float), table.joining == "best_fit"
+    )
+    return choose_set(study.task, inputs, limits, table.least_chance, table.seconds, joining)
+
+
+def _chosen_set(study: Study, search: Search) -> ViewSet | None:
+    table = study.file.set
+    if table is None:
+        return None
+    chosen = search(table.limits)
+    for (name, limit), reached in zip(table.limits.items(), chosen.feasible, strict=True):
+        if not reached:
+            say(f"{name}: {limit:g} {study.task.measurements[name].unit} is unreachable, even with all views together")
+    how = "the fewest" if chosen.exact else "not proven the fewest"
+    say(
+        f"views that measure together: {', '.join(map(str, chosen.views)) or 'none'} ({how}), "
+        f"{joining_in_words(table)}; the map predicts: {_expected(study, table.limits, chosen)}"
+    )
+    return chosen
+
+
+def _expected(study: Study, limits: dict[str, float], chosen: ViewSet) -> str:
+    """Like ``pillar1_radius u 0.36 of 0.5 mm``."""
+    rows = zip(limits.items(), chosen.uncertainty.tolist(), chosen.feasible, strict=True)
+    units = {name: study.task.measurements[name].unit for name in limits}
+    parts = [f"{name} u {u:.2g} of {limit:g} {units[name]}" for (name, limit), u, able in rows if able]
+    return ", ".join(parts) or "nothing"
+
+
+def pose_columns(scores: xr.Dataset) -> dict[str, np.ndarray]:
+    """Return the columns of ``scores.csv`` that are not part of the talk's score."""
+    poses = scores["world_from_sensor"].values
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    names = ["uncertainty_rank", "predicted_uncertainty", "chance", "limit", "limiting_feature"]
+    names += [name for name in ("final_rank", "measured_risk", "trials") if name in scores]
+    out = {name: scores[name].values for name in names}
+    out |= {name: scores[name].values for name in ("azimuth_deg", "elevation_deg", "roll_deg", "standoff_mm")}
+    out |= {f"position_{axis}_mm": poses[:, k, 3] for k, axis in enumerate("xyz")}
+    return out | {f"quaternion_{axis}": turns[:, k] for k, axis in enumerate("xyzw")}

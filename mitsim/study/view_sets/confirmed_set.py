@@ -1,0 +1,265 @@
+"""Find a set of views that keeps its limits in virtual measurements: search with the map, measure, and search again.
+
+Signal chain: limits -> the fewest views that keep them according to the map (:mod:`characterisation.scores.task_sets`)
+-> virtual measurements of the whole set (:mod:`mitsim.study.view_sets.joined`) -> a stricter search limit for each
+measurement that missed its limit, by the ratio of expected to measured uncertainty -> next set. If no set is predicted
+to keep a stricter limit, the search comes back half of the way to the limit before; if it finds a set that is already
+measured, it goes on to stricter limits. The loop ends if all limits are kept, if :data:`MOST_SEARCHES` searches find no
+further set, or after :data:`MOST_SETS` sets.
+
+The map contains neither the random finish nor the effects of curved faces and edges, so its u can be too small. The
+loop measures by how much.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from characterisation.files.atomic_io import atomic_write, json_values
+from characterisation.scores.view_sets import ViewSet
+from characterisation.statements.decision import tolerance_of
+from characterisation.statements.losses import losses
+from characterisation.statements.statement import Statement, statement
+from mitsim.running.progress import say, track
+from mitsim.running.text_table import aligned
+from mitsim.study import SetTable, Study
+from mitsim.study.exposures.planned import with_exposure
+from mitsim.study.view_sets.joined import JoinedMeasurements
+from mitsim.study.virtual.rendered import RenderedMeasurements
+from mitsim.study.virtual.stated import digits
+from mitsim.study.virtual.trials import TrialFolder
+from mitsim.study.virtual.world import SET_DAYS, Trial
+
+#: largest number of sets to measure
+MOST_SETS = 5
+
+#: searches for one more set, with limits between the last and the stricter ones
+MOST_SEARCHES = 8
+
+#: a missed limit becomes stricter for the search by at least this factor
+_TIGHTENING = 0.9
+
+#: factor for a measurement without any value, whose uncertainty is unknown
+_WITHOUT_VALUE = 0.5
+
+#: part of the digest of a set's trials; raise it when the same clouds are joined differently
+_JOINING_VERSION = 2
+
+#: finds the fewest views that keep limits, by measurement, according to the map
+Search = Callable[[dict[str, float]], ViewSet]
+
+
+@dataclass(frozen=True)
+class TriedSet:
+    """A set of views, the limits of its search, and its statements from virtual measurements of the whole set."""
+
+    chosen: ViewSet
+    searched: dict[str, float]
+    stated: tuple[Statement, ...]
+
+    def excess(self, limits: dict[str, float]) -> float:
+        """Return the largest ratio of root mean square error to limit, over reachable limits.
+
+        It is at most 1 if all reachable limits are kept.
+        """
+        found = {one.measurement: one for one in self.stated}
+        reachable = [name for name, able in zip(limits, self.chosen.feasible, strict=True) if able]
+        return max((_excess(found[name], limits[name]) for name in reachable), default=0.0)
+
+
+def confirmed_set(
+    study: Study, first: ViewSet, search: Search, renderer: RenderedMeasurements, digest: str, folder: Path
+) -> list[TriedSet]:
+    """Measure the first set, and sets for stricter limits until one keeps the limits.
+
+    Returns all measured sets, the best last: the set that keeps all reachable limits, or the one of least excess.
+    Trials in the folder are reused. Says of each set which limits it misses, and why no further set is tried.
+    """
+    table = study.file.set
+    assert table is not None
+    chosen, searched, tried = first, dict(table.limits), list[TriedSet]()
+    while True:
+        stated = state_set(study, chosen, renderer, digest, folder)
+        tried.append(TriedSet(chosen, dict(searched), tuple(stated)))
+        if tried[-1].excess(table.limits) <= 1:
+            break
+        say(f"set {len(tried)}, views {', '.join(map(str, chosen.views))}: {_missed(tried[-1], table.limits)}")
+        if len(tried) == MOST_SETS:
+            say(f"no further set is tried: {MOST_SETS} sets were measured, the most that a run measures")
+            break
+        found = _next_set(search, searched, stricter(searched, table.limits, chosen, stated), first, tried)
+        if found is None:
+            say(
+                f"no further set is tried: by the map, no set of other views is more accurate "
+                f"({MOST_SEARCHES} searches with stricter limits)"
+            )
+            break
+        chosen, searched = found
+        say(f"the next set: views {', '.join(map(str, chosen.views))}")
+    return sorted(tried, key=lambda one: -one.excess(table.limits))
+
+
+def _next_set(
+    search: Search, before: dict[str, float], strict: dict[str, float], first: ViewSet, tried: Sequence[TriedSet]
+) -> tuple[ViewSet, dict[str, float]] | None:
+    """Return a set that is not measured yet, with the limits of its search: the strictest that the map can keep.
+
+    ``before`` are the limits of the last search, ``strict`` those by what it missed. A limit that no set can keep is
+    taken back half of the way, in ratio, to the limit before. If the set is an old one, limits that were missed become
+    stricter by the least step. None if :data:`MOST_SEARCHES` searches find no new set.
+    """
+    limits, missed = dict(strict), [name for name in strict if strict[name] < before[name]]
+    for _ in range(MOST_SEARCHES):
+        chosen = search(limits)
+        lost = [name for name, once, now in zip(limits, first.feasible, chosen.feasible, strict=True) if once > now]
+        for name in lost:
+            limits[name] = math.sqrt(limits[name] * before[name])
+        if lost or not chosen.views:
+            continue
+        if all(set(one.chosen.views) != set(chosen.views) for one in tried):
+            return chosen, limits
+        for name in missed:
+            limits[name] *= _TIGHTENING
+    return None
+
+
+def _missed(tried: TriedSet, limits: dict[str, float]) -> str:
+    """Return text such as ``radius missed, 1.3 times its limit``."""
+    found = {
+        one.measurement: _excess(one, limits[one.measurement]) for one in tried.stated if one.measurement in limits
+    }
+    words = [f"{name} missed, {ratio:.2g} times its limit" for name, ratio in found.items() if 1 < ratio < math.inf]
+    return "; ".join(words + [f"{name} without a value" for name, ratio in found.items() if ratio == math.inf])
+
+
+def stricter(
+    searched: dict[str, float], limits: dict[str, float], chosen: ViewSet, stated: Sequence[Statement]
+) -> dict[str, float]:
+    """Return the limits for the next search: missed limits times the ratio of expected to measured uncertainty."""
+    out, found = dict(searched), {one.measurement: one for one in stated}
+    for name, expected, able in zip(limits, chosen.uncertainty.tolist(), chosen.feasible, strict=True):
+        one = found[name]
+        if not able or _excess(one, limits[name]) <= 1:
+            continue
+        optimism = _WITHOUT_VALUE if not one.root_mean_square > 0 else expected / one.root_mean_square
+        out[name] = min(limits[name] * optimism, _TIGHTENING * searched[name])
+    return out
+
+
+def _excess(one: Statement, limit: float) -> float:
+    return one.root_mean_square / limit if math.isfinite(one.root_mean_square) else math.inf
+
+
+def state_set(
+    study: Study, chosen: ViewSet, renderer: RenderedMeasurements, digest: str, folder: Path
+) -> list[Statement]:
+    """State every measurement from a set of views together, and reuse trials in the folder."""
+    table = study.file.set
+    assert table is not None
+    decided_by = with_exposure(
+        digest, None, ["set", list(chosen.views), table.joining, list(table.pose_known), _JOINING_VERSION]
+    )
+    trials = TrialFolder(folder / "set_trials" / decided_by, decided_by, list(study.task.measurements))
+    by_number = {view.number: view for view in study.views}
+    runner = JoinedMeasurements(renderer, [by_number[number] for number in chosen.views], table)
+    days = [SET_DAYS + k for k in range(table.trials)]
+    missing = [day for day in days if Trial(day) not in trials.known(0)]
+    for day, outcome in track(runner.run(missing), "confirm the set", len(missing)):
+        trials.add(0, Trial(day), outcome)
+    wanted = [Trial(day) for day in days]
+    found = trials.errors(0, wanted)
+    return [
+        replace(
+            statement(name, asked.unit, found[m], tolerance_of(study.task, name)),
+            losses=losses(trials.reasons(0, wanted, name)),
+        )
+        for m, (name, asked) in enumerate(study.task.measurements.items())
+    ]
+
+
+def tried_entries(tried: Sequence[TriedSet], limits: dict[str, float]) -> list[dict[str, Any]]:
+    """Return views, expected uncertainty and root mean square error of every measured set as JSON values."""
+    return [
+        {
+            "views": list(one.chosen.views),
+            "excess": json_values(one.excess(limits)),
+            "searched": one.searched,
+            "expected": dict(zip(limits, one.chosen.uncertainty.tolist(), strict=True)),
+            "found": {
+                each.measurement: json_values(each.root_mean_square)
+                for each in one.stated
+                if each.measurement in limits
+            },
+        }
+        for one in tried
+    ]
+
+
+def joining_in_words(table: SetTable) -> str:
+    """Return text such as ``joined by robot: each pose to 0.3 mm and 0.03 deg``."""
+    if table.joining == "exact":
+        return "joined as if their poses were exact"
+    position, angle = table.pose_known
+    if table.joining == "best_fit":
+        return f"joined by best fit, from poses known to {position:g} mm and {angle:g} deg"
+    return f"joined by {table.joining}: each pose to {position:g} mm and {angle:g} deg"
+
+
+def confirmed_entry(stated: Sequence[Statement]) -> dict[str, Any]:
+    """Return the results of virtual measurements of the set, by measurement, as JSON values."""
+    keys = ("unit", "trials", "without_value", "bias", "standard_uncertainty", "interval", "verdict")
+    out = {}
+    for one in stated:
+        decision = None if one.decided is None else asdict(one.decided)
+        out[one.measurement] = json_values({key: getattr(one, key) for key in keys} | {"decision": decision})
+    return out
+
+
+def write_set_csv(path: Path, table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> None:
+    """Write limit, expected and confirmed uncertainty of every measurement, one row each."""
+    expected = dict(zip(table.limits, chosen.uncertainty.tolist(), strict=True))
+    lines = ["measurement,unit,limit,expected_uncertainty,trials,without_value,bias,uncertainty,low,high,verdict"]
+    for one in stated:
+        limit, u = table.limits.get(one.measurement), expected.get(one.measurement)
+        numbers = [one.bias, one.standard_uncertainty, *one.interval]
+        lines.append(
+            ",".join(
+                [
+                    one.measurement,
+                    one.unit,
+                    "" if limit is None else f"{limit:g}",
+                    "" if u is None else f"{u:.4g}",
+                    str(one.trials),
+                    f"{one.without_value:.4g}",
+                    *("" if not math.isfinite(number) else f"{number:.4g}" for number in numbers),
+                    one.verdict,
+                ]
+            )
+        )
+    with atomic_write(path) as file:
+        file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def set_table(table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> str:
+    """Return the set as a text table: limit, expected u, and bias and u from virtual measurements."""
+    expected = dict(zip(table.limits, chosen.uncertainty.tolist(), strict=True))
+    rows = [("measurement", "unit", "limit", "expected u", "bias", "u", "no value", "limit kept")]
+    for one in stated:
+        limit, u = table.limits.get(one.measurement), expected.get(one.measurement)
+        rows.append(
+            (
+                one.measurement,
+                one.unit,
+                "-" if limit is None else f"{limit:g}",
+                "-" if u is None else f"{u:.2g}",
+                digits(one.bias),
+                digits(one.standard_uncertainty),
+                f"{100 * one.without_value:.0f} %",
+                "-" if limit is None else "yes" if one.root_mean_square <= limit else "no",
+            )
+        )
+    return "\n".join(aligned(rows))

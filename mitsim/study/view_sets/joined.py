@@ -1,0 +1,118 @@
+"""Virtual measurements of a set of views: render every view in one random world, and measure the joined clouds.
+
+Signal chain: day -> world (calibration, finish, light, temperature and position of the part shared by all views; noise
+and speckle fresh in each) -> a cloud of each view -> assumed pose of each view, with its error -> points of every
+feature in the part frame -> joining, by these poses or by best fit of all views to shapes they share -> measurement
+-> error of every measurement.
+
+A set of one view is measured like a single view. Joined points have no common viewpoint, and are fitted by their
+orthogonal distances (:func:`characterisation.tasks.evaluation.measure_points`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.features.best_fit import best_fit, motion_matrix
+from characterisation.features.fits import belonging
+from characterisation.features.robust_fit import FitError
+from characterisation.point_cloud import PointCloud
+from characterisation.scores.joining import pose_covariance
+from characterisation.tasks.evaluation import measure, measure_points
+from mitsim.study import MINIMUM_POINTS, SetTable
+from mitsim.study.virtual.rendered import RenderedMeasurements
+from mitsim.study.virtual.trials import Outcome
+from mitsim.study.virtual.world import Trial
+from mitsim.views import View
+
+Floats = NDArray[np.float64]
+
+#: seed of the streams of pose errors, different from those of the groups of unknowns
+_POSE_STREAM = 31
+
+
+@dataclass(frozen=True)
+class _MeasuredView:
+    """One view of a day: ``points`` (n, 3) [mm] of each feature, in the part frame by the assumed pose of the view."""
+
+    points: dict[str, Floats]
+    assumed: Floats
+    cloud: PointCloud
+
+
+class JoinedMeasurements:
+    """A set of views of one part, prepared for virtual measurements of all views together."""
+
+    def __init__(self, renderer: RenderedMeasurements, views: Sequence[View], table: SetTable) -> None:
+        self.renderer, self.views, self.table = renderer, list(views), table
+        self.centre = np.asarray(renderer.study.scene.centre, float)
+        self.known = pose_covariance(*table.pose_known)
+
+    def run(self, days: Iterable[int]) -> Iterable[tuple[int, Outcome]]:
+        """Yield the outcome of every virtual measurement, day by day.
+
+        Days with the same finish are consecutive.
+        """
+        draw = self.renderer.unknowns.draw
+        order = sorted(days, key=lambda day: draw(Trial(day)).finish)
+        for _, days_of_finish in groupby(order, key=lambda day: draw(Trial(day)).finish):
+            row = list(days_of_finish)
+            measured = [{day: self._measure_view(view, k, day) for day in row} for k, view in enumerate(self.views)]
+            for day in row:
+                yield day, self._measured([one[day] for one in measured], day)
+
+    def _measure_view(self, view: View, place: int, day: int) -> _MeasuredView:
+        """Return the points of one view on one day; its ``place`` in the set is the number of its capture."""
+        renderer, first = self.renderer, self.renderer.unknowns.draw(Trial(day))
+        world = replace(renderer.unknowns.draw(Trial(day, place)), placed=first.placed, assumed=first.assumed)
+        cloud, assumed = renderer.cloud_of(view, world)
+        motion = motion_matrix(self._pose_error(place, day), self.centre) @ assumed.matrix()
+        points = {}
+        for name in renderer.study.task.shapes:
+            found = cloud.of_feature(name)
+            nominal = renderer.study.task.features[name].nominal(assumed.inverse().matrix())
+            kept = found[belonging(found, nominal, cloud.grid.origin)] if len(found) else found
+            points[name] = kept @ motion[:3, :3].T + motion[:3, 3]
+        return _MeasuredView(points, assumed.matrix(), cloud)
+
+    def _pose_error(self, place: int, day: int) -> Floats:
+        """Return the error of the assumed pose of a view, as a motion [w (rad), t (mm)]."""
+        rng = np.random.default_rng(np.random.SeedSequence([self.renderer.unknowns.seed, _POSE_STREAM, day, place]))
+        return np.asarray(np.sqrt(np.diag(self.known)) * rng.standard_normal(6))
+
+    def _measured(self, measured: Sequence[_MeasuredView], day: int) -> Outcome:
+        task = self.renderer.study.task
+        if len(measured) == 1:
+            motion = np.linalg.inv(measured[0].assumed)
+            found = measure(measured[0].cloud, task, motion, MINIMUM_POINTS, False)
+        else:
+            try:
+                points = self._join(measured, day)
+            except FitError as error:
+                names = task.measurements
+                return Outcome(dict.fromkeys(names, math.nan), dict.fromkeys(names, f"the views do not join: {error}"))
+            found = measure_points(points, task, MINIMUM_POINTS, False)
+        return Outcome.of(found)
+
+    def _join(self, measured: Sequence[_MeasuredView], day: int) -> dict[str, Floats]:
+        """Return the points of every feature from all views together."""
+        motions = [np.eye(4)] * len(measured)
+        if self.table.joining == "best_fit":
+            task = self.renderer.study.task
+            shapes = {name: task.features[name].nominal() for name in task.shapes}
+            motions = best_fit([one.points for one in measured], shapes, self.centre, self.known, day)
+        return {
+            name: np.concatenate(
+                [
+                    one.points[name] @ motion[:3, :3].T + motion[:3, 3]
+                    for one, motion in zip(measured, motions, strict=True)
+                ]
+            )
+            for name in measured[0].points
+        }

@@ -1,0 +1,173 @@
+"""Virtual measurements from the map: clouds drawn by the talk's method, with the same unknowns as rendered ones.
+
+Signal chain: view and trial -> world (:mod:`mitsim.study.virtual.world`) -> F and sigma of every pixel from the map, with
+random errors and spread of the map -> P + R_N sigma V, with the measured correlation of neighbours, kept if R_U < F ->
+displacement of ideal points by the true calibration (:func:`mitsim.study.calibration.accuracy.measured_points`) -> path,
+temperature and form -> measurement at the assumed pose -> error of every measurement -> plus effects outside the map
+(:mod:`mitsim.study.virtual.beyond_map`), in units of the predicted uncertainty of the view.
+
+A sensor that was characterised on hardware, without a simulated twin, allows only this kind of virtual measurement. The
+map contains what flat coupons show. It does not contain edges, curved faces, interreflections, clusters of false
+matches, or the light of the user's room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.point_cloud import PointCloud
+from characterisation.tasks.evaluation import measure
+from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.campaign.acquire import one_ahead
+from mitsim.maps.prediction import CharacterisedScene, Predictor
+from mitsim.maps.prediction.shared_errors import terms
+from mitsim.scene.ray_casting.raycast import Surfaces
+from mitsim.sensor.preset import Sensor
+from mitsim.study import MINIMUM_POINTS, Study
+from mitsim.study.calibration.accuracy import measured_points
+from mitsim.study.virtual.beyond_map import beyond_map
+from mitsim.study.virtual.form import form_deviation
+from mitsim.study.virtual.race import Job
+from mitsim.study.virtual.rendered import displaced
+from mitsim.study.virtual.screening import screen
+from mitsim.study.virtual.trials import Outcome
+from mitsim.study.virtual.world import BEYOND, Unknowns, World
+from mitsim.views import View
+
+Floats = NDArray[np.float64]
+
+#: number of points of a cloud whose displacement by the calibration is computed; a polynomial of direction and inverse
+#: distance interpolates between them
+_POINTS = 600
+
+#: reason of a measurement without a value that screening rates as impossible
+_NOT_PREDICTED = "by the map, too few points are recovered in this view"
+
+
+class MappedMeasurements:
+    """The map of a sensor, prepared for virtual measurements of one part."""
+
+    source = "map"
+
+    def __init__(self, study: Study, unknowns: Unknowns) -> None:
+        assert study.performance_map is not None
+        self.study, self.unknowns, self.performance_map = study, unknowns, study.performance_map
+        self.geometry = sensor_geometry(study.sensor)
+        self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
+        self._characterised: dict[int, CharacterisedScene] = {}
+        self._has_form = any(unknowns.table.form.features.values())
+        self._beyond_sizes = beyond_map().of(study.sensor) if BEYOND in unknowns.varied else None
+        self._predicted: dict[int, dict[str, float]] = {}
+
+    def in_order(self, jobs: Iterable[Job]) -> list[Job]:
+        """Return the jobs sorted by view."""
+        return sorted(jobs, key=lambda job: job.view.number)
+
+    def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
+        """Yield the outcome of every virtual measurement, job by job.
+
+        A cloud is fitted while the next is drawn.
+        """
+        known = list(jobs)
+        if self._beyond_sizes is not None:
+            self._predict({job.view.number: job.view for job in known})
+        return one_ahead(known, self._take, self._finish)
+
+    def _take(self, job: Job) -> tuple[PointCloud, World, NDArray[np.int16], Surfaces | None]:
+        world = self.unknowns.draw(job.trial)
+        true, assumed = (motion.inverse() @ job.view.world_from_sensor for motion in (world.placed, world.assumed))
+        rng = np.random.default_rng(world.seed)
+        cloud = self.predictor.predict(self._scene(world.finish), true, rng, correlated=True)
+        labels = self.predictor.quick_labels(self.study.scene, assumed)
+        surfaces = self.predictor.surfaces(self.study.scene, assumed) if self._has_form and world.form else None
+        return cloud, world, labels, surfaces
+
+    def _finish(self, drawing: tuple[PointCloud, World, NDArray[np.int16], Surfaces | None], job: Job) -> Outcome:
+        cloud, world, labels, surfaces = drawing
+        scene, assumed = self.study.scene, world.assumed.inverse() @ job.view.world_from_sensor
+        cloud = replace(cloud, points=moved_by_calibration(cloud, self.study.sensor, world))
+        points = displaced(cloud, world, assumed, scene.centre)
+        if surfaces is not None:
+            form = self.unknowns.table.form.features
+            points = form_deviation(points, surfaces, scene, form, assumed, cloud.grid, world.form)
+        labelled = replace(cloud, points=points, feature=labels, feature_names=scene.names)
+        found = measure(labelled, self.study.task, assumed.inverse().matrix(), MINIMUM_POINTS, False)
+        return self._with_beyond(Outcome.of(found), job.view, world)
+
+    def _predict(self, views: dict[int, View]) -> None:
+        """Compute and keep the predicted uncertainties of views."""
+        new = [view for number, view in views.items() if number not in self._predicted]
+        if not new:
+            return
+        study = replace(self.study, candidates=replace(self.study.candidates, views=new))
+        scores, _ = screen(study, self.predictor, self.performance_map, self.unknowns)
+        predicted = scores["predicted_uncertainty"].transpose("view", "measurement").values
+        for view, row in zip(new, predicted.tolist(), strict=True):
+            self._predicted[view.number] = dict(zip(scores["measurement"].values.tolist(), row, strict=True))
+
+    def _with_beyond(self, found: Outcome, view: View, world: World) -> Outcome:
+        """Add effects outside the map; NaN if screening rates a measurement as impossible."""
+        if self._beyond_sizes is None:
+            return found
+        sizes = self._beyond_sizes.draw(np.random.default_rng(world.beyond), len(found.errors))
+        predicted = self._predicted[view.number]
+        errors = {
+            name: error + predicted[name] * size
+            for (name, error), size in zip(found.errors.items(), sizes, strict=True)
+        }
+        impossible = {name: _NOT_PREDICTED for name in errors if not np.isfinite(predicted[name])}
+        return Outcome(errors, impossible | dict(found.reasons))
+
+    def _scene(self, finish: int) -> CharacterisedScene:
+        if finish not in self._characterised:
+            drawn = drawn_map(self.performance_map, self.unknowns, finish)
+            self._characterised[finish] = CharacterisedScene(self.study.scene, drawn)
+        return self._characterised[finish]
+
+
+def drawn_map(performance_map: PerformanceMap, unknowns: Unknowns, finish: int) -> PerformanceMap:
+    """Return the map with random errors and spread of finishes; -1 returns the map unchanged.
+
+    The spread is one draw for a whole sample, scaled like the finishes of rendered measurements. Errors of the map are
+    drawn for every node.
+    """
+    if finish < 0:
+        return performance_map
+    rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, 101, finish]))
+    data = performance_map.data.copy(deep=True)
+    samples = data.sizes["sample"]
+    for name, low, high in (("recovered_fraction", 0.0, 1.0), ("ray_noise_std", 1e-6, np.inf)):
+        values = data[name].transpose("sample", "distance", "b", "a").values
+        common = rng.standard_normal((samples, 1, 1, 1)) * unknowns.table.finish.alpha
+        moved = values.copy()
+        for suffix, draw in (("spread", common), ("error", rng.standard_normal(values.shape))):
+            if f"{name}_{suffix}" in data:
+                size = data[f"{name}_{suffix}"].transpose("sample", "distance", "b", "a").values
+                moved = moved + np.nan_to_num(size) * draw
+        data[name] = (("sample", "distance", "b", "a"), np.clip(moved, low, high))
+    return PerformanceMap(data)
+
+
+def moved_by_calibration(cloud: PointCloud, sensor: Sensor, world: World) -> NDArray[np.float32]:
+    """Return points (H, W, 3) [mm] as the nominal calibration places them if the world's rig is the true one.
+
+    Parameters of a time-of-flight path are excluded; :func:`mitsim.study.virtual.rendered.displaced` applies them.
+    """
+    known = cloud.valid
+    points = cloud.points[known].astype(float)
+    if len(points) < 4:
+        return cloud.points
+    some = points[:: max(1, len(points) // _POINTS)]
+    moves = measured_points(sensor, some, world.rig) - measured_points(sensor, some, sensor.rig)
+    fine = np.isfinite(moves).all(axis=1)
+    if fine.sum() < 40:
+        return cloud.points
+    solution, *_ = np.linalg.lstsq(terms(some[fine]), moves[fine], rcond=None)
+    out = cloud.points.copy()
+    out[known] = points + terms(points) @ solution
+    return out

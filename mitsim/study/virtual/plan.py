@@ -1,0 +1,125 @@
+"""Set up the virtual measurements of a study, and compute the digest of everything that determines a trial.
+
+Signal chain: study and its unknowns (:mod:`mitsim.study.virtual.study_unknowns`) -> object that makes measurements -> digest.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from characterisation.files.errors import InputError
+from mitsim.capture.simulated.indirect_light import IndirectLight
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.maps.campaign.plan import sensor_checksum
+from mitsim.running.version import __version__
+from mitsim.sensor.matcher import MatcherSettings
+from mitsim.study import RaceTable, Study
+from mitsim.study.virtual.mapped import MappedMeasurements
+from mitsim.study.virtual.race import RaceRules
+from mitsim.study.virtual.rendered import RenderedMeasurements
+from mitsim.study.virtual.world import BEYOND, Unknowns
+
+#: part of the digest of a trial; increased if the same world gives a different measurement
+TRIAL_VERSION = 2
+
+#: keys of a task that concern the verdict, not the measurement
+_NO_PART_OF_A_TRIAL: Any = {"decision": True, "measurements": {"__all__": {"decision"}}}
+
+#: standard deviation of the smoothing of interreflections [px], see simulation/indirect_light.py
+_SMOOTHING_PX = 1.5
+
+
+def rendering_of(study: Study) -> Rendering:
+    """Return the settings for rendering the virtual measurements of a study."""
+    table = study.file.measure
+    samples = 4 if isinstance(study.sensor.settings, MatcherSettings) else 16
+    return Rendering(table.samples_per_pixel, table.light_path_depth, IndirectLight(samples, _SMOOTHING_PX))
+
+
+def measured_by(study: Study) -> str:
+    """Return ``render`` or ``map``: the choice of the study, else the one that fits the source of the map.
+
+    Raises
+    ------
+    InputError
+        If clouds shall be drawn from a map, and the study has no map yet.
+    """
+    given, known = study.file.measure.by, study.performance_map
+    if given == "map" and known is None:
+        raise InputError(
+            study.path, "measure.by", "'map' with a campaign", "a map that was made before", "set characterisation.map"
+        )
+    if given is not None:
+        return given
+    return "map" if known is not None and known.data.attrs.get("source") not in (None, "", "simulated") else "render"
+
+
+def measurements_of(
+    study: Study, unknowns: Unknowns, separate_light: bool = False
+) -> RenderedMeasurements | MappedMeasurements:
+    """Prepare a study's sensor, or its map, for virtual measurements.
+
+    With ``separate_light``, renderings share no light.
+    """
+    if measured_by(study) == "map":
+        return MappedMeasurements(study, unknowns)
+    return RenderedMeasurements(study, unknowns, rendering_of(study), separate_light)
+
+
+def race_rules(table: RaceTable, minutes: float | None = None) -> RaceRules:
+    """Return the rules of a race; ``minutes`` replace those of the table."""
+    most = table.minutes if minutes is None else minutes
+    seconds = None if most is None else 60 * most
+    return RaceRules(table.shortlist, table.trials, table.margin, table.confidence, seconds)
+
+
+def map_digest(study: Study) -> str:
+    """Return sixteen hexadecimal digits of the performance map's values, or an empty string without a map."""
+    if study.performance_map is None:
+        return ""
+    digest = hashlib.sha256(repr(study.performance_map.data.attrs).encode())
+    for name in sorted(map(str, study.performance_map.data.variables)):
+        values = study.performance_map.data[name].values
+        text = values.dtype.kind in "OU"
+        digest.update(name.encode() + (repr(values.tolist()).encode() if text else values.tobytes()))
+    return digest.hexdigest()[:16]
+
+
+def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: bool = False) -> str:
+    """Return sixteen hexadecimal digits of everything that determines a trial."""
+    file = study.file
+    content = {
+        "version": TRIAL_VERSION,
+        "mitsim": __version__,
+        "source": source,
+        "sensor": sensor_checksum(study.sensor),
+        "unknowns": unknowns.table.model_dump(mode="json"),
+        "varied": _varied(unknowns, source),
+        "seed": unknowns.seed,
+        "covariance": hashlib.sha256(unknowns.calibration.covariance.tobytes()).hexdigest(),
+        "expansion": unknowns.expansion,
+        "scene": Path(study.scene.where).read_text(encoding="utf-8"),
+        "parameters": file.parameters,
+        "task": study.task.model_dump(mode="json", exclude=_NO_PART_OF_A_TRIAL),
+        "rendering": asdict(rendering_of(study)),
+        "views": hashlib.sha256(
+            np.array([v.world_from_sensor.matrix().round(9) for v in study.views]).tobytes()
+        ).hexdigest(),
+    }
+    if separate_light or not unknowns.pooled:
+        content["apart"] = [separate_light, unknowns.pooled]
+    if source == "map":
+        assert study.performance_map is not None
+        content["map"] = hashlib.sha256(repr(study.performance_map.data.attrs).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def _varied(unknowns: Unknowns, source: str) -> list[str]:
+    """Return the groups that a trial depends on; a rendered trial does not depend on effects outside the map."""
+    return [group for group in unknowns.varied if group != BEYOND or source == "map"]

@@ -1,0 +1,101 @@
+"""Screen the candidate views of a study; runs and validations use this one function.
+
+Signal chain: study -> displacement fields of the errors of its calibration and temperature, and interreflections if
+faces see one another -> scores (:mod:`mitsim.views.view_scores`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.tasks.evaluation import InputQuantity
+from mitsim.maps.prediction import Effect, Predictor
+from mitsim.maps.prediction.interreflections import InterreflectionEffect
+from mitsim.maps.prediction.shared_errors import SharedErrors, independent_fields
+from mitsim.scene.ray_casting.self_view import sees_itself
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.rig_parameters import moved, path_error
+from mitsim.sensor.working_volume import in_image
+from mitsim.study import MINIMUM_POINTS, Study
+from mitsim.study.calibration.accuracy import measured_points
+from mitsim.study.virtual.study_unknowns import study_unknowns
+from mitsim.study.virtual.world import Unknowns, scaled_baseline, scaled_focal
+from mitsim.views.view_scores import score_candidates
+
+Floats = NDArray[np.float64]
+
+#: number of places along each axis of the box around a part, and in all views together, for which displacements are
+#: computed
+_RASTER, _PLACES = 4, 4000
+
+#: largest distance [mm] between a place and its reconstruction by the nominal rig
+_FOUND_AGAIN_MM = 1e-3
+
+
+def screen(
+    study: Study, predictor: Predictor, performance_map: PerformanceMap, unknowns: Unknowns | None = None
+) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:
+    """Score all views of a study; see :func:`mitsim.views.view_scores.score_candidates`.
+
+    ``unknowns`` are those of the study, if the caller has prepared them: a calibration may take seconds to simulate.
+    """
+    effects = effects_of(study, study_unknowns(study) if unknowns is None else unknowns)
+    return score_candidates(study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS, effects)
+
+
+def effects_of(study: Study, unknowns: Unknowns) -> list[Effect]:
+    """Return the effects that screening includes beyond the map."""
+    effects: list[Effect] = [shared_errors(study, unknowns)]
+    depth = study.file.score.light_path_depth
+    if depth > 1 and sees_itself(study.scene):
+        poses = [view.world_from_sensor for view in study.views]
+        effects.append(InterreflectionEffect(study.sensor, depth, poses=poses))
+    return effects
+
+
+def shared_errors(study: Study, unknowns: Unknowns) -> SharedErrors:
+    """Return displacement fields of the errors of calibration and sensor temperature, over the volume of the views."""
+    sensor, calibration, temperature = study.sensor, unknowns.calibration, unknowns.table.temperature
+    points = _places(study)
+    values, vectors = np.linalg.eigh(calibration.correlation)
+    root = calibration.one_sigma[:, None] * vectors * np.sqrt(np.clip(values, 0, None))
+    causes = [(calibration.names, column) for column in root.T]
+    causes += [
+        scaled_baseline(sensor.rig, temperature.body_per_kelvin * temperature.sensor_kelvin),
+        scaled_focal(sensor.rig, temperature.focal_per_kelvin * temperature.sensor_kelvin),
+    ]
+    points = points[_measurable(sensor, points)]
+    nominal = measured_points(sensor, points, sensor.rig)
+    moves = [
+        measured_points(sensor, points, moved(sensor.rig, names, step), path_error(names, step)) - nominal
+        for names, step in causes
+    ]
+    return independent_fields(points, np.array(moves))
+
+
+def _places(study: Study) -> Floats:
+    """Return places (n, 3) [mm] in the sensor frame: a grid over the box around the part, in some of the views."""
+    low, high = study.scene.bounds
+    steps = np.linspace(0, 1, _RASTER)
+    box = low + np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3) * (high - low)
+    views = study.views[:: max(1, len(study.views) * len(box) // _PLACES)]
+    return np.concatenate([view.world_from_sensor.inverse().points(box) for view in views])
+
+
+def _measurable(sensor: Sensor, points: Floats) -> NDArray[np.bool_]:
+    """Return which points (n, 3) all measuring eyes see and the nominal rig reconstructs.
+
+    Outside the image, and where it folds, a distortion polynomial is meaningless.
+    """
+    rig = sensor.measuring_rig
+    eyes = list(rig.cameras.values())
+    if rig.projector is not None and len(eyes) == 1 and sensor.technology != "time_of_flight":
+        eyes.append(rig.projector)
+    seen = np.all([in_image(eye, points) for eye in eyes], axis=0)
+    off = np.linalg.norm(measured_points(sensor, points, sensor.rig) - points, axis=1)
+    return np.asarray(seen & (off < _FOUND_AGAIN_MM))

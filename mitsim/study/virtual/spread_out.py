@@ -1,0 +1,109 @@
+"""Distribute virtual measurements to workers: processes on this machine, or those of a Dask cluster.
+
+Signal chain: jobs sorted by view and finish -> runs of jobs that share light, as plain values -> a worker, which
+prepares the study's sensor once (:class:`mitsim.study.virtual.rendered.RenderedMeasurements`) -> errors of every trial.
+
+A trial depends only on study, view and trial number, so every worker gives the same result. If a worker dies, another
+makes its trials. :mod:`mitsim.running.cluster` describes the requirements of a cluster, and who can run code on whose
+machine. Workers read the study's scene, task and sensor at the same paths.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+
+from mitsim.running.executor import Executor
+from mitsim.running.progress import say
+from mitsim.sensor.exposure import PlannedExposure
+from mitsim.study import Study, StudyFile, open_study
+from mitsim.study.virtual.plan import rendering_of, trial_digest
+from mitsim.study.virtual.race import Job, TrialRunner
+from mitsim.study.virtual.rendered import RenderedMeasurements
+from mitsim.study.virtual.trials import Outcome
+from mitsim.study.virtual.world import Unknowns
+
+#: largest number of jobs in one order; a worker that dies loses at most these
+_IN_A_ROW = 8
+
+
+@dataclass(frozen=True)
+class TrialOrder:
+    """Jobs of one view and finish as plain values."""
+
+    path: str
+    file: StudyFile
+    unknowns: Unknowns
+    separate_light: bool
+    digest: str
+    jobs: tuple[Job, ...]
+    planned: PlannedExposure | None = None
+
+
+class SpreadMeasurements:
+    """Virtual measurements that workers make."""
+
+    source = "render"
+
+    def __init__(self, workers: Executor, study: Study, unknowns: Unknowns, renderer: RenderedMeasurements) -> None:
+        self.workers, self.renderer = workers, renderer
+        digest = trial_digest(study, unknowns, self.source, renderer.separate_light)
+        self._order = TrialOrder(
+            str(Path(study.path).absolute()), study.file, unknowns, renderer.separate_light, digest, ()
+        )
+
+    def exposed_as(self, planned: PlannedExposure | None) -> SpreadMeasurements:
+        """Return the same measurements with other exposures than the sensor's own."""
+        other = copy.copy(self)
+        other._order = replace(self._order, planned=planned)
+        return other
+
+    def in_order(self, jobs: Iterable[Job]) -> list[Job]:
+        """Return the jobs sorted by view and finish."""
+        return self.renderer.in_order(jobs)
+
+    def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
+        """Yield the outcome of every virtual measurement, job by job as they arrive."""
+        orders = [replace(self._order, jobs=some) for some in self._rows(jobs)]
+        for order, results in self.workers.distribute(orders, lambda one: one, make_trials):
+            yield from zip(order.jobs, results, strict=True)
+
+    def _rows(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, ...]]:
+        """Yield runs of jobs that share light, at most :data:`_IN_A_ROW` each."""
+        draw = self.renderer.unknowns.draw
+        for _, some in groupby(jobs, key=lambda job: (job.view.number, draw(job.trial).finish)):
+            row = tuple(some)
+            for first in range(0, len(row), _IN_A_ROW):
+                yield row[first : first + _IN_A_ROW]
+
+
+def spread_over(workers: Executor | None, study: Study, unknowns: Unknowns, runner: TrialRunner) -> TrialRunner:
+    """Return the given runner, or one that distributes its trials to workers.
+
+    Clouds from a map are always drawn in this process.
+    """
+    if workers is None:
+        return runner
+    if not isinstance(runner, RenderedMeasurements):
+        say("clouds are drawn from a map in this process, not by workers")
+        return runner
+    return SpreadMeasurements(workers, study, unknowns, runner)
+
+
+_prepared: dict[str, RenderedMeasurements] = {}
+
+
+def make_trials(order: TrialOrder) -> list[Outcome]:
+    """Make the trials of an order; workers call this function."""
+    if order.digest not in _prepared:
+        from mitsim.scene import backend
+
+        backend.activate(None)
+        _prepared.clear()
+        study = open_study(order.path, order.file, mapped=False)  # trials are rendered
+        _prepared[order.digest] = RenderedMeasurements(study, order.unknowns, rendering_of(study), order.separate_light)
+    renderer = _prepared[order.digest].exposed_as(order.planned)
+    return [outcome for _, outcome in renderer.run(order.jobs)]

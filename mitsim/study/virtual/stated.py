@@ -1,0 +1,203 @@
+"""State the uncertainty of every measurement from one view, with its budget.
+
+Signal chain: trials in worlds that were not used to choose the view -> the same trials with one group of unknowns
+redrawn -> :class:`characterisation.statements.statement.Statement` of every measurement -> ``statement.json``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from characterisation.files.atomic_io import json_values, write_json
+from characterisation.statements.budget import budget
+from characterisation.statements.decision import tolerance_of
+from characterisation.statements.losses import common_losses, losses
+from characterisation.statements.statement import Statement, statement
+from characterisation.statements.verdict_words import Judged
+from mitsim.running.progress import track
+from mitsim.running.text_table import aligned
+from mitsim.running.version import __version__
+from mitsim.sensor.exposure import PlannedExposure
+from mitsim.study import StatementTable, Study
+from mitsim.study.virtual.influences import influences
+from mitsim.study.virtual.race import Job, TrialRunner
+from mitsim.study.virtual.trials import TrialFolder
+from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, STATEMENT_DAYS, Trial, Unknowns
+from mitsim.views import View
+
+
+def state_view(
+    study: Study, view: View, runner: TrialRunner, trials: TrialFolder, unknowns: Unknowns, table: StatementTable
+) -> list[Statement]:
+    """State every measurement from one view, and reuse trials in the folder.
+
+    Worlds of the race are not used: they selected the view, and are biased in its favour.
+    """
+    base = [Trial(STATEMENT_DAYS + k) for k in range(table.trials)]
+    pairs = base[: min(table.pairs, table.trials)]
+    groups = budget_groups(unknowns, runner.source)
+    swapped = {group: [Trial(one.day, one.capture, group) for one in pairs] for group in groups}
+    repeats = [Trial(one.day, one.capture + 1) for one in pairs]
+    wanted = [*base, *repeats, *(trial for some in swapped.values() for trial in some)]
+    missing = [Job(view, trial) for trial in wanted if trial not in trials.known(view.number)]
+    for job, outcome in track(runner.run(runner.in_order(missing)), f"state view {view.number}", len(missing)):
+        trials.add(view.number, job.trial, outcome)
+    found = trials.errors(view.number, base)
+    second = trials.errors(view.number, repeats)
+    again = {group: trials.errors(view.number, some) for group, some in swapped.items()}
+    out = []
+    for m, (name, asked) in enumerate(study.task.measurements.items()):
+        known = found[m][[math.isfinite(error) for error in found[m]]]
+        lines = (
+            budget(
+                found[m, : len(pairs)],
+                {group: errors[m] for group, errors in again.items()},
+                float(known.var(ddof=1)) if len(known) > 1 else None,
+            )
+            if pairs and len(known) > 1
+            else ()
+        )
+        stated = statement(name, asked.unit, found[m], tolerance_of(study.task, name), lines, second[m])
+        out.append(replace(stated, losses=losses(trials.reasons(view.number, base, name))))
+    return out
+
+
+def budget_groups(unknowns: Unknowns, source: str) -> list[str]:
+    """Return the groups of unknowns with a line in the budget: those that are drawn and can have an effect."""
+    table = unknowns.table
+    idle = set()
+    if not any(size > 0 for size in table.form.features.values()):
+        idle.add("form")
+    if source == "map":
+        idle |= {"light", "unit"}
+    else:
+        idle.add(BEYOND)
+    if source != "map" and not any(table.finish.model_dump().values()):
+        idle.add("finish")
+    return [group for group in GROUPS if group in unknowns.varied and group not in idle]
+
+
+def statement_document(
+    study: Study,
+    view: View,
+    stated: Sequence[Statement],
+    unknowns: Unknowns,
+    source: str,
+    planned: PlannedExposure | None = None,
+) -> dict[str, Any]:
+    """Return the statement as JSON values; see docs/reference/formats/statement.md.
+
+    ``planned`` are its exposures, if they are not the sensor's own.
+    """
+    declared = influences(unknowns.table, source, study.file.measure.light_path_depth)
+    exposed = {} if planned is None else {"exposure": asdict(planned)}
+    return exposed | {
+        "schema_version": 1,
+        "mitsim": __version__,
+        "study": str(study.path),
+        "sensor": study.sensor.name,
+        "measured_by": source,
+        "map_source": _map_source(study),
+        "seed": study.file.seed,
+        "view": view.number,
+        "world_from_sensor": view.world_from_sensor.matrix().tolist(),
+        "coverage_probability": 0.95,
+        "calibration": unknowns.calibration.source,
+        "unknowns": unknowns.table.model_dump(mode="json"),
+        "measurements": {one.measurement: _measurement(one) for one in stated},
+        "influences": [asdict(one) for one in declared],
+    }
+
+
+def write_statement(path: str | Path, document: dict[str, Any]) -> None:
+    """Write ``statement.json`` completely or not at all."""
+    write_json(path, document)
+
+
+def statement_table(stated: Sequence[Statement]) -> str:
+    """Return the statements as a text table."""
+    head = (
+        "measurement",
+        "unit",
+        "bias",
+        "u",
+        "95 % interval of the error",
+        "after correction",
+        "no value",
+        "most of it from",
+        "accepted readings",
+        "verdict",
+    )
+    rows = [head]
+    for one in stated:
+        largest = one.budget[0] if one.budget else None
+        rows.append(
+            (
+                one.measurement,
+                one.unit,
+                digits(one.bias),
+                digits(one.standard_uncertainty),
+                _interval(one.interval),
+                _interval(one.interval_corrected),
+                f"{100 * one.without_value:.0f} %",
+                f"{largest.group} ({100 * largest.share:.0f} %)" if largest else "",
+                _accepted(one),
+                one.verdict,
+            )
+        )
+    lost = common_losses((one.measurement, one.trials, one.losses) for one in stated)
+    lines = [f"no value in {count} of {trials}: {', '.join(names)}: {reason}" for names, count, trials, reason in lost]
+    return "\n".join([*aligned(rows), *lines])
+
+
+def judged(stated: Sequence[Statement]) -> list[Judged]:
+    """Return the verdicts, for their description in words."""
+    return [
+        Judged(
+            one.measurement,
+            one.unit,
+            one.verdict,
+            one.standard_uncertainty,
+            math.nan if one.decided is None else one.decided.needed,
+            one.decided is not None and one.decided.fits_corrected,
+            one.without_value,
+        )
+        for one in stated
+    ]
+
+
+def _accepted(one: Statement) -> str:
+    if one.decided is None:
+        return "-"
+    if one.decided.accepted is None:
+        return "none"
+    low, high = one.decided.accepted
+    digits = max(0, 2 - math.floor(math.log10(one.tolerance or 1.0)))
+    return f"up to {high:.{digits}f}" if math.isinf(low) else f"{low:.{digits}f} to {high:.{digits}f}"
+
+
+def _measurement(one: Statement) -> dict[str, Any]:
+    lines = one.budget
+    table = {key: value for key, value in asdict(one).items() if key not in ("measurement", "budget", "decided")}
+    table["decision"] = None if one.decided is None else asdict(one.decided)
+    table["budget"] = [asdict(line) | {"fresh": line.group in FRESH} for line in lines]
+    known = math.isfinite(one.repeatability) and math.isfinite(one.standard_uncertainty)
+    table["after_repeats"] = {str(n): one.after_repeats(n) for n in (1, 4, 16)} if known else {}
+    return {key: json_values(value) for key, value in table.items()}
+
+
+def _map_source(study: Study) -> str:
+    return "" if study.performance_map is None else str(study.performance_map.data.attrs.get("source", ""))
+
+
+def digits(value: float) -> str:
+    """Return a number with two digits, or a dash for NaN."""
+    return "-" if not math.isfinite(value) else f"{value:.2g}"
+
+
+def _interval(ends: tuple[float, float]) -> str:
+    return "-" if not math.isfinite(ends[0]) else f"{ends[0]:.2g} to {ends[1]:.2g}"

@@ -1,0 +1,90 @@
+"""Prepare the unknowns of a study for drawing.
+
+Signal chain: study -> covariance of the calibration with the drift since then, thermal expansion of the part ->
+:class:`~mitsim.study.virtual.world.Unknowns`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from characterisation.files.errors import InputError
+from mitsim.running.progress import say
+from mitsim.sensor.drift import Drift, with_drift
+from mitsim.sensor.preset import Sensor, presets
+from mitsim.sensor.preset_covariance import preset_covariance
+from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance
+from mitsim.sensor.unknowns import CalibrationUnknowns
+from mitsim.study import Study
+from mitsim.study.calibration.virtual_calibration import calibrate
+from mitsim.study.virtual.world import GROUPS, Unknowns
+
+#: linear expansion near 20 C [1/K], by the metal of a finish (CRC Handbook of Chemistry and Physics; steel: unalloyed)
+EXPANSION_PER_KELVIN = {
+    "aluminium": 23.1e-6,
+    "steel": 11.8e-6,
+    "iron": 11.8e-6,
+    "copper": 16.5e-6,
+    "brass": 19e-6,
+    "chromium": 4.9e-6,
+    "nickel": 13.4e-6,
+    "titanium": 8.6e-6,
+    "gold": 14.2e-6,
+    "silver": 18.9e-6,
+    "tungsten": 4.5e-6,
+}
+
+#: thermal expansion of a part whose finish names no metal [1/K]: between steel and aluminium
+_USUAL_EXPANSION = 17e-6
+
+
+def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
+    """Prepare the unknowns of a study for drawing.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or belongs to another sensor, or if a feature with a form deviation is not in the task.
+    """
+    table, sensor = study.unknowns, study.sensor
+    for name in table.form.features:
+        if name not in study.task.shapes:
+            allowed = ", ".join(study.task.shapes)
+            raise InputError(study.path, f"unknowns.form.features.{name}", "no shape of the task", allowed)
+    folder = study.path.parent
+    return Unknowns(
+        table,
+        sensor.rig,
+        calibration_covariance(sensor, table.calibration, folder),
+        sensor.wavelength_nm,
+        _expansion(study),
+        np.asarray(study.scene.centre, float),
+        study.file.seed,
+        varied,
+    )
+
+
+def calibration_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: Path) -> RigCovariance:
+    """Return the covariance of a sensor's calibration, with the drift since then."""
+    if table.covariance is not None:
+        return with_drift(read_rig_covariance(folder / table.covariance, sensor.rig), sensor.rig, table.drift())
+    if sensor.name in presets():
+        try:
+            return preset_covariance(sensor, table.drift())
+        except InputError:
+            pass  # a user's sensor with the name of a preset, but another rig
+    say(f"{sensor.name}: no covariance of its calibration is given; it is simulated (see mitsim calibrate)")
+    return with_drift(calibrate(sensor, drift=Drift.none()).covariance, sensor.rig, table.drift())
+
+
+def _expansion(study: Study) -> float:
+    """Return the linear expansion of the part [1/K], the median over the finishes of its features."""
+    given = study.unknowns.temperature.expansion_per_kelvin
+    if given is not None:
+        return given
+    finishes = [study.scene.finishes[study.scene.names.index(name)] for name in study.task.shapes]
+    metals = [finish.name.partition("/")[0] for finish in finishes if finish is not None]
+    known = [EXPANSION_PER_KELVIN.get(metal, _USUAL_EXPANSION) for metal in metals] or [_USUAL_EXPANSION]
+    return float(np.median(known))

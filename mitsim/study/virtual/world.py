@@ -1,0 +1,247 @@
+"""Worlds: one random draw of all unknowns of a measurement.
+
+Signal chain: number of a trial -> a stream of random numbers for each group of unknowns -> true geometry of the sensor,
+finish, form, light, temperatures, pose of the part, and the seeds of all noise.
+
+There are two kinds of groups. All captures of one day share those in :data:`COMMON`, which therefore do not average out
+over repeated captures. Those in :data:`FRESH` are drawn for every capture. A trial states its day and its capture, and
+these alone determine its world, on every machine and in any order. Views are compared in the same worlds (common random
+numbers).
+
+A trial may take one group from another stream (``swapped``). The two errors then differ by that group alone, which
+gives its share of the variance (:mod:`characterisation.statements.budget`).
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.special import ndtri
+
+from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation
+from mitsim.sensor.camera import Rig
+from mitsim.sensor.rig_covariance import RigCovariance
+from mitsim.sensor.rig_parameters import eyes, moved, parameter_names, path_error
+from mitsim.sensor.room_light import room_irradiance
+from mitsim.sensor.transforms import Transform
+from mitsim.sensor.unknowns import FinishUnknowns, UnknownsTable
+
+#: groups of unknowns that all captures of a day share, and groups that are drawn for every capture
+COMMON = ("calibration", "finish", "form", "light", "temperature", "unit")
+FRESH = ("pose", "noise")
+
+#: effects outside the performance map, for measurements drawn from a map (:mod:`mitsim.study.virtual.beyond_map`); they are
+#: the same in all captures of a day
+BEYOND = "beyond_map"
+
+#: all groups; the index of a group in this tuple seeds its stream
+GROUPS = (*COMMON, *FRESH, BEYOND)
+
+#: seed of the stream of finishes, different from those of the groups
+_FINISH_STREAM = 8
+
+#: size of the pool of finishes that trials share, since interreflections must be rendered for each finish
+FINISHES = 8
+
+#: number of successive days that share a finish, for the same reason
+FINISH_DAYS = 2
+
+#: first days of worlds whose finishes are not of the pool (they judge the choice of a view), of worlds of a statement,
+#: and of a set of views; the worlds of a race start at day 0
+OWN_FINISH_DAYS, STATEMENT_DAYS, SET_DAYS = 1 << 19, 1 << 20, 1 << 21
+
+#: offset of the day of the streams from which ``swapped`` takes a group
+_ELSEWHERE = 1 << 32
+
+#: reference temperature of lengths [C], ISO 1
+REFERENCE_C = 20.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Identifies a world: day, capture within the day, and the group that is redrawn ("" for none)."""
+
+    day: int
+    capture: int = 0
+    swapped: str = ""
+
+
+@dataclass(frozen=True)
+class World:
+    """All values that were drawn for one trial.
+
+    ``rig`` is the sensor's true geometry. ``path`` is offset [mm] and scale [1] of a time-of-flight distance.
+    ``finish`` numbers the deviation of the finishes (:func:`finish_deviation`), -1 for the best estimate. ``form`` and
+    ``unit`` are seeds, 0 for none. ``room`` is irradiance [W/mm^2]. ``power`` and ``exposure`` are relative to nominal
+    [1]. ``expansion`` of the part is relative [1]. ``placed`` and ``assumed`` (world to world) are the true and the
+    assumed motion of the part from its nominal pose. ``seed`` is that of the capture, ``beyond`` that of effects
+    outside the map, 0 for none.
+    """
+
+    rig: Rig
+    path: tuple[float, float]
+    finish: int
+    form: int
+    room: float
+    power: float
+    exposure: float
+    expansion: float
+    placed: Transform
+    assumed: Transform
+    unit: int
+    seed: int
+    beyond: int = 0
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Groups of unknowns of one sensor and one part, prepared for drawing.
+
+    ``table`` holds their sizes. ``rig`` is nominal. ``calibration`` is the covariance of the calibration, with the
+    drift since then. ``expansion`` of the part is in 1/K. ``centre`` (3,) [mm] is the point about which the part
+    rotates. Groups that are not in ``varied`` keep their best estimate. With ``pooled``, finishes come from a pool of
+    :data:`FINISHES`; else every world has its own. The days from :data:`OWN_FINISH_DAYS` on have
+    their own as well: they judge a choice that the pool made.
+    """
+
+    table: UnknownsTable
+    rig: Rig
+    calibration: RigCovariance
+    wavelength_nm: float
+    expansion: float
+    centre: NDArray[np.float64]
+    seed: int
+    varied: tuple[str, ...] = GROUPS
+    pooled: bool = True
+
+    def draw(self, trial: Trial) -> World:
+        """Draw the world of a trial."""
+        table, streams = self.table, {group: self._stream(group, trial) for group in GROUPS}
+        sensor_kelvin, part_kelvin = (
+            streams["temperature"].standard_normal(2) * [table.temperature.sensor_kelvin, table.temperature.part_kelvin]
+            if "temperature" in self.varied
+            else np.zeros(2)
+        )
+        names, values = self._geometry(streams["calibration"], float(sensor_kelvin))
+        room, power, exposure = self._light(streams["light"])
+        placed, assumed = self._poses(streams["pose"])
+        return World(
+            rig=moved(self.rig, names, values),
+            path=path_error(names, values),
+            finish=self._finish(streams["finish"], trial.day) if "finish" in self.varied else -1,
+            form=_seed(streams["form"]) if "form" in self.varied else 0,
+            room=room,
+            power=power,
+            exposure=exposure,
+            expansion=self.expansion * float(part_kelvin),
+            placed=placed,
+            assumed=assumed,
+            unit=_seed(streams["unit"]) if "unit" in self.varied else 0,
+            seed=_seed(streams["noise"]),
+            beyond=_seed(streams[BEYOND]) if BEYOND in self.varied else 0,
+        )
+
+    def _stream(self, group: str, trial: Trial) -> np.random.Generator:
+        day = trial.day + (_ELSEWHERE if trial.swapped == group else 0)
+        place = [day, trial.capture] if group in FRESH else [day]
+        if group == "finish" and self.pooled:
+            place = [day // FINISH_DAYS]
+        if group not in self.varied:
+            place = [0]
+        return np.random.default_rng(np.random.SeedSequence([self.seed, GROUPS.index(group), *place]))
+
+    def _finish(self, rng: np.random.Generator, day: int) -> int:
+        pooled = self.pooled and not OWN_FINISH_DAYS <= day < STATEMENT_DAYS
+        return int(rng.integers(FINISHES)) if pooled else FINISHES + _seed(rng)
+
+    def _geometry(self, rng: np.random.Generator, sensor_kelvin: float) -> tuple[tuple[str, ...], NDArray[np.float64]]:
+        """Return names and errors of the rig's parameters, due to calibration and temperature."""
+        error: dict[str, float] = {}
+
+        def add(names: tuple[str, ...], values: NDArray[np.float64]) -> None:
+            for name, value in zip(names, values.tolist(), strict=True):
+                error[name] = error.get(name, 0.0) + value
+
+        temperature = self.table.temperature
+        if "calibration" in self.varied:
+            add(self.calibration.names, self.calibration.draw(rng))
+        if sensor_kelvin:
+            add(*scaled_baseline(self.rig, temperature.body_per_kelvin * sensor_kelvin))
+            add(*scaled_focal(self.rig, temperature.focal_per_kelvin * sensor_kelvin))
+        return tuple(error), np.array(list(error.values()))
+
+    def _light(self, rng: np.random.Generator) -> tuple[float, float, float]:
+        """Return irradiance of the room [W/mm^2], and projector power and exposure relative to nominal [1]."""
+        light = self.table.light
+        level = room_irradiance(light.illuminance, light.daylight, self.wavelength_nm, light.filter_nm)
+        if "light" not in self.varied:
+            return level, 1.0, 1.0
+        room = level * light.room_factor ** float(rng.standard_normal())
+        power = max(0.1, 1 + light.power_relative * float(rng.standard_normal()))
+        return room, power, 1 + light.exposure_relative * float(rng.uniform(-1, 1))
+
+    def _poses(self, rng: np.random.Generator) -> tuple[Transform, Transform]:
+        if "pose" not in self.varied:
+            return Transform.identity(), Transform.identity()
+        pose = self.table.pose
+        placed = self._nudge(rng, pose.placement_mm, pose.placement_deg)
+        return placed, self._nudge(rng, pose.told_mm, pose.told_deg) @ placed
+
+    def _nudge(self, rng: np.random.Generator, shift_mm: float, turn_deg: float) -> Transform:
+        """Return a small rotation about the part's middle, with a shift."""
+        turn = Rotation.from_rotvec(rng.normal(0.0, np.radians(turn_deg), 3)).as_matrix()
+        return Transform(turn, self.centre + rng.normal(0.0, shift_mm, 3) - turn @ self.centre)
+
+
+def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
+    """Return the deviation of a finish, given by its BSDF's id, from its best estimate in the finishes of a number.
+
+    Deviations are quantiles of the normal distribution, scaled to variance 1. Their order is random for each finish,
+    and for alpha, wide-angle share and reflectance (Latin hypercube sampling: McKay et al. 1979). The number -1 is the
+    best estimate. A number beyond the pool of :data:`FINISHES` seeds a normal draw.
+    """
+    ranges = unknowns.table.finish
+    if number < 0:
+        return Deviation()
+    if number >= FINISHES:
+        seeded = np.random.default_rng(np.random.SeedSequence([number, _FINISH_STREAM, zlib.crc32(finish.encode())]))
+        drawn = np.clip(seeded.standard_normal(3), -LARGEST_DEVIATION, LARGEST_DEVIATION).tolist()
+        return _deviation(ranges, *drawn)
+    quantiles = ndtri((np.arange(FINISHES) + 0.5) / FINISHES)
+    quantiles = np.clip(quantiles / quantiles.std(), -LARGEST_DEVIATION, LARGEST_DEVIATION)
+    rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, _FINISH_STREAM, zlib.crc32(finish.encode())]))
+    return _deviation(ranges, *(float(quantiles[rng.permutation(FINISHES)[number]]) for _ in range(3)))
+
+
+def _deviation(ranges: FinishUnknowns, alpha: float, wide_angle: float, reflectance: float) -> Deviation:
+    return Deviation(alpha * ranges.alpha, wide_angle * ranges.wide_angle, reflectance * ranges.reflectance)
+
+
+Scaled = tuple[tuple[str, ...], NDArray[np.float64]]
+
+
+def scaled_focal(rig: Rig, share: float) -> Scaled:
+    """Return the parameters of all focal lengths, and their changes if all grow by a relative ``share``."""
+    names = tuple(name for name in parameter_names(rig) if name.endswith(("focal_x_px", "focal_y_px")))
+    optics = eyes(rig)
+    lengths = [
+        optics[name.rpartition(".")[0]].matrix[0 if "_x_" in name else 1, 0 if "_x_" in name else 1] for name in names
+    ]
+    return names, share * np.array(lengths)
+
+
+def scaled_baseline(rig: Rig, share: float) -> Scaled:
+    """Return the position parameters of all eyes, and their changes if the baselines grow by a relative ``share``."""
+    names = tuple(name for name in parameter_names(rig) if "position_" in name)
+    optics = eyes(rig)
+    reference = rig.reference.centre
+    values = [(optics[name.rpartition(".")[0]].centre - reference)["xyz".index(name[-4])] for name in names]
+    return names, share * np.array(values)
+
+
+def _seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(1, 1 << 31))

@@ -1,0 +1,186 @@
+"""Validate a simulated capture against a real one, and write the page (``mitsim validate captures``).
+
+Signal chain: capture folder -> settings of the decoder -> plane of the specimen -> twin, unless a simulated capture is
+given (:mod:`mitsim.twin.compare.rebuild`) -> rows with verdicts (:mod:`mitsim.twin.compare.compare_captures`) ->
+``comparison.json``, ``index.md`` and its picture (:mod:`mitsim.report.capture_page`). The twin is kept in
+``simulated/``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, cast
+
+import numpy as np
+
+from characterisation.files.atomic_io import write_json
+from characterisation.files.errors import InputError
+from characterisation.point_cloud import Status
+from characterisation.region_of_interest import Roi
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import read_capture, write_capture
+from mitsim.decode.cloud import decoder_settings
+from mitsim.report.capture_page import Shown, write_capture_page
+from mitsim.running.numbers import NONE, rounded, two_digits
+from mitsim.running.progress import say
+from mitsim.sensor.preset import load_sensor, presets
+from mitsim.twin.compare.compare_captures import Comparison, Row, compare_captures
+from mitsim.twin.compare.plain_image import plain_image
+from mitsim.twin.compare.rebuild import check_technology, projector_was_on, rebuild
+from mitsim.twin.compare.specimen_patches import PATCH_PX, SpecimenPatches, reference_levels
+from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.specimen import MARGIN_PX, image_mask, specimen_place
+
+#: border of the picture around the specimen [px]
+_BORDER_PX = 24
+
+
+@dataclass(frozen=True)
+class CaptureValidation:
+    """Result of the validation: the ``comparison``, its ``table`` in Markdown, and the ``page``."""
+
+    comparison: Comparison
+    table: str
+    page: Path
+
+
+def validate_captures(
+    real: Path,
+    simulated: Path | None,
+    output: Path,
+    sensor: str | None,
+    roi: Roi | None,
+    projector: str | None,
+    seed: int,
+) -> CaptureValidation:
+    """Compare a simulated capture with a real one, and write page, table and twin to a folder.
+
+    Raises
+    ------
+    InputError
+        If a folder is not a capture, the sensor is unknown or of another kind, no plane is visible, or the captures do
+        not show the same specimen.
+    """
+    recorded = read_capture(real)
+    if simulated is None and rendered_here(recorded):
+        raise InputError(
+            real,
+            "source",
+            "a simulation of mitsim",
+            "device, replay, or simulated by a maker's virtual camera",
+            "name SIMULATED to compare two simulations",
+        )
+    own = None if simulated is not None else load_sensor(_sensor(recorded, sensor, real))
+    if own is not None:
+        check_technology(recorded, own, str(real))  # before the capture is decoded
+    settings, _ = decoder_settings(recorded)
+    place = specimen_place(recorded, settings, roi, str(real))
+    on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector), str(real))
+    say(f"specimen: a plane at {_distance(place):.0f} mm, with {place.off_plane:.2g} mm rms deviation")
+    if own is not None:
+        twin = rebuild(recorded, own, place, str(real), projector_on=on, seed=seed)
+        write_capture(twin.capture, output / "simulated", overwrite=True)
+        say(f"rebuilt: {output / 'simulated'}")
+        other, where = twin.capture, str(output / "simulated")
+    else:
+        assert simulated is not None
+        other, where = read_capture(simulated), str(simulated)
+    comparison = compare_captures(recorded, other, place, settings, where, projector_on=on, seed=seed)
+    table = comparison_table(comparison.rows, _whose(recorded))
+    write_json(output / "comparison.json", comparison.numbers())
+    sides = [
+        _shown(_whose(recorded), recorded, place, comparison.real),
+        _shown("simulated", other, place, comparison.simulated),
+    ]
+    said = _preamble(recorded, other, place, comparison, real, on)
+    return CaptureValidation(comparison, table, write_capture_page(output, said, table, *sides))
+
+
+def rendered_here(capture: Capture) -> bool:
+    """Return whether mitsim simulated a capture, as opposed to a maker's virtual camera."""
+    return capture.source == "simulated" and {"exposure_rule", "noise", "seed"} <= set(capture.settings)
+
+
+def _whose(recorded: Capture) -> str:
+    """Return the name of the given capture's side: real, or the simulation of a maker's virtual camera."""
+    return "maker's simulation" if recorded.source == "simulated" else "real"
+
+
+def comparison_table(rows: tuple[Row, ...], first: str = "real") -> str:
+    """Return a Markdown table with a row for each quantity; ``first`` names the column of the given capture."""
+    lines = [
+        f"| quantity | unit | {first} | simulated | difference | u | margin | verdict |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for row in rows:
+        places = _places(row)
+        difference = rounded(row.difference, places)
+        if row.difference > 0 and difference != NONE:
+            difference = f"+{difference}"
+        word = f"**{row.verdict}**" if row.verdict == "differs" else row.verdict
+        lines.append(
+            f"| {row.quantity} | {row.unit} | {rounded(row.real, places)} | {rounded(row.simulated, places)} "
+            f"| {difference} | {two_digits(row.uncertainty)} | {two_digits(row.margin)} | {word}: {row.why} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _places(row: Row) -> int:
+    """Return the number of decimals that shows two digits of the uncertainty, 1 to 4."""
+    if not row.uncertainty > 0:
+        return 3
+    return int(np.clip(1 - np.floor(np.log10(row.uncertainty)), 1, 4))
+
+
+def _sensor(real: Capture, sensor: str | None, where: Path) -> str:
+    if sensor is not None:
+        return sensor
+    if real.sensor in presets():
+        return real.sensor
+    allowed = f"one of {', '.join(presets())}, or the path of a .toml file"
+    raise InputError("--sensor", "", f"none, and {where} comes from {real.sensor}, which is not a preset", allowed)
+
+
+def _distance(place: Place) -> float:
+    return float(np.linalg.norm(place.world_from_sensor.translation))
+
+
+def _preamble(real: Capture, simulated: Capture, place: Place, comparison: Comparison, where: Path, on: bool) -> str:
+    rebuilt = simulated.settings.get("rebuilt", {})
+    power = rebuilt.get("power_times_reflectance_w")
+    serial = f" (serial {real.serial})" if real.serial else ""
+    words = [
+        f"{_whose(real).capitalize()}: `{where}`, {real.sensor}{serial}, source {real.source}. Simulated: "
+        f"{simulated.sensor}, source {simulated.source}. Projector {'on' if on else 'off'}.",
+        f"Specimen: a plane at {_distance(place):.0f} mm; the cloud deviates by {rounded(place.off_plane, 2)} mm rms. "
+        f"Patches of {PATCH_PX} px: {comparison.image_patches} of the image, {comparison.cloud_patches} of the cloud; "
+        f"a margin of {MARGIN_PX:g} px inside the specimen's outline is excluded. Contrast in windows of "
+        f"{comparison.window_px} px. Grey levels are those of {plain_image(real).name}.",
+    ]
+    if power is not None:
+        words.append(f"Power times reflectance, fitted to the median grey level: {power:.3g} W.")
+    if not rebuilt:
+        words.append("The simulated capture was given by the user.")
+    return "\n\n".join(words) + "\n"
+
+
+def _shown(name: str, capture: Capture, place: Place, patches: SpecimenPatches) -> Shown:
+    mask = image_mask(place, capture.rig.reference)
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    image = reference_levels(capture)
+    cut = (
+        slice(max(int(rows[0]) - _BORDER_PX, 0), int(rows[-1]) + _BORDER_PX),
+        slice(max(int(columns[0]) - _BORDER_PX, 0), int(columns[-1]) + _BORDER_PX),
+    )
+    roi = Roi.around(patches.on_grid) or Roi(0, 0, 1, 1)
+    totals = patches.status.sum(axis=0)
+    shares = {status: float(totals[status] / totals.sum()) for status in Status if totals[status] > 0}
+    return Shown(
+        f"{name}: {capture.sensor}",
+        capture.source,
+        image[cut],
+        patches.levels.sum(axis=0),
+        patches.residual[roi.slices],
+        shares,
+    )

@@ -1,0 +1,313 @@
+"""Compare a real capture with a simulated one of the same specimen: quantity by quantity, each with its uncertainty.
+
+Signal chain: both captures, decoded alike -> patches of the specimen (:mod:`mitsim.twin.compare.specimen_patches`) ->
+value of each quantity over all patches, for both captures -> block bootstrap: the same patches drawn with replacement
+from both -> difference and its standard uncertainty -> verdict.
+
+A patch is many correlation lengths wide. Patches are therefore independent, unlike pixels (block bootstrap; Kunsch,
+Ann. Stat. 17 (1989) 1217, *recalled*). Patches are drawn in pairs, so variations over the specimen that both captures
+share, such as its distance, add no uncertainty. A patch whose noise is unknown in one capture is excluded from both
+medians. With k = 2,
+
+    agrees: |simulated - real| <= max(2 u, margin)
+
+A quantity that agrees only because 2 u is over half of it is not comparable. The quantities and their
+margins are those of :mod:`mitsim.twin.compare.compared_quantities`.
+
+The distance between the histograms is Wasserstein's of first order. Two samples of one population also have a distance.
+Its 2 u is therefore the 95th percentile over random exchanges of patches between real and simulated (a permutation
+test).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from scipy.stats import wasserstein_distance
+
+from characterisation.files.errors import InputError
+from mitsim.capture.capture import Capture
+from mitsim.decode.cloud import Geometry, Settings, capture_geometry
+from mitsim.decode.matching.stereo import StereoGeometry
+from mitsim.running.numbers import two_digits
+from mitsim.twin.compare.compared_quantities import QUANTITIES, Floats, Quantity
+from mitsim.twin.compare.plain_image import plain_image
+from mitsim.twin.compare.rebuild import median_level
+from mitsim.twin.compare.specimen_patches import PATCH_PX, SpecimenPatches, run_length, specimen_patches
+from mitsim.twin.finish.place import Place
+
+Verdict = Literal["agrees", "differs", "not comparable", "does not apply"]
+
+#: draws of the bootstrap, and smallest number of patches
+DRAWS, LEAST_PATCHES = 400, 6
+
+#: coverage factor of the verdicts
+COVERAGE = 2.0
+
+#: largest ratio of 2 u to a quantity for an agreement
+_TOO_UNCERTAIN = 0.5
+
+#: largest relative difference in distance between the simulated and the real plane
+_SAME_PLANE = 0.02
+
+#: ratio to the difference below which an uncertainty is rounding, since all draws gave the same value
+_ROUNDING = 1e-9
+
+#: smallest and largest side of the window for local contrast [px], and the number of runs of the pattern in it
+_WINDOWS, _RUNS = (7, 31), 2.5
+
+
+@dataclass(frozen=True)
+class Row:
+    """A quantity of both captures; ``uncertainty`` (k = 1) and ``margin`` of the difference are in its unit.
+
+    ``why`` is the reason for the verdict. Unknown numbers are NaN; all are NaN if the quantity does not apply.
+    """
+
+    quantity: str
+    unit: str
+    real: float
+    simulated: float
+    difference: float
+    uncertainty: float
+    margin: float
+    verdict: Verdict
+    why: str
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All rows, and the patches of both captures.
+
+    ``image_patches`` and ``cloud_patches`` are their numbers; ``window_px`` is the window of the contrast.
+    """
+
+    rows: tuple[Row, ...]
+    image_patches: int
+    cloud_patches: int
+    window_px: int
+    real: SpecimenPatches
+    simulated: SpecimenPatches
+
+    @property
+    def agrees(self) -> bool:
+        """Return whether no quantity differs."""
+        return all(row.verdict != "differs" for row in self.rows)
+
+    def numbers(self) -> dict[str, Any]:
+        """Return all rows for JSON; unknown numbers are null."""
+        rows = [
+            {
+                name: None if isinstance(value, float) and not np.isfinite(value) else value
+                for name, value in asdict(row).items()
+            }
+            for row in self.rows
+        ]
+        return {
+            "image_patches": self.image_patches,
+            "cloud_patches": self.cloud_patches,
+            "window_px": self.window_px,
+            "draws": DRAWS,
+            "rows": rows,
+        }
+
+
+HISTOGRAMS = "grey levels, distance"
+
+
+def compare_captures(
+    real: Capture,
+    simulated: Capture,
+    place: Place,
+    settings: Settings,
+    where: str,
+    *,
+    projector_on: bool = True,
+    seed: int = 1,
+) -> Comparison:
+    """Compare a simulated capture with a real one.
+
+    Parameters
+    ----------
+    place
+        Pose and extent of the specimen in the real capture's sensor frame; its pixels are evaluated in both captures.
+    settings
+        Settings of the decoder, the same for both.
+    where
+        Name of the simulated capture in messages.
+    projector_on
+        State of the projector in the real capture. If only one of the captures has a pattern, quantities that need one
+        are not comparable.
+
+    Raises
+    ------
+    InputError
+        If the simulated capture has another camera, or its specimen is at another place, or the specimen is too small.
+    """
+    _check(real, simulated, where)
+    run = run_length(real, place)
+    window = int(np.clip(np.nan_to_num(_RUNS * run, nan=_WINDOWS[1]), *_WINDOWS)) // 2 * 2 + 1
+    geometry = capture_geometry(real, settings)
+    seen = [
+        specimen_patches(real, settings, geometry, place, window),
+        specimen_patches(simulated, settings, capture_geometry(simulated, settings), place, window),
+    ]
+    real_patches, simulated_patches = _known_in_both(*seen)
+    patches = {"image": len(real_patches.contrast), "cloud": len(real_patches.sigma)}
+    if min(patches.values()) < LEAST_PATCHES or len(simulated_patches.sigma) != len(real_patches.sigma):
+        found = f"{min(patches.values())} patches of {PATCH_PX} px on it"
+        raise InputError(
+            "REAL", "specimen", found, f"{LEAST_PATCHES} or more", "use a larger --window, or a nearer view"
+        )
+    _check_place(real_patches, simulated_patches, where)
+    reasons, inapplicable = _reasons_not_comparable(real, simulated, projector_on), _inapplicable(real, geometry)
+    rows = [_histogram_row(real_patches, simulated_patches, reasons, seed)]
+    for number, quantity in enumerate(QUANTITIES):
+        if quantity.name in inapplicable:
+            none, why = float("nan"), inapplicable[quantity.name]
+            rows.append(Row(quantity.name, quantity.unit, none, none, none, none, none, "does not apply", why))
+            continue
+        row = _row(
+            quantity,
+            real_patches,
+            simulated_patches,
+            patches[quantity.of],
+            reasons,
+            np.random.default_rng([seed, number]),
+        )
+        # skip a status that occurs in neither
+        if row is not None:
+            rows.append(row)
+    return Comparison(tuple(rows), patches["image"], patches["cloud"], window, real_patches, simulated_patches)
+
+
+def _known_in_both(
+    real_patches: SpecimenPatches, simulated_patches: SpecimenPatches
+) -> tuple[SpecimenPatches, SpecimenPatches]:
+    """Return both without values of patches that only one capture has, so that medians are over the same patches."""
+    if len(real_patches.sigma) != len(simulated_patches.sigma):
+        return real_patches, simulated_patches
+    changes: list[dict[str, Floats]] = [{}, {}]
+    for name in ("sigma", "sigma_px", "distance", "row_error"):
+        values = getattr(real_patches, name), getattr(simulated_patches, name)
+        known = np.isfinite(values[0]) & np.isfinite(values[1])
+        for change, own in zip(changes, values, strict=True):
+            change[name] = np.where(known, own, np.nan)
+    return replace(real_patches, **changes[0]), replace(simulated_patches, **changes[1])  # type: ignore[arg-type]
+
+
+def _check(real: Capture, simulated: Capture, where: str) -> None:
+    if simulated.source != "simulated":
+        raise InputError(where, "source", simulated.source, "simulated", "give the real capture first")
+    ours, others = simulated.rig.reference, real.rig.reference
+    if (ours.width, ours.height) != (others.width, others.height) or simulated.bits != real.bits:
+        found = f"{ours.width} x {ours.height} pixels of {simulated.bits} bits"
+        allowed = f"{others.width} x {others.height} of {real.bits} bits, as REAL"
+        raise InputError(where, "camera", found, allowed, "leave SIMULATED out: mitsim then simulates it")
+    if simulated.technology != real.technology:
+        raise InputError(where, "technology", simulated.technology, f"{real.technology}, as REAL")
+
+
+def _check_place(real_patches: SpecimenPatches, simulated_patches: SpecimenPatches, where: str) -> None:
+    off = np.abs(simulated_patches.distance / real_patches.distance - 1)
+    off = off[np.isfinite(off)]
+    if len(off) and np.median(off) > _SAME_PLANE:
+        found = f"a specimen {100 * float(np.median(off)):.1f} % nearer or farther than that of REAL"
+        raise InputError(
+            where, "pose", found, f"up to {100 * _SAME_PLANE:g} %", "leave SIMULATED out: mitsim then simulates it"
+        )
+
+
+def _reasons_not_comparable(real: Capture, simulated: Capture, projector_on: bool) -> dict[str, str]:
+    """Return the reasons why quantities cannot be compared, by name."""
+    reasons: dict[str, str] = dict(simulated.settings.get("rebuilt", {}).get("taken", {}))
+    if projector_on != (simulated.settings.get("projector_on") is not False):
+        off = "REAL" if not projector_on else "SIMULATED"
+        for quantity in QUANTITIES:
+            if quantity.needs_pattern:
+                reasons.setdefault(quantity.name, f"the projector was off in {off}")
+        reasons.setdefault(HISTOGRAMS, f"the projector was off in {off}")
+    return reasons
+
+
+def _inapplicable(capture: Capture, geometry: Geometry) -> dict[str, str]:
+    """Return the reasons why quantities are meaningless for this kind of capture, by name."""
+    inapplicable: dict[str, str] = {}
+    if not isinstance(geometry, StereoGeometry):
+        inapplicable |= dict.fromkeys(
+            ("sigma in disparity", "vertical error"), "it needs points from a pair of cameras"
+        )
+    elif capture.technology == "structured_light":
+        inapplicable["vertical error"] = "stripes along the rows do not identify a row"
+    plain = plain_image(capture)
+    if not plain.has_dots:
+        for name in ("contrast", "run length"):
+            inapplicable[name] = f"there are no dots in {plain.name}"
+    return inapplicable
+
+
+def _row(
+    quantity: Quantity,
+    real_patches: SpecimenPatches,
+    simulated_patches: SpecimenPatches,
+    patches: int,
+    reasons: Mapping[str, str],
+    rng: np.random.Generator,
+) -> Row | None:
+    every = np.arange(patches)[None]
+    real, simulated = (float(quantity.figure(seen, every)[0]) for seen in (real_patches, simulated_patches))
+    if quantity.name.startswith("share") and not (real > 0 or simulated > 0):
+        return None
+    draws = rng.integers(0, patches, (DRAWS, patches))
+    off = quantity.figure(simulated_patches, draws) - quantity.figure(real_patches, draws)
+    off = off[np.isfinite(off)]
+    uncertainty = float(off.std(ddof=1)) if len(off) > DRAWS // 2 else float("nan")
+    if uncertainty <= _ROUNDING * abs(simulated - real):
+        uncertainty = 0.0
+    margin = quantity.margin if np.isfinite(real) else float("nan")
+    if quantity.factor > 1 and np.isfinite(real):  # symmetric: either capture may have the larger value
+        margin = abs(real) * (quantity.factor - 1 if simulated >= real else 1 - 1 / quantity.factor)
+    verdict, why = _verdict(simulated - real, uncertainty, margin, reasons.get(quantity.name, ""))
+    if verdict == "agrees" and quantity.factor > 1 and COVERAGE * uncertainty > _TOO_UNCERTAIN * abs(real):
+        verdict, why = "not comparable", f"2 u is over {100 * _TOO_UNCERTAIN:.0f} % of it"
+    return Row(quantity.name, quantity.unit, real, simulated, simulated - real, uncertainty, margin, verdict, why)
+
+
+def _verdict(difference: float, uncertainty: float, margin: float, reason: str) -> tuple[Verdict, str]:
+    if reason:
+        return "not comparable", reason
+    if not np.isfinite(difference) or not np.isfinite(uncertainty):
+        return "not comparable", "too few points in one of the captures"
+    if abs(difference) <= COVERAGE * uncertainty:
+        return "agrees", "within 2 u"
+    if abs(difference) <= margin:
+        return "agrees", "within the margin"
+    over = abs(difference) / uncertainty if uncertainty > 0 else np.inf
+    return "differs", f"by {two_digits(over)} u" if np.isfinite(over) else "by more than the margin"
+
+
+def _histogram_row(
+    real_patches: SpecimenPatches, simulated_patches: SpecimenPatches, reasons: Mapping[str, str], seed: int
+) -> Row:
+    """Return the row of Wasserstein's distance [DN] between the histograms of all pixels on the specimen."""
+    counts = np.stack([real_patches.levels, simulated_patches.levels])
+    distance = _distance(*counts.sum(axis=1))
+    rng = np.random.default_rng([seed, len(QUANTITIES)])
+    exchanged = []
+    every = counts.sum(axis=(0, 1))
+    for _ in range(DRAWS):
+        from_real = rng.integers(0, 2, (len(real_patches.levels), 1))
+        mixed = np.asarray(np.where(from_real == 1, counts[0], counts[1])).sum(axis=0)
+        exchanged.append(_distance(mixed, every - mixed))
+    uncertainty = float(np.percentile(exchanged, 95)) / COVERAGE
+    margin = 0.05 * median_level(real_patches.levels.sum(axis=0))
+    verdict, why = _verdict(distance, uncertainty, margin, reasons.get(HISTOGRAMS, ""))
+    return Row(HISTOGRAMS, "DN", float("nan"), float("nan"), distance, uncertainty, margin, verdict, why)
+
+
+def _distance(one: Floats, other: Floats) -> float:
+    levels = np.arange(len(one))
+    return float(wasserstein_distance(levels, levels, one, other))

@@ -1,0 +1,59 @@
+"""Select the image of a capture that shows its specimen under full projector light, for any light code.
+
+Signal chain: pattern of the capture -> role of every image -> the white image; for a code without one, the largest grey
+level of every pixel over all images of the code. A dot pattern has neither. Its first frame is used with its dots,
+since a matcher works on the grey levels of the dots.
+
+A single image of a Gray code is not suitable: the specimen may be in a dark stripe, whose grey level is independent of
+the projector's power.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.capture.capture import Capture
+from mitsim.decode.cloud import capture_pattern
+from mitsim.decode.decoder_registry import projector_size
+from mitsim.sensor.image_sequence import ImageSequence
+from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
+
+_CODED = ("gray", "gray_inverse", "phase")
+
+
+@dataclass(frozen=True)
+class PlainImage:
+    """Indices of the ``images`` over which the largest level of every pixel is taken; ``name`` of the result.
+
+    ``has_dots``: the image shows the pattern of a matcher, which determines local contrast and run length.
+    """
+
+    images: tuple[int, ...]
+    name: str
+    has_dots: bool
+
+    def of(self, stack: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.unsignedinteger[Any]]:
+        """Return the plain image (H, W) [DN] of a camera's stack (n, H, W)."""
+        return np.asarray(stack[list(self.images)].max(axis=0))
+
+
+def plain_image(capture: Capture) -> PlainImage:
+    """Select the plain image of a capture.
+
+    Raises
+    ------
+    InputError
+        If the capture's technology needs a pattern and the settings do not name one.
+    """
+    code = capture_pattern(capture)
+    if not isinstance(code, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence):
+        return PlainImage((0,), "the first frame", True)
+    kinds = [role.kind for role in roles(code, *projector_size(capture))]
+    if "white" in kinds:
+        return PlainImage((kinds.index("white"),), "the white image", False)
+    coded = tuple(number for number, kind in enumerate(kinds) if kind in _CODED)
+    return PlainImage(coded, "the brightest levels of the code's images", False)

@@ -1,0 +1,117 @@
+"""Specimen of a rebuilt capture: a matt sheet with the recorded bend, or a plate with the recorded print.
+
+Signal chain, sheet: pose and bend -> mesh -> matt white. Signal chain, print: recorded image [e-] -> removal of its
+noise (:mod:`mitsim.twin.compare.denoise`) -> ratio to the image of a white plate -> reflectance of the plate, or of every
+pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.ndimage import laplace, map_coordinates
+
+from mitsim.capture.simulated.exposing import LightOnImagers
+from mitsim.scene import backend
+from mitsim.scene.load import Scene, scene_from_dict
+from mitsim.sensor.camera import Camera
+from mitsim.sensor.preset import Sensor
+from mitsim.twin.compare.denoise import denoised
+from mitsim.twin.compare.plain_image import PlainImage
+from mitsim.twin.finish.bend import Bend
+from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.specimen import image_mask
+
+Floats = NDArray[np.float64]
+
+#: reflectance of the twin's plate without texture; the fit determines only its product with the power
+REFLECTANCE = 0.85
+
+#: number of squares of a bent sheet's mesh along each side
+_MESH = 96
+
+#: texels per pixel footprint along an axis, and largest number of texels along a side
+_TEXELS_PER_PX, _LARGEST_TEXTURE = 2.0, 4096
+#: variance [px^2] of the aperture of a rendered texture: a pixel, which the recorded image already contains, and the
+#: interpolation between texels
+_APERTURE_PX2 = 1 / 12 + 1 / (6 * _TEXELS_PER_PX**2)
+
+
+def plate(place: Place, sensor: Sensor, texture: Floats | None) -> Scene:
+    """Return a rectangle at the specimen, matt white, or with reflectances (rows, columns) from low x and y on."""
+    backend.activate()
+    mi = backend.mi
+    half = place.cell * place.occupied.shape[::-1] / 2
+    middle = place.low + half
+    to_world = mi.ScalarTransform4f().translate([*middle, 0.0]).scale([*half, 1.0])
+    bsdf: dict[str, Any] = {"type": "matt_white", "reflectance": REFLECTANCE}
+    if texture is not None:
+        image = mi.TensorXf(np.ascontiguousarray(REFLECTANCE * texture[..., None], np.float32))
+        bitmap = {"type": "bitmap", "data": image, "raw": True, "wrap_mode": "clamp"}
+        bsdf = {"type": "diffuse", "reflectance": bitmap}
+    where = "the plane of a recording"
+    if place.bend is None or texture is not None:
+        shapes = {"specimen": {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}}
+        return scene_from_dict(shapes, sensor.wavelength_nm, where)
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "sheet.ply"
+        _sheet(place, place.bend).export(file)
+        shapes = {"specimen": {"type": "ply", "filename": str(file), "bsdf": bsdf}}
+        return scene_from_dict(shapes, sensor.wavelength_nm, where)
+
+
+def _sheet(place: Place, bend: Bend) -> trimesh.Trimesh:
+    """Return the extent of the specimen as a bent mesh, with normals toward the sensor."""
+    extent = place.cell * place.occupied.shape[::-1]
+    x, y = (place.low[axis] + np.linspace(0, extent[axis], _MESH + 1) for axis in (0, 1))
+    xy = np.stack(np.meshgrid(x, y), axis=-1)
+    vertices = np.concatenate([xy, bend.heights(xy)[..., None]], axis=-1).reshape(-1, 3)
+    number = np.arange(len(vertices)).reshape(_MESH + 1, _MESH + 1)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    faces = np.concatenate([np.stack(each, axis=-1).reshape(-1, 3) for each in ((a, b, c), (b, d, c))])
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.vertex_normals  # noqa: B018 - computed here, so that they are written, and the mesh is shaded as smooth
+    return mesh
+
+
+def texture_of(place: Place, camera: Camera, electrons: Floats, light: LightOnImagers, name: str) -> Floats:
+    """Return the reflectance (rows, columns) of the plate, up to a factor.
+
+    It is the ratio of the recorded image to that of a white plate. Outside the image of the reference camera, the value
+    of the nearest pixel is repeated.
+    """
+    roi = light.rois[name]
+    inside = roi.slices
+    white = light.radiance[name][0].astype(float)
+    lit = white > 0.05 * np.percentile(white, 99)
+    ratio = denoised(electrons[inside], lit) / np.where(lit, white, np.nan)
+    ratio = np.where(np.isfinite(ratio), ratio, np.nanmedian(ratio))
+    extent = place.cell * place.occupied.shape[::-1]
+    reach = float(np.linalg.norm(place.world_from_sensor.translation))
+    texel = reach / float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])) / _TEXELS_PER_PX
+    columns, rows = np.minimum(np.ceil(extent / texel).astype(int), _LARGEST_TEXTURE)
+    x = place.low[0] + (np.arange(columns) + 0.5) / columns * extent[0]
+    y = place.low[1] + (np.arange(rows) + 0.5) / rows * extent[1]
+    xs, ys = np.meshgrid(x, y)
+    points = place.world_from_sensor.inverse().points(np.stack([xs, ys, np.zeros_like(xs)], axis=-1))
+    pixels = np.nan_to_num(camera.project(points)) - [roi.left, roi.top]
+    sharp = ratio - _APERTURE_PX2 / 2 * laplace(ratio, mode="nearest")
+    return np.asarray(map_coordinates(sharp, [pixels[..., 1], pixels[..., 0]], order=3, mode="nearest")).clip(0.0)
+
+
+def printed(
+    light: LightOnImagers, place: Place, camera: Camera, electrons: Floats, name: str, plain: PlainImage
+) -> LightOnImagers:
+    """Return light with the print of the recorded plain image on the specimen of its only camera."""
+    inside, radiance = light.rois[name].slices, light.radiance[name]
+    there = image_mask(place, camera)[inside]
+    white = radiance[list(plain.images)].max(axis=0).astype(float)
+    ratio = np.where(there & (white > 0), denoised(electrons[inside], there) / np.where(white > 0, white, 1.0), 0.0)
+    ratio /= max(float(np.percentile(ratio[there], 95)), 1e-12)
+    return replace(light, radiance={name: radiance * np.maximum(ratio, 0.0).astype(np.float32)})

@@ -1,0 +1,257 @@
+"""Rebuild a real capture as a simulated one, its twin.
+
+Signal chain: real capture -> plane of the specimen, its extent and its bend (:mod:`mitsim.twin.finish.specimen`) -> a matt
+white sheet there (:mod:`mitsim.twin.compare.plate`) -> light of the sensor file's projector, pattern and room on the
+cameras of the capture (:mod:`mitsim.capture.simulated.simulate`) -> light scaled to the recorded median grey level of the
+specimen in the plain image (:mod:`mitsim.twin.compare.plain_image`) -> exposure by the file's imager -> capture of source
+``simulated``.
+
+*Taken from the recording*: cameras and rectification, pose and bend of the sheet, light code and number of frames,
+exposure if known, median grey level. *Taken from the sensor file*: projector, dot pattern, imager, blur. The scale is a
+factor on power times reflectance, which no image can separate.
+
+*Projector off.* There is no pattern, and the matcher uses the specimen's own texture. The plate gets it from the
+recorded reference image, less its noise, so that the noise is not there twice. The plate is lit evenly. The second
+camera sees the same texture from its own pose. This plate is flat. The light of a sensor's [room] and the blur of its
+lens are in the texture, and are not simulated again.
+
+*Print under structured light.* For a single camera, the print is a factor on every pixel: the recorded plain image over
+the rebuilt one.
+
+Not included: a print under dots, and objects around the specimen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.errors import InputError
+from mitsim.capture.capture import Capture
+from mitsim.capture.simulated.exposing import LightOnImagers
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decode.cloud import capture_pattern
+from mitsim.scene.light_transport.projector_light import ProjectedPatterns
+from mitsim.sensor.modulation import AmplitudeModulation
+from mitsim.sensor.noise_sources import Noise
+from mitsim.sensor.pattern import RandomDots
+from mitsim.sensor.preset import Sensor
+from mitsim.twin.compare.plain_image import PlainImage, plain_image
+from mitsim.twin.compare.plate import REFLECTANCE, plate, printed, texture_of
+from mitsim.twin.finish.electrons import chip_of, linearised
+from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
+
+Floats = NDArray[np.float64]
+
+#: rays per pixel
+SAMPLES = 16
+
+#: range of the scale of the light, and number of bisections: accurate to a few parts in 10^5
+_SCALES, _BISECTIONS = (1e-4, 1e4), 18
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A rebuilt capture: the simulated ``capture``, and the fitted ``power_times_reflectance`` [W]."""
+
+    capture: Capture
+    power_times_reflectance: float
+
+
+def check_technology(real: Capture, sensor: Sensor, where: str) -> None:
+    """Raise an InputError if a sensor is of another technology than a recording."""
+    if sensor.technology != real.technology:
+        allowed = f"one of technology {real.technology}, as {where}"
+        raise InputError("--sensor", "technology", f"{sensor.name} of {sensor.technology}", allowed)
+
+
+def rebuild(
+    real: Capture, sensor: Sensor, place: Place, where: str, *, projector_on: bool = True, seed: int = 1
+) -> Twin:
+    """Simulate a real capture with a plane in place of its specimen.
+
+    Parameters
+    ----------
+    sensor
+        Supplies projector, pattern and imager in place of those of the device.
+    place
+        Pose and extent of the specimen, from :func:`mitsim.twin.finish.specimen.specimen_place`.
+    projector_on
+        If false, the plate has the texture that the reference camera recorded, and even light.
+
+    Raises
+    ------
+    InputError
+        If the sensor has another technology, or takes other images than the recording.
+    """
+    check_technology(real, sensor, where)
+    own = like(real, sensor, where)
+    if not projector_on and real.technology == "structured_light":
+        allowed = f"on: {where} is structured light, which has no code without it"
+        raise InputError("--projector", "", "off", allowed)
+    name, plain = next(iter(real.rig.cameras)), plain_image(real)
+    chip = chip_of(real, sensor.imager, where)  # rejects another number of bits
+    if not projector_on:  # the texture contains room light and lens blur of the recording
+        own = replace(own, room=None, imager=replace(own.imager, blur_px=0.0, corner_blur_px=None))
+    simulated = SimulatedSensor(own)
+    if not projector_on:
+        size = own.projector.optics.height, own.projector.optics.width
+        simulated.patterns = ProjectedPatterns(np.ones((1, *size), np.float32), own.projector)
+    pose, around = place.world_from_sensor, place.corners()
+    noise = Noise() if projector_on else Noise.without("speckle")  # room light has no speckle
+
+    def lit(texture: Floats | None) -> LightOnImagers:
+        scene = plate(place, own, texture)
+        return simulated.light(scene, pose, rendering=Rendering(samples=SAMPLES), seed=seed, around=around, noise=noise)
+
+    light, with_print = lit(None), projector_on and not plain.has_dots and len(real.rig.cameras) == 1
+    with_print &= not isinstance(own.pattern, AmplitudeModulation)
+    electrons = linearised(plain.of(real.images[name]), chip)
+    if with_print:
+        light = printed(light, place, real.rig.cameras[name], electrons, name, plain)
+    if not projector_on:
+        texture = texture_of(place, real.rig.cameras[name], electrons, light, name)
+        light = lit(texture / texture.max())
+    scale = _scale(simulated, light, place, _Recording(real, name, plain, where), seed)
+    scaled = replace(light, radiance={key: values * np.float32(scale) for key, values in light.radiance.items()})
+    capture = simulated.expose(scaled, seed)
+    power = scale * sensor.projector.flux * REFLECTANCE
+    taken = {"median grey level": "power times reflectance was fitted to it"}
+    if with_print:
+        taken["grey levels, distance"] = "the print was taken from the recording"
+    if not projector_on:
+        capture.settings["pattern"] = None
+        for quantity in ("contrast", "run length", "grey levels, distance"):
+            taken[quantity] = "the texture was taken from the recording"
+    capture.settings["projector_on"] = projector_on
+    capture.settings["rebuilt"] = {
+        "recorded_by": real.sensor,
+        "serial": real.serial,
+        "power_times_reflectance_w": power if projector_on else None,
+        "off_plane_mm": place.off_plane,
+        "taken": taken,
+    }
+    return Twin(capture, power if projector_on else float("nan"))
+
+
+def like(real: Capture, sensor: Sensor, where: str) -> Sensor:
+    """Return the sensor with the cameras, the number of frames and the exposure of a recording."""
+    count = len(next(iter(real.images.values())))
+    projector, pattern = sensor.projector, sensor.pattern
+    if real.technology == "structured_light":
+        pattern = capture_pattern(real) or pattern  # the order of the recorded images
+    if real.rig.projector is not None:
+        projector = replace(projector, optics=real.rig.projector)
+    if isinstance(pattern, RandomDots) and pattern.frames != count:
+        if count > pattern.frames:
+            raise InputError("--sensor", "pattern.shifts_px", f"{pattern.frames} frames", f"{count}, as {where} holds")
+        shifts = pattern.shifts_px[:count] if count > 1 else []
+        pattern = pattern.model_copy(update={"shifts_px": shifts})
+    exposure, seconds = sensor.exposure, real.settings.get("exposure_s")
+    if isinstance(seconds, list):
+        raise InputError(
+            where, "settings.exposure_s", f"{len(seconds)} exposures", "one exposure: mitsim does not rebuild a bracket"
+        )
+    if isinstance(seconds, int | float) and seconds > 0:
+        exposure = replace(
+            exposure, rule=f"as recorded, {seconds:.3g} s", base_s=float(seconds), control=None, bracket=None
+        )
+    rig = replace(real.rig, projector=projector.optics)
+    return replace(
+        sensor,
+        rig=rig,
+        projector=projector,
+        pattern=pattern,
+        exposure=exposure,
+        ambient_image=False,
+    )
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """The ``capture`` to rebuild: its reference ``camera``, that camera's ``plain`` image, ``where`` in messages."""
+
+    capture: Capture
+    camera: str
+    plain: PlainImage
+    where: str
+
+
+def _scale(simulated: SimulatedSensor, light: LightOnImagers, place: Place, recording: _Recording, seed: int) -> float:
+    """Factor of the light that makes the specimen's median level the recorded one, in the plain image; by bisection.
+
+    The levels are compared with their noise: where a pattern has two levels, few pixels are near the median, and noise
+    moves it.
+    """
+    real, name, plain, where = recording.capture, recording.camera, recording.plain, recording.where
+    roi, there = light.rois[name], image_mask(place, real.rig.cameras[name], MARGIN_PX)
+    if not there.any():
+        raise InputError(
+            "REAL", "specimen", "no pixels", "a specimen in the image", "use a larger --window, or a nearer view"
+        )
+    if not light.radiance[name].any():
+        raise InputError("--sensor", "projector", "no light on the specimen", "a projector that illuminates it")
+    wanted, full = median_level(np.bincount(plain.of(real.images[name])[there])), 2**real.bits - 1
+    if wanted > full - 0.5:
+        found = f"a median grey level of {wanted:.0f} on the specimen, in {plain.name}"
+        allowed = f"under {full}, since a saturated image does not determine the power"
+        raise InputError(where, "images", found, allowed, "repeat the capture with a shorter exposure")
+    needed = list(plain.images)
+    if isinstance(simulated.sensor.pattern, AmplitudeModulation):  # its taps are exposed together
+        needed = list(range(len(light.radiance[name])))
+
+    def too_bright(scale: float) -> bool:
+        some = light.radiance[name][needed] * np.float32(scale)
+        seen = simulated.expose(replace(light, radiance={name: some}, rois={name: roi}), seed).images[name]
+        seen = seen[[needed.index(number) for number in plain.images]].max(axis=0)
+        return median_level(np.bincount(seen[there])) > wanted
+
+    low, high = _SCALES
+    if too_bright(low) or not too_bright(high):
+        flux = simulated.sensor.projector.flux
+        found = (
+            f"{flux:g} W, with which no reflectance of {low:g} to {high:g} times {REFLECTANCE} gives {wanted:.0f} DN"
+        )
+        allowed = f"a power near that of the device; the imager and exposure of {where}"
+        raise InputError("--sensor", "projector.flux_w", found, allowed)
+    for _ in range(_BISECTIONS):
+        middle = float(np.sqrt(low * high))
+        low, high = (low, middle) if too_bright(middle) else (middle, high)
+    return float(np.sqrt(low * high))
+
+
+def median_level(counts: NDArray[Any]) -> float:
+    """Return the median [DN] of a histogram, with the pixels of each level spread evenly over the level."""
+    total = np.cumsum(counts)
+    level = int(np.searchsorted(total, total[-1] / 2))
+    below = total[level - 1] if level else 0
+    return float(level - 0.5 + (total[-1] / 2 - below) / counts[level])
+
+
+def projector_was_on(real: Capture, given: Literal["on", "off"] | None, where: str) -> bool:
+    """Return whether the projector was on: as ``given``, else as in the settings; codes and simulations need it on.
+
+    Raises
+    ------
+    InputError
+        If the state is unknown for a pair that is matched by its texture.
+    """
+    if given is not None:
+        return given == "on"
+    known = real.settings.get("projector_on")
+    if isinstance(known, bool):
+        return known
+    if real.technology != "active_stereo" or real.source == "simulated":
+        return True
+    raise InputError(
+        f"{where}/settings.json",
+        "projector_on",
+        "nothing",
+        "true or false",
+        "give --projector on or off, here or for mitsim import",
+    )

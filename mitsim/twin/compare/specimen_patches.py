@@ -1,0 +1,250 @@
+"""Metrics of a specimen in one capture, in patches of 40 px: grey levels, points and their noise.
+
+Signal chain, image: plain image of the reference camera (:mod:`mitsim.twin.compare.plain_image`), pixels on the specimen
+(:func:`mitsim.twin.finish.specimen.image_mask`) -> local mean and deviation, crossings of the local mean, changes of sign
+between neighbouring pixels -> values of every patch.
+
+Signal chain, cloud: pixels on the specimen, on the cloud's grid -> points and statuses of every patch; plane of the
+patch along the rays -> sigma, residuals and their products at every lag (:mod:`characterisation.coupon.metrics`,
+:mod:`characterisation.coupon.residual_field`). For stereo also the row error of the rectified right image.
+
+Patches are pixels of the image in one table and pixels of the cloud's grid in the other. Two captures with the same
+calibration and plane have the same patches in the same order, so they can be compared in pairs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+
+from characterisation.coupon.metrics import RayNoise, ray_noise_std
+from characterisation.coupon.residual_field import LARGEST_LAG, autocorrelation
+from characterisation.point_cloud import PointCloud, Status
+from characterisation.region_of_interest import Roi
+from mitsim.capture.capture import Capture
+from mitsim.decode.cloud import Geometry, Settings, capture_cloud
+from mitsim.decode.matching.row_error import row_error
+from mitsim.decode.matching.stereo import StereoGeometry
+from mitsim.twin.compare.plain_image import plain_image
+from mitsim.twin.finish.fine_detail import finest_detail
+from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.specimen import MARGIN_PX, image_mask, on_specimen
+
+Floats = NDArray[np.float64]
+
+PATCH_PX = 40
+
+#: smallest fraction of a patch on the specimen, and smallest fraction of its pixels with points for its noise
+LEAST_ON, LEAST_POINTS = 0.5, 0.5
+
+#: smallest fraction of a patch's pixels with points for its row error, which is one number for the whole patch
+_LEAST_FOR_ROWS = 0.15
+
+_MAD_TO_SIGMA = 1.482602218505602
+
+
+@dataclass(frozen=True)
+class SpecimenPatches:
+    """P patches of the raw image and Q patches of the cloud's grid; unknown values are NaN.
+
+    Image: ``levels`` (P, 2^bits) are pixels of each grey level. ``contrast`` (P,) [1] is local deviation over local
+    mean. ``crossings`` (P,) count crossings of the local mean in ``pixels`` (P,) pixels. ``finest`` (P,) is in DN.
+
+    Cloud: ``status`` (Q, 11) are pixels of each :class:`Status`. ``sigma`` (Q,) [mm] is along the rays, ``sigma_px``
+    [px] in disparity. ``distance`` (Q,) [mm] is that of the patch's plane along its mean ray. ``products`` and
+    ``pairs`` (Q, k, k) are those of residuals by lag. ``row_error`` (Q,) [px] is that of the right image. ``cloud`` is
+    the cloud, ``on_grid`` (H, W) are the specimen's pixels, ``residual`` (H, W) [mm] is about the planes of the
+    patches.
+    """
+
+    levels: Floats = field(repr=False)
+    contrast: Floats
+    crossings: Floats
+    pixels: Floats
+    finest: Floats
+    status: Floats
+    sigma: Floats
+    sigma_px: Floats
+    distance: Floats
+    products: Floats = field(repr=False)
+    pairs: Floats = field(repr=False)
+    row_error: Floats
+    cloud: PointCloud = field(repr=False)
+    on_grid: NDArray[np.bool_] = field(repr=False)
+    residual: Floats = field(repr=False)
+
+
+def specimen_patches(
+    capture: Capture, settings: Settings, geometry: Geometry, place: Place, window_px: int
+) -> SpecimenPatches:
+    """Compute the patches of a capture's specimen.
+
+    Parameters
+    ----------
+    place
+        Pose and extent of the specimen, in the sensor frame of the capture.
+    window_px
+        Side of the window of local mean and deviation [px].
+    """
+    camera, image = capture.rig.reference, reference_levels(capture).astype(float)
+    on_image = image_mask(place, camera, MARGIN_PX)
+    mean = uniform_filter(image, window_px)
+    deviation = np.sqrt(np.maximum(uniform_filter(image**2, window_px) - mean**2, 0.0))
+    across = (image[:, 1:] > mean[:, 1:]) != (image[:, :-1] > mean[:, :-1])
+    finest = np.abs(finest_detail(image))
+    corners = _corners(on_image)
+
+    def of_image(values: Floats) -> Floats:
+        return _tiles(np.where(on_image, values, np.nan), corners)
+
+    crossings = of_image(np.pad(across.astype(float), ((0, 0), (1, 0))))
+    grid = geometry.grid
+    on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
+    cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(on_grid))
+    places = _corners(on_grid)
+    status = _tiles(np.where(on_grid, cloud.status.astype(float), np.nan), places)
+    points = np.where(on_grid[..., None], cloud.points, np.nan).astype(float) - grid.origin
+    tiles = np.stack([_tiles(points[..., axis], places) for axis in range(3)], axis=-1)
+    noise = ray_noise_std(tiles)
+    known = noise.count >= LEAST_POINTS * np.isfinite(status).sum(axis=-1)
+    sigma = np.where(known, noise.sigma, np.nan)
+    residual = np.where(known[:, None], noise.inlier_residual, np.nan)
+    products, pairs = _products(residual)
+    field_ = np.full(on_grid.shape, np.nan)
+    for (row, column), own in zip(places, residual, strict=True):
+        field_[row : row + PATCH_PX, column : column + PATCH_PX] = own.reshape(PATCH_PX, PATCH_PX)
+    return SpecimenPatches(
+        levels=_histograms(of_image(image), 2**capture.bits),
+        contrast=np.nanmean(of_image(deviation / np.maximum(mean, 1.0)), axis=-1),
+        crossings=np.nansum(crossings, axis=-1),
+        pixels=np.isfinite(crossings).sum(axis=-1).astype(float),
+        finest=_MAD_TO_SIGMA * np.nanmedian(of_image(finest), axis=-1),
+        status=np.stack([(status == value).sum(axis=-1) for value in Status], axis=-1).astype(float),
+        sigma=sigma,
+        sigma_px=_in_disparity(noise, sigma, tiles, geometry),
+        distance=np.where(known, noise.distance, np.nan),
+        products=products,
+        pairs=pairs,
+        row_error=_row_errors(capture, geometry, cloud, places, known),
+        cloud=cloud,
+        on_grid=on_grid,
+        residual=field_,
+    )
+
+
+def patch_rows(
+    capture: Capture, settings: Settings, geometry: StereoGeometry, place: Place
+) -> tuple[Floats, Floats, Floats]:
+    """Return row errors (Q,) [px] of the patches of a pair's cloud.
+
+    Also returns columns and rows of their middles in the right image.
+    """
+    grid = geometry.grid
+    on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
+    cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(on_grid))
+    places = _corners(on_grid)
+    valid = _tiles(np.where(on_grid, cloud.valid.astype(float), np.nan), places)
+    known = np.nansum(valid, axis=-1) >= _LEAST_FOR_ROWS * np.isfinite(valid).sum(axis=-1)
+    local = (cloud.points.astype(float) - grid.origin) @ grid.rotation
+    off = _tiles(np.where(cloud.valid, geometry.rectification.disparity(local[..., 2]), np.nan), places)
+    disparity = np.full(len(places), np.nan)
+    disparity[known] = np.nanmedian(off[known], axis=-1)
+    middles = np.array(places, float).reshape(-1, 2) + (PATCH_PX - 1) / 2
+    errors = _row_errors(capture, geometry, cloud, places, known)
+    return errors, middles[:, 1] - disparity, middles[:, 0]
+
+
+def reference_levels(capture: Capture) -> NDArray[np.unsignedinteger[Any]]:
+    """Return the plain image (H, W) [DN] of the reference camera."""
+    return plain_image(capture).of(next(iter(capture.images.values())))
+
+
+def run_length(capture: Capture, place: Place) -> float:
+    """Return the mean run [px] of bright and dark pixels in the specimen's rows; NaN without changes.
+
+    The threshold is the mean of 31 px. The result determines the window for local means, so that a window contains
+    several dots of any size.
+    """
+    image = reference_levels(capture).astype(float)
+    bright = image > uniform_filter(image, 31)
+    there = image_mask(place, capture.rig.reference, MARGIN_PX)[:, 1:]
+    changes = np.count_nonzero((bright[:, 1:] != bright[:, :-1]) & there)
+    return float(np.count_nonzero(there) / changes) if changes else float("nan")
+
+
+def _corners(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the upper left pixels (row, column) of adjacent patches with enough of their pixels in a mask."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return []
+    return [
+        (row, column)
+        for row in range(int(rows[0]), int(rows[-1]) - PATCH_PX + 2, PATCH_PX)
+        for column in range(int(columns[0]), int(columns[-1]) - PATCH_PX + 2, PATCH_PX)
+        if mask[row : row + PATCH_PX, column : column + PATCH_PX].mean() >= LEAST_ON
+    ]
+
+
+def _tiles(values: Floats, corners: list[tuple[int, int]]) -> Floats:
+    """Return the pixels (P, 1600) of the patches."""
+    tiles = [values[row : row + PATCH_PX, column : column + PATCH_PX].ravel() for row, column in corners]
+    return np.stack(tiles) if tiles else np.empty((0, PATCH_PX**2))
+
+
+def _histograms(levels: Floats, count: int) -> Floats:
+    tiles = [np.bincount(own[np.isfinite(own)].astype(int), minlength=count) for own in levels]
+    return np.stack(tiles).astype(float) if tiles else np.empty((0, count))
+
+
+def _products(residual: Floats) -> tuple[Floats, Floats]:
+    """Return sums of the products of residuals (Q, n) at every lag, and numbers of pairs; 0 without points."""
+    side = 2 * LARGEST_LAG + 1
+    products, pairs = np.zeros((2, len(residual), side, side))
+    for index, own in enumerate(residual):
+        if np.isfinite(own).sum() < 2 or not np.nanvar(own) > 0:
+            continue
+        rho = autocorrelation(own.reshape(PATCH_PX, PATCH_PX))
+        products[index] = np.nan_to_num(rho.values) * rho.pairs * np.nanvar(own)
+        pairs[index] = rho.pairs
+    return products, pairs
+
+
+def _in_disparity(noise: RayNoise, sigma: Floats, tiles: Floats, geometry: Geometry) -> Floats:
+    """Return sigma of patches as disparity [px], NaN without stereo.
+
+    Z^2 sigma_d = f B sigma_Z, and Z = V cos(off axis).
+    """
+    if not isinstance(geometry, StereoGeometry):
+        return np.full(len(sigma), np.nan)
+    some = np.isfinite(tiles[..., 2]).any(axis=-1)
+    ray = np.full((len(tiles), 3), np.nan)
+    ray[some] = np.nanmean(tiles[some], axis=1)
+    cosine = geometry.grid.cos_off_axis(ray)
+    focal_baseline = geometry.rectification.matrix_left[0, 0] * geometry.rectification.baseline
+    return np.asarray(sigma * focal_baseline / (noise.distance**2 * cosine))
+
+
+def _row_errors(
+    capture: Capture, geometry: Geometry, cloud: PointCloud, places: list[tuple[int, int]], known: NDArray[np.bool_]
+) -> Floats:
+    """Return the shift [rows] of the right image that fits best, for each patch with points.
+
+    See :mod:`mitsim.decode.matching.row_error`.
+    """
+    out = np.full(len(places), np.nan)
+    if capture.technology == "structured_light" or not isinstance(geometry, StereoGeometry):
+        return out  # stripes along the rows do not identify a row
+    left, right = (stack[0].astype(float) for stack in list(capture.images.values())[:2])
+    local = (cloud.points.astype(float) - geometry.grid.origin) @ geometry.grid.rotation
+    disparity = geometry.rectification.disparity(local[..., 2])
+    for index, (row, column) in enumerate(places):
+        if not known[index]:
+            continue
+        rows, columns = np.nonzero(cloud.valid[row : row + PATCH_PX, column : column + PATCH_PX])
+        rows, columns = rows + row, columns + column
+        out[index] = row_error(left, right, geometry, rows, columns, disparity[rows, columns])
+    return out

@@ -1,0 +1,343 @@
+"""Average the pixels of a coupon in blocks, for comparison with those of a white coupon.
+
+Signal chain: images [DN] -> photo-electrons, by the inverse response curve -> mean of the images, minus the scene's own
+light -> pixels on the coupon -> blocks.
+
+Signal chain of the comparison: radiance L_1 of a white coupon at the same pose, through the same lenses
+(:mod:`mitsim.twin.finish.white_coupon`) -> electrons per unit of pi f and of relative power. Directions toward camera and
+projector are computed at every pixel.
+
+- **Low pass.** Only the mean over the images of a capture is compared.
+- **Light of the room.** A simulated scene without an ambient image is dark. The scene of a device is not. There the
+  room adds an unknown radiance that is uniform over the coupon; the lens reduces it toward the corners.
+- **Censoring.** A block with a saturated pixel in any image is excluded, with its eight neighbours. Near full scale,
+  saturation removes the bright half of grain and noise, so the mean of a block would be too low.
+
+The noise of a pixel is that of :mod:`mitsim.twin.finish.electrons`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from characterisation.files.errors import InputError
+from characterisation.region_of_interest import Roi
+from mitsim.capture.capture import Capture
+from mitsim.sensor.camera import Camera
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.modulation import AmplitudeModulation
+from mitsim.sensor.preset import Sensor
+from mitsim.twin.finish.electrons import PixelNoise, chip_of, linearised, pixel_noise
+from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.white_coupon import Pattern, WhiteCouponRenderer, coupon_roi
+
+Floats = NDArray[np.float64]
+
+#: margin inside the coupon's edge that its blur may reach [px]
+_EDGE_PX = 5.0
+#: least share of a block's pixels on the coupon
+_BLOCK_SHARE = 0.5
+#: least light of a pixel relative to the brightest; with less, the projector does not reach it
+_UNLIT = 1e-3
+
+
+@dataclass(frozen=True)
+class View:
+    """A coupon in the images of one camera at one exposure: N pixels in ``size`` blocks.
+
+    - ``capture``: index of the capture; ``name``: its name in messages; ``camera``; ``exposure_s`` [s].
+    - ``columns``, ``rows`` (N,) [px] in the camera's image.
+    - ``block`` (N,): index of each pixel's block; ``width``: side of a block [px].
+    - ``grid`` (size, 2): row and column of each block.
+    - ``electrons`` (N,) [e-]: mean over the images.
+    - ``unit`` (N,) [e-]: electrons for pi f = 1 at the power of the sensor file.
+    - ``ambient`` (N,) [s]: electrons from the light of the room, over its e-/s in the middle of the image. It is 0 if
+      there is none, or if it was subtracted.
+    - ``toward_camera``, ``toward_projector`` (N, 3): unit directions, in the frame of the coupon.
+    - ``noise`` of a pixel's mean.
+    - ``whole``: number of blocks on the coupon, saturated ones included; ``place`` of the coupon.
+    - ``why_no_block``: reason why there is no block on the coupon, "" otherwise.
+    """
+
+    capture: int
+    name: str
+    camera: str
+    exposure_s: float
+    columns: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    block: NDArray[np.int64]
+    width: int
+    grid: NDArray[np.int64]
+    electrons: Floats = field(repr=False)
+    unit: Floats = field(repr=False)
+    ambient: Floats = field(repr=False)
+    toward_camera: Floats = field(repr=False)
+    toward_projector: Floats = field(repr=False)
+    noise: PixelNoise = field(repr=False)
+    whole: int
+    place: Place = field(repr=False)
+    why_no_block: str = ""
+
+    @property
+    def size(self) -> int:
+        """Number of blocks."""
+        return len(self.grid)
+
+    @property
+    def censored(self) -> float:
+        """Share of the blocks that are excluded for saturation [1]."""
+        return 1.0 - self.size / self.whole if self.whole else 0.0
+
+    def means(self, values: Floats) -> Floats:
+        """Return the mean of pixel values (N,) in each block, (size,)."""
+        return np.asarray(np.bincount(self.block, values, self.size) / self.counts)
+
+    @property
+    def counts(self) -> Floats:
+        """Number of pixels of each block, (size,)."""
+        return np.bincount(self.block, minlength=self.size).astype(float)
+
+    def off_mirror(self) -> tuple[float, float]:
+        """Return the least and largest angle between half vector and normal [rad], over the pixels."""
+        half = self.toward_camera + self.toward_projector
+        angle = np.arccos(np.clip(half[:, 2] / np.linalg.norm(half, axis=1), -1.0, 1.0))
+        return float(angle.min()), float(angle.max())
+
+
+@dataclass(frozen=True)
+class CouponCapture:
+    """A capture of a coupon: its ``place``, the ``index`` of the capture, and its name ``where`` in messages."""
+
+    capture: Capture
+    place: Place
+    index: int
+    where: str
+
+
+def observe(
+    coupon_capture: CouponCapture,
+    renderer: WhiteCouponRenderer,
+    block_px: int,
+    *,
+    pattern: Pattern,
+    lit_room: bool = False,
+) -> list[View]:
+    """Return the view of a coupon by every camera at every exposure.
+
+    Parameters
+    ----------
+    coupon_capture
+        Capture, and place of the coupon in it.
+    renderer
+        Renders the white coupon; its sensor has the cameras of the capture.
+    block_px
+        Side of a block [px].
+    pattern
+        ``mean`` if the capture has the sensor's own pattern, otherwise ``level``.
+    lit_room
+        Whether the images contain other light than that of the projector.
+
+    Raises
+    ------
+    InputError
+        If the capture is one of time of flight or has no images, or its exposures or its number of images are wrong.
+    """
+    sensor, capture, place, where = renderer.sensor, coupon_capture.capture, coupon_capture.place, coupon_capture.where
+    if isinstance(sensor.pattern, AmplitudeModulation):
+        raise InputError(where, "technology", capture.technology, "images of light, not of its correlation")
+    if not capture.images:
+        raise InputError(where, "images", "none", "images of the coupon")
+    exposures = capture.settings.get("exposure_s")
+    exposures = exposures if isinstance(exposures, list) else [exposures]
+    if not exposures or not all(isinstance(e, int | float) and e > 0 for e in exposures):
+        raise InputError(where, "settings.exposure_s", repr(exposures), "the exposure [s] of every image")
+    ambient = bool(capture.settings.get("ambient_image", False))
+    views = []
+    for name, stack in capture.images.items():
+        if len(stack) % len(exposures) or len(stack) // len(exposures) <= ambient:
+            raise InputError(
+                where, "images", f"{len(stack)} of {name}", f"as many at each of {len(exposures)} exposures"
+            )
+        camera = sensor.rig.cameras[name]
+        roi = coupon_roi(camera, place)
+        white = renderer.white(place, name, roi, pattern)
+        loss = renderer.corner_loss(name)
+        region = _CouponRegion.of(camera, place, sensor, roi, _read_out(capture, name), white, loss)
+        each = len(stack) // len(exposures)
+        shown = stack[:, *roi.slices]
+        for number, seconds in enumerate(exposures):
+            images = shown[number * each : (number + 1) * each]
+            chip = chip_of(capture, sensor.imager, where)
+            noise = pixel_noise(sensor.imager, chip, each - ambient, float(seconds), ambient)
+            blocks = _Blocks.of(region, images, chip, block_px)
+            lit, dark = (images[:-1], images[-1]) if ambient else (images, None)
+            frames = _Frames(lit, dark, chip, float(seconds), float(seconds) if lit_room and not ambient else 0.0)
+            views.append(_view(coupon_capture, name, region, blocks, frames, noise))
+    return views
+
+
+@dataclass(frozen=True)
+class _CouponRegion:
+    """A coupon in a region (h, w) of a camera's image.
+
+    - ``inside`` (h, w): pixels on the coupon, inside its edge.
+    - ``points`` (h, w, 3) [mm]: where the view rays meet the plane, in the frame of the coupon.
+    - ``white`` (h, w) [e-/s] of a white coupon; ``loss`` (h, w) [1]: relative illumination of the lens.
+    - ``camera_centre``, ``projector_centre`` (3,) [mm]: centres of camera and projector, in the frame of the coupon.
+    """
+
+    roi: Roi
+    inside: NDArray[np.bool_]
+    points: Floats
+    white: Floats
+    loss: Floats
+    camera_centre: Floats
+    projector_centre: Floats
+
+    @classmethod
+    def of(
+        cls,
+        camera: Camera,
+        place: Place,
+        sensor: Sensor,
+        roi: Roi,
+        read_out: Roi | None,
+        white: Floats,
+        corner_loss: NDArray[np.float32] | None,
+    ) -> _CouponRegion:
+        """Intersect the view rays of a region with the plane of the coupon, and select the pixels inside its edge.
+
+        ``read_out`` is the region that the camera read out, None for the whole image.
+        """
+        pose = place.world_from_sensor
+        centre, projector_centre = pose.points(camera.centre), pose.points(sensor.projector.optics.centre)
+        columns, rows = roi.pixels()
+        rays = camera.rays(np.stack([columns, rows], axis=-1).astype(float))
+        rays = pose.directions(camera.sensor_from_camera.directions(rays))
+        down = rays[..., 2] < -1e-6
+        reach = np.where(down, -centre[2] / np.where(down, rays[..., 2], -1.0), 0.0)
+        points = centre + reach[..., None] * rays
+        focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
+        footprint = reach / (focal * np.where(down, -rays[..., 2], 1.0))
+        inside = down & (white > _UNLIT * white.max())
+        inside[inside] = place.contains(points[inside][:, :2], _EDGE_PX * footprint[inside])
+        if read_out is not None:
+            inside &= (columns >= read_out.left) & (columns < read_out.right)
+            inside &= (rows >= read_out.top) & (rows < read_out.bottom)
+        loss = np.ones(white.shape) if corner_loss is None else corner_loss[rows, columns].astype(float)
+        return cls(roi, inside, points, white, loss, centre, projector_centre)
+
+    def toward(self, centre: Floats, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
+        """Return unit directions (N, 3) from the points of pixels toward a ``centre`` (3,) [mm]."""
+        out = centre - self.points[rows, columns]
+        return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """The pixels of a region that are compared: ``rows``, ``columns`` (N,) in it, ``block`` (N,), ``grid`` (B, 2).
+
+    ``width``: side of a block [px]; ``whole``: number of blocks on the coupon, saturated ones included.
+    """
+
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    block: NDArray[np.int64]
+    grid: NDArray[np.int64]
+    width: int
+    whole: int
+
+    @classmethod
+    def of(cls, region: _CouponRegion, images: NDArray[np.unsignedinteger[Any]], chip: Imager, width: int) -> _Blocks:
+        """Group the pixels on the coupon in blocks of ``width`` px, without saturated blocks and their neighbours."""
+        rows, columns = np.nonzero(region.inside)
+        shape = tuple(-(-size // width) for size in region.inside.shape)
+        number = (rows // width) * shape[1] + columns // width
+        held = np.bincount(number, minlength=shape[0] * shape[1]) >= _BLOCK_SHARE * width**2
+        bright_rows, bright_columns = np.nonzero((images >= chip.full_scale).any(axis=0) & region.inside)
+        saturated = np.zeros(shape, bool)
+        saturated[bright_rows // width, bright_columns // width] = True
+        used = held & ~ndimage.binary_dilation(saturated, np.ones((3, 3), bool)).ravel()
+        kept = used[number]
+        labels, block = np.unique(number[kept], return_inverse=True)
+        grid = np.stack(np.divmod(labels, shape[1]), axis=1)
+        return cls(rows[kept], columns[kept], block.reshape(-1), grid, width, int(held.sum()))
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """A region of the images of one camera at one exposure.
+
+    - ``lit`` (F, h, w) [DN]; ``dark`` (h, w) [DN]: image with the projector off, None without one.
+    - ``chip``: imager with the capture's number of bits.
+    - ``seconds``: exposure [s]; ``room_seconds``: exposure to light of the room that must be fitted [s], 0 without it.
+    """
+
+    lit: NDArray[np.unsignedinteger[Any]]
+    dark: NDArray[np.unsignedinteger[Any]] | None
+    chip: Imager
+    seconds: float
+    room_seconds: float
+
+    def electrons(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
+        """Return the mean photo-electrons (N,) [e-] of pixels, minus those of the dark image."""
+        mean = linearised(self.lit[:, rows, columns], self.chip).mean(axis=0)
+        return np.asarray(mean if self.dark is None else mean - linearised(self.dark[rows, columns], self.chip))
+
+
+def _view(
+    coupon_capture: CouponCapture,
+    camera: str,
+    region: _CouponRegion,
+    blocks: _Blocks,
+    frames: _Frames,
+    noise: PixelNoise,
+) -> View:
+    rows, columns, place = blocks.rows, blocks.columns, coupon_capture.place
+    return View(
+        coupon_capture.index,
+        coupon_capture.where,
+        camera,
+        frames.seconds,
+        columns + region.roi.left,
+        rows + region.roi.top,
+        blocks.block,
+        blocks.width,
+        blocks.grid,
+        frames.electrons(rows, columns),
+        region.white[rows, columns] * frames.seconds,
+        region.loss[rows, columns] * frames.room_seconds,
+        region.toward(region.camera_centre, rows, columns),
+        region.toward(region.projector_centre, rows, columns),
+        noise,
+        blocks.whole,
+        place,
+        "" if blocks.whole else _why_no_block(region, place, blocks.width),
+    )
+
+
+def _why_no_block(region: _CouponRegion, place: Place, width: int) -> str:
+    """Return the reason why a camera has no block on a coupon, in words."""
+    met = np.isfinite(region.points).all(axis=-1) & place.contains(
+        region.points[..., :2].reshape(-1, 2), np.zeros(region.points[..., 0].size)
+    ).reshape(region.points.shape[:2])
+    if not met.any():
+        return "the coupon is not in the image: its pose, or the plane of its cloud, is elsewhere"
+    lit = region.white > _UNLIT * max(float(region.white.max()), np.finfo(float).tiny)
+    if not (met & lit).any():
+        return "the projector of the sensor file does not illuminate the coupon"
+    if not region.inside.any():
+        return f"within {2 * _EDGE_PX:g} px the coupon has two edges: it is too small, or was not read out"
+    inside = int(region.inside.sum())
+    return f"its {inside} pixels, {_EDGE_PX:g} px inside the edge, fill half of no block of {width} x {width} px"
+
+
+def _read_out(capture: Capture, camera: str) -> Roi | None:
+    """Return the region of a camera's image that was read out, None for the whole image."""
+    region = capture.settings.get("read_out", {}).get(camera)
+    return None if region is None else Roi(*region)

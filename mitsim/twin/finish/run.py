@@ -1,0 +1,325 @@
+"""Fit the finish of a coupon and the power of the projector to captures of the coupon.
+
+Signal chain: capture folders, scene of the coupon -> place of the coupon in each (:mod:`mitsim.twin.finish.specimen`) -> views
+(:mod:`mitsim.twin.finish.observation`) -> fit (:mod:`mitsim.twin.finish.estimate`) -> alpha, Ra-equivalent, power [W], residual. If the
+pattern is not that of the sensor file, its dots are compared, too (:mod:`mitsim.twin.finish.dots`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from characterisation.files.atomic_io import json_values
+from characterisation.files.errors import InputError
+from characterisation.region_of_interest import Roi
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import read_capture
+from mitsim.maps.campaign.coupons import CouponRecipe, load_sample
+from mitsim.running.progress import say, track
+from mitsim.scene.light_transport.ambient import has_emitters
+from mitsim.sensor.camera import Rig
+from mitsim.sensor.pattern import DotPattern
+from mitsim.sensor.preset import Sensor, load_sensor, presets
+from mitsim.twin.finish.dots import Dots, compare_dots
+from mitsim.twin.finish.estimate import Fit, Parameter, fit_views
+from mitsim.twin.finish.finish import MetalFinish, metal_finish
+from mitsim.twin.finish.observation import CouponCapture, View, observe
+from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.problem import Residual
+from mitsim.twin.finish.specimen import place_of
+from mitsim.twin.finish.white_coupon import WhiteCouponRenderer, pattern_is_known, with_rig
+
+#: side of a block [px] with a known pattern, and with an unknown one, whose dots count as grain. It is several times
+#: the length of the grain, which is under 1 px and about 2 px, respectively
+KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX = 8, 32
+
+DIFFUSE = "matt_white"
+
+
+@dataclass(frozen=True)
+class CouponFit:
+    """A fit and its inputs.
+
+    - ``sensor``; ``finish``: name of metal and process, or of the diffuse sheet; ``metal``: None for a diffuse sheet.
+    - ``fit``: result of the fit.
+    - ``dots``: comparison of the dots by view, if the pattern is unknown.
+    - ``captures``: their folders; ``places`` of the coupon in them; ``source`` of the captures.
+    - ``block_px``: side of a block [px].
+    - ``pattern_unknown``: whether the pattern of a capture is not known to be that of the sensor file.
+    """
+
+    sensor: Sensor = field(repr=False)
+    finish: str
+    metal: MetalFinish | None = field(repr=False)
+    fit: Fit
+    dots: tuple[Dots, ...]
+    captures: tuple[str, ...]
+    places: tuple[Place, ...] = field(repr=False)
+    block_px: int
+    source: str
+    pattern_unknown: bool
+
+    @property
+    def alpha(self) -> tuple[float, float]:
+        """Width alpha of the lobe as defined by Beckmann [1], and its standard uncertainty; NaN for a diffuse sheet."""
+        return _exponential(self.fit.log_alpha)
+
+    @property
+    def roughness(self) -> tuple[float, float]:
+        """Ra-equivalent [um] and its standard uncertainty; NaN if no Ra of the process has this lobe."""
+        if self.metal is None or self.fit.log_alpha is None:
+            return math.nan, math.nan
+        return self.metal.roughness(self.alpha[0], self.fit.log_alpha.uncertainty)
+
+    @property
+    def power(self) -> tuple[float, float]:
+        """Flux of the projector [W] and its standard uncertainty; for a diffuse sheet, both times its albedo."""
+        relative, uncertainty = _exponential(self.fit.log_power)
+        return relative * self.sensor.projector.flux, uncertainty * self.sensor.projector.flux
+
+    @property
+    def censored(self) -> float:
+        """Share of the blocks on the coupon that were excluded for saturation [1]."""
+        return 1.0 - self.fit.blocks / sum(residual.view.whole for residual in self.fit.residuals)
+
+    @property
+    def rms_dn(self) -> float:
+        """Root mean square residual of all blocks [DN]."""
+        return _pooled([(r.view.size, r.rms_dn) for r in self.fit.residuals])
+
+    @property
+    def rms_in_noise(self) -> float:
+        """Root mean square residual of all blocks in standard deviations of a block's noise [1]."""
+        return _pooled([(r.view.size, r.rms_in_noise) for r in self.fit.residuals])
+
+    @property
+    def worst(self) -> Residual:
+        """Residuals of the view with the largest (chi-square - n) / sqrt(2 n), with n its number of blocks."""
+
+        def excess(residual: Residual) -> float:
+            blocks = residual.view.size
+            return (float(residual.in_noise @ residual.in_noise) - blocks) / math.sqrt(2 * blocks)
+
+        return max((residual for residual in self.fit.residuals if residual.view.size), key=excess)
+
+    def numbers(self) -> dict[str, Any]:
+        """Return the fit as JSON values, null for unknown ones; the keys are in docs/reference/formats/fit.md."""
+        fit, (ra, ra_uncertainty) = self.fit, self.roughness
+        document: dict[str, Any] = json_values(
+            {
+                "sensor": self.sensor.name,
+                "source": self.source,
+                "finish": self.finish,
+                "captures": list(self.captures),
+                "alpha": _uncertain(self.alpha, fit.log_alpha),
+                "ra_equivalent_um": {
+                    "value": ra,
+                    "uncertainty": ra_uncertainty,
+                    "range_um": list(self.metal.roughness_range) if self.metal else None,
+                },
+                "power_w": _uncertain(self.power, fit.log_power) | {"times_albedo": self.metal is None},
+                "wide_angle_share": _linear(fit.wide_angle),
+                "room_electrons_per_s": _linear(fit.ambient),
+                "reduced_chi_square": fit.reduced_chi_square,
+                "blocks": fit.blocks,
+                "pixels": fit.pixels,
+                "block_px": self.block_px,
+                "grain": fit.grain,
+                "neighbours_correlation": fit.neighbours,
+                "alpha_at_limit": fit.at_limit,
+                "left_out_share": self.censored,
+                "residual_rms_dn": self.rms_dn,
+                "residual_rms_in_noise": self.rms_in_noise,
+                "dots": [asdict(one) for one in self.dots],
+                "views": [_view_numbers(residual) for residual in fit.residuals],
+            }
+        )
+        return document
+
+
+def fit_captures(
+    captures: Sequence[Path],
+    sensor: str | None = None,
+    scene: Path | None = None,
+    parameters: dict[str, str] | None = None,
+    block_px: int | None = None,
+    roi: Roi | None = None,
+) -> CouponFit:
+    """Fit a coupon's finish and the projector's power to captures of it.
+
+    Parameters
+    ----------
+    captures
+        Capture folders of one coupon, taken by one sensor.
+    sensor
+        Name of a preset, or path of a sensor file; by default, the preset that the captures name.
+    scene
+        Scene file with size, metal and process of the coupon; its Ra has no influence. By default, the scene that the
+        captures name.
+    parameters
+        Values for the ``<default>`` elements of the scene.
+    block_px
+        Side of a block [px]; by default :data:`KNOWN_BLOCK_PX`, or :data:`UNKNOWN_BLOCK_PX` for an unknown pattern.
+    roi
+        Region of the first camera's image [px] that shows only the coupon. The plane is then fitted to its points, and
+        the poses of the captures are not used.
+
+    Raises
+    ------
+    InputError
+        If captures, sensor and scene do not fit each other, or too few blocks can be compared.
+    """
+    if not captures:
+        raise InputError("CAPTURES", "", "none", "one capture folder or more")
+    if len({path.resolve() for path in captures}) < len(captures):
+        raise InputError("CAPTURES", "", "a folder twice", "each capture once", "the same noise twice is not a repeat")
+    chosen, first = _sensor(captures[0], sensor), read_capture(captures[0])
+    path = scene or _own_scene(first, captures[0])
+    recipe = CouponRecipe(str(path), tuple(sorted((parameters or {}).items())), chosen.wavelength_nm)
+    sample = load_sample(recipe)
+    finish = sample.scene.finishes[0]
+    assert finish is not None  # load_sample checks this
+    metal = None if finish.name == DIFFUSE else metal_finish(finish, chosen.wavelength_nm, str(path))
+    block = block_px or (KNOWN_BLOCK_PX if pattern_is_known(first, chosen) else UNKNOWN_BLOCK_PX)
+
+    views: list[View] = []
+    dots: list[Dots] = []
+    places: list[Place] = []
+    rig_and_renderer: tuple[Rig, WhiteCouponRenderer] | None = None
+    unknown = False
+    for index, folder in enumerate(track(list(captures), "captures", len(captures))):
+        capture = read_capture(folder)
+        if capture.sensor != first.sensor:
+            raise InputError(folder, "sensor", capture.sensor, f"{first.sensor}, as in {captures[0]}")
+        if rig_and_renderer is None or not _same(rig_and_renderer[0], capture.rig):
+            rig_and_renderer = capture.rig, WhiteCouponRenderer(with_rig(chosen, capture.rig))
+        renderer, known = rig_and_renderer[1], pattern_is_known(capture, chosen)
+        unknown |= not known
+        place = place_of(capture, renderer.sensor, (sample.width, sample.height), str(folder), roi)
+        lit = capture.source != "simulated" or has_emitters(sample.scene)
+        coupon_capture = CouponCapture(capture, place, index, str(folder))
+        capture_views = observe(coupon_capture, renderer, block, pattern="mean" if known else "level", lit_room=lit)
+        if not known and isinstance(chosen.pattern, DotPattern):
+            dots += [compare_dots(view, renderer) for view in capture_views if view.size]
+        views += capture_views
+        places.append(place)
+    if not sum(view.whole for view in views):
+        why = "; ".join(dict.fromkeys(f"{view.camera} of {view.name}: {view.why_no_block}" for view in views[:4]))
+        raise InputError(
+            "captures",
+            "images",
+            f"no block of {block} px on the coupon: {why}",
+            "a coupon in the images",
+            "give the region of the image that shows it: --window",
+        )
+    say(f"fitting {sum(len(view.block) for view in views)} pixels in {sum(view.size for view in views)} blocks")
+    return CouponFit(
+        chosen,
+        finish.name,
+        metal,
+        fit_views(views, metal),
+        tuple(dots),
+        tuple(str(c) for c in captures),
+        tuple(places),
+        block,
+        first.source,
+        unknown,
+    )
+
+
+def _sensor(folder: Path, name: str | None) -> Sensor:
+    if name is not None:
+        return load_sensor(name)
+    own = read_capture(folder).sensor
+    if own not in presets():
+        raise InputError(
+            folder / "capture.json",
+            "sensor",
+            own,
+            f"one of {', '.join(presets())}",
+            "give the preset or the sensor file: --sensor",
+        )
+    return load_sensor(own)
+
+
+def _own_scene(capture: Capture, folder: Path) -> Path:
+    named = capture.settings.get("scene")
+    if isinstance(named, str) and Path(named).is_file():
+        return Path(named)
+    found = repr(named) if named else "nothing"
+    raise InputError(
+        folder / "settings.json",
+        "scene",
+        found,
+        "an existing scene file",
+        "give the scene of the coupon: --scene scenes/coupon/coupon.xml",
+    )
+
+
+def _same(first: Rig, second: Rig) -> bool:
+    """Return whether two rigs have the same cameras at the same poses."""
+    if list(first.cameras) != list(second.cameras):
+        return False
+    return all(
+        np.array_equal(a.matrix, b.matrix)
+        and np.array_equal(a.distortion, b.distortion)
+        and np.array_equal(a.sensor_from_camera.matrix(), b.sensor_from_camera.matrix())
+        for a, b in zip(first.cameras.values(), second.cameras.values(), strict=True)
+    )
+
+
+def _exponential(parameter: Parameter | None) -> tuple[float, float]:
+    """Return value and standard uncertainty of a quantity whose logarithm was fitted."""
+    if parameter is None:
+        return math.nan, math.nan
+    value = math.exp(parameter.value)
+    return value, value * parameter.uncertainty
+
+
+def _uncertain(pair: tuple[float, float], parameter: Parameter | None) -> dict[str, Any]:
+    relative = (math.nan, math.nan) if parameter is None else (parameter.by_covariance, parameter.by_jackknife)
+    return {
+        "value": pair[0],
+        "uncertainty": pair[1],
+        "relative_by_covariance": relative[0],
+        "relative_by_jackknife": relative[1],
+    }
+
+
+def _linear(parameter: Parameter | None) -> dict[str, Any] | None:
+    if parameter is None:
+        return None
+    return {
+        "value": parameter.value,
+        "uncertainty": parameter.uncertainty,
+        "by_covariance": parameter.by_covariance,
+        "by_jackknife": parameter.by_jackknife,
+    }
+
+
+def _view_numbers(residual: Residual) -> dict[str, Any]:
+    view = residual.view
+    low, high = np.degrees(view.off_mirror()) if view.size else (math.nan, math.nan)
+    return {
+        "capture": view.name,
+        "camera": view.camera,
+        "exposure_s": view.exposure_s,
+        "blocks": view.size,
+        "left_out_share": view.censored,
+        "half_vector_deg": [float(low), float(high)],
+        "rms_dn": residual.rms_dn,
+        "rms_relative": residual.rms_relative,
+        "rms_in_noise": residual.rms_in_noise,
+        "off_plane_mm": view.place.off_plane,
+    }
+
+
+def _pooled(parts: list[tuple[int, float]]) -> float:
+    known = [(size, rms) for size, rms in parts if size]
+    return math.sqrt(sum(size * rms**2 for size, rms in known) / sum(size for size, _ in known))

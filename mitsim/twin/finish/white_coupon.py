@@ -1,0 +1,98 @@
+"""Render a white coupon in front of a sensor, with one projected image in place of the patterns.
+
+Signal chain: patterns of the sensor -> their light, averaged -> one image -> radiance of the white coupon at the pose
+of the coupon -> electrons per second in each pixel.
+
+The projected pattern of a device may not be that of the sensor file. A uniform image of the same mean level then
+replaces it, and the dots count as grain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.region_of_interest import Roi
+from mitsim.capture.capture import Capture
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.scene.differentiable import lambertian_coupon
+from mitsim.scene.light_transport.projector_light import ProjectedPatterns
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.pattern import RandomDots
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.projector import Projector
+from mitsim.sensor.roi import roi_around
+from mitsim.twin.finish.place import Place
+
+Floats = NDArray[np.float64]
+
+#: image in place of a sensor's patterns: the mean of all patterns; a uniform image of their mean level; the first one
+Pattern = Literal["mean", "level", "first"]
+
+#: margin around the coupon [px]
+_MARGIN_PX = 12
+
+
+class WhiteCouponRenderer:
+    """A sensor that renders white coupons, prepared once; its projector shows one image in place of its patterns."""
+
+    def __init__(self, sensor: Sensor, samples: int = 16) -> None:
+        self.sensor, self.samples = sensor, samples
+        # white() sets the image; a placeholder here keeps the patterns from being loaded on the device all at once
+        self._simulated = SimulatedSensor(replace(sensor, pattern=RandomDots(kind="random_dots", run_length_px=10.0)))
+        self._lit: dict[Pattern, ProjectedPatterns] = {}
+
+    def corner_loss(self, camera: str) -> NDArray[np.float32] | None:
+        """Return the relative illumination of a camera's lens (H, W) [1], None if it is uniform."""
+        return self._simulated.corner_loss[camera]
+
+    def white(self, place: Place, camera: str, roi: Roi, pattern: Pattern) -> Floats:
+        """Return electrons per second (h, w) [e-/s] in a region that shows a Lambertian coupon of reflectance 1."""
+        if pattern not in self._lit:
+            self._lit[pattern] = self._one(pattern)
+        self._simulated.patterns = self._lit[pattern]
+        scene = lambertian_coupon(*place.size, self.sensor.wavelength_nm)
+        radiance = self._simulated.radiance(
+            scene, place.world_from_sensor, camera, Rendering(samples=self.samples, depth=1), seed=0, roi=roi
+        )
+        return np.asarray(radiance[0], np.float64) * self.sensor.electrons()
+
+    def _one(self, pattern: Pattern) -> ProjectedPatterns:
+        projector = self.sensor.projector
+        frames = self.sensor.patterns()
+        sent = projector.emit(frames[:1]) if pattern == "first" else _mean_sent(frames, projector)
+        if pattern == "level":
+            sent = np.full_like(sent, sent.mean())
+        values = (sent - projector.black_level) / (1.0 - projector.black_level)
+        values = np.clip(values, 0.0, 1.0) ** (1.0 / projector.gamma)
+        return ProjectedPatterns(values.astype(np.float32), projector)
+
+
+def _mean_sent(frames: NDArray[np.float32], projector: Projector) -> NDArray[np.float32]:
+    """Return the mean light (1, H, W) of frames (P, H, W), summed one by one to save memory."""
+    total = np.zeros(frames.shape[1:])
+    for frame in frames:
+        total += projector.emit(frame)
+    return np.asarray(total[None] / len(frames), np.float32)
+
+
+def pattern_is_known(capture: Capture, sensor: Sensor) -> bool:
+    """Return whether the settings of a capture state the same pattern as the sensor file."""
+    return capture.settings.get("pattern") == sensor.pattern.model_dump(mode="json")
+
+
+def with_rig(sensor: Sensor, rig: Rig) -> Sensor:
+    """Return the sensor with the cameras of a capture, and the projector of its own file.
+
+    Recordings do not describe their projector.
+    """
+    return replace(sensor, rig=replace(rig, projector=sensor.rig.projector))
+
+
+def coupon_roi(camera: Camera, place: Place) -> Roi:
+    """Return the region of a camera's image that holds a coupon and a margin of 12 px."""
+    return roi_around(camera, place.corners(), _MARGIN_PX) or Roi.whole(camera.width, camera.height)

@@ -1,0 +1,1 @@
+"""A sensor file fitted to captures of one unit in one room."""

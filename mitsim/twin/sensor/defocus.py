@@ -1,0 +1,116 @@
+"""Estimate a projector's depth of focus and aperture from one capture of stripes.
+
+Signal chain: decoded points -> depth in front of the projector, block by block -> modulation of stripes by width ->
+blur s [projector px] of every block (:func:`mitsim.twin.sensor.stripes.modulation`) -> least squares on
+
+    s^2(z) = s_0^2 + (a f |1/z - 1/z_f| / 4)^2
+
+with a the diameter of the lens's aperture, z_f the depth of sharp focus, and s_0 all blur that does not change with
+depth, including the camera's. A point at depth z receives light from a disc of diameter a f |1/z - 1/z_f| px. The
+standard deviation of the disc along one axis is a quarter of its diameter (:mod:`mitsim.sensor.projector`). Points
+beside the specimen are used too: a larger range of depths separates s_0 and a better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from mitsim.decode.cloud import capture_cloud, decoder_settings
+from mitsim.twin.sensor.input_captures import InputCapture
+from mitsim.twin.sensor.modulation import fitted_blur
+
+Floats = NDArray[np.float64]
+
+#: side of a block [px]; least share of decoded pixels; largest relative spread of depths and of white levels [1]
+_BLOCK_PX, _LEAST_SHARE, _DEEP, _EVEN = 32, 0.15, 0.025, 0.12
+
+#: least white minus black [DN of 8 bit]; below, rounding raises the modulation of fine stripes
+_LEAST_DN = 50.0
+
+#: widest stripes used [projector px]; least number of blocks; parts of the jackknife
+_WIDEST_PX, _FEWEST, _PARTS = 40.0, 60, 20
+
+#: blur residual [px] beyond which a block loses weight as an outlier
+_SOFT_PX = 0.1
+
+
+@dataclass(frozen=True)
+class Defocus:
+    """Constant blur ``still_px`` [projector px], ``aperture_mm``, ``focus_mm`` and their covariance (3, 3)."""
+
+    still_px: float
+    aperture_mm: float
+    focus_mm: float
+    covariance: Floats
+
+
+def fit_defocus(source: InputCapture, white: Floats, black: Floats, pairs: Floats, widths: Floats) -> Defocus | None:
+    """Fit the focus of a capture's projector; None if there are too few blocks.
+
+    Parameters
+    ----------
+    white, black
+        (H, W) images of full light and of no light, linear in light.
+    pairs
+        (n, 2, H, W) images of stripes and of their inverses, linear too.
+    widths
+        (n,) of the stripes [projector px].
+    """
+    projector = source.capture.rig.projector
+    assert projector is not None
+    settings, _ = decoder_settings(source.capture)
+    points = capture_cloud(source.capture, settings).points.astype(float)
+    depth = projector.sensor_from_camera.inverse().points(points.reshape(-1, 3)).reshape(points.shape)[..., 2]
+    fine = widths < _WIDEST_PX
+    difference = np.abs(pairs[fine, 0] - pairs[fine, 1])
+    least = _LEAST_DN * (2**source.capture.bits - 1) / 255
+    rows = []
+    for top in range(0, white.shape[0] - _BLOCK_PX + 1, _BLOCK_PX):
+        for left in range(0, white.shape[1] - _BLOCK_PX + 1, _BLOCK_PX):
+            part = np.s_[top : top + _BLOCK_PX, left : left + _BLOCK_PX]
+            own, level = depth[part][np.isfinite(depth[part])], white[part]
+            if len(own) < _LEAST_SHARE * _BLOCK_PX**2 or level.std() > _EVEN * level.mean():
+                continue
+            near, middle, far = np.percentile(own, [10, 50, 90])
+            modulated = float((level - black[part]).mean())
+            if far - near > _DEEP * middle or modulated < least:
+                continue
+            ratio = difference[:, *part].mean(axis=(1, 2)) / modulated
+            rows.append((middle, fitted_blur(widths[fine], ratio)))
+    table = np.array(rows).reshape(-1, 2)
+    if len(table) < _FEWEST:
+        return None
+    focal = float(projector.matrix[0, 0])
+    found = _fitted(table, focal)
+    # neighbouring blocks are correlated: the jackknife leaves out runs of them
+    parts = np.array_split(np.arange(len(table)), _PARTS)
+    others = np.array([_fitted(np.delete(table, part, axis=0), focal) for part in parts])
+    off = others - others.mean(axis=0)
+    return Defocus(float(found[0]), float(found[1]), float(found[2]), (_PARTS - 1) / _PARTS * off.T @ off)
+
+
+def _fitted(table: Floats, focal: float) -> Floats:
+    """Fit constant blur, aperture and focus to depths and blurs (n, 2)."""
+    depth, blur = table.T
+
+    def off(x: Floats) -> Floats:
+        return np.asarray(np.hypot(x[0], x[1] * focal * (1 / depth - 1 / x[2]) / 4) - blur)
+
+    low, high = float(depth.min()), float(depth.max())
+    starts = (low, float(np.median(depth)), high)
+    tried = [
+        least_squares(
+            off,
+            [max(float(np.median(blur)), 0.05), 20.0, start],
+            loss="soft_l1",
+            f_scale=_SOFT_PX,
+            bounds=([0.0, 0.0, low / 2], [20.0, 500.0, 2 * high]),
+            x_scale=[0.1, 10.0, 100.0],
+        )
+        for start in starts
+    ]
+    return np.asarray(min(tried, key=lambda one: one.cost).x)

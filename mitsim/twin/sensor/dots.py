@@ -1,0 +1,228 @@
+"""Fit sensor parameters to one capture of projected dots on a sheet.
+
+Signal chain: capture -> plane and bend of the sheet -> features over the field (:mod:`mitsim.twin.sensor.figures`) -> power,
+room light, dots, noise and corner losses by simulated moments (:mod:`mitsim.twin.sensor.moments`,
+:mod:`mitsim.twin.sensor.parameters`) with the forward model (:mod:`mitsim.twin.sensor.specimen_simulator`).
+
+The six terms of room light may not explain the level and contrast over the field within chance. The mean square of the
+remainder is then added to the covariance of these terms, and the fit is repeated. It is also repeated without the
+parameters that are not determined, until all are. If the misfit is still significant, the covariance is scaled by the
+reduced chi-square (Birge, Phys. Rev. 40 (1932) 207).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from characterisation.files.errors import InputError
+from characterisation.region_of_interest import Roi
+from mitsim.capture.capture import Capture
+from mitsim.sensor.pattern import DotPattern
+from mitsim.sensor.preset import Sensor
+from mitsim.twin.compare.specimen_patches import run_length
+from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
+from mitsim.twin.sensor.estimate import scaled, unscaled
+from mitsim.twin.sensor.figures import TERMS, Field, field_figures
+from mitsim.twin.sensor.moments import MomentFit, Prior, match_moments
+from mitsim.twin.sensor.parameters import CORNER_BLUR, SMOOTHING, Parameter, room_parameters, with_room
+from mitsim.twin.sensor.specimen_simulator import SpecimenSimulator
+
+Floats = NDArray[np.float64]
+
+#: side of a patch [px], and the least number of patches of a capture
+PATCH_PX, FEWEST_PATCHES = 40, 8
+
+#: limits of the window of local means [px], and its width in run lengths of the pattern: as `mitsim validate captures`
+_WINDOWS, _RUNS = (7, 31), 2.5
+
+_ALONE = ("crossings", "sharpness", "noise in the dark half", "noise in the bright half", "grain")
+
+#: initial room light as a share of the projector's; significance level of a misfit
+_FIRST_ROOM, _CHANCE = 0.2, 0.01
+
+#: step of the derivatives of the file's numbers, and least significance of a smoothing, in standard uncertainties
+_DIFFERENCE, _SURE = 0.3, 2.0
+
+
+@dataclass(frozen=True)
+class DotsFit:
+    """Result of the fit of ``parameters`` to one capture, started at ``sensor``.
+
+    - ``patches``: number of patches seen.
+    - ``uneven``: standard deviation of the field's terms that no parameter explains [1].
+    - ``undetermined``: parameters that the capture does not determine; they keep the sensor's own values.
+    """
+
+    sensor: Sensor
+    parameters: tuple[Parameter, ...]
+    moment_fit: MomentFit
+    patches: int
+    uneven: float
+    undetermined: tuple[Parameter, ...] = ()
+
+    def with_values(self, theta: Floats) -> Sensor:
+        """Return the sensor with the varied numbers (k,) inserted."""
+        return with_values(self.sensor, self.parameters, theta)
+
+    def in_file_units(self) -> tuple[Floats, Floats]:
+        """Return the numbers (k,) in the file's units, and their standard uncertainties, each on its scale.
+
+        The covariance is propagated through numerical derivatives of the file's numbers by the varied ones.
+        """
+        theta, spread = self.moment_fit.values, np.sqrt(np.diag(self.moment_fit.covariance))
+
+        def numbers(at: Floats) -> Floats:
+            sensor = self.with_values(at)
+            return np.array([scaled(parameter.read(sensor), parameter.scale) for parameter in self.parameters])
+
+        jacobian = np.empty((len(theta), len(theta)))
+        for index, parameter in enumerate(self.parameters):
+            ends = np.clip(
+                theta[index] + _DIFFERENCE * spread[index] * np.array([-1, 1]), parameter.low, parameter.high
+            )
+            low, high = (np.where(np.arange(len(theta)) == index, end, theta) for end in ends)
+            jacobian[:, index] = (numbers(high) - numbers(low)) / max(float(ends[1] - ends[0]), 1e-12)
+        found = [unscaled(x, p.scale) for x, p in zip(numbers(theta), self.parameters, strict=True)]
+        return np.array(found), np.sqrt(np.diag(jacobian @ self.moment_fit.covariance @ jacobian.T))
+
+
+def with_values(sensor: Sensor, parameters: Sequence[Parameter], theta: Floats) -> Sensor:
+    """Return the sensor with varied numbers (k,) of parameters inserted."""
+    for parameter, value in zip(parameters, theta, strict=True):
+        sensor = parameter.put(sensor, float(value))
+    return sensor
+
+
+@dataclass(frozen=True)
+class DotDraws:
+    """Simulated dots that a fit compares with: how many ``number``, their ``seed``, and patches of ``patch_px``."""
+
+    number: int = 3
+    seed: int = 1
+    patch_px: int = PATCH_PX
+
+
+_DRAWS = DotDraws()
+
+
+def fit_dots(
+    capture: Capture,
+    sensor: Sensor,
+    place: Place,
+    parameters: Sequence[Parameter],
+    where: str,
+    *,
+    room: Sequence[float] | None = None,
+    draws: DotDraws = _DRAWS,
+) -> DotsFit:
+    """Fit parameters to one capture of dots.
+
+    Parameters
+    ----------
+    sensor
+        With the capture's own cameras and exposure, from :func:`mitsim.twin.compare.rebuild.like`.
+    parameters
+        Parameters to vary, without those of the room.
+    room
+        Six terms of the irradiance [W/mm^2] of the room, if known from another capture; otherwise they are fitted too.
+
+    Raises
+    ------
+    InputError
+        If too little of the sheet is visible.
+    """
+    name, camera = next(iter(capture.rig.cameras.items()))
+    seed, patch_px = draws.seed, draws.patch_px
+    field = Field.of(camera, image_mask(place, camera, MARGIN_PX if patch_px >= PATCH_PX else 2.0), patch_px)
+    if len(field.corners) < FEWEST_PATCHES:
+        seen = f"{len(field.corners)} patches of {patch_px} px of it"
+        raise InputError(where, "specimen", seen, f"{FEWEST_PATCHES} or more", "a larger --window, or a nearer view")
+    roi = Roi(field.column, field.row, *field.mask.shape[::-1])
+    window = int(np.clip(np.nan_to_num(_RUNS * run_length(capture, place), nan=_WINDOWS[1]), *_WINDOWS)) // 2 * 2 + 1
+    black = sensor.imager.black_level
+    real = field_figures(capture.images[name][0][roi.slices].astype(float), field, window, black)
+    simulator = SpecimenSimulator(sensor, place, roi)
+    unit = simulator.projector_irradiance(sensor, seed)
+    own = list(parameters)
+    if room is None:
+        own += room_parameters(unit / sensor.projector.flux)
+        sensor = with_room(sensor, [_FIRST_ROOM * unit, 0.0, 0.0, 0.0, 0.0, 0.0])
+    else:
+        sensor = with_room(sensor, list(room))
+    even = np.isfinite(real.coefficients[1, 0])
+    terms = TERMS if even else TERMS[:1]
+    names = [(figure, term) for figure in ("level", "contrast") for term in terms]
+    names += [(alone, "1") for alone in _ALONE]
+    spatial, count = np.array([term != "1" for _, term in names]), len(names)
+    if any(parameter is CORNER_BLUR for parameter in own):
+        names += [("sharpness", term) for term in terms if term != "1"]
+        spatial = np.append(spatial, np.zeros(len(names) - len(spatial), bool))
+    wanted, covariance = real.of(names)
+
+    def simulate(theta: Floats, number: int) -> tuple[Floats, Floats]:
+        levels = simulator.levels(_with_other_dots(with_values(sensor, own, theta), number), 1000 * seed + number)
+        return field_figures(levels.astype(float), field, window, black).of(names)
+
+    start = np.array([parameter.get(sensor) for parameter in own])
+    for index, parameter in enumerate(own):
+        if parameter.key == "projector.flux_w":
+            start[index] += wanted[0] - simulate(start, 0)[0][0]
+    found = match_moments(wanted, covariance, simulate, _prior(own, start), draws.number, where)
+    uneven = 0.0
+    if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)) and spatial.sum() > 0:
+        off = wanted - np.mean([simulate(found.values, number)[0] for number in range(draws.number)], axis=0)
+        excess = float(np.mean(off[spatial] ** 2 - np.diag(covariance)[spatial]))
+        uneven = float(np.sqrt(max(excess, 0.0)))
+        covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
+    undetermined: list[Parameter] = []
+    settled = uneven == 0
+    while True:
+        kept = np.array([_is_determined(found, index, parameter) for index, parameter in enumerate(own)])
+        dropped = [parameter for parameter, is_kept in zip(own, kept, strict=True) if not is_kept]
+        if settled and not dropped:
+            break
+        # without it no parameter explains the variation of sharpness
+        if any(parameter is CORNER_BLUR for parameter in dropped):
+            names, spatial = names[:count], spatial[:count]
+            wanted, covariance = real.of(names)
+            covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
+        undetermined += dropped
+        own = [parameter for parameter, is_kept in zip(own, kept, strict=True) if is_kept]
+        start = start[kept]
+        again = _prior(own, start, found.values[kept])
+        found = match_moments(wanted, covariance, simulate, again, draws.number, f"{where}, once more")
+        settled = True
+    if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)):
+        wider = found.covariance * found.chi_square / max(found.freedom, 1)
+        found = replace(found, covariance=wider)
+    return DotsFit(sensor, tuple(own), found, len(field.corners), uneven, tuple(undetermined))
+
+
+def _is_determined(found: MomentFit, index: int, parameter: Parameter) -> bool:
+    """Return whether a parameter stays in the fit: the room's always, smoothing and corner blur if significant."""
+    if parameter.key.startswith("room."):
+        return True
+    if parameter is SMOOTHING or parameter is CORNER_BLUR:
+        return bool(found.values[index] > _SURE * np.sqrt(found.covariance[index, index]))
+    return bool(found.determined[index])
+
+
+def _prior(own: Sequence[Parameter], middle: Floats, first: Floats | None = None) -> Prior:
+    spread, step, low, high = (
+        np.array([getattr(parameter, name) for parameter in own]) for name in ("spread", "step", "low", "high")
+    )
+    return Prior(middle, spread, step, low, high, first)
+
+
+def _with_other_dots(sensor: Sensor, number: int) -> Sensor:
+    """Return the sensor with other random dots of the same kind, because the real pattern is unknown."""
+    pattern = sensor.pattern
+    if number == 0 or not isinstance(pattern, DotPattern):
+        return sensor
+    return replace(sensor, pattern=pattern.model_copy(update={"seed": pattern.seed + 7919 * number}))

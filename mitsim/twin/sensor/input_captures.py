@@ -1,0 +1,97 @@
+"""Sort the captures of a fit: projector on or off, dark, and repeats of one pose.
+
+Two captures are repeats if only the imager's noise differs between them. The mean over 5 x 5 px reduces noise to a
+fifth, as measured by its finest detail; the difference of a moved dot or shadow remains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from characterisation.files.errors import InputError
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import read_capture
+from mitsim.sensor.preset import Sensor
+from mitsim.twin.finish.fine_detail import finest_detail
+
+Kind = Literal["on", "off", "dark"]
+
+#: side of the mean, factor over the noise that remains in it, and allowance for rounding [DN]
+_MEAN_PX, _FACTOR, _ROUNDING_DN = 5, 3.0, 0.1
+
+
+@dataclass(frozen=True)
+class InputCapture:
+    """One capture: its ``folder``, and its kind: projector ``on`` or ``off``, or all light off (``dark``)."""
+
+    folder: Path
+    capture: Capture
+    kind: Kind
+
+    @property
+    def name(self) -> str:
+        """Return the folder as text."""
+        return str(self.folder)
+
+
+def read_input_captures(
+    folders: Sequence[Path], off: Sequence[Path], dark: Sequence[Path], sensor: Sensor
+) -> list[InputCapture]:
+    """Read the captures; those of ``off`` and ``dark`` are of that kind, the settings of the others state theirs.
+
+    Raises
+    ------
+    InputError
+        If there is none, one is given twice, or one is of another technology or has no images.
+    """
+    requested: list[tuple[Path, Kind | None]] = [(folder, None) for folder in folders]
+    requested += [(folder, "off") for folder in off] + [(folder, "dark") for folder in dark]
+    if not requested:
+        raise InputError("CAPTURES", "", "none", "one capture folder or more")
+    if len({folder.resolve() for folder, _ in requested}) < len(requested):
+        raise InputError("CAPTURES", "", "a folder twice", "each capture once", "the same noise twice is not a repeat")
+    input_captures = []
+    for folder, given_kind in requested:
+        capture = read_capture(folder)
+        if capture.technology != sensor.technology:
+            allowed = f"{sensor.technology}, as --sensor {sensor.name}"
+            raise InputError(folder, "technology", capture.technology, allowed)
+        if not capture.images:
+            raise InputError(folder, "images", "none", "a capture with images")
+        stated_kind: Kind = "off" if capture.settings.get("projector_on") is False else "on"
+        if capture.settings.get("dark") is True:
+            stated_kind = "dark"
+        input_captures.append(InputCapture(folder, capture, given_kind or stated_kind))
+    return input_captures
+
+
+def repeats(input_captures: Sequence[InputCapture]) -> list[list[InputCapture]]:
+    """Group captures that repeat one another, in the given order; a group of one has no repeat."""
+    groups: list[list[InputCapture]] = []
+    for source in input_captures:
+        for group in groups:
+            if group[0].kind == source.kind and same_light(group[0].capture, source.capture):
+                group.append(source)
+                break
+        else:
+            groups.append([source])
+    return groups
+
+
+def same_light(one: Capture, other: Capture) -> bool:
+    """Return whether the first images of two captures differ by noise alone."""
+    first, second = (next(iter(capture.images.values()))[0].astype(float) for capture in (one, other))
+    if first.shape != second.shape or one.bits != other.bits:
+        return False
+    if one.settings.get("exposure_s") != other.settings.get("exposure_s"):
+        return False
+    off = first - second
+    noise = float(np.abs(finest_detail(off)).mean()) * np.sqrt(np.pi / 2)
+    smooth = float(np.sqrt(np.mean(uniform_filter(off, _MEAN_PX) ** 2)))
+    return bool(smooth < _FACTOR * noise / _MEAN_PX + _ROUNDING_DN)

@@ -1,0 +1,281 @@
+"""Estimate the imager's noise from repeats, from dark captures, or from one uniform image, in this order.
+
+Signal chain: one image with the projector off -> first knee of the response curve (:mod:`mitsim.twin.sensor.response`); groups
+of repeats -> photon-transfer line -> full well, read noise; dark captures -> black level, DSNU; uniform light -> PRNU.
+Without repeats, from one image with the projector off: finest detail by level -> smoothing, full well, read noise,
+including the fixed pattern (:mod:`mitsim.twin.sensor.photon_transfer`). From dots alone the imager stays
+unknown here, and is fitted with the dots.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.point_spread import point_spread
+from mitsim.sensor.preset import Sensor
+from mitsim.twin.compare.denoise import denoised
+from mitsim.twin.finish.electrons import linearised
+from mitsim.twin.finish.fine_detail import FINEST, finest_detail
+from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
+from mitsim.twin.sensor.estimate import Estimate, Undetermined
+from mitsim.twin.sensor.input_captures import InputCapture
+from mitsim.twin.sensor.photon_transfer import (
+    Repeats,
+    TransferLine,
+    fixed_variance,
+    independent_share,
+    one_image_line,
+    repeated_line,
+    widths,
+)
+from mitsim.twin.sensor.response import first_knee, quiet_pixels
+
+Floats = NDArray[np.float64]
+
+#: largest number of pixels used in a group
+_PIXELS = 200_000
+
+#: range of the smoothing estimate [px], and its least significance in standard uncertainties
+_SMOOTHINGS, _SURE = (0.05, 3.0), 3.0
+
+#: share of the specimen's pixels away from edges of the print, above which the noise is estimated from these alone
+_LEAST_QUIET = 0.2
+
+_EVERY_SOURCE = "imager.dsnu_e", "imager.prnu"
+
+
+@dataclass(frozen=True)
+class ImagerFit:
+    """The fitted ``imager``, ``estimates`` of its numbers, undetermined numbers, and whether its noise is ``known``."""
+
+    imager: Imager
+    estimates: tuple[Estimate, ...]
+    undetermined: tuple[Undetermined, ...]
+    known: bool
+
+
+def fit_imager(groups: list[list[InputCapture]], sensor: Sensor, places: dict[str, Place]) -> ImagerFit:
+    """Fit the noise of the reference camera's imager."""
+    repeated = [group for group in groups if len(group) > 1]
+    dark = [group for group in groups if group[0].kind == "dark"]
+    imager, estimates = sensor.imager, []
+    if dark:
+        imager, level = _with_black_level(imager, dark)
+        estimates.append(level)
+    imager, curve = _with_curve(imager, groups, sensor)
+    estimates += curve
+    if repeated:
+        line = repeated_line([_repeats(group, _specimen_mask(group[0], places)) for group in repeated], imager)
+        if line is not None:
+            names = tuple(source.name for group in repeated for source in group)
+            imager, found = _with_line(imager, line, names, "photon transfer of repeats")
+            imager, fixed, undetermined = _with_fixed(imager, sensor.imager, repeated, places)
+            return ImagerFit(imager, (*estimates, *found, *fixed), tuple(undetermined), True)
+    for group in groups:
+        if group[0].kind == "off":
+            found_one = _from_one_image(group[0], imager, places)
+            if found_one is not None:
+                imager, found = found_one
+                determined_by = "repeats of one pose; until then read_noise_e and full_well_e include it"
+                undetermined = [
+                    Undetermined(key, 0.0, determined_by)
+                    for key in (*_EVERY_SOURCE, "imager.row_noise_e", "imager.column_pattern_e")
+                ]
+                return ImagerFit(imager, (*estimates, *found), tuple(undetermined), True)
+    return ImagerFit(imager, tuple(estimates), (), False)
+
+
+def smoothing_of(
+    image: NDArray[np.unsignedinteger], mask: NDArray[np.bool_], rounding: float = 1 / 12
+) -> tuple[float, float]:
+    """Return the standard deviation [px] of the Gaussian that smoothed an image's noise, and its uncertainty.
+
+    The correlation of neighbours in the finest detail is -0.8 for white noise and rises with smoothing. ``rounding``
+    [DN^2] is the white noise of whole grey levels; it is subtracted first.
+    """
+    fine = finest_detail(image.astype(float))
+    size = 1.4826 * float(np.median(np.abs(fine[mask])))
+    usable = mask & (np.abs(fine) < 4 * max(size, 0.5))
+    energy, products = float((fine[usable] ** 2).mean()), []
+    for first, second in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        both = usable[first] & usable[second]
+        products.append(float((fine[first] * fine[second])[both].mean()))
+    white_energy, white_product = _fine_moments(0.0)
+    left = energy - rounding * white_energy
+    if left <= 0.1 * energy:
+        return 0.0, float("inf")
+    correlation = (float(np.mean(products)) - rounding * white_product) / left
+    spread = np.sqrt(2 / (float(usable.sum()) * independent_share())) * energy / left
+    low, high = (_correlation(s) for s in _SMOOTHINGS)
+
+    def at(value: float) -> float:
+        if value <= low:
+            return 0.0
+        if value >= high:
+            return _SMOOTHINGS[1]
+        return float(brentq(lambda s: _correlation(s) - value, *_SMOOTHINGS))
+
+    found = at(correlation)
+    return found, max(at(correlation + spread) - found, found - at(correlation - spread), 1e-3)
+
+
+def fine_gain(smoothing: float) -> float:
+    """Return the variance of the finest detail of smoothed white noise over that of white noise [1]."""
+    return float(_fine_moments(smoothing)[0] / _fine_moments(0.0)[0])
+
+
+def _fine_moments(smoothing: float) -> tuple[float, float]:
+    """Return the variance of the finest detail of smoothed white noise, and the mean product of neighbours."""
+    weights = np.convolve(FINEST, point_spread(smoothing)) if smoothing > 0 else FINEST
+    energy, product = float(weights @ weights), float(weights[1:] @ weights[:-1])
+    return energy**2, product * energy
+
+
+def _correlation(smoothing: float) -> float:
+    energy, product = _fine_moments(smoothing)
+    return product / energy
+
+
+def _specimen_mask(source: InputCapture, places: dict[str, Place]) -> NDArray[np.bool_]:
+    camera = source.capture.rig.reference
+    if source.kind == "dark":
+        return np.ones((camera.height, camera.width), bool)
+    return image_mask(places[source.name], camera, MARGIN_PX)
+
+
+def _with_curve(imager: Imager, groups: list[list[InputCapture]], sensor: Sensor) -> tuple[Imager, list[Estimate]]:
+    """Return the imager with the knee of its curve, if one image shows it; only stereo sensor files may have one.
+
+    The whole image is used: a curve belongs to the imager, whatever it sees. Black and saturated pixels are left out.
+    """
+    if sensor.technology != "active_stereo" or imager.companding or imager.gamma != 1:
+        return imager, []
+    for source in (group[0] for group in groups if group[0].kind == "off"):
+        image = next(iter(source.capture.images.values()))[0]
+        levels, mask = image.astype(float), (image > 0) & (image < imager.full_scale)
+        knee = first_knee(levels, mask, imager)
+        if knee is not None:
+            method = f"noise by level of one image: the first knee, {knee.slope:g} times as steep beyond it"
+            knee_estimate = Estimate("imager.companding_dn", knee.level, knee.uncertainty, "DN", (source.name,), method)
+            return replace(imager, companding=knee.companding(imager.bits)), [knee_estimate]
+    return imager, []
+
+
+def _repeats(group: list[InputCapture], mask: NDArray[np.bool_]) -> Repeats:
+    """Return the first image of every repeat."""
+    images = np.stack([next(iter(source.capture.images.values()))[0] for source in group])
+    return Repeats.of(images, mask, _PIXELS)
+
+
+def _with_black_level(imager: Imager, dark: list[list[InputCapture]]) -> tuple[Imager, Estimate]:
+    input_captures = [source for group in dark for source in group]
+    levels = [float(next(iter(source.capture.images.values()))[0].mean()) for source in input_captures]
+    image = next(iter(input_captures[0].capture.images.values()))[0]
+    value, spread = float(np.mean(levels)), float(image.std() / np.sqrt(image.size * len(input_captures)))
+    names = tuple(source.name for source in input_captures)
+    estimate = Estimate("imager.black_level_dn", value, spread, "DN", names, "mean grey level in the dark")
+    return replace(imager, black_level=value), estimate
+
+
+def _with_line(
+    imager: Imager, line: TransferLine, names: tuple[str, ...], method: str
+) -> tuple[Imager, list[Estimate]]:
+    (well, well_u), (read, read_u) = line.full_well(imager), line.read_noise()
+    return replace(imager, full_well=well, read_noise=read, row_noise=0.0), [
+        Estimate("imager.full_well_e", well, well_u, "e-", names, method),
+        Estimate("imager.read_noise_e", read, read_u, "e-", names, method),
+    ]
+
+
+def _with_fixed(
+    imager: Imager, before: Imager, repeated: list[list[InputCapture]], places: dict[str, Place]
+) -> tuple[Imager, list[Estimate], list[Undetermined]]:
+    """Estimate DSNU from dark repeats, PRNU from repeats in uniform light."""
+    estimates: list[Estimate] = []
+    undetermined = [Undetermined("imager.row_noise_e", 0.0, "the mean of rows in the dark; read_noise_e includes it")]
+    for kind, key, determined_by in (
+        ("dark", "imager.dsnu_e", "repeats in the dark"),
+        ("off", "imager.prnu", "repeats with the projector off"),
+    ):
+        groups = [group for group in repeated if group[0].kind == kind]
+        if not groups:
+            undetermined.append(Undetermined(key, before.dsnu if kind == "dark" else before.prnu, determined_by))
+            continue
+        group = groups[0]
+        images = np.stack([next(iter(source.capture.images.values()))[0] for source in group])
+        level, variance, spread = fixed_variance(images, _specimen_mask(group[0], places), imager)
+        if kind == "off":
+            variance -= imager.dsnu**2
+        root = float(np.sqrt(max(variance, 0.0)))
+        spread_root = spread / (2 * root) if root > 0 else float(np.sqrt(spread))
+        scale = 1.0 if kind == "dark" else level
+        names = tuple(source.name for source in group)
+        estimates.append(
+            Estimate(
+                key,
+                root / scale,
+                spread_root / scale,
+                "e-" if kind == "dark" else "1",
+                names,
+                "finest detail of the mean of repeats",
+            )
+        )
+        imager = replace(imager, dsnu=root) if kind == "dark" else replace(imager, prnu=root / scale)
+    return imager, estimates, undetermined
+
+
+def _from_one_image(
+    source: InputCapture, imager: Imager, places: dict[str, Place]
+) -> tuple[Imager, list[Estimate]] | None:
+    image, mask = next(iter(source.capture.images.values()))[0], _specimen_mask(source, places)
+    names, method = (source.name,), "finest detail of one image by level, including its fixed pattern"
+    estimates = []
+    bare = replace(imager, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0)
+    smoothing, spread = smoothing_of(image, mask)
+    quiet = quiet_pixels(image.astype(float), denoised(image.astype(float), mask), mask)
+    mask = quiet if quiet.mean() > _LEAST_QUIET * mask.mean() else mask
+    gain = 1.0
+    if smoothing > max(_SURE * spread, 0.2):
+        bare, gain = replace(bare, smoothing_px=smoothing), fine_gain(smoothing)
+        estimates.append(
+            Estimate(
+                "imager.smoothing_px", smoothing, spread, "px", names, "correlation of neighbours in finest detail"
+            )
+        )
+    line = one_image_line(image, mask, imager)
+    if line is not None:
+        line = TransferLine(
+            line.offset / gain, line.slope / gain, line.covariance / gain**2, line.bins, line.chi_square
+        )
+        line = line.not_negative()
+        if line.full_well(imager)[1] < 0.3 * line.full_well(imager)[0] and line.offset >= 0:
+            found, from_line = _with_line(bare, line, names, method)
+            return found, [*estimates, *from_line]
+    # nearly one level: keep the file's full well and attribute the rest to read noise; without a rest, fit the well
+    electrons = linearised(image, imager)
+    level = float(np.median(electrons[mask]))
+    fine = finest_detail(electrons)
+    variance = float(np.median(fine[mask] ** 2)) / 0.45493642311957283
+    variance = (variance - float(widths(np.array(float(np.median(image[mask]))), imager)) ** 2 / 12) / gain
+    relative = float(np.sqrt(2 / (mask.sum() * 0.37 * independent_share())))
+    read = imager.read_noise
+    if variance > level + 1.0:
+        value = float(np.sqrt(variance - level))
+        estimates.append(Estimate("imager.read_noise_e", value, relative * variance / (2 * value), "e-", names, method))
+        return replace(bare, read_noise=value), estimates
+    if variance <= 0:
+        return None
+    # kappa level + kappa^2 read^2 = variance, the share of shot noise as the file has it
+    share = level / (level + read**2)
+    kappa = variance * share / level
+    well = imager.full_well / kappa
+    estimates.append(Estimate("imager.full_well_e", well, relative * well, "e-", names, method))
+    value = float(np.sqrt(variance * (1 - share))) / kappa
+    estimates.append(Estimate("imager.read_noise_e", value, relative * value, "e-", names, method))
+    return replace(bare, full_well=well, read_noise=value), estimates

@@ -1,0 +1,211 @@
+"""Measure gain, read noise and fixed pattern of an imager by photon transfer (EMVA Standard 1288, 4.0, section 6).
+
+Signal chain, repeats of one pose: grey levels -> electrons of the sensor file, its response curve inverted -> mean and
+variance of every pixel over the images -> bins of similar mean -> weighted line. If the file states a full well W and
+the imager has W', file electrons are kappa = W / W' of the true ones, and
+
+    v = kappa mu + kappa^2 r^2 + q^2 / 12,        q the grey level's width in file electrons
+
+so the slope gives the full well, and the intercept the read noise r, including row noise.
+
+Fixed pattern: mean of the images -> finest detail (:mod:`mitsim.twin.finish.fine_detail`), which uniform light and lenses do
+not produce -> its variance less v / n -> dsnu^2 + (prnu mu)^2. A single image gives the sum of both: its finest detail
+by level is the same line, including the fixed pattern.
+
+The variance of a bin's v from N pixels and n images is 2 v^2 / (N (n - 1)). For finest detail, N counts a third because
+its weights extend over neighbours, and the median of squares has an efficiency of 0.37.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+
+from mitsim.sensor.imager import Imager
+from mitsim.twin.finish.electrons import linearised
+from mitsim.twin.finish.fine_detail import FINEST, level_variances
+
+Floats = NDArray[np.float64]
+
+#: number of bins; least distance of a bin from either end of the grey levels, in standard deviations
+_BINS, _CLEAR = 24, 4.0
+
+#: side [px] of the local mean around a pixel
+_AROUND_PX = 3
+
+#: least number of bins for a line, and least ratio of their largest and smallest means
+_FEWEST, _SPAN = 3, 1.3
+
+#: standard uncertainties under 0 that an offset may lie by chance
+_BY_CHANCE = 3.0
+
+#: efficiency of the median of squares against their mean (chi-square of one degree of freedom, recalled)
+_MEDIAN_EFFICIENCY = 0.37
+
+
+@dataclass(frozen=True)
+class TransferLine:
+    """Variance of the noise v = ``offset`` + ``slope`` mu in file electrons, their ``covariance`` (2, 2).
+
+    ``bins``: number of fitted bins; ``chi_square`` of the fit.
+    """
+
+    offset: float
+    slope: float
+    covariance: Floats
+    bins: int
+    chi_square: float
+
+    def full_well(self, imager: Imager) -> tuple[float, float]:
+        """Return the full well [e-] and its standard uncertainty."""
+        value = imager.full_well / self.slope
+        return value, value * float(np.sqrt(self.covariance[1, 1])) / self.slope
+
+    def not_negative(self) -> TransferLine:
+        """The line through 0 where its offset is negative by chance: the slope that is expected given an offset of 0.
+
+        An offset further under 0 than three standard uncertainties stays: the line does not fit.
+        """
+        spread = float(np.sqrt(self.covariance[0, 0]))
+        if not -_BY_CHANCE * spread < self.offset < 0:
+            return self
+        share = self.covariance[0, 1] / self.covariance[0, 0]
+        slope, variance = self.slope - share * self.offset, self.covariance[1, 1] - share * self.covariance[0, 1]
+        return replace(self, offset=0.0, slope=float(slope), covariance=np.diag([spread**2, float(variance)]))
+
+    def read_noise(self) -> tuple[float, float]:
+        """Return the read noise [true e-] and its standard uncertainty; 0 for a negative intercept."""
+        variance = max(self.offset, 0.0) / self.slope**2
+        gradient = np.array([1 / self.slope**2, -2 * self.offset / self.slope**3])
+        spread = float(np.sqrt(gradient @ self.covariance @ gradient))
+        value = float(np.sqrt(variance))
+        return value, spread / (2 * value) if value > 0 else float(np.sqrt(spread))
+
+
+def widths(levels: Floats, chip: Imager) -> Floats:
+    """Return the width of a grey level in electrons at levels (...) [DN]."""
+    below, above = linearised(np.asarray(levels - 0.5), chip), linearised(np.asarray(levels + 0.5), chip)
+    return np.asarray(above - below)
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Grey levels (n, N) of N pixels in n images of one light, and the local mean ``around`` (N,) used for binning.
+
+    Binning by a pixel's own mean would bias the variance: pixels of few images that are equal by chance have none.
+    """
+
+    levels: NDArray[np.unsignedinteger[Any]]
+    around: Floats
+
+    @classmethod
+    def of(cls, images: NDArray[np.unsignedinteger[Any]], mask: NDArray[np.bool_], pixels: int) -> Repeats:
+        """Take up to ``pixels`` of the pixels ``mask`` of images (n, H, W)."""
+        around = uniform_filter(images.mean(axis=0), _AROUND_PX)
+        step = max(1, int(mask.sum()) // pixels)
+        rows, columns = (axis[::step] for axis in np.nonzero(mask))
+        return cls(images[:, rows, columns], around[rows, columns])
+
+
+def repeated_line(repeats: list[Repeats], chip: Imager) -> TransferLine | None:
+    """Return the photon-transfer line from repeats of one or more lights; None with too few levels."""
+    rows = []
+    for own in repeats:
+        electrons = linearised(own.levels, chip)
+        mean, variance = electrons.mean(axis=0), electrons.var(axis=0, ddof=1)
+        clear = _CLEAR * float(np.sqrt(own.levels.var(axis=0, ddof=1).mean()))
+        inside = (own.around > clear) & (own.around < chip.full_scale - clear)
+        rows += _bins(mean[inside], variance[inside], own.around[inside], len(own.levels) - 1, chip)
+    return _line(rows)
+
+
+def one_image_line(
+    image: NDArray[np.unsignedinteger[Any]], mask: NDArray[np.bool_], chip: Imager
+) -> TransferLine | None:
+    """Return the line of the finest detail of one image (H, W), or of a mean, in pixels ``mask`` without a pattern.
+
+    The fixed pattern counts as noise, and a smoothed image has too little noise. None for a single level.
+    """
+    electrons = linearised(image, chip)
+    levels, variances, counts = level_variances(electrons, mask)
+    rows, every = [], np.arange(chip.full_scale + 1.0)
+    for level, variance, count in zip(levels, variances, counts, strict=True):
+        shown = float(np.interp(level, linearised(every, chip), every))
+        if not _CLEAR < shown < chip.full_scale - _CLEAR:
+            continue
+        own = float(widths(np.array(shown), chip)) ** 2 / 12
+        spread = 2 * variance**2 / (count * _MEDIAN_EFFICIENCY * independent_share())
+        rows.append((level, variance - own, spread))
+    return _line(rows)
+
+
+def independent_share() -> float:
+    """Return the share of the pixels of finest detail that count as independent for its variance: 1 / sum of rho^2."""
+    along = np.correlate(FINEST, FINEST, "full")
+    return float(1 / (along**2).sum() ** 2)
+
+
+def fixed_variance(
+    images: NDArray[np.unsignedinteger[Any]], mask: NDArray[np.bool_], chip: Imager
+) -> tuple[float, float, float]:
+    """Return mean level [e-], variance [e-^2] of the fixed pattern in uniform light, and its uncertainty."""
+    electrons = linearised(images, chip)
+    mean = electrons.mean(axis=0)
+    temporal = float(electrons.var(axis=0, ddof=1)[mask].mean())
+    levels, variances, counts = level_variances(mean, mask)
+    weight = counts  # weights by estimated variances would favour bins that are small by chance
+    total = float((weight * variances).sum() / weight.sum())
+    spread = np.sqrt(2 / (counts.sum() * _MEDIAN_EFFICIENCY * independent_share())) * total
+    left = 2 / (mask.sum() * (len(images) - 1)) * temporal**2 / len(images) ** 2
+    level = float((weight * levels).sum() / weight.sum())
+    return level, total - temporal / len(images), float(np.sqrt(spread**2 + left))
+
+
+def with_noise(imager: Imager, full_well: float, read_noise: float, dsnu: float, prnu: float) -> Imager:
+    """Return the imager with the fitted noise."""
+    return replace(imager, full_well=full_well, read_noise=read_noise, dsnu=dsnu, prnu=prnu)
+
+
+def _bins(
+    mean: Floats, variance: Floats, level: Floats, freedom: int, chip: Imager
+) -> list[tuple[float, float, float]]:
+    """Return mean, variance without rounding, and the variance of that, for bins of similar local mean."""
+    if len(mean) < _BINS:
+        return []
+    edges = np.quantile(level, np.linspace(0, 1, _BINS + 1))
+    where = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, _BINS - 1)
+    rows = []
+    for index in range(_BINS):
+        own = where == index
+        if own.sum() < 2:
+            continue
+        cut = float((widths(level[own], chip) ** 2).mean()) / 12
+        found = float(variance[own].mean())
+        if found <= 0:
+            continue
+        rows.append((float(mean[own].mean()), found - cut, 2 * found**2 / (freedom * float(own.sum()))))
+    return rows
+
+
+def _line(rows: list[tuple[float, float, float]]) -> TransferLine | None:
+    if len(rows) < _FEWEST:
+        return None
+    mu, v, spread = (np.array(column) for column in zip(*rows, strict=True))
+    if mu.max() < _SPAN * max(mu.min(), 1e-9):
+        return None
+    design = np.column_stack([np.ones_like(mu), mu])
+    expected = np.maximum(v, 1e-12)
+    for _ in range(3):  # the variance of a bin follows from the line, not from its own random value
+        weight = design / spread[:, None]
+        covariance = np.linalg.inv(weight.T @ design)
+        offset, slope = covariance @ (weight.T @ v)
+        before, expected = expected, np.maximum(offset + slope * mu, 1e-12)
+        spread = spread * (expected / before) ** 2
+    if not slope > 0:
+        return None
+    chi_square = float(((v - offset - slope * mu) ** 2 / spread).sum())
+    return TransferLine(float(offset), float(slope), np.asarray(covariance), len(mu), chi_square)

@@ -1,0 +1,347 @@
+"""The first knee of an imager's response curve, by the noise of one image over its levels.
+
+Signal chain: image -> the same without noise (:mod:`mitsim.twin.compare.denoise`) -> tiles of 32 px, and in them the
+pixels whose finest detail is noise -> likelihood of the squared finest detail for a straight curve, and for curves with
+a knee at K and the slope g beyond it -> K, and the uncertainty of K by a jackknife over the tiles. Its bias
+by levels that still contain some noise is simulated and subtracted.
+
+In the converter's levels u, noise has the variance s^2 = a + b (u - black). The curve takes u + z to
+
+    x - (1 - g) max(x - K, 0),      x = u + z
+
+With z normal, t = (u - K) / s, e1 = phi(t) + t Phi(t) and e2 = (1 + t^2) Phi(t) + t phi(t), a pixel has
+
+    mean M(u) = u - (1 - g) s e1,      variance s^2 [1 - 2 (1 - g) Phi(t) + (1 - g)^2 (e2 - e1^2)] + 1/12
+
+The chip rounds down behind its curve: with a knee of 80 DN in the sensor file, level 80 is the first that holds 1 / g
+levels of the converter, from 79.5 on. So K is half a level under the file's knee. Finest detail is a sum over 25
+pixels. Its variance is the mean of theirs by the squares of its weights: at an edge they differ.
+
+Photon noise grows with the level. Bright pixels that are quieter than dark ones therefore show a curve that is flatter
+there. Chips compand by steps of two (data sheets of the MT9V03x family: 12 bits to 10), so the first knee has g = 1/2;
+others are not looked for. Levels beyond the brightest pixel are unknown; the curve is assumed to go on with g.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from mitsim.sensor.imager import Imager
+from mitsim.twin.compare.denoise import denoised
+from mitsim.twin.finish.fine_detail import FINEST, finest_detail, noise_of_levels
+from mitsim.twin.sensor.photon_transfer import independent_share
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: side of a tile and its rim, which the weights reach [px]; largest number of tiles, least number with quiet pixels
+_TILE_PX, _RIM_PX, _TILES, _FEWEST = 32, 2, 120, 8
+
+#: slope beyond a knee; steps of its level [DN], coarse and fine; fine steps to either side of a coarse level, and of a
+#: level that is known, and as many at most
+_SLOPE, _COARSE_DN, _STEP_DN, _AROUND, _BESIDE_IT, _FARTHEST = 0.5, 3.0, 0.5, 4, 1, 20
+
+#: how far a level's own share of the light begins under the knee of the file [DN]
+_ROUNDED_DOWN_DN = 0.5
+
+#: draws of noise that tell the bias of a knee
+_DRAWS = 4
+
+#: pixels nearer than this to a knee do not say whether it is there [DN]
+_NEAR_DN = 4.0
+
+#: share of the quiet pixels that lie on either side of a knee at least
+_BESIDE = 0.01
+
+#: -2 log likelihood that a knee must gain: two more numbers, by chance once in 10^4; and in deviations of the tiles
+_GAIN, _SURE = 18.4, 3.0
+
+#: the print's own finest detail that a pixel may have, and the largest finest detail, in standard deviations of noise
+_QUIET, _LARGEST = 0.5, 4.0
+
+#: squares of the weights of finest detail along an axis (32, 36): of the pixels of a tile and its rim, for those within
+_WEIGHTS = sum(np.eye(_TILE_PX, _TILE_PX + 2 * _RIM_PX, at) * weight for at, weight in enumerate(FINEST**2))
+
+#: median of chi-square with one degree of freedom
+_MEDIAN_SQUARE = 0.45493642311957283
+
+
+@dataclass(frozen=True)
+class Knee:
+    """A curve's first knee at ``level`` [DN], its standard ``uncertainty``, and the ``slope`` beyond it [1]."""
+
+    level: float
+    uncertainty: float
+    slope: float
+
+    def companding(self, bits: int) -> tuple[tuple[float, float], ...]:
+        """Knees of the curve: straight to the knee, then with the slope to near full scale."""
+        full = 2.0**bits
+        near = full * (1 - 1 / 64)
+        reached = self.level + (near - self.level) / self.slope
+        last = 2.0 ** np.ceil(np.log2(reached + (full - near)))
+        return (self.level, self.level), (reached, near), (float(last), full)
+
+
+def quiet_pixels(image: Floats, clean: Floats, mask: Mask) -> Mask:
+    """Pixels ``mask`` of an image (H, W) whose finest detail is noise and not the edge of a print.
+
+    ``clean`` is the image without its noise.
+    """
+    return _quiet(noise_of_levels(image, mask), clean, mask)
+
+
+def _quiet(variance: Callable[[Floats], Floats], clean: Floats, mask: Mask) -> Mask:
+    """Pixels ``mask`` whose finest detail is noise of a variance that is known by level."""
+    return mask & (finest_detail(clean) ** 2 < _QUIET**2 * np.maximum(variance(clean), 1e-12))
+
+
+def first_knee(image: Floats, mask: Mask, imager: Imager) -> Knee | None:
+    """Find the first knee [DN] in the pixels ``mask`` of an image (H, W); None if a straight curve explains it."""
+    clean = denoised(image, mask)
+    tiles = _Tiles.of(image, clean, quiet_pixels(image, clean, mask), imager.black_level)
+    if tiles is None:
+        return None
+    low, high = np.quantile(tiles.clean[tiles.inside], [_BESIDE, 1 - _BESIDE])
+    coarse = np.arange(low, high, _COARSE_DN)
+    if not len(coarse):
+        return None
+    _, middle = min((tiles.best(k, _SLOPE).sum(), k) for k in coarse)
+    slope, level = _SLOPE, _least(tiles, middle, _SLOPE, _AROUND)
+    away = tiles.away_from(level)
+    gain = away.best(np.inf, 1.0) - away.best(level, slope)
+    if gain.sum() < max(_GAIN, _SURE * float(gain.std()) * np.sqrt(len(gain))) or not low < level < high:
+        return None
+    bias, spread = _bias(clean, mask, tiles, Knee(level, 0.0, slope))
+    return Knee(level - bias, float(np.hypot(tiles.uncertainty(level, slope), spread)), slope)
+
+
+def _bias(clean: Floats, mask: Mask, tiles: _Tiles, knee: Knee) -> tuple[float, float]:
+    """By how much a knee is off since levels come from an image without noise, not from the light; and its uncertainty.
+
+    The image without noise serves as light: noise is drawn, and the knee found once with the levels of that image after
+    its noise is taken off, once with the true ones.
+    """
+    numbers, found = tiles.fitted(knee.level, knee.slope), []
+    k = knee.level - _ROUNDED_DOWN_DN
+    every = np.linspace(0.0, k + (float(clean.max()) + 5 - k) / knee.slope, 1500)
+    spread = tiles.spread(every, numbers)
+    mean, _ = _through(every, knee.level, knee.slope, spread)
+    light = np.interp(clean, mean, every)
+    for stream in np.random.default_rng(0).spawn(_DRAWS):
+        drawn = light + np.interp(light, every, spread) * stream.normal(size=light.shape)
+        drawn = np.rint(np.minimum(drawn, k) + knee.slope * np.maximum(drawn - k, 0.0))
+        variance = noise_of_levels(drawn, mask)
+        both = [
+            _Tiles.of(drawn, levels, _quiet(variance, levels, mask), tiles.black)
+            for levels in (denoised(drawn, mask), clean)
+        ]
+        found.append([np.nan if one is None else _least(one, knee.level, knee.slope, _BESIDE_IT) for one in both])
+    off = np.array(found) @ [1.0, -1.0]
+    off = off[np.isfinite(off)]
+    return (float(off.mean()), float(off.std(ddof=1) / np.sqrt(len(off)))) if len(off) > 1 else (0.0, float("inf"))
+
+
+def _least(tiles: _Tiles, middle: float, slope: float, around: int) -> float:
+    """The level whose curve is most likely, by a parabola through three levels.
+
+    The best of ``middle`` and ``around`` levels to either side is the start; from there on, downhill.
+    """
+    total: dict[int, float] = {}
+
+    def at(step: int) -> float:
+        if step not in total:
+            total[step] = float(tiles.best(middle + step * _STEP_DN, slope).sum())
+        return total[step]
+
+    best = min(range(-around, around + 1), key=at)
+    while abs(best) < _FARTHEST and at(beside := min(best - 1, best + 1, key=at)) < at(best):
+        best = beside
+    before, least, after = at(best - 1), at(best), at(best + 1)
+    bend = before - 2 * least + after
+    aside = (before - after) / (2 * bend) if bend > 0 else 0.0
+    return float(middle + (best + float(np.clip(aside, -1, 1))) * _STEP_DN)
+
+
+@dataclass(frozen=True)
+class _Tiles:
+    """Tiles (n, 36, 36) of an image without noise, which of their pixels are used, and these pixels' squared detail.
+
+    ``rising`` (n * 36 * 36,) are the indices of the pixels by rising level.
+    """
+
+    clean: Floats
+    rising: NDArray[np.intp]
+    inside: Mask
+    square: Floats
+    own: Floats
+    black: float
+
+    @classmethod
+    def of(cls, image: Floats, clean: Floats, quiet: Mask, black: float) -> _Tiles | None:
+        side = _TILE_PX + 2 * _RIM_PX
+        if min(image.shape) < side:
+            return None
+        rim = np.zeros((side, side), bool)
+        rim[_RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX] = True
+        inside = _cut(quiet, side).astype(bool) & rim
+        some = np.flatnonzero(inside.any(axis=(1, 2)))
+        if len(some) < _FEWEST:
+            return None
+        some = some[:: int(np.ceil(len(some) / _TILES))]
+        levels, square, own = (_cut(one, side)[some] for one in (clean, finest_detail(image), finest_detail(clean)))
+        return cls(
+            levels,
+            np.argsort(levels, axis=None),
+            inside[some],
+            square[inside[some]] ** 2,
+            own[inside[some]] ** 2,
+            black,
+        )
+
+    @cached_property
+    def median_square(self) -> float:
+        """Median squared detail."""
+        return float(np.median(self.square))
+
+    @cached_property
+    def excess(self) -> Floats:
+        """Squared detail less that of rounding and of the print."""
+        return self.square - 1 / 12 - self.own
+
+    @cached_property
+    def median_level(self) -> float:
+        """Median level [DN]."""
+        return float(np.median(self.clean))
+
+    @cached_property
+    def rising_levels(self) -> Floats:
+        """Levels of all pixels [DN], rising."""
+        return self.clean.reshape(-1)[self.rising]
+
+    @cached_property
+    def ranks(self) -> NDArray[np.intp]:
+        """Place of every pixel (n, 36, 36) among the rising levels."""
+        ranks = np.empty(self.clean.size, np.intp)
+        ranks[self.rising] = np.arange(len(ranks))
+        return ranks.reshape(self.clean.shape)
+
+    @cached_property
+    def used(self) -> NDArray[np.intp]:
+        """Indices of the pixels that are used, among all pixels of the tiles without their rims."""
+        return np.flatnonzero(self.inside[:, _RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX])
+
+    def away_from(self, level: float) -> _Tiles:
+        """The tiles without pixels near a level: a curve that is flat there only is no knee."""
+        far = np.abs(self.clean - level) > _NEAR_DN
+        kept = far[self.inside]
+        return replace(self, inside=self.inside & far, square=self.square[kept], own=self.own[kept])
+
+    def best(self, knee: float, slope: float) -> Floats:
+        """-2 log likelihood (n,) of the tiles with the best a and b of all of them."""
+        return self.misfit(knee, slope, self.fitted(knee, slope))
+
+    def fitted(self, knee: float, slope: float) -> Floats:
+        """The a and b of all tiles, by weighted least squares."""
+        middle = self.median_square / _MEDIAN_SQUARE
+        numbers, variance = np.array([0.0, middle / max(self.median_level, 1.0)]), np.full_like(self.square, middle)
+        for _ in range(3):
+            maps = self._maps(knee, slope, numbers)
+            for _ in range(2):
+                weight = (self.square < _LARGEST**2 * variance) / variance**2
+                numbers = _two(maps, self.excess, weight)
+                variance = np.maximum(numbers @ maps, 1e-3) + 1 / 12 + self.own
+        return numbers
+
+    def misfit(self, knee: float, slope: float, numbers: Floats) -> Floats:
+        """-2 log likelihood (n,) of the tiles."""
+        ratio, light = self._shares(knee, slope, numbers)
+        known = _of_neighbours(numbers[0] * ratio + numbers[1] * light).take(self.used)
+        variance = np.maximum(known, 1e-3) + 1 / 12 + self.own
+        each = np.zeros((len(self.clean), _TILE_PX**2))
+        each.reshape(-1)[self.used] = np.log(variance) + np.minimum(self.square / variance, _LARGEST**2)
+        return np.asarray(independent_share() * each.sum(axis=1), float)
+
+    def uncertainty(self, knee: float, slope: float) -> float:
+        """Standard uncertainty of the knee by the jackknife: one tile after another is left out.
+
+        K, a and b without a tile follow by one Newton step, from the first and second derivatives of every tile's
+        likelihood. Tiles are independent samples, whether the model fits or not.
+        """
+        numbers = self.fitted(knee, slope)
+        steps = np.diag([_STEP_DN, 0.1 * max(numbers[0], 0.1), 0.05 * max(numbers[1], 1e-4)])
+
+        def at(step: Floats) -> Floats:
+            return self.misfit(knee + float(step[0]), slope, numbers + step[1:])
+
+        middle, sides = at(np.zeros(3)), [(at(step), at(-step)) for step in steps]
+        slopes, bend = np.stack([(up - down) / 2 for up, down in sides], axis=1), np.empty((len(middle), 3, 3))
+        for i, (up, down) in enumerate(sides):
+            bend[:, i, i] = up - 2 * middle + down
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            both = (
+                at(steps[i] + steps[j]) - at(steps[i] - steps[j]) - at(steps[j] - steps[i]) + at(-steps[i] - steps[j])
+            )
+            bend[:, i, j] = bend[:, j, i] = both / 4
+        without = bend.sum(axis=0) - bend
+        moved = np.linalg.solve(without, (slopes - slopes.mean(axis=0))[..., None])[:, 0, 0] * _STEP_DN
+        return float(np.sqrt((len(moved) - 1) * moved.var()))
+
+    def _maps(self, knee: float, slope: float, numbers: Floats) -> Floats:
+        """Return the factors (2, N) of a and b in every used pixel."""
+        return np.stack([_of_neighbours(one).take(self.used) for one in self._shares(knee, slope, numbers)])
+
+    def _shares(self, knee: float, slope: float, numbers: Floats) -> tuple[Floats, Floats]:
+        """Return the factors (n, 36, 36) of a and b in every pixel alone."""
+        light, ratio = self.clean, np.ones(self.clean.shape)
+        if slope < 1:
+            top = knee + (float(self.rising_levels[-1]) + 5 - knee) / slope
+            every = np.linspace(0.0, top, 1500)
+            mean, share = _through(every, knee, slope, self.spread(every, numbers))
+            # both at once, and in the order of the levels, which finds the neighbours five times as fast
+            found = np.interp(self.rising_levels, mean, every + 1j * share).take(self.ranks)
+            light, ratio = found.real, found.imag.copy()
+        return ratio, ratio * np.maximum(light - self.black, 0.0)
+
+    def spread(self, level: Floats, numbers: Floats) -> Floats:
+        """Return the standard deviation [DN] of the noise at levels (n,) of the converter, from a and b."""
+        return np.asarray(np.sqrt(np.maximum(numbers[0] + numbers[1] * np.maximum(level - self.black, 0.0), 0.02)))
+
+
+def _cut(values: NDArray[Any], side: int) -> Floats:
+    """Tiles (n, side, side) of an image, one rim over another."""
+    tiles = sliding_window_view(values, (side, side))[::_TILE_PX, ::_TILE_PX]
+    return np.asarray(tiles.reshape(-1, side, side), float)
+
+
+def _through(level: Floats, knee: float, slope: float, spread: Floats) -> tuple[Floats, Floats]:
+    """Mean (n,) behind the curve of levels with normal noise, and the share of the noise's variance there."""
+    t, flat = (level - (knee - _ROUNDED_DOWN_DN)) / spread, 1 - slope
+    above, density = ndtr(t), np.exp(-(t**2) / 2.0) / np.sqrt(2 * np.pi)
+    first, second = density + t * above, (1 + t**2) * above + t * density
+    return level - flat * spread * first, 1 - 2 * flat * above + flat**2 * (second - first**2)
+
+
+def _two(design: Floats, values: Floats, weight: Floats) -> Floats:
+    """Two numbers by weighted least squares, neither of them negative; the design is (2, N)."""
+    weighted = design * weight
+    normal, right = weighted @ design.T, weighted @ values
+    found = np.linalg.solve(normal + 1e-12 * np.eye(2), right)
+    if found[0] < 0:
+        found = np.array([0.0, max(right[1] / normal[1, 1], 0.0)])
+    elif found[1] < 0:
+        found = np.array([max(right[0] / normal[0, 0], 0.0), 0.0])
+    return np.asarray(found)
+
+
+def _of_neighbours(values: Floats) -> Floats:
+    """Mean (n, 32, 32) of the pixels about each of a tile (n, 36, 36) by the squares of their weights in detail."""
+    return np.asarray(_WEIGHTS @ values @ _WEIGHTS.T)

@@ -1,0 +1,92 @@
+"""Fit the light of the room to captures with the projector off.
+
+Signal chain: grey levels of a uniform sheet -> electrons -> divided by those of 1 W/mm^2 from all sides on the model's
+sheet, including the loss of the lens -> medians of patches -> least squares on 1, x, y, xx, xy, yy of the view ray's
+slopes -> irradiance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.sensor.imager import electrons_per_radiance
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.vignetting import camera_illumination
+from mitsim.twin.compare.plate import REFLECTANCE
+from mitsim.twin.compare.rebuild import like
+from mitsim.twin.finish.electrons import chip_of, linearised
+from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
+from mitsim.twin.sensor.estimate import Estimate
+from mitsim.twin.sensor.figures import Field
+from mitsim.twin.sensor.input_captures import InputCapture
+from mitsim.twin.sensor.parameters import ROOM_KEYS
+
+Floats = NDArray[np.float64]
+
+_PATCH_PX, _FEWEST_FOR_TERMS = 20, 24
+
+
+@dataclass(frozen=True)
+class RoomFit:
+    """Six ``terms`` of the irradiance [W/mm^2], and the estimates of the file's numbers."""
+
+    terms: tuple[float, ...]
+    estimates: tuple[Estimate, ...]
+
+
+def fit_room(input_captures: list[InputCapture], sensor: Sensor, places: dict[str, Place]) -> RoomFit | None:
+    """Fit the light of the room to captures with the projector off; None if none shows enough of a sheet."""
+    rows, values = [], []
+    for source in input_captures:
+        name, camera = next(iter(source.capture.rig.cameras.items()))
+        own = like(source.capture, sensor, source.name)
+        if own.exposure.base_s is None:
+            continue
+        chip = chip_of(source.capture, sensor.imager, source.name)
+        electrons = linearised(source.capture.images[name][0], chip)
+        loss = camera_illumination(sensor.imager.corner_illumination, camera)
+        scale = electrons_per_radiance(sensor.imager, sensor.wavelength_nm, own.exposure.base_s) * REFLECTANCE / np.pi
+        irradiance = electrons / scale / (1.0 if loss is None else loss)
+        field = Field.of(camera, image_mask(places[source.name], camera, MARGIN_PX), _PATCH_PX)
+        corners = field.corners + np.array([field.row, field.column])
+        if not len(corners):
+            continue
+        middles = corners[:, ::-1] + (_PATCH_PX - 1) / 2
+        rays = camera.rays(middles)
+        x, y = (rays[:, :2] / rays[:, 2:]).T
+        rows.append(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1))
+        values.append([float(np.median(irradiance[r : r + _PATCH_PX, c : c + _PATCH_PX])) for r, c in corners])
+    if not rows:
+        return None
+    design, seen = np.concatenate(rows), np.concatenate([np.array(own) for own in values])
+    if len(seen) < _FEWEST_FOR_TERMS:
+        design = design[:, :1]
+    found = np.linalg.lstsq(design, seen, rcond=None)[0]
+    rest = seen - design @ found
+    covariance = float(rest @ rest) / max(len(seen) - design.shape[1], 1) * np.linalg.inv(design.T @ design)
+    terms = np.zeros(len(ROOM_KEYS))
+    terms[: len(found)] = found
+    names, estimates = tuple(source.name for source in input_captures), []
+    for index in range(len(found)):
+        gradient = np.zeros(len(found))
+        if index == 0:
+            gradient[0], value = 1.0, found[0]
+        else:
+            value = found[index] / found[0]
+            gradient[index], gradient[0] = 1 / found[0], -value / found[0]
+        spread = float(np.sqrt(gradient @ covariance @ gradient))
+        estimates.append(
+            Estimate(
+                f"room.{ROOM_KEYS[index]}",
+                float(value),
+                spread,
+                "W/mm^2" if index == 0 else "1",
+                names,
+                "level with the projector off",
+            )
+        )
+    return RoomFit(tuple(float(term) for term in terms), tuple(estimates))

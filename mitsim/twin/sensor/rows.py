@@ -1,0 +1,82 @@
+"""Measure the row error of a rectified pair over the field, and the rotation of the second camera that explains it.
+
+Signal chain: capture -> cloud -> row error of each patch of the right image
+(:mod:`mitsim.twin.compare.specimen_patches`) -> line over the columns of the right image, without outliers -> rotation
+about its x axis and roll.
+
+A camera rotated by w about x sees a point f w (1 + y^2) rows lower; one that rolls by r about its axis, f r x rows
+higher, with x and y the slopes of the ray. One specimen in one part of the field hardly separates the two. Each has a
+normal prior about 0, with the standard deviation of ``[unknowns.calibration]`` of the sensor. Rotation toward the other
+camera (vergence) causes no row error and cannot be measured here. Vergence is assumed as large as these two, since the
+mounts are the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.capture.capture import Capture
+from mitsim.decode.cloud import Settings, capture_geometry
+from mitsim.decode.matching.stereo import StereoGeometry
+from mitsim.twin.compare.specimen_patches import patch_rows
+from mitsim.twin.finish.place import Place
+
+Floats = NDArray[np.float64]
+
+#: least number of patches for a line; outlier limit in standard deviations
+_FEWEST, _CLIP = 6, 3.0
+_MAD_TO_SIGMA = 1.482602218505602
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rotations [mrad] of the second camera with standard uncertainties; ``mean`` row error [px] and ``patches``."""
+
+    row_mrad: tuple[float, float]
+    roll_mrad: tuple[float, float]
+    mean: tuple[float, float]
+    patches: int
+
+
+def row_turns(capture: Capture, settings: Settings, place: Place, prior: tuple[float, float]) -> Rows | None:
+    """Return the rotation of a pair's second camera from its row errors; None for too few patches or no pair.
+
+    ``prior`` contains the standard deviations [mrad] of rotation and roll before the measurement.
+    """
+    geometry = capture_geometry(capture, settings)
+    if not isinstance(geometry, StereoGeometry) or capture.technology == "structured_light":
+        return None
+    errors, columns, rows = patch_rows(capture, settings, geometry, place)
+    focal, matrix = float(geometry.rectification.matrix_right[0, 0]), geometry.rectification.matrix_right
+    x, y = (columns - matrix[0, 2]) / focal, (rows - matrix[1, 2]) / focal
+    known = np.isfinite(errors)
+    design = focal * 1e-3 * np.column_stack([1 + y**2, -x])
+    for _ in range(3):
+        if known.sum() < _FEWEST:
+            return None
+        found, covariance, rest = _line(design[known], errors[known], np.array(prior))
+        off = errors - design @ found
+        known &= np.abs(off) <= _CLIP * max(_MAD_TO_SIGMA * float(np.median(np.abs(rest))), 1e-3)
+    spread = np.sqrt(np.diag(covariance))
+    mean = float(errors[known].mean())
+    return Rows(
+        (float(found[0]), float(spread[0])),
+        (float(found[1]), float(spread[1])),
+        (mean, float(errors[known].std(ddof=1) / np.sqrt(known.sum()))),
+        int(known.sum()),
+    )
+
+
+def _line(design: Floats, values: Floats, prior: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return numbers with a normal prior about 0, their covariance, and the residuals of the values.
+
+    The variance of the values is that about the least-squares line, which knows no prior.
+    """
+    free = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
+    variance = max(float(free @ free) / max(len(values) - design.shape[1], 1), 1e-12)
+    covariance = np.linalg.inv(design.T @ design / variance + np.diag(1 / np.maximum(prior, 1e-6) ** 2))
+    found = covariance @ design.T @ values / variance
+    return np.asarray(found, float), np.asarray(covariance, float), values - design @ found

@@ -1,0 +1,225 @@
+"""Fit camera and projector to one capture of a stripe code on a sheet, printed or not.
+
+Signal chain: images of the code -> white and black -> line of black over white through all pixels of the print: black
+level of the imager, share of light without a pattern -> finest detail of both by level: full well, read noise ->
+difference of stripes on and off, by width: blur (:mod:`mitsim.twin.sensor.modulation`); if it changes with depth, the
+projector's focus and aperture (:mod:`mitsim.twin.sensor.defocus`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from mitsim.decode.cloud import capture_pattern
+from mitsim.sensor.image_role import Role
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.light_code import LightCode, roles
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
+from mitsim.twin.finish.electrons import linearised
+from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
+from mitsim.twin.sensor.defocus import Defocus, fit_defocus
+from mitsim.twin.sensor.estimate import Estimate
+from mitsim.twin.sensor.input_captures import InputCapture
+from mitsim.twin.sensor.modulation import fitted_blur
+from mitsim.twin.sensor.photon_transfer import one_image_line
+
+Floats = NDArray[np.float64]
+
+#: side of the window around a pixel that must be uniform, and its largest variation as a share of white
+_EVEN_PX, _EVEN_SHARE = 7, 0.3
+
+#: least white minus black [DN] of a pixel's modulation; side of the blocks whose scatter gives the uncertainty
+_LEAST_DN, _BLOCK_PX = 8.0, 40
+
+#: share of full scale below which a pixel is unsaturated; least significance of an aperture in standard uncertainties
+_UNSATURATED, _SURE = 0.97, 2.0
+
+
+@dataclass(frozen=True)
+class Stripes:
+    """White, black and pairs of stripes of a capture's first camera [DN]; ``widths`` of the stripes [projector px].
+
+    ``pairs`` (n, 2, H, W): on and off; ``across``: whether the stripes are along the columns.
+    """
+
+    white: Floats
+    black: Floats
+    pairs: Floats
+    widths: Floats
+    across: NDArray[np.bool_]
+
+
+def stripes_of(source: InputCapture) -> Stripes | None:
+    """Extract the stripes of a capture; None if it has no stripes with their inverse.
+
+    The brightest and the darkest of the stripes replace a missing white or black image.
+    """
+    code, projector = capture_pattern(source.capture), source.capture.rig.projector
+    if not isinstance(code, LightCode) or projector is None:
+        return None
+    images = next(iter(source.capture.images.values()))
+    kinds: list[Role] = list(roles(code, projector.width, projector.height))
+    names = [role.kind for role in kinds]
+    pairs, widths, across = [], [], []
+    for number, role in enumerate(kinds):
+        if role.kind != "gray":
+            continue
+        for other, inverse in enumerate(kinds):
+            if inverse.kind == "gray_inverse" and (inverse.axis, inverse.index) == (role.axis, role.index):
+                pairs.append((images[number], images[other]))
+                widths.append(2 * role.period)  # a bit of a Gray code changes every second time
+                across.append(role.axis == "columns")
+    if not pairs:
+        return None
+    every = np.array(pairs, float)
+    white = images[names.index("white")].astype(float) if "white" in names else every.max(axis=(0, 1))
+    black = images[names.index("black")].astype(float) if "black" in names else every.min(axis=(0, 1))
+    return Stripes(white, black, every, np.array(widths), np.array(across))
+
+
+def fit_stripes(source: InputCapture, sensor: Sensor, place: Place) -> tuple[Sensor, list[Estimate]]:
+    """Fit one capture of stripes; the sensor must have the capture's own cameras and exposure."""
+    seen = stripes_of(source)
+    if seen is None:
+        return sensor, []
+    camera = source.capture.rig.reference
+    mask = image_mask(place, camera, MARGIN_PX)
+    full = 2**source.capture.bits - 1
+    clear = mask & (maximum_filter(seen.white, 3) < _UNSATURATED * full)
+    spread = maximum_filter(seen.white, _EVEN_PX) - minimum_filter(seen.white, _EVEN_PX)
+    even = clear & (spread < np.maximum(_EVEN_SHARE * seen.white, 4.0))
+    estimates: list[Estimate] = []
+    sensor, first = _levels(source, sensor, seen, even)
+    estimates += first
+    sensor, second = _noise(source, sensor, seen, even)
+    estimates += second
+    sensor, third = _blur(source, sensor, place, seen, even)
+    return sensor, estimates + third
+
+
+def _levels(
+    source: InputCapture, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]
+) -> tuple[Sensor, list[Estimate]]:
+    """Estimate the imager's black level and the light without a pattern from the line of black over white."""
+    white, black = seen.white[even], seen.black[even]
+    if len(white) < 500 or np.percentile(white, 95) < 2 * np.percentile(white, 5):
+        return sensor, []
+    rows, columns = np.nonzero(even)
+    block = (rows // _BLOCK_PX) * 10_000 + columns // _BLOCK_PX
+    lines = []
+    labels = np.unique(block)
+    whole = np.polyfit(white, black, 1)
+    for part in np.array_split(np.random.default_rng(0).permutation(labels), 20):  # a jackknife over blocks
+        kept = ~np.isin(block, part)
+        lines.append(np.polyfit(white[kept], black[kept], 1))
+    spread = np.sqrt(19 / 20 * ((np.array(lines) - np.mean(lines, axis=0)) ** 2).sum(axis=0))
+    slope, intercept = float(whole[0]), float(whole[1])
+    # black = level + slope (white - level)
+    level = intercept / (1 - slope)
+    method, names = "line of the black image over the white one through the print", (source.name,)
+    imager = replace(sensor.imager, black_level=max(level, 0.0))
+    estimates = [
+        Estimate("imager.black_level_dn", max(level, 0.0), float(spread[1]) / (1 - slope), "DN", names, method)
+    ]
+    share = float(np.clip(slope, 0.0, 0.95))
+    estimates.append(
+        Estimate("projector.black_level", share, float(spread[0]), "1", names, method + "; includes the room")
+    )
+    return replace(sensor, imager=imager, projector=replace(sensor.projector, black_level=share)), estimates
+
+
+def _noise(
+    source: InputCapture, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]
+) -> tuple[Sensor, list[Estimate]]:
+    line = one_image_line(seen.white.astype(np.uint16), even, sensor.imager)
+    if line is None:
+        return sensor, []
+    (well, well_u), (read, read_u) = line.full_well(sensor.imager), line.read_noise()
+    method, names = "finest detail of the white image by level, including its fixed pattern", (source.name,)
+    chip: Imager = replace(
+        sensor.imager, full_well=well, read_noise=read, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0
+    )
+    return replace(sensor, imager=chip), [
+        Estimate("imager.full_well_e", well, well_u / well**2, "e-", names, method, "inverse"),
+        Estimate("imager.read_noise_e", read, read_u, "e-", names, method),
+    ]
+
+
+def _blur(
+    source: InputCapture, sensor: Sensor, place: Place, seen: Stripes, even: NDArray[np.bool_]
+) -> tuple[Sensor, list[Estimate]]:
+    """Estimate the blur of camera and projector together from the modulation of stripes of every width, by blocks."""
+    chip = sensor.imager
+    depth = linearised(seen.white, chip) - linearised(seen.black, chip)
+    usable = even & (seen.white - seen.black > _LEAST_DN)
+    if usable.sum() < 500:
+        return sensor, []
+    off = np.abs(linearised(seen.pairs[:, 0], chip) - linearised(seen.pairs[:, 1], chip))
+    scales = _pixels_per_stripe(source, place)
+    pairs = np.stack([linearised(seen.pairs[:, side], chip) for side in (0, 1)], axis=1)
+    focus = fit_defocus(source, linearised(seen.white, chip), linearised(seen.black, chip), pairs, seen.widths)
+    if focus is not None and focus.aperture_mm > _SURE * np.sqrt(focus.covariance[1, 1]):
+        return _with_focus(source, sensor, focus, float(np.mean(scales)))
+    values = []
+    rows, columns = np.nonzero(usable)
+    block = (rows // _BLOCK_PX) * 10_000 + columns // _BLOCK_PX
+    width = seen.widths * np.where(seen.across, scales[0], scales[1])
+    fine = width < 40 * max(scales)
+    for label in np.unique(block):
+        own = rows[block == label], columns[block == label]
+        if len(own[0]) < 200:
+            continue
+        ratio = off[:, *own].mean(axis=1) / depth[own].mean()
+        values.append(fitted_blur(width[fine], ratio[fine]))
+    if len(values) < 4:
+        return sensor, []
+    blur = float(np.median(values))
+    spread = 1.2533 * float(np.std(values, ddof=1)) / np.sqrt(len(values))
+    estimate = Estimate(
+        "imager.blur_px",
+        min(blur, 5.0),
+        spread,
+        "px",
+        (source.name,),
+        "modulation of stripes by width, including the projector's blur",
+    )
+    projector = replace(sensor.projector, aperture_mm=0.0)
+    return replace(sensor, imager=replace(chip, blur_px=min(blur, 5.0)), projector=projector), [
+        estimate,
+        Estimate("projector.aperture_mm", 0.0, 0.0, "mm", (source.name,), "imager.blur_px includes its blur"),
+    ]
+
+
+def _with_focus(source: InputCapture, sensor: Sensor, focus: Defocus, scale: float) -> tuple[Sensor, list[Estimate]]:
+    """Return the sensor with the fitted focus; one projector pixel is ``scale`` camera pixels."""
+    spread, names = np.sqrt(np.diag(focus.covariance)), (source.name,)
+    method = "modulation of stripes by width and depth"
+    blur = min(focus.still_px * scale, 5.0)
+    projector = replace(sensor.projector, aperture_mm=focus.aperture_mm, focus_mm=focus.focus_mm)
+    return replace(sensor, imager=replace(sensor.imager, blur_px=blur), projector=projector), [
+        Estimate("imager.blur_px", blur, float(spread[0]) * scale, "px", names, method + ", independent of depth"),
+        Estimate("projector.aperture_mm", focus.aperture_mm, float(spread[1]), "mm", names, method),
+        Estimate("projector.focus_mm", focus.focus_mm, float(spread[2]), "mm", names, method),
+    ]
+
+
+def _pixels_per_stripe(source: InputCapture, place: Place) -> tuple[float, float]:
+    """Return the camera pixels per projector pixel, along columns and rows, at the centre of the specimen."""
+    camera, projector = source.capture.rig.reference, source.capture.rig.projector
+    assert projector is not None
+    pose: Transform = place.world_from_sensor.inverse()
+    middle = place.low + place.cell * place.occupied.shape[::-1] / 2
+    steps = np.array([[0, 0, 0], [1.0, 0, 0], [0, 1.0, 0]]) + np.array([*middle, 0.0])
+    points = pose.points(steps)
+    seen, sent = camera.project(points), projector.project(points)
+    to_camera = np.stack([seen[1] - seen[0], seen[2] - seen[0]], axis=1)
+    to_projector = np.stack([sent[1] - sent[0], sent[2] - sent[0]], axis=1)
+    # a stripe's edge moves along the gradient of its coordinate in the camera: 1 / |gradient| px for one of its pixels
+    gradient = to_projector @ np.linalg.inv(to_camera)
+    return float(1 / np.linalg.norm(gradient[0])), float(1 / np.linalg.norm(gradient[1]))

@@ -1,0 +1,319 @@
+"""Score candidate views: the predicted uncertainty of every measurement of a task from each view.
+
+Signal chain: view -> thinned rays x part -> F, sigma, noise area and persistent noise of every point from the map ->
+expected fits and measurements with their uncertainty (:mod:`characterisation.tasks.prediction`), and the points and
+noise of the talk's score V_m -> ranks by each, and the limiting factor of each view -> sets of views.
+
+Scores are expectations; nothing is drawn at random.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from characterisation.maps.performance_map import PerformanceMap
+from characterisation.scores.view_score import rank_views, score_views, view_statistics
+from characterisation.tasks.covariance import LEAST_CHANCE, ExpectedPoints
+from characterisation.tasks.evaluation import InputQuantity
+from characterisation.tasks.prediction import (
+    ExpectedInput,
+    ExpectedMeasurement,
+    expected_inputs,
+    expected_measurement,
+)
+from characterisation.tasks.task_file import Task
+from mitsim.maps.campaign.acquire import one_ahead
+from mitsim.maps.prediction import (
+    CharacterisedScene,
+    Effect,
+    Ideal,
+    Perturbation,
+    Predictor,
+    SceneView,
+    ViewPoints,
+    expected_points,
+    feature_statistics,
+    performance,
+    together,
+)
+from mitsim.running.progress import track
+from mitsim.scene.load import Scene
+from mitsim.scene.materials import Finish
+from mitsim.sensor.transforms import Transform
+from mitsim.views import View
+
+Floats = NDArray[np.float64]
+
+__all__ = ["LEAST_CHANCE", "MATT_WHITE", "score_candidates", "with_poses"]
+
+MATT_WHITE = Finish("matt_white", float("nan"))
+
+#: approximate number of rays per view; with fewer, expectations over a feature change by one per cent
+RAYS = 40_000
+
+#: R_f below which a lack of points is attributed to occlusion
+OCCLUDED = 0.75
+
+
+@dataclass(frozen=True)
+class _Cast:
+    """Rays of one view: their ``ideal`` points, and the ``perturbation`` of these by all effects.
+
+    ``labels`` (H, W) are the shapes that the rays show. ``n_only`` (features,) are the rays that return from a feature
+    in matt white if the rest of the part is removed.
+    """
+
+    ideal: Ideal
+    labels: NDArray[np.int16]
+    n_only: Floats
+    perturbation: Perturbation
+
+
+@dataclass(frozen=True)
+class _Scoring:
+    """Scene, task, map and predictor of a scoring; the ``predictor`` casts every ``step``-th ray of every such row."""
+
+    scene: Scene
+    task: Task
+    performance_map: PerformanceMap
+    minimum_points: float
+    predictor: Predictor
+    step: int
+
+
+@dataclass(frozen=True)
+class _ViewScore:
+    """Results of one view: a row of each statistic of V_m by feature, and the expected inputs and measurements."""
+
+    n: Floats
+    sigma: Floats
+    n_white: Floats
+    sigma_white: Floats
+    n_only: Floats
+    inputs: dict[InputQuantity, Any]
+    measurements: list[ExpectedMeasurement]
+
+
+def score_candidates(
+    scene: Scene,
+    task: Task,
+    views: Sequence[View],
+    predictor: Predictor,
+    performance_map: PerformanceMap,
+    minimum_points: float,
+    effects: Sequence[Effect] = (),
+) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:
+    """Score and rank views.
+
+    Parameters
+    ----------
+    predictor
+        Casts the rays of the sensor's full grid.
+    effects
+        Effects beyond the map that the predicted uncertainty includes. V_m includes none.
+
+    Returns
+    -------
+    Dataset
+        That of :func:`characterisation.scores.view_score.score_views`, with ``predicted_uncertainty`` [mm or deg],
+        ``chance``, ``uncertainty_possible``, ``uncertainty_rank``, ``limit`` and ``limiting_feature`` (measurement,
+        view); ``overall_rank`` (view); ``mean_sigma``, ``n_white``, ``mean_sigma_white`` and ``n_only_white`` (view,
+        feature); the poses; and ``nominal``, ``tolerance`` and ``unit`` of the measurements.
+    list of dict
+        For every view, the input quantities of its measurements, from which sets of views are chosen.
+    """
+    looking, step = predictor.thinned_to(RAYS)
+    scoring = _Scoring(scene, task, performance_map, minimum_points, looking, step)
+    names = list(task.shapes)
+    alone = [CharacterisedScene(scene.only(name), performance_map, MATT_WHITE) for name in names]
+
+    def cast(view: View) -> _Cast:
+        pose = view.world_from_sensor
+        whole = looking.surfaces(scene, pose)
+        ideal, labels = looking.ideal(whole), looking.labels(scene, pose, whole)
+        n_only = np.array([_white_points(looking, one, pose) for one in alone])
+        view_of = SceneView(scene, pose, whole, ideal)
+        return _Cast(ideal, labels, n_only, together((effect(view_of) for effect in effects), len(ideal.pixel)))
+
+    def score(cast: _Cast, view: View) -> _ViewScore:
+        return _score_view(scoring, cast, view)
+
+    # the rays of the next view are cast while this view is evaluated
+    scored = [one for _, one in track(one_ahead(views, cast, score), "score views", len(views))]
+    columns = {
+        key: np.array([getattr(one, key) for one in scored])
+        for key in ("n", "sigma", "n_white", "sigma_white", "n_only")
+    }
+    statistics = view_statistics(
+        names, columns["n"], columns["sigma"], columns["n_white"], columns["sigma_white"], columns["n_only"]
+    )
+    scores = score_views(statistics, task, minimum_points)
+    scores["mean_sigma"] = statistics["mean_sigma"]
+    for name in ("n_white", "mean_sigma_white", "n_only_white"):
+        scores[name] = statistics[name]
+    uncertainty = np.array([[one.measurements[m].uncertainty for one in scored] for m in range(len(task.measurements))])
+    chance = np.array([[one.measurements[m].chance for one in scored] for m in range(len(task.measurements))])
+    possible = np.isfinite(uncertainty) & (chance >= LEAST_CHANCE)
+    by = ("measurement", "view")
+    scores["predicted_uncertainty"] = (
+        by,
+        uncertainty,
+        {"long_name": "predicted standard uncertainty", "units": "mm or deg"},
+    )
+    scores["chance"] = (by, chance, {"long_name": "chance that there are enough points", "units": "1"})
+    scores["uncertainty_possible"] = (
+        by,
+        possible,
+        {"long_name": "whether the measurement is possible, by uncertainty and chance", "units": "1"},
+    )
+    risk = screening_risk(scores)
+    scores["uncertainty_rank"] = (
+        by,
+        rank_views(-risk, possible),
+        {"long_name": "rank by predicted risk, uncertainty over the square root of chance; 1 is best", "units": "1"},
+    )
+    scores["overall_rank"] = (
+        "view",
+        rank_views(-risk.mean(axis=0), np.asarray(possible.all(axis=0))),
+        {
+            "long_name": "rank by the mean logarithm of the predicted risk over all measurements, 1 is best",
+            "units": "1",
+        },
+    )
+    limit, feature = _limits(task, scored, scores, possible)
+    scores["limit"] = (by, limit, {"long_name": "limiting factor of the view, against the best view", "units": "1"})
+    scores["limiting_feature"] = (by, feature, {"long_name": "the feature that contributes most", "units": "1"})
+    measurements = task.measurements.values()
+    scores["nominal"] = ("measurement", [m.nominal for m in measurements], {"units": "mm or deg"})
+    tolerances = [math.nan if m.tolerance_size is None else m.tolerance_size for m in measurements]
+    scores["tolerance"] = ("measurement", tolerances, {"units": "mm or deg"})
+    scores["unit"] = ("measurement", [m.unit for m in measurements])
+    return with_poses(scores, views), [one.inputs for one in scored]
+
+
+def screening_risk(scores: xr.Dataset) -> Floats:
+    """Return the logarithm of the predicted risk u / sqrt(chance) (measurement, view).
+
+    It is infinite where the map excludes the view. It orders the views for the race. Tables have the same order, but
+    for views with a chance under one half, which come last.
+    """
+    u = scores["predicted_uncertainty"].transpose("measurement", "view").values
+    chance = scores["chance"].transpose("measurement", "view").values
+    able = np.isfinite(u) & (u > 0) & (chance > 0)
+    return np.where(able, np.log(np.where(able, u, 1.0)) - 0.5 * np.log(np.where(able, chance, 1.0)), np.inf)
+
+
+def _score_view(scoring: _Scoring, cast: _Cast, view: View) -> _ViewScore:
+    """Return the results of a view from its rays: every ``step``-th ray of every ``step``-th row."""
+    scene, task, performance_map = scoring.scene, scoring.task, scoring.performance_map
+    names, ideal, labels = list(task.shapes), cast.ideal, cast.labels
+    shapes = [scene.names.index(name) for name in names]
+    white = performance(ideal, scene, performance_map, MATT_WHITE)
+    n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
+    thinning, pitch = scoring.step**2, scoring.predictor.grid.angular_pitch / scoring.step
+    points_of_view = ViewPoints(ideal, labels, view.world_from_sensor, thinning, pitch)
+
+    def expected(perturbation: Perturbation | None) -> dict[str, ExpectedPoints]:
+        return {
+            name: expected_points(points_of_view, scene, shape, performance_map, perturbation)
+            for name, shape in zip(names, shapes, strict=True)
+        }
+
+    as_mapped, points = expected(None), expected(cast.perturbation)
+    inputs = expected_inputs(task, points, scoring.minimum_points)
+    measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
+    return _ViewScore(
+        np.array([one.count for one in as_mapped.values()]),
+        np.array([one.mean_sigma for one in as_mapped.values()]),
+        n_white * thinning,
+        sigma_white,
+        cast.n_only * thinning,
+        dict(inputs),
+        measurements,
+    )
+
+
+def _white_points(predictor: Predictor, alone: CharacterisedScene, world_from_sensor: Transform) -> float:
+    """Return the expected number of points of one feature in matt white, without the rest of the part."""
+    predicted = predictor.look_up(alone, world_from_sensor)
+    counted = (predicted.labels[predicted.seen.roi.slices] == 0) & np.isfinite(predicted.seen.sigma)
+    return float(predicted.seen.fraction[counted].sum(dtype=float))
+
+
+def _limits(
+    task: Task, scored: Sequence[_ViewScore], scores: xr.Dataset, possible: NDArray[np.bool_]
+) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
+    """Return the limiting factor of each measurement in each view, and its feature, (measurement, view) each.
+
+    The feature is the one that contributes most to u. Its contribution is noise / sqrt(n) times a factor of geometry.
+    Each of the three is compared with its best value over all views; the one with the largest ratio is the limiting
+    factor.
+    """
+    shape = (len(task.measurements), len(scored))
+    limit, feature = np.full(shape, "", object), np.full(shape, "", object)
+    kinds = {name: one.kind for name, one in task.features.items()}
+    share = scores["R_f"]
+    for m in range(shape[0]):
+        for v, one in enumerate(scored):
+            predicted = one.measurements[m]
+            if not predicted.uncertainty > 0:
+                short = [name for name in predicted.reason.split(":")[0].split(", ") if name in kinds]
+                feature[m, v] = short[0] if short else ""
+        inputs = next((one.measurements[m].inputs for one in scored), ())
+        parts = np.array([one.measurements[m].contributions for one in scored])
+        noise, count = np.full((2, len(scored), len(inputs)), np.nan)
+        for v, one in enumerate(scored):
+            for i, quantity in enumerate(inputs):
+                if isinstance(known := one.inputs[quantity], ExpectedInput):
+                    noise[v, i], count[v, i] = known.fit.noise, known.fit.count
+        able = possible[m]
+        if not able.any():
+            limit[m] = "few points"
+            continue
+        among = np.broadcast_to(able[:, None], noise.shape)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            geometry = parts * np.sqrt(count) / noise
+            excess = np.stack(
+                [
+                    noise / np.min(noise, axis=0, where=among & np.isfinite(noise), initial=np.inf),
+                    np.sqrt(np.max(count, axis=0, where=among & np.isfinite(count), initial=0.0) / count),
+                    geometry / np.min(geometry, axis=0, where=among & (geometry > 0), initial=np.inf),
+                ]
+            )
+        for v in range(len(scored)):
+            if not np.isfinite(parts[v]).all() or not parts[v].any():
+                limit[m, v] = "few points"
+                continue
+            worst = int(np.argmax(parts[v]))
+            name = inputs[worst].features[0]
+            feature[m, v] = name
+            what = int(np.nanargmax(np.where(np.isfinite(excess[:, v, worst]), excess[:, v, worst], -1)))
+            limit[m, v] = ("noise", "few points", "small extent" if kinds[name] == "plane" else "short arc")[what]
+            shaped = name in share["feature"].values
+            if what == 1 and shaped and float(share.sel(feature=name).values[v]) < OCCLUDED:
+                limit[m, v] = "occlusion"
+            if not able[v]:
+                limit[m, v] = "occlusion" if limit[m, v] == "occlusion" else "few points"
+    return limit.astype(str), feature.astype(str)
+
+
+def with_poses(scores: xr.Dataset, views: Sequence[View]) -> xr.Dataset:
+    """Add the poses of the views to their scores."""
+    poses = np.stack([view.world_from_sensor.matrix() for view in views])
+    scores["world_from_sensor"] = (("view", "i", "j"), poses, {"units": "mm", "long_name": "pose of the sensor"})
+    scores["direction"] = (("view", "xyz"), np.stack([view.direction for view in views]), {"units": "1"})
+    for name, values, units in (
+        ("roll_deg", [view.roll_deg for view in views], "deg"),
+        ("elevation_deg", [view.elevation_deg for view in views], "deg"),
+        ("azimuth_deg", [view.azimuth_deg for view in views], "deg"),
+        ("standoff_mm", [view.standoff for view in views], "mm"),
+    ):
+        scores[name] = (("view",), values, {"units": units})
+    return scores

@@ -1,0 +1,125 @@
+"""Keep the trials of a case in one small file.
+
+Signal chain: trial folders of a run -> ``CASE.nc``: a row for each trial -> trial folders of a later run, which makes
+only missing trials. Judging the same trials by another rule then takes seconds.
+
+For each kind of trials, the file has a digest of everything that determines them. It is used only with the same digest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from characterisation.files.datasets import Schema, Variable, read_dataset
+from characterisation.files.errors import InputError
+from mitsim.maps.campaign.run import write_netcdf
+from mitsim.study.virtual.trials import TrialFolder
+from mitsim.study.virtual.world import GROUPS, Trial
+
+_TRIAL = ("trial",)
+_SCHEMA = Schema(
+    "a file that `mitsim validate statements` wrote",
+    {
+        "error": Variable(("trial", "measurement"), gaps=True),
+        "measurement": Variable(("measurement",), "text"),
+        "kind": Variable(_TRIAL, "whole", 0, 100),
+        "view": Variable(_TRIAL, "whole", 0, 1e9),
+        "day": Variable(_TRIAL, "whole", 0, 2**62),
+        "capture": Variable(_TRIAL, "whole", 0, 2**15),
+        "swapped": Variable(_TRIAL, "whole", 0, len(GROUPS)),
+    },
+    hint="remove `measured` from the cases file to measure everything again",
+)
+
+#: groups that a trial may have redrawn, by their number in a file
+_SWAPPED_GROUPS = ("", *GROUPS)
+
+
+def write_trials(path: Path, folders: Mapping[str, TrialFolder], views: list[int]) -> None:
+    """Write all finished trials of some views, by kind, completely or not at all."""
+    rows = [
+        (kind, view, trial, [one.errors[name] for name in folder.measurements])
+        for kind, folder in folders.items()
+        for view in views
+        for trial, one in sorted(folder.known(view).items(), key=lambda item: _place(item[0]))
+    ]
+    if not rows:
+        return
+    kinds = list(folders)
+    names = next(iter(folders.values())).measurements
+    errors = np.array([row[3] for row in rows], np.float32)
+    columns = {
+        "kind": np.array([kinds.index(row[0]) for row in rows], np.int8),
+        "view": np.array([row[1] for row in rows], np.int32),
+        "day": np.array([row[2].day for row in rows], np.int64),
+        "capture": np.array([row[2].capture for row in rows], np.int16),
+        "swapped": np.array([_SWAPPED_GROUPS.index(row[2].swapped) for row in rows], np.int8),
+    }
+    data = xr.Dataset(
+        {
+            "error": (("trial", "measurement"), errors, {"units": "mm or deg"}),
+            **{name: ("trial", values, {"units": "1"}) for name, values in columns.items()},
+        },
+        {"measurement": list(names)},
+        {
+            "title": "virtual measurements",
+            "schema_version": 1,
+            "kinds": kinds,
+            "digests": [folders[kind].digest for kind in kinds],
+        },
+    )
+    for name in data.data_vars:
+        data[name].encoding = {"zlib": True, "complevel": 6}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_netcdf(data, path)
+
+
+def take_up_trials(path: Path, folders: Mapping[str, TrialFolder]) -> dict[str, int]:
+    """Add the trials in a file of :func:`write_trials` to trial folders of the same kind and digest.
+
+    Returns the number of added trials of each kind; zero if there is no such file.
+
+    Raises
+    ------
+    InputError
+        If the file has another format.
+    """
+    taken = dict.fromkeys(folders, 0)
+    if not path.exists():
+        return taken
+    data = read_dataset(path, _SCHEMA)
+    try:
+        kinds, digests = (np.atleast_1d(data.attrs[name]).tolist() for name in ("kinds", "digests"))
+        known = dict(zip(kinds, digests, strict=True))
+        for kind, folder in folders.items():
+            if known.get(kind) != folder.digest or tuple(data["measurement"].values) != folder.measurements:
+                continue
+            mine = data.isel(trial=np.flatnonzero(data["kind"].values == kinds.index(kind)))
+            values = mine["error"].values.astype(float)
+            for view in np.unique(mine["view"].values).tolist():
+                rows = np.flatnonzero(mine["view"].values == view)
+                trials = {
+                    Trial(int(mine["day"][i]), int(mine["capture"][i]), _SWAPPED_GROUPS[int(mine["swapped"][i])]): dict(
+                        zip(folder.measurements, values[i].tolist(), strict=True)
+                    )
+                    for i in rows
+                }
+                folder.take_up(int(view), trials)
+                taken[kind] += len(trials)
+    except (KeyError, ValueError, IndexError, TypeError) as problem:
+        raise InputError(
+            path,
+            "",
+            str(problem).splitlines()[0],
+            "a file that `mitsim validate statements` wrote",
+            "remove `measured` from the cases file to measure everything again",
+        ) from problem
+    return taken
+
+
+def _place(trial: Trial) -> tuple[int, int, str]:
+    return trial.day, trial.capture, trial.swapped

@@ -1,0 +1,123 @@
+"""Judge statements of uncertainty and choices of views by independent virtual measurements.
+
+Signal chain: case (:mod:`tests.proofs.part_cases`) -> screening, race and statement by the functions of `mitsim
+run`, with its defaults -> errors in other worlds -> share of the errors inside the stated 95 % intervals; risk of the
+chosen view over that of the best.
+
+The trials are those of :mod:`tests.proofs.case_trials`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from characterisation.statements.statement import Statement
+from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.prediction import Predictor
+from mitsim.running.executor import Executor
+from mitsim.running.progress import say
+from mitsim.study import StatementTable, Study
+from mitsim.study.virtual.plan import race_rules
+from mitsim.study.virtual.race import ALL, Raced, run_race
+from mitsim.study.virtual.screening import screen
+from mitsim.study.virtual.stated import state_view
+from mitsim.views import View
+from mitsim.views.view_scores import screening_risk
+from tests.proofs.case_trials import CaseTrials, days, keep_trials, measured_choice, measured_truth, trials_by_kind
+from tests.proofs.part_cases import PartCase
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StatedView:
+    """A view's statements, by measurement, and the ``errors`` (measurement, world) in other worlds that judge them.
+
+    ``why`` is the reason why the view was stated.
+    """
+
+    view: int
+    why: str
+    statements: tuple[Statement, ...]
+    errors: Floats
+
+
+@dataclass(frozen=True)
+class JudgedCase:
+    """Results of a case.
+
+    ``sensor`` is its name. ``views`` (v,) are the numbers of all candidates. ``truth`` (measurement, v, world) are
+    errors, infinite where a view was not measured in a world. ``scores`` are those of screening. ``raced`` is the race,
+    and ``choice`` (measurement, candidate, world) are the errors that judge its choices; both are None if the case is
+    not raced.
+    """
+
+    case: PartCase
+    sensor: str
+    measurements: tuple[str, ...]
+    views: NDArray[np.int64]
+    truth: Floats
+    scores: xr.Dataset
+    raced: Raced | None
+    choice: Floats | None
+    stated: tuple[StatedView, ...]
+
+
+def run_cases(cases: Sequence[PartCase], folder: str | Path, workers: Executor | None = None) -> list[JudgedCase]:
+    """Measure and judge all cases; reuse trials in the folder or in the cases file."""
+    return [run_case(case, Path(folder), workers) for case in cases]
+
+
+def run_case(case: PartCase, folder: Path, workers: Executor | None = None) -> JudgedCase:
+    """Measure and judge one case."""
+    say(f"case: {case.name}")
+    study = case.open()
+    trials_of_kind = trials_by_kind(case, study, folder, workers)
+    assert study.performance_map is not None
+    predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
+    scores, _ = screen(study, predictor, study.performance_map)
+    raced = None
+    if case.table.raced:
+        few, tool = study.views[: case.file.raced_candidates], trials_of_kind["tool"]
+        few_scores = scores.sel(view=[view.number for view in few])
+        raced = run_race(few, few_scores, tool.runner, tool.trials, race_rules(study.file.race))
+    truth = measured_truth(case, trials_of_kind["truth"])
+    choice = None if raced is None else measured_choice(case, trials_of_kind["choice"])
+    chosen = None if raced is None else raced.leaders().get(ALL)
+    stated = [_stated(case, trials_of_kind, view, why) for view, why in _to_state(case, study, scores, chosen)]
+    keep_trials(case, folder, trials_of_kind)
+    numbers = np.array([view.number for view in study.views])
+    return JudgedCase(
+        case, study.sensor.name, tuple(study.task.measurements), numbers, truth, scores, raced, choice, tuple(stated)
+    )
+
+
+def _to_state(case: PartCase, study: Study, scores: xr.Dataset, chosen: int | None) -> list[tuple[View, str]]:
+    """Return the views whose statements are judged: the chosen one, and random ones that the map rates as possible."""
+    risk = screening_risk(scores)
+    by_number = {view.number: view for view in study.views}
+    numbers = [int(number) for number in scores["view"].values]
+    possible = [numbers[i] for i in np.flatnonzero(np.isfinite(risk).all(axis=0))]
+    if not possible:
+        finite = np.isfinite(risk).sum(axis=0)
+        possible = [numbers[i] for i in np.flatnonzero(finite == finite.max())] if finite.max() else numbers
+    total = np.where(np.isfinite(risk), risk, 0.0).sum(axis=0)
+    by_screening = [numbers[i] for i in np.argsort(total, kind="stable") if numbers[i] in possible]
+    first = by_screening[0] if chosen is None else chosen
+    others = [number for number in possible if number != first]
+    drawn = np.random.default_rng([case.file.seed, len(numbers)]).permutation(len(others))[: case.file.stated - 1]
+    return [(by_number[number], why) for number, why in [(first, "chosen"), *((others[i], "at random") for i in drawn)]]
+
+
+def _stated(case: PartCase, trials_of_kind: dict[str, CaseTrials], view: View, why: str) -> StatedView:
+    tool, apart, count = trials_of_kind["tool"], trials_of_kind["apart"], case.file.stated_worlds
+    table = StatementTable(trials=tool.study.file.statement.trials, pairs=0)
+    statements = state_view(tool.study, view, tool.runner, tool.trials, tool.unknowns, table)
+    apart.measure([view], {view.number: days(count)})
+    return StatedView(view.number, why, tuple(statements), apart.trials.errors(view.number, days(count)))
