@@ -29,6 +29,7 @@ from mitsim.cli.options import (
     check_folder,
     definitions,
     pose_of,
+    requested_workers,
     start,
 )
 
@@ -81,7 +82,6 @@ def characterise(
     from mitsim.maps.campaign.run import measure_captures, run_campaign
     from mitsim.report.figures import write_map_figures
     from mitsim.report.findings import spread_in_words
-    from mitsim.running.executor import executor_of
     from mitsim.running.progress import say
     from mitsim.sensor.preset import load_sensor
 
@@ -106,7 +106,7 @@ def characterise(
         with live_source(live, mount) as take:
             performance_map = run_campaign(plan, place_by_place(in_turn(take, plan)), output)
     else:
-        workers = executor_of(scheduler, processes)
+        workers = requested_workers(scheduler, processes)
         simulated = SimulatedSensor(plan.sensor)
         coupon_residuals(simulated, plan)
         if workers is None:

@@ -6,13 +6,16 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from characterisation.files.errors import InputError
 from mitsim.cli.folder_lock import lock_folder, remove_partial_beside
+
+if TYPE_CHECKING:
+    from mitsim.running.executor import Executor
 
 Out = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")]
 OutCloud = Annotated[Path, typer.Option("--output", "-o", help="Point cloud to write, a PLY file.")]
@@ -87,6 +90,17 @@ def start(variant: str | None) -> None:
     from mitsim.scene import backend
 
     backend.activate(variant)
+
+
+def requested_workers(scheduler: str | None, processes: int) -> Executor | None:
+    """Return what ``--scheduler`` and ``--processes`` ask for; None if this process works alone.
+
+    With a CUDA device, one process uses all of it.
+    """
+    from mitsim.running.executor import executor_of
+    from mitsim.scene.backend import cuda_devices
+
+    return executor_of(scheduler, 1 if processes == 0 and cuda_devices() else processes)
 
 
 def pose_of(position: tuple[float, float, float], target: tuple[float, float, float], roll: float, sensor: Any) -> Any:

@@ -132,7 +132,12 @@ _STOPPED = 130
 
 
 def main() -> None:
-    """Run the command line; errors that users can correct end with a message and an exit code, not a traceback."""
+    """Run the command line of mitsim."""
+    run_application(app)
+
+
+def run_application(app: typer.Typer) -> None:
+    """Run commands; errors that users can correct end with a message and an exit code, not a traceback."""
     _prepare_streams()
     _stop_as_by_hand()
     code = 0

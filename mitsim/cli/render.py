@@ -22,6 +22,7 @@ from mitsim.cli.options import (
     check_folder,
     definitions,
     pose_of,
+    requested_workers,
     start,
 )
 
@@ -90,12 +91,11 @@ def render(
         raise InputError(option, "", given, "only with --many", "a single capture runs in this process")
     start(variant)
     if many is not None:
-        from mitsim.running.executor import executor_of
         from mitsim.sensor.noise_sources import Noise
         from mitsim.study.many_captures import CommonSettings
 
         common = CommonSettings(definitions(define), deviation, seed, samples, depth, Noise.parse(noise), truth)
-        _render_many(many, scene, sensor, common, output, executor_of(scheduler, processes))
+        _render_many(many, scene, sensor, common, output, requested_workers(scheduler, processes))
         return
     assert position is not None
     from dataclasses import asdict

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from mitsim.cli.options import Out, Processes, Scheduler, Seed, Variant, check_folder, start
+from mitsim.cli.options import Out, Processes, Scheduler, Seed, Variant, check_folder, requested_workers, start
 
 
 def datasheet(
@@ -27,13 +27,12 @@ def datasheet(
     from mitsim.maps.data_sheet import gallery, measure_sensor
     from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_leaves_out, sheet_table
     from mitsim.report.style import write_png
-    from mitsim.running.executor import executor_of
     from mitsim.running.progress import say
     from mitsim.sensor.preset import load_sensor, presets
 
     chosen = [load_sensor(name) for name in (sensors or presets())]
     check_folder(output)
-    workers = executor_of(scheduler, processes)
+    workers = requested_workers(scheduler, processes)
     sheets = []
     for sensor in chosen:
         sheets.append(measure_sensor(sensor, seed, workers))

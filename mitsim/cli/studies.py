@@ -19,6 +19,7 @@ from mitsim.cli.options import (
     asking,
     check_folder,
     keep_finished,
+    requested_workers,
     start,
 )
 
@@ -67,7 +68,6 @@ def run(
     """
     start(variant)
     from mitsim.report.page import write_report
-    from mitsim.running.executor import executor_of
     from mitsim.running.progress import say
     from mitsim.study import read_study, report_lays, with_plan
     from mitsim.study.run import run_study
@@ -77,7 +77,7 @@ def run(
     chosen = with_plan(read_study(study, ask=asking(yes)), plan)
     keep_finished(output, overwrite, "run.json")
     report_lays(chosen)
-    stated = run_study(chosen, output, minutes, executor_of(scheduler, processes))
+    stated = run_study(chosen, output, minutes, requested_workers(scheduler, processes))
     write_report(output)
     say(f"scores: {output / 'scores.csv'}\nreport: {output / 'report.html'}")
     _tell_statement(stated, output, read_run(output).about.view_sets)
@@ -115,7 +115,6 @@ def choose(
     from characterisation.files.atomic_io import write_json
     from characterisation.statements.verdict_words import fits_all
     from mitsim.report.choice_page import write_choice_page
-    from mitsim.running.executor import executor_of
     from mitsim.running.progress import say
     from mitsim.study import report_lays, with_plan
     from mitsim.study.choice_document import CHOICE, judged, read_choice
@@ -141,7 +140,7 @@ def choose(
         known = document(candidates[0].study, found, excluded, time.monotonic() - began, finished)
         write_json(output / CHOICE, known.model_dump(mode="json"))
 
-    found = choose_sensor(candidates, output, minutes, report_results, executor_of(scheduler, processes))
+    found = choose_sensor(candidates, output, minutes, report_results, requested_workers(scheduler, processes))
     best = found[0].candidate.study
     write_scene_geometry(output, best.scene, best.sensor)
     write_choice_page(output)
@@ -170,14 +169,13 @@ def budget(
     Example: mitsim budget scenes/two_pillars/study.toml --view 12 -o runs/view_12
     """
     start(variant)
-    from mitsim.running.executor import executor_of
     from mitsim.study import with_plan
     from mitsim.study.programs import open_study, stated_view, study_view
     from mitsim.study.virtual.stated import write_statement
 
     check_folder(output)
     chosen = with_plan(open_study(study, ask=asking(yes)), plan)
-    stated = stated_view(chosen, study_view(chosen, view, "--view"), output, executor_of(scheduler, processes))
+    stated = stated_view(chosen, study_view(chosen, view, "--view"), output, requested_workers(scheduler, processes))
     write_statement(output / "statement.json", stated.document)
     _tell_statement(stated.statements, output)
 

@@ -1,26 +1,23 @@
 """Write the page that compares a real with a simulated capture: images, histograms, residuals, statuses, table.
 
-Signal chain: data of the specimen in either capture (:class:`Shown`) -> one figure, both captures on the same scales ->
+Signal chain: data of the specimen in either capture (:class:`~mitsim.twin.compare.captures_run.Shown`) -> one figure, both captures on the same scales ->
 ``side_by_side.png`` and ``index.md``, Markdown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from characterisation.files.atomic_io import atomic_write
 from characterisation.point_cloud import Status
 from mitsim.report.cloud_figures import REASONS
 from mitsim.report.style import BLUE, FIELD, VERMILION, drawing, write_png
 from mitsim.running.numbers import percent
+from mitsim.twin.compare.captures_run import Shown
 
 #: percentile of |residual| at the ends of the colour scale, so that a few wrong matches do not set it
 _RESIDUAL_PERCENTILE = 97.0
@@ -31,23 +28,6 @@ _STRETCH = (0.01, 0.995)
 _DPI = 90
 
 PICTURE = "side_by_side.png"
-
-
-@dataclass(frozen=True)
-class Shown:
-    """One capture of the comparison, as drawn.
-
-    ``name`` and ``source`` of the capture; ``image`` (h, w) [DN] around the specimen; ``levels`` (n,) number of its
-    pixels at each grey level; ``residual`` (h, w) [mm] along the rays, NaN without a value; ``shares`` of the statuses
-    [1].
-    """
-
-    name: str
-    source: str
-    image: NDArray[np.unsignedinteger[Any]]
-    levels: NDArray[np.float64]
-    residual: NDArray[np.float64]
-    shares: Mapping[Status, float]
 
 
 def write_capture_page(folder: Path, preamble: str, table: str, real: Shown, simulated: Shown) -> Path:

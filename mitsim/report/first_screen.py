@@ -20,12 +20,12 @@ from characterisation.statements.verdict_words import OFTEN, Judged, fits_all, l
 from mitsim.report.first_rows import Row, RowValues, measured_words
 from mitsim.report.placement_figure import face_verdicts, placement_figure
 from mitsim.report.set_words import with_sets
-from mitsim.report.statement_section import StatedMeasurement
 from mitsim.report.style import Picture, as_svg
 from mitsim.running.numbers import NONE, count, rounded, with_degree_signs
 from mitsim.study.choice_document import ChoiceDocument, SensorEntry, judged
 from mitsim.study.run_folder import Run
 from mitsim.study.scene_geometry import SceneGeometry
+from mitsim.study.statement_file import StatedMeasurement
 
 #: good: every tolerance fits; plain: there are no tolerances; warn: values are missing, or a verdict is open; bad: a
 #: tolerance does not fit, or a set of views exceeds a limit

@@ -19,12 +19,13 @@ from matplotlib.figure import Figure
 from characterisation.files.atomic_io import atomic_write
 from mitsim.report.first_screen import FirstScreen, Tone, of_choice, of_run
 from mitsim.report.placement_figure import draw_placement
-from mitsim.report.statement_section import exposed_in_words, read_statement
+from mitsim.report.statement_section import exposed_in_words
 from mitsim.report.style import INK, MUTED, drawing
 from mitsim.running.numbers import listed, rounded, two_digits
 from mitsim.study.choice_document import CHOICE, ChoiceDocument, read_choice
 from mitsim.study.run_folder import Run, read_run
 from mitsim.study.scene_geometry import SceneGeometry, read_scene_geometry
+from mitsim.study.statement_file import read_statement
 
 #: an A4 page, and its margins [in]
 _WIDTH, _HEIGHT, _MARGIN = 8.27, 11.69, 0.65

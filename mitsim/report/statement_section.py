@@ -7,16 +7,11 @@ of unknowns. All bars share a scale from 0 to the largest sum of parts. An inter
 from __future__ import annotations
 
 import math
-import os
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from pydantic import ConfigDict, Field
-
-from characterisation.files.checked_files import read_json_object
-from characterisation.files.documents import Document, validate
 from characterisation.statements.losses import Loss, common_losses
 from mitsim.running.numbers import NONE, listed, percent, quantity, rounded, two_digits
+from mitsim.study.statement_file import ExposureEntry, StatedMeasurement, StatementDocument
 
 #: colour and name of a group of unknowns (Okabe and Ito, safe for colour-blind readers)
 GROUPS = {
@@ -30,107 +25,6 @@ GROUPS = {
     "noise": ("#56b4e9", "noise and speckle"),
     "beyond_map": ("#000000", "effects outside the map"),
 }
-
-
-class _Loose(Document):
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
-
-
-class BudgetEntry(_Loose):
-    """One line of the budget."""
-
-    group: str
-    variance: float = Field(ge=0)
-    low: float
-    high: float
-    share: float
-    pairs: int
-    fresh: bool
-
-
-class DecisionEntry(_Loose):
-    """Result of the decision rule for a measurement, as far as a report needs it."""
-
-    rule: str
-    accepted: tuple[float | None, float] | None
-    fits_corrected: bool
-    needed: float | None
-    false_accept: float | None
-    false_reject: float | None
-    consumer_risk: float | None
-    producer_risk: float | None
-    demand: float | None = None
-    demand_interval: tuple[float | None, float | None] | None = None
-
-
-class LossEntry(_Loose):
-    """A kind of reason why trials had no value, and their number."""
-
-    reason: str
-    count: int = Field(ge=0)
-
-
-class StatedMeasurement(_Loose):
-    """One measurement of ``statement.json``."""
-
-    unit: str
-    trials: int
-    without_value: float
-    bias: float | None
-    bias_uncertainty: float | None
-    standard_uncertainty: float | None
-    interval: tuple[float | None, float | None]
-    interval_corrected: tuple[float | None, float | None]
-    numerical_tolerance: float | None
-    settled: bool
-    repeatability: float | None
-    budget: list[BudgetEntry]
-    after_repeats: dict[str, float] = Field(default_factory=dict)
-    tolerance: float | None
-    share_of_tolerance: float | None
-    decision: DecisionEntry | None = None
-    verdict: str
-    losses: list[LossEntry] = Field(default_factory=list)
-
-
-class InfluenceEntry(_Loose):
-    """An influence, and whether the statement contains it."""
-
-    name: str
-    included: bool
-    how: str
-
-
-class ExposureEntry(_Loose):
-    """Exposures [s] of the captures behind a statement, and the share of the projector's power."""
-
-    exposures_s: list[float] = Field(min_length=1)
-    power: float
-
-
-class StatementDocument(_Loose):
-    """``statement.json``."""
-
-    schema_version: Literal[1]
-    measured_by: str
-    view: int
-    calibration: str
-    measurements: dict[str, StatedMeasurement]
-    influences: list[InfluenceEntry]
-    exposure: ExposureEntry | None = None
-
-
-def read_statement(path: Path) -> StatementDocument | None:
-    """Read ``statement.json``; return None if there is none.
-
-    Raises
-    ------
-    InputError
-        If the file is not a valid statement.
-    """
-    if not os.path.lexists(path):
-        return None
-    return validate(path, read_json_object(path), StatementDocument)
 
 
 def statement_section(document: StatementDocument) -> dict[str, Any]:

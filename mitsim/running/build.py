@@ -10,10 +10,14 @@ import hashlib
 import importlib.metadata
 import platform
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 
-import characterisation
-import mitsim
+from mitsim.running.version import __version__
+
+#: packages whose files make up the build
+_OWN = ("characterisation", "mitsim")
+
 
 #: packages that can influence a capture or its metrics
 _PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "opencv-contrib-python-headless", "xarray")
@@ -25,7 +29,7 @@ _LEFT_OUT = (".pyc", ".pyo", ".nc")
 @lru_cache(maxsize=1)
 def own_build() -> dict[str, str]:
     """Return versions by name, and ``source``, a digest of all installed files of mitsim and characterisation."""
-    found = {"mitsim": mitsim.__version__, "source": _source(), "python": platform.python_version()}
+    found = {"mitsim": __version__, "source": _source(), "python": platform.python_version()}
     for name in _PACKAGES:
         try:
             found[name] = importlib.metadata.version(name)
@@ -51,8 +55,10 @@ def differences(own: dict[str, str], other: dict[str, str]) -> str:
 def _source() -> str:
     """Return sixteen hexadecimal digits of the paths and contents of all files of both packages."""
     digest = hashlib.sha256()
-    for package in (characterisation, mitsim):
-        root = Path(str(package.__file__)).parent
+    for package in _OWN:
+        spec = find_spec(package)
+        assert spec is not None and spec.submodule_search_locations
+        root = Path(spec.submodule_search_locations[0])
         for path in sorted(root.rglob("*")):
             if path.is_file() and path.suffix not in _LEFT_OUT:
                 data = path.read_bytes()

@@ -81,11 +81,7 @@ def executor_of(scheduler: str | None, processes: int = 1) -> Executor | None:
 
 
 def fitting_processes() -> int:
-    """Return the number of workers for this machine: one per core and per :data:`MEMORY`; one on a CUDA device."""
-    from mitsim.scene.backend import cuda_devices
-
-    if cuda_devices():
-        return 1  # one process uses the whole device
+    """Return the number of workers for this machine: one per core and per :data:`MEMORY`."""
     return max(1, min(usable_cores(), available_memory() // MEMORY))
 
 
@@ -156,25 +152,18 @@ class Pool:
 
     def _ready(self) -> ProcessPoolExecutor:
         if self._pool is None:
-            from mitsim.scene import backend
-
             threads = max(1, usable_cores() // self.processes)
             context = multiprocessing.get_context("spawn")  # a forked process with Dr.Jit's threads hangs
-            self._pool = ProcessPoolExecutor(
-                self.processes, context, _start_worker, (threads, os.getpid(), backend.active())
-            )
+            self._pool = ProcessPoolExecutor(self.processes, context, _start_worker, (threads, os.getpid()))
         return self._pool
 
 
-def _start_worker(threads: int, parent: int, variant: str | None) -> None:
+def _start_worker(threads: int, parent: int) -> None:
     """Set up a worker process: limit its threads, and ignore Ctrl-C, which the parent handles."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _end_with_parent(parent)
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = str(threads)
-    from mitsim.scene import backend
-
-    backend.activate(variant)  # with as many threads
 
 
 def _end_with_parent(parent: int) -> None:

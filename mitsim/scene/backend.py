@@ -28,6 +28,9 @@ from characterisation.files.threads import asked_threads
 
 LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 LLVM_MINIMUM = 19
+
+#: environment variable with the variant of a process and of the processes that it starts
+VARIANT_VARIABLE = "MITSIM_VARIANT"
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono")
 
 _SYSTEM_FOLDERS = (
@@ -130,7 +133,7 @@ def cuda_devices() -> int:
 def choose_variant(requested: str | None = None) -> str:
     """Return the Mitsuba variant to run: the requested one, else CUDA if there is a device, else LLVM.
 
-    Sets the environment variable ``LLVM_VARIABLE`` for LLVM.
+    Without a request, the environment variable :data:`VARIANT_VARIABLE` is one. Sets the environment variable ``LLVM_VARIABLE`` for LLVM.
 
     Raises
     ------
@@ -139,8 +142,11 @@ def choose_variant(requested: str | None = None) -> str:
     MissingEnvironmentError
         If the variant cannot run on this machine.
     """
+    where = "--variant"
+    if requested is None and (asked := os.environ.get(VARIANT_VARIABLE)):
+        requested, where = asked, VARIANT_VARIABLE
     if requested is not None and requested not in VARIANTS:
-        raise InputError("--variant", "", repr(requested), ", ".join(VARIANTS))
+        raise InputError(where, "", repr(requested), ", ".join(VARIANTS))
     if requested == "cuda_ad_mono" and cuda_devices() == 0:
         raise MissingEnvironmentError("cuda_ad_mono was requested, but the NVIDIA driver offers no device")
     if requested == "cuda_ad_mono" or (requested is None and cuda_devices() > 0):
@@ -160,7 +166,8 @@ _active: str | None = None
 def activate(requested: str | None = None) -> str:
     """Start Mitsuba in the requested variant, once per process, and return the name of the variant.
 
-    It renders with ``OMP_NUM_THREADS`` threads, or with one for each core.
+    It renders with ``OMP_NUM_THREADS`` threads, or with one for each core. Processes that this one starts run the same
+    variant (:data:`VARIANT_VARIABLE`).
 
     Raises
     ------
@@ -181,13 +188,8 @@ def activate(requested: str | None = None) -> str:
     mi.set_log_level(mi.LogLevel.Error)
     if count := asked_threads():
         limit_threads(count)
-    _active = variant
+    _active = os.environ[VARIANT_VARIABLE] = variant
     return variant
-
-
-def active() -> str | None:
-    """Return the variant that this process runs, None before one is chosen."""
-    return _active
 
 
 def limit_threads(count: int) -> None:

@@ -20,9 +20,9 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
-from mitsim.report.statement_section import StatementDocument, read_statement
 from mitsim.scene.surface.lay import LayLeftOut
 from mitsim.study.run_files import check_own
+from mitsim.study.statement_file import StatementDocument, read_statement
 
 _MADE_BY = "a folder made by mitsim run"
 

@@ -32,7 +32,6 @@ from mitsim.cli.program import app
 from mitsim.maps.campaign.plan import CampaignFile
 from mitsim.maps.campaign.run import _all_patches
 from mitsim.maps.campaign.stage_pose import StageCalibrationFile
-from mitsim.report.statement_section import StatementDocument
 from mitsim.scene.surface.surface_light import nominal_light
 from mitsim.sensor.rig_covariance import CovarianceFile
 from mitsim.sensor.sensor_file import SensorFile
@@ -42,6 +41,7 @@ from mitsim.study.choice_document import ChoiceDocument
 from mitsim.study.many_captures import ManyFile
 from mitsim.study.run_folder import RunDocument
 from mitsim.study.scoring import pose_columns
+from mitsim.study.statement_file import StatementDocument
 from tests.proofs.part_cases import PartCasesFile
 
 ROOT = Path(__file__).resolve().parents[2]

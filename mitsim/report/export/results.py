@@ -17,11 +17,11 @@ from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.task_reading import read_task
-from mitsim.report.statement_section import StatedMeasurement
 from mitsim.running.version import __version__
 from mitsim.sensor.transforms import Transform
 from mitsim.study import StudyFile
 from mitsim.study.run_folder import Run, read_run
+from mitsim.study.statement_file import StatedMeasurement
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,20 @@
-"""Validate a simulated capture against a real one, and write the page (``mitsim validate captures``).
+"""Validate a simulated capture against a real one (``mitsim validate captures``).
 
 Signal chain: capture folder -> settings of the decoder -> plane of the specimen -> twin, unless a simulated capture is
 given (:mod:`mitsim.twin.compare.rebuild`) -> rows with verdicts (:mod:`mitsim.twin.compare.compare_captures`) ->
-``comparison.json``, ``index.md`` and its picture (:mod:`mitsim.report.capture_page`). The twin is kept in
+``comparison.json``, and what the page shows of both (:mod:`mitsim.report.capture_page`). The twin is kept in
 ``simulated/``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from characterisation.files.atomic_io import write_json
 from characterisation.files.errors import InputError
@@ -21,7 +23,6 @@ from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.decode.cloud import decoder_settings
-from mitsim.report.capture_page import Shown, write_capture_page
 from mitsim.running.numbers import NONE, rounded, two_digits
 from mitsim.running.progress import say
 from mitsim.sensor.preset import load_sensor, presets
@@ -37,12 +38,30 @@ _BORDER_PX = 24
 
 
 @dataclass(frozen=True)
+class Shown:
+    """One capture of the comparison, as drawn.
+
+    ``name`` and ``source`` of the capture; ``image`` (h, w) [DN] around the specimen; ``levels`` (n,) number of its
+    pixels at each grey level; ``residual`` (h, w) [mm] along the rays, NaN without a value; ``shares`` of the statuses
+    [1].
+    """
+
+    name: str
+    source: str
+    image: NDArray[np.unsignedinteger[Any]]
+    levels: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    shares: Mapping[Status, float]
+
+
+@dataclass(frozen=True)
 class CaptureValidation:
-    """Result of the validation: the ``comparison``, its ``table`` in Markdown, and the ``page``."""
+    """Result of the validation: the ``comparison``, its ``table`` and a ``preamble`` in Markdown, and both ``sides``."""
 
     comparison: Comparison
     table: str
-    page: Path
+    preamble: str
+    sides: tuple[Shown, Shown]
 
 
 def validate_captures(
@@ -54,7 +73,7 @@ def validate_captures(
     projector: str | None,
     seed: int,
 ) -> CaptureValidation:
-    """Compare a simulated capture with a real one, and write page, table and twin to a folder.
+    """Compare a simulated capture with a real one, and write the numbers and the twin to a folder.
 
     Raises
     ------
@@ -89,12 +108,11 @@ def validate_captures(
     comparison = compare_captures(recorded, other, place, settings, where, projector_on=on, seed=seed)
     table = comparison_table(comparison.rows, _whose(recorded))
     write_json(output / "comparison.json", comparison.numbers())
-    sides = [
+    sides = (
         _shown(_whose(recorded), recorded, place, comparison.real),
         _shown("simulated", other, place, comparison.simulated),
-    ]
-    said = _preamble(recorded, other, place, comparison, real, on)
-    return CaptureValidation(comparison, table, write_capture_page(output, said, table, *sides))
+    )
+    return CaptureValidation(comparison, table, _preamble(recorded, other, place, comparison, real, on), sides)
 
 
 def rendered_here(capture: Capture) -> bool:
