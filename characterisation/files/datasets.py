@@ -144,8 +144,8 @@ def _check_content(path: Path, data: xr.Dataset, schema: Schema) -> None:
 def _check_bytes(path: Path, schema: Schema) -> None:
     """Reject a damaged file before this process parses it: HDF5 may hang or crash on such a file.
 
-    A valid seal (:func:`characterisation.files.atomic_io.write_netcdf`) proves that the file is as it was written. A file
-    without a seal is first read in a separate process.
+    A valid seal (:func:`characterisation.files.atomic_io.write_netcdf`) proves that the file is as it was written. A
+    file without a seal is first read in a separate process.
     """
     data = read_bounded(path, schema.made_by, schema.hint, LARGEST_DATASET)
     body, seal = data[: -len(SEAL) - 64], data[-len(SEAL) - 64 :]

@@ -5,8 +5,8 @@ reflectance. A map therefore identifies its samples by these: two surfaces that 
 sensor, whatever their names.
 
 A sample is *as made* if its optical properties follow from its finish and Ra alone, by the laws of
-:mod:`mitsim.scene.surface`. A third surface between two as-made samples of one finish follows the same laws, so a map may
-interpolate by Ra. A lobe from another source (a trace, a gloss, alpha itself) has no such neighbours: it equals a
+:mod:`mitsim.scene.surface`. A third surface between two as-made samples of one finish follows the same laws, so a map
+may interpolate by Ra. A lobe from another source (a trace, a gloss, alpha itself) has no such neighbours: it equals a
 sample, or it is unknown to the map.
 """
 

@@ -1,7 +1,7 @@
 """Write the page that compares a real with a simulated capture: images, histograms, residuals, statuses, table.
 
-Signal chain: data of the specimen in either capture (:class:`~mitsim.twin.compare.captures_run.Shown`) -> one figure, both captures on the same scales ->
-``side_by_side.png`` and ``index.md``, Markdown.
+Signal chain: data of the specimen in either capture (:class:`~mitsim.twin.compare.captures_run.Shown`) -> one figure,
+both captures on the same scales -> ``side_by_side.png`` and ``index.md``, Markdown.
 """
 
 from __future__ import annotations

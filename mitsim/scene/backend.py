@@ -133,7 +133,8 @@ def cuda_devices() -> int:
 def choose_variant(requested: str | None = None) -> str:
     """Return the Mitsuba variant to run: the requested one, else CUDA if there is a device, else LLVM.
 
-    Without a request, the environment variable :data:`VARIANT_VARIABLE` is one. Sets the environment variable ``LLVM_VARIABLE`` for LLVM.
+    Without a request, the environment variable :data:`VARIANT_VARIABLE` is one. Sets the environment variable
+    ``LLVM_VARIABLE`` for LLVM.
 
     Raises
     ------

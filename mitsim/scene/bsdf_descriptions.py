@@ -1,7 +1,7 @@
 """Describe finishes as Mitsuba BSDFs that reflect light as :mod:`mitsim.scene.surface` computes.
 
-Signal chain: refractive index and :class:`~mitsim.scene.surface.scatter.Scatter` of a finish -> widths, factors and blend
-weights of stock BSDFs -> dictionary for ``mi.load_dict``.
+Signal chain: refractive index and :class:`~mitsim.scene.surface.scatter.Scatter` of a finish -> widths, factors and
+blend weights of stock BSDFs -> dictionary for ``mi.load_dict``.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Define the ``[unknowns]`` tables of a study and of a sensor file: unknown properties of a measurement.
 
 Each table is one group of unknowns, given by standard deviations. A virtual measurement draws all of them
-(:mod:`mitsim.study.virtual.world`). A sensor file states the unknowns of the type of sensor, such as the stability of its
-calibration and the width of its optical filter. A study states those of the part and the room; its keys override the
-sensor's. Defaults are the assumptions of an engineer who knows the workshop but has not measured it.
+(:mod:`mitsim.study.virtual.world`). A sensor file states the unknowns of the type of sensor, such as the stability of
+its calibration and the width of its optical filter. A study states those of the part and the room; its keys override
+the sensor's. Defaults are the assumptions of an engineer who knows the workshop but has not measured it.
 docs/reference/unknowns.md grades each of them.
 """
 

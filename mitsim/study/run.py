@@ -1,9 +1,9 @@
 """Run a study: choose the best views with a performance map and virtual measurements, and state the uncertainty.
 
-Signal chain: study -> performance map -> score of every candidate view (:mod:`mitsim.views.view_scores`), which screens the
-views -> race of the promising views by virtual measurements (:mod:`mitsim.study.virtual.race`) -> statement of the best view
-(:mod:`mitsim.study.virtual.stated`) -> predicted clouds, and images, of the best views -> ``scores.csv``, ``scores.nc``,
-``poses/``, ``trials/``, ``checks.nc``, ``statement.json``, ``clouds/``, ``captures/``, ``run.json``.
+Signal chain: study -> performance map -> score of every candidate view (:mod:`mitsim.views.view_scores`), which screens
+the views -> race of the promising views by virtual measurements (:mod:`mitsim.study.virtual.race`) -> statement of the
+best view (:mod:`mitsim.study.virtual.stated`) -> predicted clouds, and images, of the best views -> ``scores.csv``,
+``scores.nc``, ``poses/``, ``trials/``, ``checks.nc``, ``statement.json``, ``clouds/``, ``captures/``, ``run.json``.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Score all candidate views with the performance map, and choose the fewest views that keep limits of uncertainty.
 
-Signal chain: study, map -> score of every view (:mod:`mitsim.study.virtual.screening`) -> fewest views that measure together
-(:mod:`characterisation.scores.task_sets`) -> ``scores.csv``, ``scores.nc``, ``poses/``, ``part.ply``.
+Signal chain: study, map -> score of every view (:mod:`mitsim.study.virtual.screening`) -> fewest views that measure
+together (:mod:`characterisation.scores.task_sets`) -> ``scores.csv``, ``scores.nc``, ``poses/``, ``part.ply``.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def score_study(
 ) -> tuple[xr.Dataset, ViewSet | None, Search]:
     """Score all views, choose a set if the study asks for one, and write ``scores``, ``poses`` and ``part.ply``.
 
-    ``unknowns``: see :func:`~mitsim.study.virtual.screening.screen`. Returns the scores, the set, and the function that finds
-    a set for other limits.
+    ``unknowns``: see :func:`~mitsim.study.virtual.screening.screen`. Returns the scores, the set, and the function that
+    finds a set for other limits.
     """
     write_views(folder / "poses", study.candidates, study.file.views, study.sensor.name)
     scores, inputs = screen(study, predictor, performance_map, unknowns)

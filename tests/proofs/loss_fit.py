@@ -2,7 +2,8 @@ r"""Fit the share of points that survive interreflections, to renders of the ope
 
 Signal chain: open cases of matchers and of codes -> some views of each, captured once with every unknown at its best
 estimate, and decoded -> ideal points away from edges, with F of the map and rho, the ratio of interreflected to direct
-light (:mod:`mitsim.maps.prediction.interreflections`) -> which points were found within 1 % of their distance -> r and k of
+light (:mod:`mitsim.maps.prediction.interreflections`) -> which points were found within 1 % of their distance -> r
+and k of
 
     P(found) = F / (1 + (rho / r)^k)
 

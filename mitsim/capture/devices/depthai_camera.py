@@ -4,9 +4,9 @@ Signal chain: settings -> pipeline of two cameras and the device's own matcher -
 number -> raw left and right images, disparity -> with the calibration stored in the device, as JSON.
 
 The device's depth is never used: its conversion may use the design baseline or the calibrated one
-(:mod:`mitsim.capture.devices.depthai_settings`). Dot projector and flood light are switched off on closing, on every error and
-on Ctrl-C. The tests use the real package's frames, queues and calibrations. Its pipelines need a device; they have not
-been run on one.
+(:mod:`mitsim.capture.devices.depthai_settings`). Dot projector and flood light are switched off on closing, on every
+error and on Ctrl-C. The tests use the real package's frames, queues and calibrations. Its pipelines need a device; they
+have not been run on one.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """Live cameras of any make as sources of captures.
 
-Signal chain: the ``[device]`` table -> an open camera (:mod:`mitsim.capture.devices`) -> its shot, in the maker's terms -> a
-:class:`~mitsim.capture.capture.Capture`, and the maker's own files with it.
+Signal chain: the ``[device]`` table -> an open camera (:mod:`mitsim.capture.devices`) -> its shot, in the maker's terms
+-> a :class:`~mitsim.capture.capture.Capture`, and the maker's own files with it.
 
 NxLib computes the points of an Ensenso. Recordings show that they are in the frame of the rectified left camera
-(:mod:`mitsim.capture.recordings.nxlib_calibration`); they are rotated to the sensor frame, that of the raw left camera. The
-disparity of the same shot verifies this for every capture. The frame in which both agree is used. Points that agree in
-neither frame are kept only as the maker's file.
+(:mod:`mitsim.capture.recordings.nxlib_calibration`); they are rotated to the sensor frame, that of the raw left camera.
+The disparity of the same shot verifies this for every capture. The frame in which both agree is used. Points that agree
+in neither frame are kept only as the maker's file.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@ r"""Exchange lines of text with a device on a serial port: pyserial, with plain 
 
 Signal chain: port (a name, or a URL such as socket://host:4000) -> bytes -> lines, each awaited until a deadline.
 
-Whatever the device sends, a call ends at its deadline: with a line, or with a :class:`~characterisation.files.errors.DeviceError`.
-Bytes that are not ASCII are kept as ``\xNN``. A carriage return or a line feed ends a line, and empty lines are
-skipped.
+Whatever the device sends, a call ends at its deadline: with a line, or with a
+:class:`~mitsim.capture.devices.device_error.DeviceError`. Bytes that are not ASCII are kept as ``\xNN``. A carriage
+return or a line feed ends a line, and empty lines are skipped.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 Every matrix is stored column by column. ``Link`` is the pose of the camera: it takes coordinates of its target, a
 workspace or another camera, to those of the *rectified* left camera, by a rotation about an axis and a translation
 [mm]. The manufacturer's manual (*Common Tree Elements*) says that links go "from Target to object". The vendor's own
-pose of a pattern agrees (recording ``locate_pattern``, see :mod:`mitsim.capture.recordings.nxlib_calibration`). NxLib's own
-point maps are in the target's frame.
+pose of a pattern agrees (recording ``locate_pattern``, see :mod:`mitsim.capture.recordings.nxlib_calibration`). NxLib's
+own point maps are in the target's frame.
 """
 
 from __future__ import annotations

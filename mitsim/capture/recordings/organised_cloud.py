@@ -64,8 +64,8 @@ def read_organised_cloud(
     Parameters
     ----------
     calibration
-        The camera of the grid, see :mod:`mitsim.capture.recordings.calibration_file`; by default a pinhole is fitted. With a
-        rectification, the grid may also be that of the rectified left image, at full or reduced size.
+        The camera of the grid, see :mod:`mitsim.capture.recordings.calibration_file`; by default a pinhole is fitted.
+        With a rectification, the grid may also be that of the rectified left image, at full or reduced size.
     unit
         ``um``, ``mm``, ``cm`` or ``m``; by default metres if the median distance is under :data:`METRES_UNDER`, else
         millimetres.

@@ -1,8 +1,8 @@
 """Complete a map for the finishes of a scene: characterise missing finishes now, if that is allowed.
 
 Signal chain: map of a sensor, scene -> finishes missing in the map -> those in the cache are read -> the user is asked
-about the others, with the expected time -> a quick campaign for each (:mod:`mitsim.maps.campaign.one_finish`) at the map's
-distances around the views -> one map.
+about the others, with the expected time -> a quick campaign for each (:mod:`mitsim.maps.campaign.one_finish`) at the
+map's distances around the views -> one map.
 """
 
 from __future__ import annotations

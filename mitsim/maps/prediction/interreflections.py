@@ -2,8 +2,8 @@ r"""Effect of interreflections on a view, which a map made from flat coupons doe
 
 Signal chain: codes of the projector, reference camera with large pixels -> radiance L_1 of direct light, and L_2 of
 light over two to ``depth`` surfaces -> rho = L_2 / L_1 at every point -> F g(rho), sigma h(rho). For a phase code also:
-fringes -> phase bias (:mod:`mitsim.maps.prediction.multipath_phase_bias`). For time of flight also: correlations -> path
-bias (:mod:`mitsim.maps.prediction.multipath_range_bias`).
+fringes -> phase bias (:mod:`mitsim.maps.prediction.multipath_phase_bias`). For time of flight also: correlations ->
+path bias (:mod:`mitsim.maps.prediction.multipath_range_bias`).
 
 Next to a corner of bright metal, such as a plate and a pillar, rho is 1 to 30. The interreflected light carries the
 code of another place. Weak interreflections are a background that reduces the contrast for a matcher,

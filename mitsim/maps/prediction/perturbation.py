@@ -5,8 +5,8 @@ point (:class:`Perturbation`) -> all of them combined.
 
 A map is made from flat coupons without neighbours. Other influences are effects: interreflections
 (:mod:`mitsim.maps.prediction.interreflections`) and errors of calibration and temperature
-(:mod:`mitsim.maps.prediction.shared_errors`). A new effect is a module with a function of a :class:`SceneView`, and an entry
-in :func:`mitsim.study.virtual.screening.effects_of`.
+(:mod:`mitsim.maps.prediction.shared_errors`). A new effect is a module with a function of a :class:`SceneView`, and an
+entry in :func:`mitsim.study.virtual.screening.effects_of`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Convert the dimensions and tolerances of a drawing to measurements of a task, and list those without one.
 
-Signal chain: dimensions and tolerances with the numbers of their faces (:mod:`mitsim.scene.authoring.product_information`) ->
-faces by name -> a measurement if the task has its kind for these features, else a sentence with the reason.
+Signal chain: dimensions and tolerances with the numbers of their faces
+(:mod:`mitsim.scene.authoring.product_information`) -> faces by name -> a measurement if the task has its kind for these
+features, else a sentence with the reason.
 """
 
 from __future__ import annotations

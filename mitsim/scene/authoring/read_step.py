@@ -1,8 +1,8 @@
 """Read the faces of a STEP file with their exact surfaces, instead of estimates from a mesh.
 
-Signal chain: STEP -> OpenCASCADE in a separate process (:mod:`mitsim.scene.authoring.step_worker`) -> faces with their exact
-surfaces -> faces of one body that lie on one surface and share an edge joined (CAD divides a bore into two halves) ->
-names from the file's text.
+Signal chain: STEP -> OpenCASCADE in a separate process (:mod:`mitsim.scene.authoring.step_worker`) -> faces with their
+exact surfaces -> faces of one body that lie on one surface and share an edge joined (CAD divides a bore into two
+halves) -> names from the file's text.
 """
 
 from __future__ import annotations

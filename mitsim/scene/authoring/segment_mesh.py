@@ -1,8 +1,9 @@
 """Segment a mesh of a part into its faces, and recognise planes, cylinders and spheres.
 
 Signal chain: triangles [mm] -> vertices merged, degenerate triangles removed -> neighbours joined if the angle between
-them is small (or if the CAD file states one face) -> the surface of each piece (:mod:`mitsim.scene.authoring.recognise`) ->
-neighbours on one surface joined (CAD divides a cylinder in two) -> names by kind and area.
+them is small (or if the CAD file states one face) -> the surface of each piece
+(:mod:`mitsim.scene.authoring.recognise`) -> neighbours on one surface joined (CAD divides a cylinder in two) -> names
+by kind and area.
 """
 
 from __future__ import annotations

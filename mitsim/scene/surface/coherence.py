@@ -52,8 +52,8 @@ def lobe_numbers(
 ) -> tuple[float, float, float]:
     """Return the coefficients c_0, c_1 and c_2 [1] of h.
 
-    The parameters of the lobe are those of :class:`~mitsim.scene.surface.scatter.Scatter`. For an elongated lobe the energy
-    is averaged over the azimuth of the light.
+    The parameters of the lobe are those of :class:`~mitsim.scene.surface.scatter.Scatter`. For an elongated lobe the
+    energy is averaged over the azimuth of the light.
     """
     returned, missing = [], []
     lobes: tuple[tuple[float, float, Distribution], ...] = (

@@ -10,9 +10,9 @@ N = J^T Sigma^-1 J + P, board errors k of covariance K and G = df/dk,
     cov = N^-1 + N^-1 J^T Sigma^-1 G K G^T Sigma^-1 J N^-1
 
 (Triggs et al., Bundle adjustment - a modern synthesis, 2000; "consider" covariance of Bierman 1977, as
-:mod:`mitsim.study.calibration.bundle`). A few poses do not determine all parameters of a lens: without a prior the weakest
-coefficients diverge. A projector's coordinates are read at the camera's corners, so their errors are correlated with
-the camera's.
+:mod:`mitsim.study.calibration.bundle`). A few poses do not determine all parameters of a lens: without a prior the
+weakest coefficients diverge. A projector's coordinates are read at the camera's corners, so their errors are correlated
+with the camera's.
 """
 
 from __future__ import annotations

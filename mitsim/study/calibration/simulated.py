@@ -45,7 +45,7 @@ class SimulatedCorners:
 def simulate_corners(
     eyes: Mapping[str, Camera], board: Board, views: Sequence[BoardView], rng: np.random.Generator
 ) -> SimulatedCorners:
-    """Draw one board and the errors of all its corners, by the model of :func:`mitsim.study.calibration.bundle.linearise`."""
+    """Draw a board and the errors of all its corners, by :func:`mitsim.study.calibration.bundle.linearise`."""
     modes, sigma = board.imperfections()
     true = board.corners + np.einsum("m,mni->ni", sigma * rng.standard_normal(len(sigma)), modes)
     pixels: dict[str, list[Floats]] = {name: [] for name in eyes}

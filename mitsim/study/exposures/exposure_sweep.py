@@ -1,9 +1,9 @@
 """Predict how well one view measures each feature at any exposure, from a single simulation of the light.
 
 Signal chain: view with every unknown at its best estimate -> light on the imagers, traced once
-(:meth:`mitsim.study.virtual.rendered.RenderedMeasurements.lit`) -> images for each set of exposures and noise sample -> cloud
--> recovered points of each feature, their share F of the possible points, and the standard uncertainty u of its fitted
-surface.
+(:meth:`mitsim.study.virtual.rendered.RenderedMeasurements.lit`) -> images for each set of exposures and noise sample ->
+cloud -> recovered points of each feature, their share F of the possible points, and the standard uncertainty u of its
+fitted surface.
 
 Images are linear in the projector's power and in the exposure, so the light is traced only once. The uncertainty u is
 that of the surface's position along the view rays, as the root mean square over the visible part of the feature. Let g

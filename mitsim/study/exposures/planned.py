@@ -1,7 +1,7 @@
 """Plan the exposures of a study's views, store the plans, and make virtual measurements with them.
 
-Signal chain: study and view -> plan (:mod:`mitsim.study.exposures.exposure_plan`), or the exposures that the study gives ->
-``exposures/view_0012.json`` -> the same virtual measurements with these exposures, and separate trials.
+Signal chain: study and view -> plan (:mod:`mitsim.study.exposures.exposure_plan`), or the exposures that the study
+gives -> ``exposures/view_0012.json`` -> the same virtual measurements with these exposures, and separate trials.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Virtual measurements from the map: clouds drawn by the talk's method, with the same unknowns as rendered ones.
 
-Signal chain: view and trial -> world (:mod:`mitsim.study.virtual.world`) -> F and sigma of every pixel from the map, with
-random errors and spread of the map -> P + R_N sigma V, with the measured correlation of neighbours, kept if R_U < F ->
-displacement of ideal points by the true calibration (:func:`mitsim.study.calibration.accuracy.measured_points`) -> path,
-temperature and form -> measurement at the assumed pose -> error of every measurement -> plus effects outside the map
-(:mod:`mitsim.study.virtual.beyond_map`), in units of the predicted uncertainty of the view.
+Signal chain: view and trial -> world (:mod:`mitsim.study.virtual.world`) -> F and sigma of every pixel from the map,
+with random errors and spread of the map -> P + R_N sigma V, with the measured correlation of neighbours, kept if R_U <
+F -> displacement of ideal points by the true calibration (:func:`mitsim.study.calibration.accuracy.measured_points`) ->
+path, temperature and form -> measurement at the assumed pose -> error of every measurement -> plus effects outside the
+map (:mod:`mitsim.study.virtual.beyond_map`), in units of the predicted uncertainty of the view.
 
 A sensor that was characterised on hardware, without a simulated twin, allows only this kind of virtual measurement. The
 map contains what flat coupons show. It does not contain edges, curved faces, interreflections, clusters of false

@@ -1,6 +1,7 @@
 """Set up the virtual measurements of a study, and compute the digest of everything that determines a trial.
 
-Signal chain: study and its unknowns (:mod:`mitsim.study.virtual.study_unknowns`) -> object that makes measurements -> digest.
+Signal chain: study and its unknowns (:mod:`mitsim.study.virtual.study_unknowns`) -> object that makes measurements ->
+digest.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Virtual measurements by rendering: one sensor and one part in any number of random worlds.
 
-Signal chain: view and trial -> world (:mod:`mitsim.study.virtual.world`) -> images of the part by the *true* sensor: direct
-light traced for every trial, interreflections rendered once for a view and finish, room light, power, exposure, noise
--> cloud, decoded with the *nominal* calibration -> errors other than light: path, temperature and form of the part ->
-measurement at the assumed pose -> error of every measurement.
+Signal chain: view and trial -> world (:mod:`mitsim.study.virtual.world`) -> images of the part by the *true* sensor:
+direct light traced for every trial, interreflections rendered once for a view and finish, room light, power, exposure,
+noise -> cloud, decoded with the *nominal* calibration -> errors other than light: path, temperature and form of the
+part -> measurement at the assumed pose -> error of every measurement.
 
 Interreflections are rendered at the nominal pose and calibration of the view. They are smooth, and the random pose and
 calibration shift them by about a pixel. Trials sorted by finish (:func:`in_order`) render them once for each finish.

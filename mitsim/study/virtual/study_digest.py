@@ -17,8 +17,8 @@ from mitsim.study import Study
 def study_digest(study: Study, trials: str) -> str:
     """Return thirty-two hexadecimal digits of everything that determines the results of a study.
 
-    ``trials`` is the digest of its trials (:func:`mitsim.study.virtual.plan.trial_digest`), which covers sensor, scene, task,
-    views and unknowns.
+    ``trials`` is the digest of its trials (:func:`mitsim.study.virtual.plan.trial_digest`), which covers sensor, scene,
+    task, views and unknowns.
     """
     content = {
         "trials": trials,

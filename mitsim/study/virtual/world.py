@@ -34,8 +34,8 @@ from mitsim.sensor.unknowns import FinishUnknowns, UnknownsTable
 COMMON = ("calibration", "finish", "form", "light", "temperature", "unit")
 FRESH = ("pose", "noise")
 
-#: effects outside the performance map, for measurements drawn from a map (:mod:`mitsim.study.virtual.beyond_map`); they are
-#: the same in all captures of a day
+#: effects outside the performance map, for measurements drawn from a map (:mod:`mitsim.study.virtual.beyond_map`); they
+#: are the same in all captures of a day
 BEYOND = "beyond_map"
 
 #: all groups; the index of a group in this tuple seeds its stream

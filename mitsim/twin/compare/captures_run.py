@@ -56,7 +56,9 @@ class Shown:
 
 @dataclass(frozen=True)
 class CaptureValidation:
-    """Result of the validation: the ``comparison``, its ``table`` and a ``preamble`` in Markdown, and both ``sides``."""
+    """Result of the validation: the ``comparison``, its ``table`` and a ``preamble`` in Markdown, and both
+    ``sides``.
+    """
 
     comparison: Comparison
     table: str

@@ -1,8 +1,8 @@
 """A recorded image less its noise, edges of the print kept.
 
-Signal chain: image [e-] -> variance of its noise by level (:mod:`mitsim.twin.finish.fine_detail`) -> cosine transform of the
-8 x 8 window about every pixel -> coefficients under three standard deviations of the noise are set to 0 -> back, and
-the mean of all windows that hold a pixel, each weighted by one over the coefficients that it kept.
+Signal chain: image [e-] -> variance of its noise by level (:mod:`mitsim.twin.finish.fine_detail`) -> cosine transform
+of the 8 x 8 window about every pixel -> coefficients under three standard deviations of the noise are set to 0 -> back,
+and the mean of all windows that hold a pixel, each weighted by one over the coefficients that it kept.
 
 The method is that of Yu and Sapiro (IPOL 1 (2011) 292) with the weights of Guleryuz (IEEE TIP 16 (2007) 3020). A filter
 by local mean and variance (Lee, IEEE TPAMI 2 (1980) 165) would leave all noise at edges. In a twin that noise is part

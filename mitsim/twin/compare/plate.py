@@ -1,8 +1,8 @@
 """Specimen of a rebuilt capture: a matt sheet with the recorded bend, or a plate with the recorded print.
 
 Signal chain, sheet: pose and bend -> mesh -> matt white. Signal chain, print: recorded image [e-] -> removal of its
-noise (:mod:`mitsim.twin.compare.denoise`) -> ratio to the image of a white plate -> reflectance of the plate, or of every
-pixel.
+noise (:mod:`mitsim.twin.compare.denoise`) -> ratio to the image of a white plate -> reflectance of the plate, or of
+every pixel.
 """
 
 from __future__ import annotations

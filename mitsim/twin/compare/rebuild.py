@@ -1,10 +1,10 @@
 """Rebuild a real capture as a simulated one, its twin.
 
-Signal chain: real capture -> plane of the specimen, its extent and its bend (:mod:`mitsim.twin.finish.specimen`) -> a matt
-white sheet there (:mod:`mitsim.twin.compare.plate`) -> light of the sensor file's projector, pattern and room on the
-cameras of the capture (:mod:`mitsim.capture.simulated.simulate`) -> light scaled to the recorded median grey level of the
-specimen in the plain image (:mod:`mitsim.twin.compare.plain_image`) -> exposure by the file's imager -> capture of source
-``simulated``.
+Signal chain: real capture -> plane of the specimen, its extent and its bend (:mod:`mitsim.twin.finish.specimen`) -> a
+matt white sheet there (:mod:`mitsim.twin.compare.plate`) -> light of the sensor file's projector, pattern and room on
+the cameras of the capture (:mod:`mitsim.capture.simulated.simulate`) -> light scaled to the recorded median grey level
+of the specimen in the plain image (:mod:`mitsim.twin.compare.plain_image`) -> exposure by the file's imager -> capture
+of source ``simulated``.
 
 *Taken from the recording*: cameras and rectification, pose and bend of the sheet, light code and number of frames,
 exposure if known, median grey level. *Taken from the sensor file*: projector, dot pattern, imager, blur. The scale is a

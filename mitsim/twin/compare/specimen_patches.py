@@ -1,8 +1,8 @@
 """Metrics of a specimen in one capture, in patches of 40 px: grey levels, points and their noise.
 
-Signal chain, image: plain image of the reference camera (:mod:`mitsim.twin.compare.plain_image`), pixels on the specimen
-(:func:`mitsim.twin.finish.specimen.image_mask`) -> local mean and deviation, crossings of the local mean, changes of sign
-between neighbouring pixels -> values of every patch.
+Signal chain, image: plain image of the reference camera (:mod:`mitsim.twin.compare.plain_image`), pixels on the
+specimen (:func:`mitsim.twin.finish.specimen.image_mask`) -> local mean and deviation, crossings of the local mean,
+changes of sign between neighbouring pixels -> values of every patch.
 
 Signal chain, cloud: pixels on the specimen, on the cloud's grid -> points and statuses of every patch; plane of the
 patch along the rays -> sigma, residuals and their products at every lag (:mod:`characterisation.coupon.metrics`,

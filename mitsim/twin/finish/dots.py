@@ -46,8 +46,8 @@ class Dots:
 def compare_dots(view: View, renderer: WhiteCouponRenderer) -> Dots:
     """Compare the dots of a view with those of the first frame of the sensor's own pattern.
 
-    ``view`` comes from :func:`~mitsim.twin.finish.observation.observe` with the pattern ``level``, so that its ``unit`` light
-    has no dots.
+    ``view`` comes from :func:`~mitsim.twin.finish.observation.observe` with the pattern ``level``, so that its ``unit``
+    light has no dots.
     """
     camera = renderer.sensor.rig.cameras[view.camera]
     roi = coupon_roi(camera, view.place)

@@ -1,8 +1,9 @@
 r"""Estimate the width of the lobe and the power of the projector from the blocks of several views.
 
-Signal chain: blocks (:mod:`mitsim.twin.finish.observation`) and their model (:mod:`mitsim.twin.finish.problem`) -> scan of alpha, with
-the two amplitudes solved at each value -> weighted Gauss-Newton from every local minimum, with the Jacobian from
-forward-mode differentiation -> noise and grain from the best prediction, and repetition -> covariance, jackknife.
+Signal chain: blocks (:mod:`mitsim.twin.finish.observation`) and their model (:mod:`mitsim.twin.finish.problem`) -> scan
+of alpha, with the two amplitudes solved at each value -> weighted Gauss-Newton from every local minimum, with the
+Jacobian from forward-mode differentiation -> noise and grain from the best prediction, and repetition -> covariance,
+jackknife.
 
     p = a_s + a_w, relative power of the projector             w = a_w / p, wide-angle share
 

@@ -1,7 +1,7 @@
 """Describe a finish as a function of its lobe's width alpha, and find the Ra with this lobe.
 
-Signal chain: metal, process, wavelength -> alpha(Ra) by :func:`mitsim.scene.surface.machined.machined` -> range in which
-alpha increases with Ra -> its inverse: alpha -> Ra-equivalent -> height, and from it the coherent shares -> a
+Signal chain: metal, process, wavelength -> alpha(Ra) by :func:`mitsim.scene.surface.machined.machined` -> range in
+which alpha increases with Ra -> its inverse: alpha -> Ra-equivalent -> height, and from it the coherent shares -> a
 :class:`~mitsim.scene.surface.scatter.Scatter` for any alpha.
 
 The Ra-equivalent is the Ra with which ``machined_metal`` renders the fitted lobe; it is not a measurement of Ra. The

@@ -4,8 +4,8 @@ Signal chain: images [DN] -> photo-electrons, by the inverse response curve -> m
 light -> pixels on the coupon -> blocks.
 
 Signal chain of the comparison: radiance L_1 of a white coupon at the same pose, through the same lenses
-(:mod:`mitsim.twin.finish.white_coupon`) -> electrons per unit of pi f and of relative power. Directions toward camera and
-projector are computed at every pixel.
+(:mod:`mitsim.twin.finish.white_coupon`) -> electrons per unit of pi f and of relative power. Directions toward camera
+and projector are computed at every pixel.
 
 - **Low pass.** Only the mean over the images of a capture is compared.
 - **Light of the room.** A simulated scene without an ambient image is dark. The scene of a device is not. There the

@@ -1,8 +1,9 @@
 """Fit the finish of a coupon and the power of the projector to captures of the coupon.
 
-Signal chain: capture folders, scene of the coupon -> place of the coupon in each (:mod:`mitsim.twin.finish.specimen`) -> views
-(:mod:`mitsim.twin.finish.observation`) -> fit (:mod:`mitsim.twin.finish.estimate`) -> alpha, Ra-equivalent, power [W], residual. If the
-pattern is not that of the sensor file, its dots are compared, too (:mod:`mitsim.twin.finish.dots`).
+Signal chain: capture folders, scene of the coupon -> place of the coupon in each (:mod:`mitsim.twin.finish.specimen`)
+-> views (:mod:`mitsim.twin.finish.observation`) -> fit (:mod:`mitsim.twin.finish.estimate`) -> alpha, Ra-equivalent,
+power [W], residual. If the pattern is not that of the sensor file, its dots are compared, too
+(:mod:`mitsim.twin.finish.dots`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Find plane, outline and bend of the flat specimen in a capture, and the pixels that show it.
 
 Signal chain: capture -> cloud, from its own decoder -> plane of the points in the image region that the user gave, or
-of most points (:mod:`mitsim.twin.finish.place`) -> its outline, and the bend of its points (:mod:`mitsim.twin.finish.bend`) -> pixels
-and view rays that meet it.
+of most points (:mod:`mitsim.twin.finish.place`) -> its outline, and the bend of its points
+(:mod:`mitsim.twin.finish.bend`) -> pixels and view rays that meet it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Fit sensor parameters to one capture of projected dots on a sheet.
 
-Signal chain: capture -> plane and bend of the sheet -> features over the field (:mod:`mitsim.twin.sensor.figures`) -> power,
-room light, dots, noise and corner losses by simulated moments (:mod:`mitsim.twin.sensor.moments`,
+Signal chain: capture -> plane and bend of the sheet -> features over the field (:mod:`mitsim.twin.sensor.figures`) ->
+power, room light, dots, noise and corner losses by simulated moments (:mod:`mitsim.twin.sensor.moments`,
 :mod:`mitsim.twin.sensor.parameters`) with the forward model (:mod:`mitsim.twin.sensor.specimen_simulator`).
 
 The six terms of room light may not explain the level and contrast over the field within chance. The mean square of the

@@ -1,10 +1,10 @@
 """Estimate the imager's noise from repeats, from dark captures, or from one uniform image, in this order.
 
-Signal chain: one image with the projector off -> first knee of the response curve (:mod:`mitsim.twin.sensor.response`); groups
-of repeats -> photon-transfer line -> full well, read noise; dark captures -> black level, DSNU; uniform light -> PRNU.
-Without repeats, from one image with the projector off: finest detail by level -> smoothing, full well, read noise,
-including the fixed pattern (:mod:`mitsim.twin.sensor.photon_transfer`). From dots alone the imager stays
-unknown here, and is fitted with the dots.
+Signal chain: one image with the projector off -> first knee of the response curve (:mod:`mitsim.twin.sensor.response`);
+groups of repeats -> photon-transfer line -> full well, read noise; dark captures -> black level, DSNU; uniform light ->
+PRNU. Without repeats, from one image with the projector off: finest detail by level -> smoothing, full well, read
+noise, including the fixed pattern (:mod:`mitsim.twin.sensor.photon_transfer`). From dots alone the imager stays unknown
+here, and is fitted with the dots.
 """
 
 from __future__ import annotations

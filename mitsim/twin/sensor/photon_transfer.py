@@ -8,9 +8,9 @@ the imager has W', file electrons are kappa = W / W' of the true ones, and
 
 so the slope gives the full well, and the intercept the read noise r, including row noise.
 
-Fixed pattern: mean of the images -> finest detail (:mod:`mitsim.twin.finish.fine_detail`), which uniform light and lenses do
-not produce -> its variance less v / n -> dsnu^2 + (prnu mu)^2. A single image gives the sum of both: its finest detail
-by level is the same line, including the fixed pattern.
+Fixed pattern: mean of the images -> finest detail (:mod:`mitsim.twin.finish.fine_detail`), which uniform light and
+lenses do not produce -> its variance less v / n -> dsnu^2 + (prnu mu)^2. A single image gives the sum of both: its
+finest detail by level is the same line, including the fixed pattern.
 
 The variance of a bin's v from N pixels and n images is 2 v^2 / (N (n - 1)). For finest detail, N counts a third because
 its weights extend over neighbours, and the median of squares has an efficiency of 0.37.

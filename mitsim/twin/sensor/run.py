@@ -1,9 +1,10 @@
 """Run ``mitsim fit sensor``: from captures of a flat object and a sensor file to the file of one unit in its room.
 
 Signal chain: captures, sorted (:mod:`mitsim.twin.sensor.input_captures`) -> repeats and dark captures: photon transfer
-(:mod:`mitsim.twin.sensor.photon_transfer`) -> projector off: light of the room (:mod:`mitsim.twin.sensor.room`) -> dots: the
-remaining parameters (:mod:`mitsim.twin.sensor.dots`) -> row errors (:mod:`mitsim.twin.sensor.rows`) -> several captures combined
-(:mod:`mitsim.twin.sensor.estimate`) -> the sensor file (:mod:`mitsim.twin.sensor.sensor_text`).
+(:mod:`mitsim.twin.sensor.photon_transfer`) -> projector off: light of the room (:mod:`mitsim.twin.sensor.room`) ->
+dots: the remaining parameters (:mod:`mitsim.twin.sensor.dots`) -> row errors (:mod:`mitsim.twin.sensor.rows`) ->
+several captures combined (:mod:`mitsim.twin.sensor.estimate`) -> the sensor file
+(:mod:`mitsim.twin.sensor.sensor_text`).
 """
 
 from __future__ import annotations

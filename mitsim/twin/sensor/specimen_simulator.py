@@ -1,8 +1,8 @@
 """Simulate a flat specimen in front of one camera for varying sensor parameters: the forward model of the fit.
 
 Signal chain: pose and bend of the specimen -> light of the projector's pattern on one camera, traced once for each
-pattern (:mod:`mitsim.capture.simulated.simulate`) -> power, and light of the room -> blur and corner loss of the lens ->
-electrons -> grey levels (:mod:`mitsim.sensor.image_formation`). It is the signal chain of every simulated
+pattern (:mod:`mitsim.capture.simulated.simulate`) -> power, and light of the room -> blur and corner loss of the lens
+-> electrons -> grey levels (:mod:`mitsim.sensor.image_formation`). It is the signal chain of every simulated
 capture, except that results which a parameter does not affect are cached.
 """
 
