@@ -22,7 +22,7 @@ from mitsim.study.virtual.world import GROUPS, Trial
 
 _TRIAL = ("trial",)
 _SCHEMA = Schema(
-    "a file that `mitsim validate statements` wrote",
+    "a file that `python -m tests.proofs statements` wrote",
     {
         "error": Variable(("trial", "measurement"), gaps=True),
         "measurement": Variable(("measurement",), "text"),
@@ -115,7 +115,7 @@ def take_up_trials(path: Path, folders: Mapping[str, TrialFolder]) -> dict[str, 
             path,
             "",
             str(problem).splitlines()[0],
-            "a file that `mitsim validate statements` wrote",
+            "a file that `python -m tests.proofs statements` wrote",
             "remove `measured` from the cases file to measure everything again",
         ) from problem
     return taken

@@ -66,7 +66,7 @@ def test_an_open_case_is_judged_by_the_others_and_sealed_ones_lend_nothing():
 def test_the_file_names_its_cases_and_its_command():
     kinds = ("matched", "coded", "time_of_flight")
     cases = [case(1.0, 2.0, n, kind) for n, kind in enumerate(kinds)] + [case(1.0, 9.0, 7, sealed=True)]
-    text = beyond_map_document("mitsim validate maps x.toml -o y.toml", cases)
+    text = beyond_map_document("python -m tests.proofs maps x.toml -o y.toml", cases)
     read = BeyondMap.model_validate(tomllib.loads(text))
     assert read.cases == ["part_0__x__white", "part_1__x__white", "part_2__x__white"]
     assert read.coded == fitted_sizes([cases[1]])
@@ -76,7 +76,7 @@ def test_the_file_names_its_cases_and_its_command():
 
 def test_the_file_that_comes_along_is_read():
     shipped = beyond_map()
-    assert shipped.command.startswith("mitsim validate maps scenes/parts/validation.toml")
+    assert shipped.command.startswith("python -m tests.proofs maps scenes/parts/validation.toml")
     assert {name.split("__")[1] for name in shipped.cases} >= {"kinect-v2", "ensenso-n10", "zivid-2-m70"}
 
 

@@ -108,7 +108,7 @@ def test_a_file_of_other_trials_is_not_taken_up(tmp_path):
 @pytest.mark.parametrize("content", [b"", b"no netCDF", b"CDF\x01" + bytes(200)])
 def test_a_file_that_is_none_is_refused(tmp_path, content):
     (tmp_path / "case.nc").write_bytes(content)
-    with pytest.raises(InputError, match="validate statements"):
+    with pytest.raises(InputError, match="proofs statements"):
         take_up_trials(tmp_path / "case.nc", {"tool": TrialFolder(tmp_path, "a", ["one"])})
 
 

@@ -17,7 +17,7 @@ are found at the right place is
     g = 1 / (1 + (rho / r)^k)
 
 with one pair of constants r and k for matchers and one for codes (:func:`losses`). Their file states its source;
-`mitsim validate losses` estimates them. A time-of-flight sensor loses the points that its own decoder rejects.
+`python -m tests.proofs losses` estimates them. A time-of-flight sensor loses the points that its own decoder rejects.
 
 Not included: the response of a matcher to mirror images of the projector or of a face, and the positions of false
 points.
