@@ -153,9 +153,8 @@ def test_builds_differ_in_versions_and_in_any_file(tmp_path, monkeypatch):
     for name in ("mitsim", "characterisation"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("")
-    monkeypatch.setattr(build, "mitsim", type("M", (), {"__file__": str(tmp_path / "mitsim/__init__.py")}))
     monkeypatch.setattr(
-        build, "characterisation", type("C", (), {"__file__": str(tmp_path / "characterisation/__init__.py")})
+        build, "find_spec", lambda name: type("S", (), {"submodule_search_locations": [str(tmp_path / name)]})
     )
     before = build._source()
     (tmp_path / "mitsim/__init__.py").write_text("shot_noise = 1.5")

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from characterisation.files.errors import InputError, MissingEnvironmentError
 from mitsim.capture.devices.device_error import DeviceError
+from mitsim.cli.options import requested_workers
 from mitsim.cli.program import app
 from mitsim.running import executor
 from mitsim.running.executor import Pool, available_memory, executor_of, fitting_processes, results_of
@@ -95,7 +96,6 @@ def test_what_a_worker_refuses_is_told_as_it_said_it(pool):
 
 
 def test_processes_follow_cores_and_memory(monkeypatch):
-    monkeypatch.setattr("mitsim.scene.backend.cuda_devices", lambda: 0)
     monkeypatch.setattr(executor, "usable_cores", lambda: 16)
     monkeypatch.setattr(executor, "available_memory", lambda: 9 << 30)
     assert fitting_processes() == 4
@@ -103,9 +103,9 @@ def test_processes_follow_cores_and_memory(monkeypatch):
     assert fitting_processes() == 1
     monkeypatch.setattr(executor, "available_memory", lambda: 1 << 50)
     assert fitting_processes() == 16
-    monkeypatch.setattr("mitsim.scene.backend.cuda_devices", lambda: 1)
-    assert fitting_processes() == 1
-    assert available_memory() > 1 << 20
+    for devices, expected in ((1, type(None)), (0, Pool)):  # one process uses a whole CUDA device
+        monkeypatch.setattr("mitsim.scene.backend.cuda_devices", lambda devices=devices: devices)
+        assert type(requested_workers(None, 0)) is expected
     assert executor_of(None, 1) is None and isinstance(executor_of(None, 3), Pool)
     with pytest.raises(InputError, match="--processes"):
         executor_of("tcp://a:1", 2)

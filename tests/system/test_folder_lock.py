@@ -103,7 +103,7 @@ def test_signals_end_a_command_as_ctrl_c_does(tmp_path, number):
     # tests that a shell runs in its background, or under nohup, ignore SIGINT or SIGHUP, and so does what they start
     wait = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
     wait += "signal.signal(signal.SIGHUP, signal.SIG_DFL); "
-    wait += "import mitsim.cli.machine as m, time; import mitsim.cli as c; "
+    wait += "import mitsim.cli.machine as m, time; import mitsim.cli.program as c; "
     wait += "c.app.command(name='wait')(lambda: (print('on', flush=True), time.sleep(60))[1]); c.main()"
     with subprocess.Popen(
         [sys.executable, "-c", wait, "wait"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -132,7 +132,7 @@ def test_commands_hold_their_folders_and_let_them_go(tmp_path, tmp_path_factory,
         seen.append(json.loads((tmp_path / LOCK).read_text())["pid"])
         return score_study(*given)
 
-    with mock.patch("mitsim.study.score_study", scored):
+    with mock.patch("mitsim.study.scoring.score_study", scored):
         mitsim_here("score", study, *into)
     assert seen == [os.getpid()]
     assert (tmp_path / "scores.csv").exists() and not (tmp_path / LOCK).exists()
