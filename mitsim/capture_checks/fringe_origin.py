@@ -171,7 +171,8 @@ class Change:
         return " and ".join(words for changed, words in parts if changed)
 
 
-_CHANGES = sorted(
+#: all changes of a description, the simplest first
+CHANGES = sorted(
     (
         Change(wave=wave, negated=negated, reverse=reverse, half_turn=half_turn)
         for wave, negated, reverse, half_turn in product((False, True), repeat=4)
@@ -202,7 +203,7 @@ def origin_in_words(edges: Edges, code: LightCode, image_roles: list[Role], axis
     change = next(
         (
             each
-            for each in _CHANGES
+            for each in CHANGES
             if all(_off(each.shifts(f), n) < _EIGHTH for f, n in zip(every, needed, strict=True))
         ),
         None,
@@ -217,7 +218,8 @@ def origin_in_words(edges: Edges, code: LightCode, image_roles: list[Role], axis
             f"{360 * each.cycles:+.0f} deg at {fringes.period:g} px"
             for fringes, each in zip(every, measured, strict=True)
         )
-        return f"{start}: at the edges of the stripes the phases are off by {off}. Subtract this from shifts_deg"
+        sign = "" if forward else " with the opposite sign"
+        return f"{start}: at the edges of the stripes the phases are off by {off}. Subtract this from the shifts{sign}"
     change = replace(change, at=_half_a_pixel_off(edges, every, measured, needed))
     if change == Change():
         return ""

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from characterisation.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.capture_checks.fringe_origin import origin_in_words, stripe_edges
+from mitsim.capture_checks.fringe_wave import wave_in_words
 from mitsim.decode.structured_light.decoder import decode_coordinates
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis, Kind, Role
@@ -93,7 +94,10 @@ def image_warnings(
         if edges is not None:
             extent = size[0] if axis == "columns" else size[1]
             warning = origin_in_words(edges, code, image_roles, axis, extent)
-            warning = f"{camera}: {warning}" if warning else ""
+        elif not warning:
+            warning = wave_in_words(lines, code, size, settings, full_scale, axis)
+        if warning and camera not in warning:
+            warning = f"{camera}: {warning}"
         if not warning and (own.doubtful or own.evenness < _ASKED):
             least = BELIEVED if own.doubtful else own.evenness - own.contradicted + _BETTER
             orders: Iterable[tuple[str, list[int]]] = _other_orders(image_roles, axis)
