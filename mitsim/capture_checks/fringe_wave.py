@@ -100,7 +100,7 @@ class _Trial:
 
     @classmethod
     def of(cls, parts: list[tuple[Floats, NDArray[np.uint8]]], extent: int, along: int) -> _Trial:
-        """Judge values [px] and statuses (n, W) along rows, and along columns; ``along``: which of them the code has."""
+        """Judge values [px] and statuses (n, W) along rows, and along columns; the code runs along ``along``."""
         lit = [np.isin(status, [Status.VALID, Status.PHASE_INCONSISTENT]) for _, status in parts]
         rejected = sum(
             int((each & (status != Status.VALID)).sum()) for each, (_, status) in zip(lit, parts, strict=True)

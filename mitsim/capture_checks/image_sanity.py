@@ -22,6 +22,7 @@ from characterisation.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.capture_checks.fringe_origin import origin_in_words, stripe_edges
 from mitsim.capture_checks.fringe_wave import wave_in_words
+from mitsim.capture_checks.gray_origin import beyond_in_words
 from mitsim.decode.structured_light.decoder import decode_coordinates
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis, Kind, Role
@@ -96,6 +97,7 @@ def image_warnings(
             warning = origin_in_words(edges, code, image_roles, axis, extent)
         elif not warning:
             warning = wave_in_words(lines, code, size, settings, full_scale, axis)
+            warning = warning or beyond_in_words(lines, code, size, settings, full_scale, axis)
         if warning and camera not in warning:
             warning = f"{camera}: {warning}"
         if not warning and (own.doubtful or own.evenness < _ASKED):

@@ -40,13 +40,13 @@ class Role:
     offset: float = 0.0
 
 
-def offset_in_pixels(offset: Offset, bits: int, stripe: float, extent: int) -> float:
+def offset_in_pixels(offset: Offset | None, bits: int, stripe: float, extent: int) -> float:
     """Return the offset of a Gray code of ``bits`` bits and stripes of ``stripe`` px over ``extent`` pixels [px].
 
     A centred code has the offset floor((2^bits stripe - extent) / 2), as in the programs of Lanman and Taubin
     (SIGGRAPH 2009 course), and of Moreno and Taubin (3DIMPVT 2012).
     """
-    return float(np.floor((2**bits * stripe - extent) / 2)) if offset == "centred" else offset
+    return float(np.floor((2**bits * stripe - extent) / 2)) if offset == "centred" else offset or 0.0
 
 
 def origin_shift(wave: Wave, at: Origin, period: float) -> float:

@@ -52,7 +52,7 @@ class GrayImages(Document):
     - ``stripe_px``: width of the finest stripe, by default 1 px. A stripe of half a fringe gives the complementary
       code.
     - ``first``: the bit that comes first.
-    - ``offset_px``: column c has the code of c + offset, or the code is ``"centred"`` on the projector.
+    - ``offset_px``: column c has the code of c + offset, or the code is ``"centred"`` on the projector. None is 0.
     - ``inverse``: the complement of ``each`` bit follows it or comes ``before`` it, ``all`` complements follow all
       bits, or there are ``none``.
     """
@@ -63,7 +63,7 @@ class GrayImages(Document):
     stripe_px: Annotated[float, Field(ge=1, le=1e5)] | None = None
     first: Literal["most_significant", "least_significant"] = "most_significant"
     inverse: Literal["none", "each", "before", "all"] = "none"
-    offset_px: Offset = 0.0
+    offset_px: Offset | None = None
 
     def stripes(self, extent: int) -> tuple[int, float]:
         """Return the number of bits and the width of the finest stripe [px] along an axis of ``extent`` pixels.

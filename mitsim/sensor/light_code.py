@@ -90,7 +90,7 @@ class GrayCode(Document):
     - ``bits``: number of bits, from the most significant on; by default all that the projector's size needs. With fewer
       bits the finest stripes are wider than one pixel.
     - ``axis`` along which the code changes.
-    - ``offset_px``: column c has the code of c + offset, likewise for rows, or the code is ``"centred"`` along each axis.
+    - ``offset_px``: column c has the code of c + offset, likewise for rows, or the code is ``"centred"``. None is 0.
     - ``inverse``: each pattern is followed by its complement, which gives the more robust threshold.
     - ``white_black``: a white and a black frame come first.
     """
@@ -100,7 +100,7 @@ class GrayCode(Document):
     axis: Axis | Literal["both"] = "columns"
     inverse: bool = True
     white_black: bool = True
-    offset_px: Offset = 0.0
+    offset_px: Offset | None = None
 
     @model_validator(mode="after")
     def _has_a_threshold(self) -> GrayCode:
@@ -169,7 +169,7 @@ def stripes(code: GrayCode | GrayCodePhaseShift, extent: int) -> tuple[int, floa
     bits = code.bits or needed
     if bits > needed:
         raise InputError("pattern", "bits", bits, f"up to {needed}, which distinguish all {extent} {code.axis}")
-    if code.offset_px != "centred" and code.offset_px + extent > 2**needed:
+    if code.offset_px is not None and code.offset_px != "centred" and code.offset_px + extent > 2**needed:
         raise InputError(
             "pattern", "offset_px", code.offset_px, f"up to {2**needed - extent}, for {bits} bits over {extent} px"
         )
