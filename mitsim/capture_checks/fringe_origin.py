@@ -214,12 +214,12 @@ def origin_in_words(edges: Edges, code: LightCode, image_roles: list[Role], axis
         if offset is not None:
             return f"{start}: they fit if the Gray code has offset_px = {offset} in [pattern]"
     if change is None or any(each.unusual(edges, f, n) for each, f, n in zip(measured, every, needed, strict=True)):
-        off = ", ".join(
-            f"{360 * each.cycles:+.0f} deg at {fringes.period:g} px"
-            for fringes, each in zip(every, measured, strict=True)
+        fitting = " and ".join(
+            f"shifts_deg = {_degrees(shifts - origin_shift(fringes.wave, fringes.at, fringes.period))} at "
+            f"{fringes.period:g} px"
+            for fringes, shifts in zip(every, needed, strict=True)
         )
-        sign = "" if forward else " with the opposite sign"
-        return f"{start}: at the edges of the stripes the phases are off by {off}. Subtract this from the shifts{sign}"
+        return f"{start}: they fit if the fringes of the {axis} have about {fitting}"
     change = replace(change, at=_half_a_pixel_off(edges, every, measured, needed))
     if change == Change():
         return ""
@@ -284,6 +284,11 @@ def _off(shifts: Floats, needed: Floats) -> float:
     """Return the largest distance of shifts (N,) [rad] from those needed, apart from whole turns [cycles]."""
     cycles = (shifts - needed) / (2 * np.pi)
     return float(np.max(np.abs(cycles - np.rint(cycles))))
+
+
+def _degrees(shifts: Floats) -> list[int]:
+    """Return shifts (N,) [rad] as whole degrees from 0 to 359."""
+    return [int(each) % 360 for each in np.rint(np.degrees(shifts))]
 
 
 def _fitting_offset(edges: Edges, every: list[Fringes], image_roles: list[Role], axis: Axis, extent: int) -> str | None:
