@@ -4,8 +4,8 @@ Signal chain: groups of images, as the rig shows them -> roles, one for each ima
 (:func:`mitsim.sensor.light_code.value`) and the same decoders as for mitsim's own codes.
 
 The conventions are those of :mod:`mitsim.sensor.light_code`: stripes and fringes count from the projector's edge, at
-u = -0.5, and a fringe is mean + contrast cos(2 pi (u + 0.5) / period - delta). A rig whose fringes are sines, or count
-from the centre of the first pixel, has other shifts delta: sin(x) = cos(x - 90 deg).
+u = -0.5, and a fringe is mean + contrast cos(2 pi (u + 0.5) / period - delta). Keys of a group state other origins:
+``offset_px`` of Gray stripes, ``at`` and ``wave`` of fringes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,18 @@ from pydantic import Field, model_validator
 
 from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
-from mitsim.sensor.image_role import Axis, Period, Role, Share, Steps
+from mitsim.sensor.image_role import (
+    Axis,
+    Offset,
+    Origin,
+    Period,
+    Role,
+    Share,
+    Steps,
+    Wave,
+    offset_in_pixels,
+    origin_shift,
+)
 
 
 class PlainImages(Document):
@@ -41,6 +52,7 @@ class GrayImages(Document):
     - ``stripe_px``: width of the finest stripe, by default 1 px. A stripe of half a fringe gives the complementary
       code.
     - ``first``: the bit that comes first.
+    - ``offset_px``: column c has the code of c + offset, or the code is ``"centred"`` on the projector. None is 0.
     - ``inverse``: the complement of ``each`` bit follows it or comes ``before`` it, ``all`` complements follow all
       bits, or there are ``none``.
     """
@@ -51,6 +63,7 @@ class GrayImages(Document):
     stripe_px: Annotated[float, Field(ge=1, le=1e5)] | None = None
     first: Literal["most_significant", "least_significant"] = "most_significant"
     inverse: Literal["none", "each", "before", "all"] = "none"
+    offset_px: Offset | None = None
 
     def stripes(self, extent: int) -> tuple[int, float]:
         """Return the number of bits and the width of the finest stripe [px] along an axis of ``extent`` pixels.
@@ -67,20 +80,33 @@ class GrayImages(Document):
         else:
             stripe = self.stripe_px
             bits = self.bits or max(1, int(np.ceil(np.log2(np.ceil(extent / stripe)))))
-        if 2**bits * stripe < extent or bits > 15:
+        offset = offset_in_pixels(self.offset_px, bits, stripe, extent)
+        if 2**bits * stripe < extent + max(offset, 0.0) or bits > 15:
+            behind = f" from an offset of {offset:g} px on" if offset > 0 else ""
             raise InputError(
                 "pattern",
                 "images",
-                f"{bits} Gray bits of stripes of {stripe:g} px",
+                f"{bits} Gray bits of stripes of {stripe:g} px{behind}",
                 f"up to 15 bits whose stripes cover all {extent} {self.axis}",
             )
         return bits, stripe
+
+    def offset(self, extent: int) -> float:
+        """Return the offset of the code along an axis of ``extent`` pixels [px].
+
+        Raises
+        ------
+        InputError
+            As for :meth:`stripes`.
+        """
+        return offset_in_pixels(self.offset_px, *self.stripes(extent), extent)
 
     def roles(self, extent: int) -> list[Role]:
         """Return one role for each image."""
         bits, stripe = self.stripes(extent)
         order = range(bits) if self.first == "most_significant" else range(bits - 1, -1, -1)
-        lit = [Role("gray", self.axis, bit, stripe * 2 ** (bits - 1 - bit)) for bit in order]
+        offset = self.offset(extent)
+        lit = [Role("gray", self.axis, bit, stripe * 2 ** (bits - 1 - bit), offset=offset) for bit in order]
         inverse = [replace(role, kind="gray_inverse") for role in lit]
         if self.inverse in ("each", "before"):
             pairs = zip(lit, inverse, strict=True) if self.inverse == "each" else zip(inverse, lit, strict=True)
@@ -89,30 +115,40 @@ class GrayImages(Document):
 
 
 class FringeImages(Document):
-    """Shifted fringes of one period: ``shifts_deg`` delta of each image, or ``steps`` N for 360 deg k / N."""
+    """Shifted fringes of one period: mean + contrast wave(2 pi x / period_px - delta).
+
+    - ``steps`` N for delta = 360 deg k / N, ``shifts_deg`` delta of each image, or ``phases_deg`` theta = -delta of
+      each, as in cos(2 pi x / P + theta).
+    - ``wave``: cosine or sine.
+    - ``at``: x = u + 0.5 counts from the projector's ``edge``, or x = u from the middle of its first ``pixel``.
+    """
 
     show: Literal["fringes"]
     axis: Axis = "columns"
     period_px: Period
     steps: Steps | None = None
     shifts_deg: Annotated[list[float], Field(min_length=3, max_length=64)] | None = None
+    phases_deg: Annotated[list[float], Field(min_length=3, max_length=64)] | None = None
+    wave: Wave = "cosine"
+    at: Origin = "edge"
 
     @model_validator(mode="after")
     def _solvable(self) -> FringeImages:
-        if (self.steps is None) == (self.shifts_deg is None):
-            raise ValueError("steps or shifts_deg, one of the two")
-        turns = np.exp(1j * np.radians(self.shifts_deg or [0, 120, 240]))
+        if [self.steps, self.shifts_deg, self.phases_deg].count(None) != 2:
+            raise ValueError("steps or shifts_deg or phases_deg, one of the three")
+        turns = np.exp(1j * np.array(self.shifts))
         if len(np.unique(np.round(turns, 6))) < 3:
             raise ValueError("three or more different shifts; 360 deg equals 0 deg")
         return self
 
     @property
     def shifts(self) -> tuple[float, ...]:
-        """Return the shifts delta_k [rad]."""
-        if self.shifts_deg is not None:
-            return tuple(np.radians(self.shifts_deg).tolist())
-        assert self.steps is not None  # checked by the validator
-        return tuple(2 * np.pi * k / self.steps for k in range(self.steps))
+        """Return the shifts delta_k [rad] of the same fringes as cosines that count from the edge."""
+        origin = origin_shift(self.wave, self.at, self.period_px)
+        if self.steps is not None:
+            return tuple(2 * np.pi * k / self.steps + origin for k in range(self.steps))
+        listed = np.radians(self.shifts_deg) if self.shifts_deg is not None else -np.radians(self.phases_deg or [])
+        return tuple((listed + origin).tolist())
 
 
 Group = Annotated[PlainImages | GrayImages | FringeImages, Field(discriminator="show")]

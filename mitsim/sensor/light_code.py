@@ -4,10 +4,11 @@ Signal chain: code -> roles, the list of its images in display order -> for each
 coordinate -> patterns in projector pixels.
 
 A code runs along one axis: with ``columns`` the value changes with the column u, with ``rows`` with the row v. Pixel
-centres lie at integers, so the left edge of the projector is at u = -0.5. All codes count from there:
+centres lie at integers, so the left edge of the projector is at u = -0.5. All codes count from there, unless ``wave``,
+``at`` or ``offset_px`` state another origin:
 
     phase      I_k(u) = mean + contrast cos(2 pi (u + 0.5) / period - delta_k),    delta_k = 2 pi k / N
-    Gray bit   I(u) = bit of g = s ^ (s >> 1),    s = floor((u + 0.5) / stripe),   most significant bit first
+    Gray bit   I(u) = bit of g = s ^ (s >> 1),    s = floor((u + 0.5 + offset) / stripe),   most significant bit first
 
 The Gray code is the reflected binary code (Gray, US patent 2632058, 1953): one bit changes between two stripes. A Gray
 code for the fringe order with a phase inside the fringe: Sansoni et al., Applied Optics 38(31), 1999. The complementary
@@ -28,7 +29,18 @@ from pydantic import Field, field_validator, model_validator
 
 from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
-from mitsim.sensor.image_role import Axis, Period, Role, Share, Steps
+from mitsim.sensor.image_role import (
+    Axis,
+    Offset,
+    Origin,
+    Period,
+    Role,
+    Share,
+    Steps,
+    Wave,
+    offset_in_pixels,
+    origin_shift,
+)
 from mitsim.sensor.image_sequence import ImageSequence
 
 
@@ -39,6 +51,7 @@ class PhaseShift(Document):
       measures (hierarchical), or neighbouring periods whose beat covers it (heterodyne).
     - ``steps``: N for each period, or one number for all.
     - ``axis`` along which the fringes change.
+    - ``wave`` and ``at``: cosines or sines, counted from the projector's ``edge`` or the middle of its first ``pixel``.
     - ``mean`` and ``contrast`` of the projected cosine [1]. The projector's gamma is not pre-corrected.
     """
 
@@ -46,6 +59,8 @@ class PhaseShift(Document):
     periods_px: list[Period] = Field(min_length=1, max_length=12)
     steps: Steps | list[Steps] = 4
     axis: Axis = "columns"
+    wave: Wave = "cosine"
+    at: Origin = "edge"
     mean: Share = 0.5
     contrast: Annotated[float, Field(gt=0, le=0.5)] = 0.5
 
@@ -75,6 +90,7 @@ class GrayCode(Document):
     - ``bits``: number of bits, from the most significant on; by default all that the projector's size needs. With fewer
       bits the finest stripes are wider than one pixel.
     - ``axis`` along which the code changes.
+    - ``offset_px``: column c has the code of c + offset, likewise for rows, or the code is ``"centred"``. None is 0.
     - ``inverse``: each pattern is followed by its complement, which gives the more robust threshold.
     - ``white_black``: a white and a black frame come first.
     """
@@ -84,6 +100,7 @@ class GrayCode(Document):
     axis: Axis | Literal["both"] = "columns"
     inverse: bool = True
     white_black: bool = True
+    offset_px: Offset | None = None
 
     @model_validator(mode="after")
     def _has_a_threshold(self) -> GrayCode:
@@ -95,7 +112,7 @@ class GrayCode(Document):
 class GrayCodePhaseShift(Document):
     """Gray code for the order of the fringe, phase shifting inside it.
 
-    - ``period_px`` of the fringe [projector px]; ``steps`` N; ``axis`` as for the others.
+    - ``period_px`` of the fringe [projector px]; ``steps`` N; ``axis``, ``wave`` and ``at`` as for the others.
     - ``complementary``: one more Gray bit than the fringes need, so that stripes half a fringe wide never end where the
       phase jumps.
     - ``inverse`` and ``white_black``: as for :class:`GrayCode`. With neither, the mean of the fringes is the threshold.
@@ -106,6 +123,8 @@ class GrayCodePhaseShift(Document):
     period_px: Period
     steps: Steps = 4
     axis: Axis = "columns"
+    wave: Wave = "cosine"
+    at: Origin = "edge"
     complementary: bool = True
     inverse: bool = False
     white_black: bool = True
@@ -150,7 +169,22 @@ def stripes(code: GrayCode | GrayCodePhaseShift, extent: int) -> tuple[int, floa
     bits = code.bits or needed
     if bits > needed:
         raise InputError("pattern", "bits", bits, f"up to {needed}, which distinguish all {extent} {code.axis}")
+    if code.offset_px is not None and code.offset_px != "centred" and code.offset_px + extent > 2**needed:
+        raise InputError(
+            "pattern", "offset_px", code.offset_px, f"up to {2**needed - extent}, for {bits} bits over {extent} px"
+        )
     return bits, float(2 ** (needed - bits))
+
+
+def gray_offset(code: GrayCode | GrayCodePhaseShift, extent: int) -> float:
+    """Return the offset of the Gray code along an axis of ``extent`` pixels [px].
+
+    Raises
+    ------
+    InputError
+        As for :func:`stripes`.
+    """
+    return offset_in_pixels(code.offset_px, *stripes(code, extent), extent) if isinstance(code, GrayCode) else 0.0
 
 
 def roles(code: LightCode, width: int, height: int) -> list[Role]:
@@ -167,15 +201,16 @@ def roles(code: LightCode, width: int, height: int) -> list[Role]:
         if code.white_black:
             out += [Role("white"), Role("black")]
         for axis in axes(code):
-            bits, stripe = stripes(code, width if axis == "columns" else height)
+            extent = width if axis == "columns" else height
+            (bits, stripe), offset = stripes(code, extent), gray_offset(code, extent)
             for bit in range(bits):
-                out.append(Role("gray", axis, bit, stripe * 2 ** (bits - 1 - bit)))
+                out.append(Role("gray", axis, bit, stripe * 2 ** (bits - 1 - bit), offset=offset))
                 if code.inverse:
                     out.append(replace(out[-1], kind="gray_inverse"))
     if not isinstance(code, GrayCode):
         every = _fringes(code)
         out += [
-            Role("phase", code.axis, index, period, 2 * np.pi * k / steps)
+            Role("phase", code.axis, index, period, 2 * np.pi * k / steps + origin_shift(code.wave, code.at, period))
             for index, (period, steps) in enumerate(every)
             for k in range(steps)
         ]
@@ -198,7 +233,7 @@ def value(code: LightCode, role: Role, coordinate: NDArray[np.floating]) -> NDAr
             return np.asarray(code.mean + code.contrast * np.cos(2 * np.pi * place / role.period - role.shift))
         case _:
             # bit i of s ^ (s >> 1): of every four stripes of bit i, each role.period wide, the middle two are lit
-            quarters = (np.floor(place / role.period) + 1) / 4
+            quarters = (np.floor((place + role.offset) / role.period) + 1) / 4
             lit = quarters - np.floor(quarters) >= 0.5
             return np.asarray(lit if role.kind == "gray" else ~lit, np.float64)
 

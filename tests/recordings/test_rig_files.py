@@ -36,9 +36,9 @@ def eye(x=0.0, turn=0.0, lens=LENS, model="perspective"):
     return Camera(K, lens, 240, 180, Transform.from_degrees((0, turn, 0.2 if x else 0), (x, 0.5 if x else 0, 0)), model)
 
 
-def beamer(width, height, place=BESIDE, lens=(0.02, -0.01, 0, 0, 0)):
-    """A projector whose field the camera just sees."""
-    K = np.array([[1.05 * width, 0, width / 2 - 0.5], [0, 1.05 * width, height / 2 - 0.5], [0, 0, 1]])
+def beamer(width, height, place=BESIDE, lens=(0.02, -0.01, 0, 0, 0), focal=1.05):
+    """A projector whose field the camera just sees, or with a shorter focal length (in widths) a part of it."""
+    K = np.array([[focal * width, 0, width / 2 - 0.5], [0, focal * width, height / 2 - 0.5], [0, 0, 1]])
     return Camera(K, np.array(lens, float), width, height, Transform.from_degrees(*place))
 
 
@@ -151,9 +151,9 @@ FISH = {name: replace(each, distortion=ROUND, model="fisheye") for name, each in
 PAIRED = {"K1": "K1", "D1": "D1", "S1": "image_size", "K2": "K2", "D2": "D2", "R": "R", "T": "T"}
 RIGS = {
     "opencv": Rigged(ONE, beamer(256, 192), opencv(), "graycode_{:02d}.png", tolerance=4.0),
-    "moreno": Rigged(
+    "moreno": Rigged(  # the camera resolves single columns
         ONE,
-        beamer(1024, 768),
+        beamer(1024, 768, focal=0.28),
         yml("calibration.yml", K1="cam_K", D1="cam_kc", K2="proj_K", D2="proj_kc", R="R", T="T"),
         "cam_{:02d}.png",
         tolerance=8.0,

@@ -86,6 +86,79 @@ def test_any_shifts_give_the_phase(shifts):
     assert_true(decoded(code), 0.05)
 
 
+@pytest.mark.parametrize("wave", ["cosine", "sine"])
+@pytest.mark.parametrize("at", ["edge", "pixel"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_words_of_an_owner_show_his_formula(wave, at, sign):
+    """mean + contrast wave(2 pi x / P + theta), x from the edge or from the middle of the first pixel."""
+    angles = [-120.0, 10.0, 120.0]
+    listed = {"phases_deg": angles} if sign > 0 else {"shifts_deg": angles}
+    x = np.arange(WIDTH) + (0.5 if at == "edge" else 0.0)
+    function = {"cosine": np.cos, "sine": np.sin}[wave]
+    code = sequence(gray(stripe_px=8), fringes(16, wave=wave, at=at, **listed))
+    shown_here = patterns(code, WIDTH, HEIGHT)[-3:, 0]
+    for image, angle in zip(shown_here, angles, strict=True):
+        np.testing.assert_allclose(
+            image, 0.5 + 0.5 * function(2 * np.pi * x / 16 + sign * np.radians(angle)), atol=1e-6
+        )
+    assert_true(decoded(code), 0.05)
+
+
+@pytest.mark.parametrize("wave", ["cosine", "sine"])
+@pytest.mark.parametrize("at", ["edge", "pixel"])
+def test_our_own_codes_take_the_same_words(wave, at):
+    x = 2 * np.pi * (np.arange(WIDTH) + (0.5 if at == "edge" else 0.0)) / 16
+    expected = 0.5 + 0.5 * {"cosine": np.cos, "sine": np.sin}[wave](x - np.pi / 2)
+    for code, index in (
+        (PhaseShift(periods_px=[110, 16], wave=wave, at=at), 5),
+        (GrayCodePhaseShift(period_px=16, wave=wave, at=at), -3),
+    ):
+        np.testing.assert_allclose(patterns(code, WIDTH, HEIGHT)[index, 0], expected, atol=1e-6)
+        assert_true(decoded(code), 0.05)
+
+
+@pytest.mark.parametrize("offset", [0, 3, 14, 28, "centred"])
+@pytest.mark.parametrize("more", [{"inverse": "each"}, {"bits": 4, "inverse": "all"}, {"inverse": "none"}])
+def test_column_c_has_the_code_of_c_plus_offset(offset, more):
+    """The bits of 100 columns in a code of 128: 28 columns are left, 14 on either side of a centred code."""
+    code = sequence(WHITE, BLACK, gray(offset_px=offset, **more))
+    number = (np.arange(WIDTH) + (14 if offset == "centred" else offset)) >> (3 if "bits" in more else 0)
+    bits = more.get("bits", 7)
+    images = {
+        (role.kind, role.index): image[0]
+        for role, image in zip(code.roles(WIDTH, HEIGHT), patterns(code, WIDTH, HEIGHT), strict=True)
+    }
+    for bit in range(bits):
+        np.testing.assert_array_equal(images["gray", bit], ((number ^ (number >> 1)) >> (bits - 1 - bit)) & 1)
+    found = decoded(code)["columns"]
+    assert (found.status == Status.VALID).all()
+    assert np.abs(found.value - np.arange(WIDTH)).max() <= (4 if "bits" in more else 0)
+    own = GrayCode(offset_px=offset, bits=bits, inverse=more["inverse"] != "none")
+    if more["inverse"] != "all":
+        np.testing.assert_array_equal(patterns(own, WIDTH, HEIGHT), patterns(code, WIDTH, HEIGHT))
+        np.testing.assert_array_equal(decoded(own)["columns"].value, found.value)
+
+
+def test_columns_between_the_edges_of_offset_stripes():
+    code = sequence(gray(bits=4, inverse="each", offset_px="centred"))
+    found = decode_coordinates(shown(code), code, (WIDTH, HEIGHT), SETTINGS, full_scale=255, interpolate=True)
+    inner = found["columns"].value[:, 8:-8]
+    assert np.abs(inner - np.arange(WIDTH)[8:-8]).max() < 0.6
+
+
+def test_fringes_under_an_offset_gray_code():
+    code = sequence(gray(stripe_px=8, offset_px=5), fringes(16, steps=4))
+    assert_true(decoded(code), 0.05)
+
+
+def test_stripes_beyond_the_projector_are_no_coordinates():
+    """Images of columns 0 to 99 of an offset code; with the offset of another, 10 columns lie beyond."""
+    shown_code, stated = (sequence(gray(inverse="each", offset_px=offset)) for offset in (0, 10))
+    found = decoded(stated, shown(shown_code))["columns"]
+    assert (found.status[:, :10] == Status.PHASE_INCONSISTENT).all()
+    assert (found.status[:, 10:] == Status.VALID).all()
+
+
 def test_several_periods_under_one_gray_code_measure_with_the_finest():
     """Gray stripes of 40 px, fringes of 32 and 80/3 px that beat at 160 px: stripes of 1/4 of the beat."""
     code = sequence(
@@ -161,6 +234,9 @@ def test_every_order_shows_each_image_once_and_decodes(order, inverse, least_fir
         ([gray(inverse="each"), gray(inverse="all")], "one group of gray"),
         ([fringes(16, steps=4), fringes(16, steps=3)], "one of fringes for each period"),
         ([fringes(16)], "steps or shifts_deg"),
+        ([fringes(16, shifts_deg=[0, 1, 2], phases_deg=[0, 1, 2])], "one of the three"),
+        ([fringes(16, steps=4, wave="triangle")], "wave"),
+        ([gray(inverse="each", offset_px=-1)], "offset_px"),
         ([fringes(16, steps=4, shifts_deg=[0, 1, 2])], "steps or shifts_deg"),
         ([fringes(16, shifts_deg=[0, 120, 360])], "different shifts"),
         ([{"show": "white", "count": 2}, BLACK, gray()], "one white"),
@@ -170,6 +246,13 @@ def test_every_order_shows_each_image_once_and_decodes(order, inverse, least_fir
 def test_a_sequence_that_cannot_be_decoded_is_refused(images, message):
     with pytest.raises(ValidationError, match=message):
         sequence(*images)
+
+
+def test_an_offset_leaves_stripes_for_all_columns():
+    with pytest.raises(InputError, match="from an offset of 29 px on"):
+        gray_group({"offset_px": 29}).roles(WIDTH, HEIGHT)
+    with pytest.raises(InputError, match="offset_px"):
+        roles(GrayCode(offset_px=29), WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize("given", [{"bits": 5}, {"bits": 3, "stripe_px": 8}, {"stripe_px": 1e-3}])

@@ -10,8 +10,9 @@ changes is nearly the sum of their absolute values. If bits are exchanged, the c
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,9 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
+from mitsim.decode.checks.fringe_origin import origin_in_words, stripe_edges
+from mitsim.decode.checks.fringe_wave import wave_in_words
+from mitsim.decode.checks.gray_origin import beyond_in_words
 from mitsim.decode.structured_light.decoder import decode_coordinates
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis, Kind, Role
@@ -87,9 +91,22 @@ def image_warnings(
     for axis in [axis for axis in axes(code) if axis in found]:
         warning = _unresolved(lines[0], image_roles, axis, settings, camera)
         own, order = found[axis], ""
+        edges = None if warning else stripe_edges(lines, code, image_roles, axis, settings, full_scale)
+        if edges is not None:
+            extent = size[0] if axis == "columns" else size[1]
+            warning = origin_in_words(edges, code, image_roles, axis, extent)
+        elif not warning:
+            warning = wave_in_words(lines, code, size, settings, full_scale, axis)
+            warning = warning or beyond_in_words(lines, code, size, settings, full_scale, axis)
+        if warning and camera not in warning:
+            warning = f"{camera}: {warning}"
         if not warning and (own.doubtful or own.evenness < _ASKED):
             least = BELIEVED if own.doubtful else own.evenness - own.contradicted + _BETTER
-            order = _fitting_order(lines, code, size, settings, full_scale, axis, least)
+            orders: Iterable[tuple[str, list[int]]] = _other_orders(image_roles, axis)
+            if edges is not None and edges.bits_fit:
+                orders = _with_bits_in_place(orders, image_roles, axis)
+            measure = partial(_smoothness_in, lines, code, size, settings, full_scale, axis)
+            order = _fitting_order(lines[0], image_roles, axis, orders, measure, least)
         if order:
             warning = f"{_doubt(own, axis, camera)}: they fit if {order}"
         warning = warning or _changed_exposure(lines[0], image_roles, axis, camera)
@@ -97,6 +114,19 @@ def image_warnings(
             warning = f"{_doubt(own, axis, camera)}: check that the images are in the order of [pattern]"
         out += [warning] if warning else []
     return out
+
+
+def _smoothness_in(
+    lines: Sequence[Levels],
+    code: LightCode,
+    size: tuple[int, int],
+    settings: DecoderSettings,
+    full_scale: float,
+    axis: Axis,
+    order: list[int],
+) -> Smoothness:
+    """Return the smoothness of the coordinate along an axis with the images in another order."""
+    return smoothness([each[order] for each in lines], code, size, settings, full_scale, axis)[axis]
 
 
 def _doubt(found: Smoothness, axis: Axis, camera: str) -> str:
@@ -107,20 +137,19 @@ def _doubt(found: Smoothness, axis: Axis, camera: str) -> str:
 
 
 def _fitting_order(
-    lines: Sequence[Levels],
-    code: LightCode,
-    size: tuple[int, int],
-    settings: DecoderSettings,
-    full_scale: float,
+    stack: Levels,
+    image_roles: list[Role],
     axis: Axis,
+    orders: Iterable[tuple[str, list[int]]],
+    smoothness_in: Callable[[list[int]], Smoothness],
     least: float,
 ) -> str:
-    """Return the description of an order of the images with more smoothness than ``least``; "" if none."""
+    """Return the description of an order of the images (P, H, W) with more smoothness than ``least``; "" if none."""
     best, description = least, ""
-    for name, order in _other_orders(roles(code, *size), axis):
-        found = smoothness([each[order] for each in lines], code, size, settings, full_scale, axis)[axis]
+    for name, order in orders:
+        found = smoothness_in(order)
         # an order may be smooth although most pixels are contradictory, or its pairs are not complements
-        if _changed_exposure(lines[0][order], roles(code, *size), axis, ""):
+        if _changed_exposure(stack[order], image_roles, axis, ""):
             continue
         if not found.doubtful and found.evenness - found.contradicted > best:
             best, description = found.evenness - found.contradicted, name
@@ -251,6 +280,17 @@ def _unresolved(stack: Levels, image_roles: list[Role], axis: Axis, settings: De
         f"{camera} does not resolve {which} of the {axis}, stripes up to {period[pairs[-count][0]]:g} px: leave "
         "them out by bits in [pattern], and list those images as unused"
     )
+
+
+def _with_bits_in_place(
+    orders: Iterable[tuple[str, list[int]]], image_roles: list[Role], axis: Axis
+) -> list[tuple[str, list[int]]]:
+    """Return the orders that leave the Gray bits of an axis in place.
+
+    If the bits alone are in the right order, another order of them can only make fringes agree with wrong stripes.
+    """
+    bits = [i for i, role in enumerate(image_roles) if role.axis == axis and role.kind in ("gray", "gray_inverse")]
+    return [(name, order) for name, order in orders if all(order[i] == i for i in bits)]
 
 
 def _other_orders(image_roles: list[Role], axis: Axis) -> Iterator[tuple[str, list[int]]]:

@@ -12,6 +12,7 @@ import numpy as np
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
+from mitsim.decode.checks.gray_origin import gray_origin_warning
 from mitsim.decode.checks.image_sanity import image_warnings
 from mitsim.decode.checks.rig_sanity import (
     LARGEST_ROW_ERROR,
@@ -74,6 +75,10 @@ def capture_findings(capture: Capture, settings: Settings) -> Findings:
             return Findings(*pair_warnings(stacks[0], stacks[1], capture.rig, code, size, settings, full_scale))
         except InputError as error:
             return Findings([str(error)])
+    recorded = capture.source == "device"  # mitsim's own simulations have the pattern that their file states
+    origin = gray_origin_warning(stacks[0], capture.rig, code, settings, full_scale, recorded)
+    if origin:
+        return Findings([f"{next(iter(capture.images))}: {origin}"])
     along = baseline_warning(capture.rig, code)
     return Findings(([along] if along else []) + camera_warnings(stacks[0], capture.rig, code, settings, full_scale))
 

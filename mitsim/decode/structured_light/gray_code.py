@@ -34,7 +34,7 @@ from mitsim.decode.structured_light.unwrapping import UnwrappingPath, beat_cycle
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis, Role
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, axes, check_stack, roles, stripes
+from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, axes, check_stack, gray_offset, roles, stripes
 
 #: kinds of images that determine the stripe
 _STRIPE_IMAGES = ("white", "black", "gray", "gray_inverse")
@@ -53,6 +53,20 @@ class Stripes:
     neighbour: NDArray[np.uint16]
     undecided: NDArray[np.bool_]
     contrast: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class CodedAxis:
+    """An axis of the projector with a Gray code.
+
+    ``extent``: number of pixels. ``stripe``: width of the finest stripe [projector px]. ``offset``: column c has the
+    code of c + offset [projector px].
+    """
+
+    axis: Axis
+    extent: int
+    stripe: float
+    offset: float = 0.0
 
 
 def binary_of_gray(gray: NDArray[np.unsignedinteger]) -> NDArray[np.uint16]:
@@ -163,10 +177,11 @@ def decode_gray_code(
     out: dict[Axis, ProjectorCoordinate] = {}
     for axis in axes(code):
         extent = width if axis == "columns" else height
-        decoded, stripe = decode_stripes(stack, image_roles, axis, settings.bit_share), stripes(code, extent)[1]
-        out[axis] = stripe_coordinate(decoded, stripe, extent, saturated, settings, full_scale)
+        decoded = decode_stripes(stack, image_roles, axis, settings.bit_share)
+        coded = CodedAxis(axis, extent, stripes(code, extent)[1], gray_offset(code, extent))
+        out[axis] = stripe_coordinate(decoded, coded, saturated, settings, full_scale)
         if interpolate and axis == "columns":
-            out[axis] = interpolated_columns(out[axis], decoded, stack, image_roles, stripe)
+            out[axis] = interpolated_columns(out[axis], decoded, stack, image_roles, coded)
     return out
 
 
@@ -175,12 +190,12 @@ def interpolated_columns(
     decoded: Stripes,
     stack: NDArray[np.generic],
     image_roles: list[Role],
-    stripe: float,
+    coded: CodedAxis,
 ) -> ProjectorCoordinate:
     """Return columns that are interpolated between the edges of their stripes, instead of the stripes' centres.
 
-    ``coordinate`` and ``decoded`` are the results for the columns of ``stack`` (P, H, W) [DN]; ``stripe`` is the width
-    of a stripe [projector px].
+    ``coordinate`` and ``decoded`` are the results for the columns of ``stack`` (P, H, W) [DN]; ``coded`` describes
+    their code.
     """
     image_of = {(role.kind, role.axis, role.index): image for role, image in zip(image_roles, stack, strict=True)}
     bits = sorted((role.index for role in image_roles if role.kind == "gray" and role.axis == "columns"), reverse=True)
@@ -192,31 +207,37 @@ def interpolated_columns(
         white, black = (image_of[kind, None, 0].astype(np.float32) for kind in ("white", "black"))
         return np.asarray(image - (white + black) / 2)
 
-    value, located = interpolate_between_edges(decoded.number, coordinate.status == Status.VALID, signed, stripe)
-    return replace(coordinate, value=value, status=status_without_edges(coordinate.status, located))
+    valid = coordinate.status == Status.VALID
+    value, located = interpolate_between_edges(decoded.number, valid, signed, coded.stripe)
+    return replace(coordinate, value=value - coded.offset, status=status_without_edges(coordinate.status, located))
 
 
 def stripe_coordinate(
     decoded: Stripes,
-    stripe: float,
-    extent: int,
+    coded: CodedAxis,
     saturated: NDArray[np.bool_],
     settings: DecoderSettings,
     full_scale: float,
 ) -> ProjectorCoordinate:
-    """Return the projector coordinate of decoded stripes, whose width is ``stripe`` over ``extent`` projector pixels.
+    """Return the projector coordinate of decoded stripes of an axis. Stripes beyond the projector are rejected.
 
     ``saturated`` (H, W): whether the pixel is saturated in any image of the code; ``full_scale`` [DN].
     """
     modulation = np.asarray(decoded.contrast / 2, np.float32)
     low_modulation = modulation < settings.minimum_modulation_dn * full_scale / 255
-    outside = decoded.number * stripe >= extent
+    outside = stripes_outside(decoded.number, coded)
     rejected = decoded.undecided | outside
     status = rejection_status(saturated & (low_modulation | rejected), low_modulation, rejected)
-    value = _centre(decoded, stripe)
+    value = _centre(decoded, coded)
     value[status != Status.VALID] = np.nan
-    sigma = np.full(value.shape, stripe / np.sqrt(12), np.float32)
+    sigma = np.full(value.shape, coded.stripe / np.sqrt(12), np.float32)
     return ProjectorCoordinate(value, sigma, modulation, status)
+
+
+def stripes_outside(number: NDArray[np.unsignedinteger], coded: CodedAxis) -> NDArray[np.bool_]:
+    """Return whether stripes (...), by their numbers, lie beyond the projector's first or last pixel."""
+    start = number * coded.stripe - coded.offset  # from the projector's edge
+    return np.asarray((start >= coded.extent) | (start + coded.stripe <= 0))
 
 
 def decode_gray_code_phase_shift(
@@ -254,15 +275,6 @@ def decode_gray_code_phase_shift(
         full_scale=full_scale,
         imager=imager,
     )
-
-
-@dataclass(frozen=True)
-class CodedAxis:
-    """An axis of the projector: ``extent`` pixels, with ``stripe`` the width of the finest stripe [projector px]."""
-
-    axis: Axis
-    extent: int
-    stripe: float
 
 
 def decode_gray_fringes(
@@ -314,7 +326,7 @@ def decode_gray_fringes(
     period = path.beats[0].period
     variance = grey_level_variance(phases.offset, imager)
     relative = variance / np.maximum(weakest, np.float32(1e-3)) ** 2
-    turns = (_centre(decoded, stripe) + 0.5) / period - beat_cycles(phase, path.beats[0])
+    turns = (_centre(decoded, coded_axis) + 0.5) / period - beat_cycles(phase, path.beats[0])
     order = np.rint(turns)
     limit = (0.5 * stripe / period + 0.5) / 2
     contradicted = np.abs(turns - order) > limit
@@ -344,10 +356,10 @@ def _unwrapping_of_fringes(fringes: Fringes, stripe: float) -> UnwrappingPath:
         return unwrapping_path(fringes.periods, fringes.steps, stripe)
 
 
-def _centre(decoded: Stripes, stripe: float) -> NDArray[np.float64]:
+def _centre(decoded: Stripes, coded: CodedAxis) -> NDArray[np.float64]:
     """Return the centre of the stripe, or the edge to its neighbour [projector px]."""
     centre = decoded.number.astype(np.float64) + decoded.neighbour
     centre += 1
-    centre *= stripe / 2
-    centre -= 0.5
+    centre *= coded.stripe / 2
+    centre -= 0.5 + coded.offset
     return centre

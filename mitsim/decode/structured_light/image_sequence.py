@@ -97,17 +97,14 @@ def decode_image_sequence(
                 white_black=(white_black["white"], white_black["black"]) if len(white_black) == 2 else None,
             )
             continue
-        stripe = gray[0].stripes(extent)[1]
+        coded_axis = CodedAxis(axis, extent, gray[0].stripes(extent)[1], gray[0].offset(extent))
         if groups:
-            coded_axis = CodedAxis(axis, extent, stripe)
             out[axis] = decode_gray_fringes(
                 images, axis_roles, coded_axis, fringes, settings, full_scale=full_scale, imager=imager
             )
         else:
             decoded = decode_stripes(images, axis_roles, axis, settings.bit_share)
-            out[axis] = stripe_coordinate(
-                decoded, stripe, extent, images.max(axis=0) >= full_scale, settings, full_scale
-            )
+            out[axis] = stripe_coordinate(decoded, coded_axis, images.max(axis=0) >= full_scale, settings, full_scale)
             if interpolate and axis == "columns":
-                out[axis] = interpolated_columns(out[axis], decoded, images, axis_roles, stripe)
+                out[axis] = interpolated_columns(out[axis], decoded, images, axis_roles, coded_axis)
     return out
