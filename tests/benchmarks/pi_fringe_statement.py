@@ -8,8 +8,8 @@ miss is its distance from the interval, and the 95 % interval of that distance o
 
 Signal chain: poses of a board -> corners in camera and projector (:mod:`pi_fringe_code`) -> calibration and its
 covariance (:mod:`mitsim.study.calibration.recorded`) -> for each pose to be measured, from the camera's image alone,
-where the board is -> rigs and boards drawn -> what would be measured of squares of 10 mm: ``predicted.json`` -> only then
-the projector's coordinates of that pose -> what is measured, and whether the intervals hold it.
+where the board is -> rigs and boards drawn -> what would be measured of squares of 10 mm: ``predicted.json`` -> only
+then the projector's coordinates of that pose -> what is measured, and whether the intervals hold it.
 
 A point is where the camera's ray has the projector's *column*: rows are used to calibrate, not to measure. Drawn are
 the calibration by its covariance, bends of a printed sheet, noise of corners and columns by the residuals of the

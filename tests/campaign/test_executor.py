@@ -14,7 +14,7 @@ from mitsim.capture.devices.device_error import DeviceError
 from mitsim.cli.options import requested_workers
 from mitsim.cli.program import app
 from mitsim.running import executor
-from mitsim.running.executor import Pool, available_memory, executor_of, fitting_processes, results_of
+from mitsim.running.executor import Pool, executor_of, fitting_processes, results_of
 from tests.smaller_sensors import coarse_sensor
 
 pytestmark = pytest.mark.timeout(300)

@@ -159,7 +159,8 @@ def described(path: str | Path, cases: Sequence[PartCase]) -> str:
     sealed = sorted({case.table.part for case in cases if case.sealed})
     parts = sorted({case.table.part for case in cases if not case.sealed})
     return (
-        f"\nMade by `python -m tests.proofs statements {path} -o FOLDER`, which writes this page, its figure and its tables.\n"
+        f"\nMade by `python -m tests.proofs statements {path} -o FOLDER`, which writes this page, its figure "
+        "and its tables.\n"
         f"\nOpen parts: {', '.join(parts) or 'none'}. Sealed parts, at which nothing but this page looks: "
         f"{', '.join(sealed) or 'none'}.\n\nEvery case has {file.candidates} candidate views, drawn at random from "
         "those of a study. The functions of `mitsim run` screen them, race the first "

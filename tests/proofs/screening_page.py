@@ -122,7 +122,8 @@ def described_screening(path: str | Path, cases: Sequence[PartCase]) -> str:
     file = cases[0].file
     parts = {sealed: sorted({case.table.part for case in cases if case.sealed == sealed}) for sealed in (False, True)}
     return (
-        f"\nMade by `python -m tests.proofs scores {path} -o FOLDER`, which writes this page, its figures and `scores.csv`.\n"
+        f"\nMade by `python -m tests.proofs scores {path} -o FOLDER`, which writes this page, its figures "
+        "and `scores.csv`.\n"
         f"\nOpen parts: {', '.join(parts[False]) or 'none'}. Sealed parts, which are used only for "
         f"validation: {', '.join(parts[True]) or 'none'}.\n\nEvery case has {file.candidates} candidate views, drawn "
         "at random from those of a study. The function that `mitsim run` uses screens them, with its defaults. "
