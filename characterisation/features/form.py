@@ -49,8 +49,11 @@ Array = NDArray[np.float64]
 #: total degree of the polynomial: an oval cylinder with less than half visible differs from a round one from degree 4
 DEGREE = 4
 
-#: nodes in each coordinate at which the heights of a form are kept; a polynomial of degree 4 has 3 turning points at most
+#: nodes in each coordinate at which the heights of a form are kept: a polynomial of degree 4 turns 3 times at most
 NODES = 7
+
+#: share (49,) of the points that each node stands for, in any unit: a node at the edge stands for half a cell
+NODE_SHARES = np.kron(np.r_[0.5, np.ones(NODES - 2), 0.5], np.r_[0.5, np.ones(NODES - 2), 0.5])
 
 #: modes are excluded if less than this share of them remains after projection off the changes of the surface
 LEAST_SHARE = 0.01

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,6 +33,13 @@ from characterisation.statements.losses import Loss
 from characterisation.statements.one_sided import OneSidedErrors
 
 Floats = NDArray[np.float64]
+
+Part = Literal["any part", "part at the limit of the tolerance", "part far from nominal"]
+
+#: parts whose errors are stated
+ANY_PART: Part = "any part"
+AT_THE_LIMIT: Part = "part at the limit of the tolerance"
+FAR_FROM_NOMINAL: Part = "part far from nominal"
 
 
 @dataclass(frozen=True)
@@ -81,9 +89,9 @@ class Statement:
         ``fits``, ``does not fit``, ``undecidable``, ``not decided``, or ``no tolerance``.
     losses
         Reasons of the trials without a value, most frequent first; empty if none are known.
-    deviation
-        Size of the deviation of the part for which errors are stated, if they depend on it: that at the limit of the
-        tolerance, or infinite, for deviations much larger than the errors. None for errors that do not depend on it.
+    errors_of
+        Parts whose errors are stated: ``any part``; or where errors depend on the deviation of the part, ``part at the
+        limit of the tolerance``, or without a tolerance ``part far from nominal``.
     """
 
     measurement: str
@@ -106,7 +114,7 @@ class Statement:
     decided: Decided | None
     verdict: Verdict
     losses: tuple[Loss, ...] = ()
-    deviation: float | None = None
+    errors_of: Part = ANY_PART
 
     @property
     def root_mean_square(self) -> float:
@@ -134,9 +142,9 @@ def statement(
 
     ``repeats`` (m,) are errors of a second capture on the day of the first m trials, for the same part.
     """
-    deviation = None
+    part: Part = ANY_PART
     if isinstance(errors, OneSidedErrors):
-        deviation = math.inf if errors.limit is None else errors.limit
+        part = AT_THE_LIMIT if errors.limit is not None else FAR_FROM_NOMINAL
         every = errors.stated
     else:
         every = np.asarray(errors, float)
@@ -173,7 +181,7 @@ def statement(
             None,
             decided,
             verdict,
-            deviation=deviation,
+            errors_of=part,
         )
     bias, spread = float(known.mean()), float(known.std(ddof=1))
     low, high = coverage_interval(known)
@@ -206,7 +214,7 @@ def statement(
         shares,
         decided,
         verdict,
-        deviation=deviation,
+        errors_of=part,
     )
 
 

@@ -16,7 +16,7 @@ Deviations are rows of 3-vectors, or of signed distances or angles:
 | position, coaxiality, symmetry | offsets at the places of the outline, or of the point | twice the largest |
 | parallelism, perpendicularity to one direction | distances along it | range |
 | the same of an axis to a line or a plane | offsets across it | largest distance of two |
-| the same of a plane, angularity | distances from a plane of the nominal angle | least range over a turn about the datum |
+| the same of a plane, angularity | distances from the nominal angle | least range over turns about the datum |
 | flatness, cylindricity | heights of the form at nodes, and its noise | range, shortened for the noise |
 | pose; distances and angles of nominally 0 | the vector, or the signed distance or angle | length |
 | angles of nominally 90 deg | signed deviation from 90 deg | 90 deg minus the length |
@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from characterisation.features.figures import Circle, EdgePoint
-from characterisation.features.form import Form, node_heights, node_modes
+from characterisation.features.form import NODE_SHARES, node_heights, node_modes
 from characterisation.features.pose_fit import Pose
 from characterisation.features.surfaces import Cone, Cylinder, Plane, unit
 from characterisation.tasks.definitions import DEFINITIONS
@@ -169,7 +169,8 @@ def form_size(rows: Array) -> Array:
     """
     heights, noise = rows[..., :-1, 0], rows[..., -1, 0]
     seen = np.isfinite(heights)
-    square = np.where(seen, heights**2, 0.0).sum(axis=-1) / np.maximum(seen.sum(axis=-1), 1)
+    share = seen * NODE_SHARES
+    square = (share * np.where(seen, heights, 0.0) ** 2).sum(axis=-1) / np.maximum(share.sum(axis=-1), 1e-12)
     shortened = np.sqrt(np.maximum(0.0, 1 - noise**2 / np.maximum(square, np.finfo(float).tiny)))
     high = np.where(seen, heights, -np.inf).max(axis=-1)
     low = np.where(seen, heights, np.inf).min(axis=-1)
@@ -236,10 +237,11 @@ def _offsets_across(fits: Sequence[Any], ideal: Sequence[Any], outline: Array) -
 
 
 def _wall_heights(fits: Sequence[Any], ideal: Sequence[Any], outline: Array) -> Array:
-    """Return the heights (k, 1) of a plane over the plane through the datum's direction nearest to the nominal one."""
-    along = direction(fits[1])
+    """Return the heights (k, 1) of a plane over the plane through the datum's direction nearest to it."""
+    along, nominal = direction(fits[1]), direction(ideal[1])
     heights = feet_on(fits[0], outline) @ _across(ideal[0].normal, along)
-    return np.asarray(heights - heights.mean())[:, None]
+    sideways = feet_on(ideal[0], outline) @ np.cross(nominal, _across(ideal[0].normal, nominal))
+    return _without_turn(heights, sideways)
 
 
 def _angled(feature: Any, datum: Any) -> tuple[Array, Array, float]:
@@ -252,11 +254,17 @@ def _angled(feature: Any, datum: Any) -> tuple[Array, Array, float]:
 
 def _angular_heights(fits: Sequence[Any], ideal: Sequence[Any], outline: Array) -> Array:
     along = direction(_alike(fits[1], ideal[1]))
-    _, _, sine = _angled(*ideal[:2])
+    sine = _angled(*ideal[:2])[2]
     cosine = float(direction(ideal[0]) @ direction(ideal[1]))
     across = _across(direction(ideal[0]), along) if sine > 1e-4 else np.zeros(3)
     heights = feet_on(fits[0], outline) @ (cosine * along + sine * across)
-    return np.asarray(heights - heights.mean())[:, None]
+    return _without_turn(heights, feet_on(ideal[0], outline) @ np.cross(*_angled(*ideal[:2])[:2]))
+
+
+def _without_turn(heights: Array, sideways: Array) -> Array:
+    """Return heights (k, 1) at places (k,) less the straight line of least squares through them."""
+    line = np.column_stack([np.ones(len(sideways)), sideways])
+    return np.asarray(heights - line @ np.linalg.lstsq(line, heights, rcond=None)[0])[:, None]
 
 
 def _pose_shift(pose: Pose, ideal: Pose, point: Array) -> Array:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import zlib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,9 @@ from characterisation.tasks.evaluation import measurement_model
 from characterisation.tasks.task_file import Task
 
 Array = NDArray[np.float64]
+
+#: number of the stream of added deviations, apart from those of days
+_MOVE = 1 << 40
 
 #: step of the parameters of features [mm or rad] whose changes span the possible deviations; the least change, and the
 #: least singular value of a possible deviation, over the largest
@@ -73,6 +77,15 @@ class FoldedValue:
         size = self.size(rows)
         return size if self.fold == 0 else self.fold - size
 
+    def moved(self, rows: Array, size: float, seed: int) -> Array:
+        """Return deviations (k, m) with another of the given size added, in a random direction of its own."""
+        direction = np.where(np.isnan(rows), np.nan, self.direction(_MOVE, seed))
+        return np.asarray(rows + abs(size) / float(self.size(direction)) * direction)
+
+    def error(self, rows: Array) -> float:
+        """Return the error of the value of a nominal part that is measured with the deviations (k, m)."""
+        return float(self.value(self.nominal + rows) - self.value(self.nominal))
+
 
 def folded_values(task: Task) -> dict[str, FoldedValue]:
     """Return the measurements of a task whose values fold, by name."""
@@ -97,7 +110,8 @@ def folded_value(task: Task, measurement: str) -> FoldedValue | None:
     places = [np.array(task.features[name].point_mm or (0.0, 0.0, 0.0)) for name in asked.features]
     point = np.mean(places, axis=0) if asked.point_mm is None else np.array(asked.point_mm)
     if definition.of == "pose":
-        inputs, nominal = [Pose(np.eye(4), point)], [Pose(np.eye(4), point)]
+        inputs: list[Any] = [Pose(np.eye(4), point)]
+        nominal: list[Any] = [Pose(np.eye(4), point)]
     else:
         inputs = [task.nominal(name) for name in task.fitted_for(measurement)]
         nominal = [task.nominal(name) for name in asked.features]

@@ -275,7 +275,7 @@ def _prepared(one: SensorResult, folder: Path, workers: Executor | None) -> _Wor
     virtual_measurements = measurements_of(study, unknowns)
     runner = spread_over(workers, study, unknowns, virtual_measurements)
     digest = trial_digest(study, unknowns, runner.source)
-    trials = TrialFolder(folder / "trials", digest, list(study.task.measurements))
+    trials = TrialFolder.of(folder / "trials", digest, study.task)
     return _Workspace(candidate, unknowns, virtual_measurements, runner, trials, digest, folder)
 
 
