@@ -30,6 +30,9 @@ Floats = NDArray[np.float64]
 #: number of deviations of a part at which the value of each trial is tabulated
 _STEPS = 257
 
+#: number of trials that are tabulated at once, which limits the memory
+_AT_ONCE = 16
+
 #: ratio of a deviation without a tolerance to the largest error
 _MUCH_LARGER = 1e4
 
@@ -105,9 +108,11 @@ class OneSidedErrors:
         """
         largest = self.deviation + abs(self.correction) + self.size(self.vectors)
         sizes = 2 * largest[:, None] * np.linspace(0, 1, _STEPS)
-        trials = zip(sizes, self._units, self.vectors, strict=True)  # one by one, to take little memory
-        values = [self.size(some[:, None, None] * unit + vector) for some, unit, vector in trials]
-        return sizes, np.array(values) - self.correction
+        values = [
+            self.size(sizes[some, :, None, None] * self._units[some, None] + self.vectors[some, None])
+            for some in (slice(first, first + _AT_ONCE) for first in range(0, len(sizes), _AT_ONCE))
+        ]
+        return sizes, np.concatenate(values) - self.correction
 
     def accepted_parts(self, limit: float) -> tuple[Floats, Floats]:
         """Return the smallest and largest deviations (n,) of parts of which each trial reads at most a limit.
