@@ -26,8 +26,11 @@ from characterisation.tasks.task_file import Task
 
 Array = NDArray[np.float64]
 
-#: number of the stream of added deviations, apart from those of days
-_MOVE = 1 << 40
+#: numbers of streams of directions, apart from those of days
+_MOVE, _SHARE = 1 << 40, 1 << 41
+
+#: number of draws of a share, and the size of a deviation far from nominal over the largest error
+_DRAWS, _FAR = 1000, 1e4
 
 #: step of the parameters of features [mm or rad] whose changes span the possible deviations; the least change, and the
 #: least singular value of a possible deviation, over the largest
@@ -85,6 +88,18 @@ class FoldedValue:
     def error(self, rows: Array) -> float:
         """Return the error of the value of a nominal part that is measured with the deviations (k, m)."""
         return float(self.value(self.nominal + rows) - self.value(self.nominal))
+
+    def far_share(self) -> float:
+        """Return the root mean square error far from nominal over that of a nominal part, for errors of equal size.
+
+        An error of equal size in every direction makes the value of a nominal part larger by all of it, and that of a
+        part far from nominal larger or smaller by its component. For a point in space the share is 1 / sqrt(3).
+        """
+        drawn = np.array([self.direction(_SHARE, draw) for draw in range(2 * _DRAWS)])
+        vectors, parts = drawn[:_DRAWS], drawn[_DRAWS:]
+        far = _FAR * float(self.size(vectors).max()) / self.size(parts)[:, None, None] * parts
+        change = self.size(far + vectors) - self.size(far)
+        return float(np.sqrt((change**2).mean() / (self.size(vectors) ** 2).mean()))
 
 
 def folded_values(task: Task) -> dict[str, FoldedValue]:

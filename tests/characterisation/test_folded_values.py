@@ -191,3 +191,16 @@ def test_a_form_adds_up_with_that_of_a_part():
     nodes = np.linspace(-1, 1, 7)
     part = np.append(np.multiply.outer(nodes, nodes).ravel() * 0.1, 0.0)[:, None]
     assert float(form_size(rows[0] + part)) == pytest.approx(values[1], rel=0.03)
+
+
+def test_far_from_nominal_only_the_component_of_an_error_counts():
+    some = task(CASES, 0)
+    for name, dimensions in (("edge", 1), ("hole", 2), ("ball", 3)):
+        assert folded_value(some, name).far_share() == pytest.approx(dimensions**-0.5, rel=0.1)
+
+
+def test_an_added_deviation_has_its_size_and_a_direction_of_its_own():
+    folded = folded_value(task(CASES, 0), "ball")
+    moved = [folded.moved(np.zeros((1, 3)), -0.5, seed) for seed in (1, 1, 2)]
+    assert [folded.error(one) for one in moved] == pytest.approx([0.5] * 3)
+    assert np.array_equal(moved[0], moved[1]) and not np.allclose(moved[0], moved[2])
