@@ -142,6 +142,20 @@ def test_a_value_is_the_size_of_its_deviations(name):
         assert np.abs(left).max() < 2e-3 * size
 
 
+def test_deviations_are_in_the_part_frame():
+    some, sensor_from_part = task(CASES, 0), motion()
+    shift = np.array([0.3, -0.2, 0.1])
+    for name, seen in (("ball", shift), ("hole", [0.3, -0.2, 0]), ("edge", [0.3, 0, 0])):
+        model = measurement_model(some, name, sensor_from_part)
+        fits = [some.nominal(one) for one in some.fitted_for(name)]
+        off = np.eye(4)
+        off[:3, 3] = shift
+        moved = [one.placed(sensor_from_part @ off) for one in fits]
+        if len(moved) > 1:  # the plane of a figure stays
+            moved[0] = fits[0].placed(sensor_from_part)
+        assert model.deviations(*moved)[0] == pytest.approx(seen, abs=1e-9)
+
+
 def test_values_that_do_not_fold_have_no_deviations():
     apart, angle = ("point_distance", ["ball", "foot"], "mm", 0), ("plane_angle", ["ramp", "top"], "deg", 0)
     cases = {"apart": apart, "angle": angle}
