@@ -147,7 +147,7 @@ class Decided:
         interval from the number of trials.
     false_reject, false_reject_nominal
         Probability of rejecting a part whose value lies just inside, at the worse limit; or in the middle of the
-        tolerance (for a zone: at 0).
+        tolerance (for a zone: a perfect part).
     consumer_risk, producer_risk
         Global risks over the parts of the process; None without a process.
     """
