@@ -174,9 +174,9 @@ def _deviations(
     """Return the deviations from nominal, in the part frame, as a function of the measured features, form or pose."""
     if fold_of(asked) is None:
         return None
-    found = deviations(asked, outline, nominal, point).of
 
     def from_nominal(*measured: Any) -> Array:
+        found = deviations(asked, outline, nominal, point).of
         rows = found(measured, nominal)
         if nominal[0] is not None:
             rows = rows - found(nominal, nominal)
