@@ -16,6 +16,7 @@ from pydantic import ConfigDict, Field
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import Document, validate
 from characterisation.statements.losses import Loss, common_losses
+from characterisation.statements.statement import ANY_PART, AT_THE_LIMIT, FAR_FROM_NOMINAL
 from mitsim.running.numbers import NONE, listed, percent, quantity, rounded, two_digits
 
 #: colour and name of a group of unknowns (Okabe and Ito, safe for colour-blind readers)
@@ -91,6 +92,7 @@ class StatedMeasurement(_Loose):
     decision: DecisionEntry | None = None
     verdict: str
     losses: list[LossEntry] = Field(default_factory=list)
+    errors_of: str = ANY_PART
 
 
 class InfluenceEntry(_Loose):
@@ -163,6 +165,8 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
                 for name, one in document.measurements.items()
             )
         ],
+        "at_limit": [name for name, one in document.measurements.items() if one.errors_of == AT_THE_LIMIT],
+        "far": [name for name, one in document.measurements.items() if one.errors_of == FAR_FROM_NOMINAL],
         "unsettled": [name for name, one in document.measurements.items() if not one.settled],
     }
 
