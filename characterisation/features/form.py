@@ -49,6 +49,12 @@ Array = NDArray[np.float64]
 #: total degree of the polynomial: an oval cylinder with less than half visible differs from a round one from degree 4
 DEGREE = 4
 
+#: nodes in each coordinate at which the heights of a form are kept: a polynomial of degree 4 turns 3 times at most
+NODES = 7
+
+#: share (49,) of the points that each node stands for, in any unit: a node at the edge stands for half a cell
+NODE_SHARES = np.kron(np.r_[0.5, np.ones(NODES - 2), 0.5], np.r_[0.5, np.ones(NODES - 2), 0.5])
+
 #: modes are excluded if less than this share of them remains after projection off the changes of the surface
 LEAST_SHARE = 0.01
 
@@ -60,6 +66,9 @@ class Form:
     - ``modes`` (n, k): orthogonal distance [mm] at n places for each coefficient of 1 mm.
     - ``coefficients`` (k,) [mm] and their ``covariance`` (k, k) [mm^2].
     - ``residual_std`` [mm] along the rays, of ``count`` points.
+    - ``places`` (n, 2): coordinates of the places on the surface, -1 to 1 over the points. ``heights`` (n,) [mm] of the
+      form there before its coefficients are shortened, and ``noise`` [mm], the root mean square of the heights that
+      noise alone gives. None and NaN for a predicted form.
     """
 
     modes: Array
@@ -67,6 +76,9 @@ class Form:
     covariance: Array
     residual_std: float
     count: int
+    places: Array | None = None
+    heights: Array | None = None
+    noise: float = np.nan
 
     kind: ClassVar[str] = "form"
 
@@ -83,6 +95,39 @@ class Form:
 def zone(form: Form) -> float:
     """Return the range [mm] of a form over its places."""
     return float(np.ptp(form.modes @ form.coefficients))
+
+
+def node_heights(form: Form) -> Array:
+    """Return heights (49, 1) [mm] of a fitted form at the nodes of a grid over its points, then its noise: (50, 1).
+
+    The grid has :data:`NODES` nodes in each coordinate. A node takes the height of the nearest point in its cell, and
+    is NaN if there is none.
+    """
+    assert form.places is not None and form.heights is not None
+    cell = np.clip(np.rint((form.places + 1) * (NODES - 1) / 2), 0, NODES - 1)
+    distance = ((form.places + 1) * (NODES - 1) / 2 - cell) ** 2 @ np.ones(2)
+    nearest = np.argsort(distance, kind="stable")
+    number = (cell[nearest] @ [NODES, 1]).astype(int)
+    number, first = np.unique(number, return_index=True)
+    heights = np.full((NODES**2 + 1, 1), np.nan)
+    heights[number, 0] = form.heights[nearest[first]]
+    heights[-1] = form.noise
+    return heights
+
+
+def node_modes(kind: str) -> Array:
+    """Return orthonormal forms (49, k) at the nodes that no small change of a ``plane`` or ``cylinder`` produces.
+
+    They are polynomials of total degree :data:`DEGREE`. Changes of a cylinder are taken to second order in the angle
+    about its axis.
+    """
+    nodes = np.linspace(-1, 1, NODES)
+    u, v = (one.ravel() for one in np.meshgrid(nodes, nodes, indexing="ij"))
+    rigid = [(0, 0), (1, 0), (0, 1)] + ([(2, 0), (1, 1)] if kind == "cylinder" else [])
+    others = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if (i, j) not in rigid]
+    columns = [legvander(u, DEGREE)[:, i] * legvander(v, DEGREE)[:, j] for i, j in [*rigid, *others]]
+    modes: Array = np.linalg.qr(np.column_stack(columns))[0][:, len(rigid) :]
+    return modes
 
 
 def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None, degree: int = DEGREE) -> Array:
@@ -160,6 +205,8 @@ def fit_form(
     freedom = len(chosen) - surface.parameter_count - modes.shape[1]
     variance = float(deviation @ deviation) / freedom
     square, noise = float(coefficients @ coefficients), variance * modes.shape[1]
+    slope = at.slope[chosen]
+    heights = slope * (modes @ coefficients)
     coefficients = coefficients * np.sqrt(max(0.0, 1.0 - noise / max(square, np.finfo(float).tiny)))
     return Form(
         modes * at.slope[chosen, None],
@@ -167,6 +214,9 @@ def fit_form(
         variance * np.eye(modes.shape[1]),
         float(np.sqrt(variance)),
         len(chosen),
+        np.column_stack([_scaled(one) for one in _coordinates(surface, at.foot[chosen])]),
+        heights,
+        float(np.sqrt(noise / len(chosen) * np.mean(slope**2))),
     )
 
 

@@ -7,6 +7,10 @@ A reading is y = x + e, with the value x of a part and an error e. The errors ar
 distribution, so heavy tails are included. They were drawn on a part of nominal values, and are assumed equal over the
 whole tolerance.
 
+The value of a zone is the size of a vector, to which the error adds as a vector. Its errors are those of a part at the
+limit of the tolerance, deviating in random directions (:mod:`characterisation.statements.one_sided`). JCGM 106 uses
+the readings of each trial at all values x; the risks are then means of G over the parts that a trial accepts.
+
 - ISO 14253-1: y is accepted if lower + U <= y <= upper - U. The expanded uncertainty U is the end of the 95 % coverage
   interval of the error that is larger in absolute value. It therefore contains a bias that is not subtracted (ISO/TS
   15530-4, 8; JCGM 100, F.2.4.5). With ``subtract_bias``, the interval is that of the corrected reading, and each limit
@@ -37,10 +41,14 @@ from scipy.stats import gamma, norm, t
 
 from characterisation.statements.coverage import BLOCKS, coverage_interval, standard_errors
 from characterisation.statements.judgement import share
+from characterisation.statements.one_sided import OneSidedErrors, stated_errors, without_bias
 from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.task_file import Task
 
 Floats = NDArray[np.float64]
+
+#: errors (n,) of trials, or those of a value that folds
+Errors = Floats | OneSidedErrors
 
 #: description of each rule in a decision
 WORDS = {
@@ -139,7 +147,7 @@ class Decided:
         interval from the number of trials.
     false_reject, false_reject_nominal
         Probability of rejecting a part whose value lies just inside, at the worse limit; or in the middle of the
-        tolerance (for a zone: at 0).
+        tolerance (for a zone: a perfect part).
     consumer_risk, producer_risk
         Global risks over the parts of the process; None without a process.
     """
@@ -159,7 +167,7 @@ class Decided:
     producer_risk: float | None
 
 
-def decide(errors: Floats, tolerance: Tolerance) -> Decided:
+def decide(errors: Errors, tolerance: Tolerance) -> Decided:
     """Decide from the errors (n,) of trials with a value whether a measurement fits its tolerance."""
     rule = tolerance.rule
     if len(errors) < 2:
@@ -167,19 +175,19 @@ def decide(errors: Floats, tolerance: Tolerance) -> Decided:
         return Decided(
             WORDS[rule.rule], None, nan, (nan, nan), "undecidable", False, nan, nan, (nan, nan), nan, nan, None, None
         )
-    bias = float(errors.mean())
-    taken = errors - bias if rule.subtract_bias else errors
+    bias = float(stated_errors(errors).mean())
+    taken: Errors = without_bias(errors, bias) if rule.subtract_bias else errors
     limits = acceptance(taken, tolerance)
     asked = demand(taken, tolerance)
     low, high = _demand_interval(taken, tolerance, asked)
-    corrected = demand(errors - bias, tolerance) if not rule.subtract_bias else asked
+    corrected = demand(without_bias(errors, bias), tolerance) if not rule.subtract_bias else asked
     verdict: Verdict = "not decided"
     if high <= 1:
         verdict = "fits"
     elif low > 1:
         verdict = "undecidable" if limits is None else "does not fit"
     edges = [edge for edge in (tolerance.lower, tolerance.upper) if math.isfinite(edge)]
-    through = [share(_within(edge + taken, limits)) for edge in edges]
+    through = [share(_within(edge + stated_errors(taken), limits)) for edge in edges]
     worst = max(through, key=lambda one: one.value)
     risks = None if rule.rule != "jcgm_106" else global_risks(taken, tolerance, limits)
     return Decided(
@@ -193,12 +201,17 @@ def decide(errors: Floats, tolerance: Tolerance) -> Decided:
         worst.value,
         (worst.low, worst.high),
         1 - min(one.value for one in through),
-        1 - float(_within(tolerance.middle + taken, limits).mean()),
+        1 - float(_within(tolerance.middle + _in_the_middle(taken, tolerance), limits).mean()),
         *(risks or (None, None)),
     )
 
 
-def acceptance(errors: Floats, tolerance: Tolerance) -> tuple[float, float] | None:
+def _in_the_middle(errors: Errors, tolerance: Tolerance) -> Floats:
+    """Return the errors (n,) of a part in the middle of the tolerance."""
+    return errors.at(abs(errors.fold - tolerance.middle)) if isinstance(errors, OneSidedErrors) else errors
+
+
+def acceptance(errors: Errors, tolerance: Tolerance) -> tuple[float, float] | None:
     """Return the readings, from and to, that the rule of the tolerance accepts; None if there are none."""
     lower, upper, rule = tolerance.lower, tolerance.upper, tolerance.rule
     if rule.rule == "simple_acceptance":
@@ -207,7 +220,7 @@ def acceptance(errors: Floats, tolerance: Tolerance) -> tuple[float, float] | No
         guard = _least_guard(errors, tolerance)
         below = above = guard
     elif rule.subtract_bias:
-        low, high = coverage_interval(errors)
+        low, high = coverage_interval(stated_errors(errors))
         below, above = max(high, 0.0), max(-low, 0.0)
     else:
         below = above = expanded(errors)
@@ -215,12 +228,12 @@ def acceptance(errors: Floats, tolerance: Tolerance) -> tuple[float, float] | No
     return (lower + below, upper - above) if room > 0 else None
 
 
-def expanded(errors: Floats) -> float:
+def expanded(errors: Errors) -> float:
     """Return the expanded uncertainty.
 
     It is the end of the 95 % coverage interval of the error that is larger in absolute value.
     """
-    low, high = coverage_interval(errors)
+    low, high = coverage_interval(stated_errors(errors))
     return max(abs(low), abs(high))
 
 
@@ -229,7 +242,7 @@ def conformance_probability(reading: float, errors: Floats, tolerance: Tolerance
     return float(_within(reading - errors, (tolerance.lower, tolerance.upper)).mean())
 
 
-def demand(errors: Floats, tolerance: Tolerance) -> float:
+def demand(errors: Errors, tolerance: Tolerance) -> float:
     """Return the demand of the rule, at most 1 where the measurement fits; see :class:`Decided`."""
     rule = tolerance.rule
     if rule.rule == "iso_14253_1":
@@ -240,29 +253,38 @@ def demand(errors: Floats, tolerance: Tolerance) -> float:
     return global_risks(errors, tolerance, acceptance(errors, tolerance))[1] / rule.producer_risk
 
 
-def needed(errors: Floats, tolerance: Tolerance) -> float:
+def needed(errors: Errors, tolerance: Tolerance) -> float:
     """Return the largest standard uncertainty that fits, for errors without bias.
 
     The distribution of the errors is that of ``errors``, scaled.
     """
-    centred = errors - errors.mean()
-    u = float(errors.std(ddof=1))
+    u = float(stated_errors(errors).std(ddof=1))
     if not u > 0:
         return math.nan
     unbiased = replace(tolerance, rule=tolerance.rule.model_copy(update={"subtract_bias": False}))
-    if tolerance.rule.rule != "jcgm_106":
-        return u / demand(centred, unbiased)  # the demand is proportional to the errors
+    if tolerance.rule.rule != "jcgm_106" and not isinstance(errors, OneSidedErrors):
+        return u / demand(errors - errors.mean(), unbiased)  # the demand is proportional to the errors
 
     def over(logarithm: float) -> float:
-        return demand(math.exp(logarithm) * centred, unbiased) - 1
+        return demand(_scaled_without_bias(errors, math.exp(logarithm)), unbiased) - 1
 
     low, high = (math.log(tolerance.size / u * factor) for factor in (1e-4, 10.0))
     if over(high) <= 0:
         return math.inf  # so few parts conform that rejecting all meets the demand
-    return u * math.exp(float(brentq(over, low, high, xtol=1e-4)))
+    factor = math.exp(float(brentq(over, low, high, xtol=1e-4)))
+    if isinstance(errors, OneSidedErrors):  # its standard deviation is not proportional to the vectors
+        return float(errors.scaled(factor).stated.std(ddof=1))
+    return u * factor
 
 
-def global_risks(errors: Floats, tolerance: Tolerance, limits: tuple[float, float] | None) -> tuple[float, float]:
+def _scaled_without_bias(errors: Errors, factor: float) -> Errors:
+    if isinstance(errors, OneSidedErrors):
+        scaled = errors.scaled(factor)
+        return scaled.corrected(float(scaled.stated.mean()))
+    return np.asarray(factor * (errors - errors.mean()))
+
+
+def global_risks(errors: Errors, tolerance: Tolerance, limits: tuple[float, float] | None) -> tuple[float, float]:
     """Return the global consumer's and producer's risk (JCGM 106, 9.5) of accepting readings between ``limits``.
 
     They are means over parts of the tolerance's process, with equally likely errors (n,).
@@ -271,6 +293,10 @@ def global_risks(errors: Floats, tolerance: Tolerance, limits: tuple[float, floa
     conforming = float(process(upper) - process(lower))
     if limits is None:
         return 0.0, conforming
+    if isinstance(errors, OneSidedErrors):
+        if math.isinf(lower):
+            return _one_sided_risks(errors, tolerance, limits[1])
+        errors = errors.stated
     a, b = limits[0] - errors, limits[1] - errors  # values whose reading lies at a limit
     below = process(np.minimum(lower, b)) - process(a)
     above = process(b) - process(np.maximum(upper, a))
@@ -279,7 +305,16 @@ def global_risks(errors: Floats, tolerance: Tolerance, limits: tuple[float, floa
     return float(consumer.mean()), conforming - float(np.maximum(right, 0.0).mean())
 
 
-def _least_guard(errors: Floats, tolerance: Tolerance) -> float:
+def _one_sided_risks(errors: OneSidedErrors, tolerance: Tolerance, limit: float) -> tuple[float, float]:
+    """Return the global risks of accepting readings up to a limit, of a value that folds at 0."""
+    process, upper = tolerance.process.cdf, tolerance.upper
+    low, high = errors.accepted_parts(limit)
+    accepted = process(np.minimum(upper, high)) - process(np.minimum(upper, low))
+    wrong = process(np.maximum(upper, high)) - process(np.maximum(upper, low))
+    return float(wrong.mean()), float(process(upper) - accepted.mean())
+
+
+def _least_guard(errors: Errors, tolerance: Tolerance) -> float:
     """Return the least guard band for which the consumer's risk is at most the stated one.
 
     It is at most the whole tolerance.
@@ -304,13 +339,20 @@ def _within(readings: Floats, limits: tuple[float, float] | None) -> Floats:
     return np.asarray((readings >= limits[0]) & (readings <= limits[1]), float)
 
 
-def _demand_interval(errors: Floats, tolerance: Tolerance, asked: float) -> tuple[float, float]:
+def _demand_interval(errors: Errors, tolerance: Tolerance, asked: float) -> tuple[float, float]:
     """Return the 95 % interval of the demand, symmetric in its logarithm.
 
     Few trials determine only the order of magnitude of a scale.
     """
     if not asked > 0:
         return 0.0, 0.0
-    moved = float(standard_errors(errors, lambda part: np.array([demand(part, tolerance)]))[0])
+    if isinstance(errors, OneSidedErrors):
+
+        def without_block(chosen: Floats) -> Floats:
+            return np.array([demand(errors.part(chosen.astype(int)), tolerance)])
+
+        moved = float(standard_errors(np.arange(len(errors), dtype=float), without_block)[0])
+    else:
+        moved = float(standard_errors(errors, lambda part: np.array([demand(part, tolerance)]))[0])
     factor = math.exp(min(float(t.ppf(0.975, BLOCKS - 1)) * moved / asked, 700.0))
     return asked / factor, asked * factor

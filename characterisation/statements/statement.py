@@ -8,12 +8,19 @@ An error is the measured value minus the true one. If a user measures y, the tru
 the coverage probability, where [low, high] is the interval of the error (JCGM 101:2008, 5.5). The bias is the mean
 error, common to all trials. It may be subtracted as a correction for a recognised systematic effect (JCGM 100:2008,
 3.2.3); its own uncertainty is that of a mean.
+
+In the words of the guides for virtual experiments, this is "simulate and analyse": data are simulated and analysed as
+real data are. If the error does not depend on the value of the part, so that a reading is the sum of both, the result
+equals the propagation of distributions of JCGM 101. A value that folds at 0, such as a zone, is no such sum. Its
+errors are stated for a part at the limit of its tolerance, or far from 0 without a tolerance
+(:mod:`characterisation.statements.one_sided`).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,8 +30,16 @@ from characterisation.statements.budget import BudgetLine
 from characterisation.statements.coverage import BLOCKS, coverage_interval, standard_errors
 from characterisation.statements.decision import Decided, Tolerance, Verdict, decide
 from characterisation.statements.losses import Loss
+from characterisation.statements.one_sided import OneSidedErrors
 
 Floats = NDArray[np.float64]
+
+Part = Literal["any part", "part at the limit of the tolerance", "part far from nominal"]
+
+#: parts whose errors are stated
+ANY_PART: Part = "any part"
+AT_THE_LIMIT: Part = "part at the limit of the tolerance"
+FAR_FROM_NOMINAL: Part = "part far from nominal"
 
 
 @dataclass(frozen=True)
@@ -74,6 +89,9 @@ class Statement:
         ``fits``, ``does not fit``, ``undecidable``, ``not decided``, or ``no tolerance``.
     losses
         Reasons of the trials without a value, most frequent first; empty if none are known.
+    errors_of
+        Parts whose errors are stated: ``any part``; or where errors depend on the deviation of the part, ``part at the
+        limit of the tolerance``, or without a tolerance ``part far from nominal``.
     """
 
     measurement: str
@@ -96,6 +114,7 @@ class Statement:
     decided: Decided | None
     verdict: Verdict
     losses: tuple[Loss, ...] = ()
+    errors_of: Part = ANY_PART
 
     @property
     def root_mean_square(self) -> float:
@@ -114,23 +133,30 @@ class Statement:
 def statement(
     measurement: str,
     unit: str,
-    errors: ArrayLike,
+    errors: ArrayLike | OneSidedErrors,
     tolerance: Tolerance | None = None,
     budget: tuple[BudgetLine, ...] = (),
     repeats: ArrayLike = (),
 ) -> Statement:
     """State a measurement from the errors (n,) of independent trials, NaN for trials without a value.
 
-    ``repeats`` (m,) are errors of a second capture on the day of the first m trials.
+    ``repeats`` (m,) are errors of a second capture on the day of the first m trials, for the same part.
     """
-    every = np.asarray(errors, float)
+    part: Part = ANY_PART
+    if isinstance(errors, OneSidedErrors):
+        part = AT_THE_LIMIT if errors.limit is not None else FAR_FROM_NOMINAL
+        every = errors.stated
+    else:
+        every = np.asarray(errors, float)
     second = np.asarray(repeats, float)
     square = (every[: len(second)] - second) ** 2 / 2
     square = square[np.isfinite(square)]
     repeatability = math.sqrt(float(square.mean())) if len(square) else math.nan
     known = every[np.isfinite(every)]
     count = len(known)
-    decided = None if tolerance is None else decide(known, tolerance)
+    decided = None
+    if tolerance is not None:
+        decided = decide(errors.part(errors.known) if isinstance(errors, OneSidedErrors) else known, tolerance)
     size = None if tolerance is None else tolerance.size
     verdict: Verdict = "no tolerance" if decided is None else decided.verdict
     if count < 2:
@@ -155,6 +181,7 @@ def statement(
             None,
             decided,
             verdict,
+            errors_of=part,
         )
     bias, spread = float(known.mean()), float(known.std(ddof=1))
     low, high = coverage_interval(known)
@@ -187,6 +214,7 @@ def statement(
         shares,
         decided,
         verdict,
+        errors_of=part,
     )
 
 

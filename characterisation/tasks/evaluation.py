@@ -27,7 +27,7 @@ from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.fits import LEAST_BELONGING, belonging, fit_surface
 from characterisation.features.fitted import CylinderFit, Fit, PlaneFit
 from characterisation.features.form import Form, fit_form
-from characterisation.features.pose_fit import PoseFit, fit_pose
+from characterisation.features.pose_fit import Pose, PoseFit, fit_pose
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Surface
 from characterisation.files.errors import InputError, nearest
@@ -40,6 +40,7 @@ from characterisation.tasks.definitions import (
     plane_axis_angle,
     radius,
 )
+from characterisation.tasks.deviations import deviations, fold_of
 from characterisation.tasks.places import intersection, mid_plane
 from characterisation.tasks.task_file import DERIVED, Feature, Measurement, Task
 from characterisation.tasks.task_reading import check_features, read_task
@@ -68,6 +69,9 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
+#: no place, and the origin of a frame
+NOWHERE, ORIGIN = np.empty((0, 3)), np.zeros(3)
+
 
 class Estimate(Protocol):
     """Any fit: it has a covariance (p, p), and can be changed by p parameters."""
@@ -94,11 +98,14 @@ class MeasurementModel:
 
     ``value`` takes a fit for each of ``inputs``, in their order, and returns mm or rad. The fit is a
     :data:`~characterisation.features.fitted.Fit` for a feature, a :class:`~characterisation.features.form.Form`, or a
-    :class:`~characterisation.features.pose_fit.Pose`.
+    :class:`~characterisation.features.pose_fit.Pose`. ``deviations`` takes the same, and returns what they deviate from
+    nominal (k, m) [mm or rad], in the part frame: None for values that do not fold
+    (:mod:`characterisation.tasks.deviations`).
     """
 
     inputs: tuple[InputQuantity, ...]
     value: Callable[..., float]
+    deviations: Callable[..., Array] | None = None
 
 
 @dataclass(frozen=True)
@@ -106,7 +113,8 @@ class Measured:
     """Outcome of one measurement in one cloud, in the measurement's unit.
 
     ``error`` is value minus nominal; ``standard_uncertainty`` is propagated from the fits. If the measurement was not
-    possible, all three are NaN and ``reason`` gives the cause.
+    possible, all three are NaN and ``reason`` gives the cause. ``deviations`` (k, m) are those from nominal of a value
+    that folds, in its unit, part frame (:mod:`characterisation.tasks.deviations`); None for any other.
     """
 
     value: float
@@ -114,6 +122,7 @@ class Measured:
     standard_uncertainty: float
     possible: bool
     reason: str
+    deviations: Array | None = None
 
 
 def measurement_model(task: Task, measurement: str, sensor_from_part: ArrayLike | None = None) -> MeasurementModel:
@@ -125,27 +134,55 @@ def measurement_model(task: Task, measurement: str, sensor_from_part: ArrayLike 
     asked = task.measurements[measurement]
     definition = DEFINITIONS[asked.kind]
     motion = np.eye(4) if sensor_from_part is None else np.asarray(sensor_from_part, float)
+    places = [np.array(task.features[name].point_mm or (0.0, 0.0, 0.0)) for name in asked.features]
+    point = np.mean(places, axis=0) if asked.point_mm is None else np.array(asked.point_mm)
     if definition.of == "form":
-        return MeasurementModel((InputQuantity("form", asked.features),), definition.value)
+        form_of = _deviations(asked, motion, [None])
+        return MeasurementModel((InputQuantity("form", asked.features),), definition.value, form_of)
     if definition.of == "pose":
-        places = [np.array(task.features[name].point_mm) for name in asked.features]
-        point = np.mean(places, axis=0) if asked.point_mm is None else np.array(asked.point_mm)
         value = partial(definition.value, sensor_from_part=motion, point=point)
-        return MeasurementModel((InputQuantity("pose", asked.features),), value)
+        pose_of = _deviations(asked, motion, [Pose(motion, motion[:3, :3] @ point + motion[:3, 3])], point=point)
+        return MeasurementModel((InputQuantity("pose", asked.features),), value, pose_of)
     extra: dict[str, Any] = {}
+    outline = np.array(task.features[asked.features[0]].outline_mm or (), float).reshape(-1, 3)
+    outline = outline @ motion[:3, :3].T + motion[:3, 3]
+    nominal = [task.nominal(name, motion) for name in asked.features]
     if "nominal" in definition.needs:
-        extra["nominal"] = [task.nominal(name, motion) for name in asked.features]
+        extra["nominal"] = nominal
     if "outline" in definition.needs:
-        outline = np.array(task.features[asked.features[0]].outline_mm or (), float).reshape(-1, 3)
-        extra["outline"] = outline @ motion[:3, :3].T + motion[:3, 3]
+        extra["outline"] = outline
     fitted = task.fitted_for(measurement)
 
-    def value_of_fits(*fits: Any) -> float:
+    def features_of(fits: Sequence[Any]) -> list[Any]:
         by_name = dict(zip(fitted, fits, strict=True))
-        features = [_resolved(task.features[name], name, by_name) for name in asked.features]
-        return definition.value(*features, **extra)
+        return [_resolved(task.features[name], name, by_name) for name in asked.features]
 
-    return MeasurementModel(tuple(InputQuantity("feature", (name,)) for name in fitted), value_of_fits)
+    def value_of_fits(*fits: Any) -> float:
+        return definition.value(*features_of(fits), **extra)
+
+    of_features = _deviations(asked, motion, nominal, outline)
+    return MeasurementModel(
+        tuple(InputQuantity("feature", (name,)) for name in fitted),
+        value_of_fits,
+        None if of_features is None else lambda *fits: of_features(*features_of(fits)),
+    )
+
+
+def _deviations(
+    asked: Measurement, motion: Array, nominal: Sequence[Any], outline: Array = NOWHERE, point: Array = ORIGIN
+) -> Callable[..., Array] | None:
+    """Return the deviations from nominal, in the part frame, as a function of the measured features, form or pose."""
+    if fold_of(asked) is None:
+        return None
+
+    def from_nominal(*measured: Any) -> Array:
+        found = deviations(asked, outline, nominal, point).of
+        rows = found(measured, nominal)
+        if nominal[0] is not None:
+            rows = rows - found(nominal, nominal)
+        return rows @ motion[:3, :3] if rows.shape[1] == 3 else rows
+
+    return from_nominal
 
 
 def _resolved(feature: Feature, name: str, fits: Mapping[str, Any]) -> Any:
@@ -309,7 +346,8 @@ def _measured(
         why = "an axis lies in a plane, or planes or axes that must intersect are parallel"
         return Measured(np.nan, np.nan, np.nan, False, f"{measurement.kind} has no value: {why}")
     scale = np.rad2deg(1.0) if measurement.unit == "deg" else 1.0
-    return Measured(value * scale, value * scale - measurement.nominal, uncertainty * scale, True, "")
+    rows = None if model.deviations is None else scale * model.deviations(*estimates)
+    return Measured(value * scale, value * scale - measurement.nominal, uncertainty * scale, True, "", rows)
 
 
 def evaluate(

@@ -46,11 +46,11 @@ def position(feature: Plane | Axis | PointLike, *datums: Datum, nominal: Sequenc
     if isinstance(feature, Plane | Cylinder | Cone):
         assert isinstance(target, Plane | Cylinder | Cone)
         along = turn @ direction(target)
-        feet = _on(target, outline) @ turn.T + shift
+        spots = feet_on(target, outline) @ turn.T + shift
         if isinstance(feature, Plane):
-            offsets = (feet - feature.point) @ feature.normal / (along @ feature.normal)
+            offsets = (spots - feature.point) @ feature.normal / (along @ feature.normal)
             return 2 * float(np.abs(offsets).max())
-        return 2 * max(float(np.linalg.norm(on_axis(Plane(spot, along), feature) - spot)) for spot in feet)
+        return 2 * max(float(np.linalg.norm(on_axis(Plane(spot, along), feature) - spot)) for spot in spots)
     assert not isinstance(target, Plane | Cylinder | Cone)
     offset = place(feature) - (turn @ place(target) + shift)
     if isinstance(target, Circle):
@@ -101,7 +101,7 @@ def parallelism(feature: Plane | Axis, datum: Plane | Axis, *, outline: Array) -
     - Datum axis, plane: two planes parallel to the axis, at the angle about it with the least width.
     - Datum axis, axis: a cylinder along the datum axis.
     """
-    places, along = _on(feature, outline), direction(datum)
+    places, along = feet_on(feature, outline), direction(datum)
     if isinstance(datum, Plane):
         return float(np.ptp(places @ along))
     across = places - np.outer(places @ along, along)
@@ -117,7 +117,7 @@ def perpendicularity(feature: Plane | Axis, datum: Plane | Axis, *, outline: Arr
     - Datum plane, plane: two planes perpendicular to the datum, at the angle with the least width.
     - Datum plane, axis: a cylinder perpendicular to the datum.
     """
-    places, along = _on(feature, outline), direction(datum)
+    places, along = feet_on(feature, outline), direction(datum)
     if not isinstance(datum, Plane):
         return float(np.ptp(places @ along))
     across = places - np.outer(places @ along, along)
@@ -157,7 +157,7 @@ def angularity(feature: Plane, datum: Datum, *, nominal: Sequence[Geometry], out
     sine = float(np.linalg.norm(np.cross(target, nominal_datum)))
     normal = feature.normal * (1.0 if feature.normal @ target >= 0 else -1.0)
     away = unit(normal - (normal @ along) * along) if sine > PARALLEL else np.zeros(3)
-    places = _on(feature, outline)
+    places = feet_on(feature, outline)
     across, turned = places @ (cosine * along + sine * away), sine * (places @ np.cross(along, away))
     first, second = np.triu_indices(len(places), 1)
     change, by_turn = across[second] - across[first], turned[second] - turned[first]
@@ -168,7 +168,7 @@ def angularity(feature: Plane, datum: Datum, *, nominal: Sequence[Geometry], out
 
 def coaxiality(feature: Axis, datum: Axis, *, outline: Array) -> float:
     """Return the coaxiality [mm] (ISO 1101): diameter of the cylinder about the datum axis that contains the axis."""
-    from_datum = _on(feature, outline) - datum.point
+    from_datum = feet_on(feature, outline) - datum.point
     across = from_datum - np.outer(from_datum @ datum.axis, datum.axis)
     return 2 * float(np.linalg.norm(across, axis=1).max())
 
@@ -178,10 +178,10 @@ def symmetry(feature: Plane | Axis, datum: Plane, *, outline: Array) -> float:
 
     The planes contain the median plane or axis.
     """
-    return 2 * float(np.abs((_on(feature, outline) - datum.point) @ datum.normal).max())
+    return 2 * float(np.abs((feet_on(feature, outline) - datum.point) @ datum.normal).max())
 
 
-def _on(feature: Plane | Axis, outline: Array) -> Array:
+def feet_on(feature: Plane | Axis, outline: Array) -> Array:
     """Return the feet (k, 3), on a plane or an axis, of the places that span it."""
     along = direction(feature)
     from_point = np.asarray(outline, float) - feature.point

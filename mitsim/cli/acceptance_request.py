@@ -6,6 +6,7 @@ each window -> figures of each cloud, and those of all clouds together (:mod:`ch
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -20,6 +21,7 @@ from characterisation.acceptance.depth_quality import (
     plane_quality,
     temporal_noise,
 )
+from characterisation.acceptance.range_uncertainty import flatness_uncertainty, form_error_uncertainty
 from characterisation.acceptance.vdi_2634 import flatness_error, probing_error, sphere_spacing_error
 from characterisation.coupon.patches import Coupon
 from characterisation.files.errors import InputError, nearest
@@ -94,6 +96,9 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
     - Sphere: form error PF and size error PS [mm].
     - Spacing: spacing error SD [mm].
 
+    Flatness and form errors have the standard uncertainty of a repeated capture, conditional on the form that was read
+    (:mod:`characterisation.acceptance.range_uncertainty`).
+
     Definitions and sources: :mod:`characterisation.acceptance.vdi_2634` and
     :mod:`characterisation.acceptance.depth_quality`. A figure that cannot be computed has no value, but a reason.
 
@@ -113,7 +118,8 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
             if isinstance(error, str):
                 out.append(failed(label, "mm", error, len(points), count))
             else:
-                out.append(Result(label, "mm", getattr(error, field), points=len(points), points_given=count))
+                uncertainty = form_error_uncertainty(points, error.centre) if field == "form" else math.nan
+                out.append(_result(label, "mm", getattr(error, field), uncertainty, len(points), count))
     for first, second, distance in artefacts.spacings:
         one, other = (window_points(artefacts.spheres[name][0], cloud, name) for name in (first, second))
         label = f"{first}-{second} spacing error SD"
@@ -181,17 +187,32 @@ def _plane_figures(
         values["sub-pixel RMS", "px"] = quality.subpixel_rms if enough else np.nan
     too_few = f"{len(points)} points in the window, at least {LEAST_POINTS} are needed"
     holes = "no patch of 9 x 9 pixels has all points"
+    uncertainty = {"flatness error": flatness_uncertainty(points)} if enough else {}
     return [
-        _figure_or_reason(f"{name} {quantity}", unit, value, too_few if not enough else holes, len(points), count)
+        _figure_or_reason(
+            f"{name} {quantity}",
+            unit,
+            value,
+            too_few if not enough else holes,
+            len(points),
+            count,
+            uncertainty.get(quantity, math.nan),
+        )
         for (quantity, unit), value in values.items()
     ]
 
 
-def _figure_or_reason(name: str, unit: str, value: float, reason: str, points: int = 0, count: int = 0) -> Result:
+def _figure_or_reason(
+    name: str, unit: str, value: float, reason: str, points: int = 0, count: int = 0, uncertainty: float = math.nan
+) -> Result:
     """Return the result of a figure, or the reason why it has no value."""
     if np.isfinite(value):
-        return Result(name, unit, float(value), points=points, points_given=count)
+        return _result(name, unit, float(value), uncertainty, points, count)
     return failed(name, unit, reason, points, count)
+
+
+def _result(name: str, unit: str, value: float, uncertainty: float, points: int, count: int) -> Result:
+    return Result(name, unit, value, uncertainty, "fit" if math.isfinite(uncertainty) else "none", points, count)
 
 
 def _value_or_reason(function: Callable[..., Value], *arguments: Any) -> Value | str:

@@ -10,6 +10,7 @@ import math
 from typing import Any
 
 from characterisation.statements.losses import Loss, common_losses
+from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
 from mitsim.running.numbers import NONE, listed, percent, quantity, rounded, two_digits
 from mitsim.study.statement_file import ExposureEntry, StatedMeasurement, StatementDocument
 
@@ -57,6 +58,8 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
                 for name, one in document.measurements.items()
             )
         ],
+        "at_limit": [name for name, one in document.measurements.items() if one.errors_of == AT_THE_LIMIT],
+        "far": [name for name, one in document.measurements.items() if one.errors_of == FAR_FROM_NOMINAL],
         "unsettled": [name for name, one in document.measurements.items() if not one.settled],
     }
 

@@ -197,7 +197,7 @@ def stated_view(
     runner = spread_over(workers, study, unknowns, virtual_measurements)
     claim(folder, f"budget of view {view.number}", study_digest(study, digest))
     exposed = exposed_for(study, view, virtual_measurements, runner, digest, folder)
-    trials = TrialFolder(folder / "trials", exposed.digest, list(study.task.measurements))
+    trials = TrialFolder.of(folder / "trials", exposed.digest, study.task)
     stated = state_view(study, view, exposed.runner, trials, unknowns, table or study.file.statement)
     return StatedView(
         stated, statement_document(study, view, stated, unknowns, virtual_measurements.source, exposed.planned)

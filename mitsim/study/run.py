@@ -109,7 +109,7 @@ def run_study(
     predictor = virtual_measurements.predictor
     scores, chosen, search = score_study(study, predictor, performance_map, folder, unknowns)
     clock.lap("score")
-    trials = TrialFolder(folder / "trials", digest, list(study.task.measurements))
+    trials = TrialFolder.of(folder / "trials", digest, study.task)
     raced = run_race(study.views, scores, runner, trials, race_rules(study.file.race, minutes))
     scores = with_race(scores, raced)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="final_rank")

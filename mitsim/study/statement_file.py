@@ -10,6 +10,7 @@ from pydantic import ConfigDict, Field
 
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import Document, validate
+from characterisation.statements.statement import ANY_PART
 
 
 class _Loose(Document):
@@ -71,6 +72,7 @@ class StatedMeasurement(_Loose):
     decision: DecisionEntry | None = None
     verdict: str
     losses: list[LossEntry] = Field(default_factory=list)
+    errors_of: str = ANY_PART
 
 
 class InfluenceEntry(_Loose):

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 from seen_shapes import GRID, cloud_of, plane, sphere
 from shell import mitsim_here
 
@@ -45,6 +46,9 @@ def test_a_wall_has_the_offset_the_noise_and_the_gap_that_it_was_made_with(walls
         assert one["wall sub-pixel RMS"]["value"] == pytest.approx(50 * 600 * 0.962 * SIGMA / 603**2, rel=0.06)
         # without the farthest 3 per mille the range is from -2.968 to 2.968 sigma, +- 1.1 %
         assert one["wall flatness error"]["value"] == pytest.approx(2 * 2.968 * SIGMA, rel=0.05)
+        # it is known as well as the quantile of 0.15 % at either end: sqrt(2 * 0.0015 / n) over the density there
+        scatter = np.sqrt(2 * 0.0015 / (152 * 200)) / norm.pdf(2.968) * SIGMA
+        assert one["wall flatness error"]["standard_uncertainty"] == pytest.approx(scatter, rel=0.4)
         assert one["wall fill rate"]["points"] == 152 * 200 and one["wall fill rate"]["points_given"] == 160 * 200
     assert together["wall mean depth error"]["value"] == pytest.approx(0.5, abs=0.002)
     # of 4 captures, 3 degrees of freedom: the median of chi over sqrt(3) is 0.888

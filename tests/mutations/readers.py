@@ -340,18 +340,19 @@ def _trials(folder):
     from mitsim.study.virtual.trials import Outcome, TrialFolder
     from mitsim.study.virtual.world import Trial
 
-    trials = TrialFolder(folder / "trials", "0123", ["a", "b"])
+    trials = TrialFolder(folder / "trials", "0123", ["a", "b"], {"a": 2})
     for day in range(5):
-        trials.add(3, Trial(day), Outcome({"a": 0.1 * day, "b": float("nan")}))
+        trials.add(3, Trial(day), Outcome({"a": 0.1 * day, "b": float("nan")}, {}, {"a": [0.1 * day, float("nan")]}))
     return folder / "trials" / "view_0003.jsonl"
 
 
 def _read_trials(path):
     from mitsim.study.virtual.trials import TrialFolder
 
-    found = TrialFolder(path.parent, "0123", ["a", "b"])
+    found = TrialFolder(path.parent, "0123", ["a", "b"], {"a": 2})
     trials = list(found.known(3))
     found.errors(3, trials)
+    found.deviations(3, trials, "a")
 
 
 def _plan_of_many(folder):

@@ -50,7 +50,7 @@ class CaseTrials:
         self.unknowns: Unknowns = replace(unknowns, seed=unknowns.seed + KINDS[kind], pooled=not separate_light)
         self._runner: TrialRunner | None = None
         digest = trial_digest(study, self.unknowns, measured_by(study), separate_light)
-        self.trials = TrialFolder(folder / case.name / kind, digest, list(study.task.measurements))
+        self.trials = TrialFolder.of(folder / case.name / kind, digest, study.task)
 
     @property
     def runner(self) -> TrialRunner:

@@ -8,16 +8,18 @@ For each kind of trials, the file has a digest of everything that determines the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from characterisation.files.datasets import Schema, Variable, read_dataset
 from characterisation.files.errors import InputError
 from mitsim.maps.campaign.run import write_netcdf
-from mitsim.study.virtual.trials import TrialFolder
+from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import GROUPS, Trial
 
 _TRIAL = ("trial",)
@@ -25,6 +27,7 @@ _SCHEMA = Schema(
     "a file that `python -m tests.proofs statements` wrote",
     {
         "error": Variable(("trial", "measurement"), gaps=True),
+        "deviation": Variable(("trial", "place"), gaps=True, needed=False),
         "measurement": Variable(("measurement",), "text"),
         "kind": Variable(_TRIAL, "whole", 0, 100),
         "view": Variable(_TRIAL, "whole", 0, 1e9),
@@ -42,7 +45,7 @@ _SWAPPED_GROUPS = ("", *GROUPS)
 def write_trials(path: Path, folders: Mapping[str, TrialFolder], views: list[int]) -> None:
     """Write all finished trials of some views, by kind, completely or not at all."""
     rows = [
-        (kind, view, trial, [one.errors[name] for name in folder.measurements])
+        (kind, view, trial, [one.errors[name] for name in folder.measurements], _deviations(folder, one))
         for kind, folder in folders.items()
         for view in views
         for trial, one in sorted(folder.known(view).items(), key=lambda item: _place(item[0]))
@@ -72,6 +75,9 @@ def write_trials(path: Path, folders: Mapping[str, TrialFolder], views: list[int
             "digests": [folders[kind].digest for kind in kinds],
         },
     )
+    if rows[0][4]:
+        values = np.array([row[4] for row in rows], np.float32)
+        data["deviation"] = (("trial", "place"), values, {"units": "mm or deg"})
     for name in data.data_vars:
         data[name].encoding = {"zlib": True, "complevel": 6}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -100,16 +106,16 @@ def take_up_trials(path: Path, folders: Mapping[str, TrialFolder]) -> dict[str, 
                 continue
             mine = data.isel(trial=np.flatnonzero(data["kind"].values == kinds.index(kind)))
             values = mine["error"].values.astype(float)
+            behind = mine["deviation"].values.astype(float) if "deviation" in mine else np.empty((len(values), 0))
             for view in np.unique(mine["view"].values).tolist():
                 rows = np.flatnonzero(mine["view"].values == view)
                 trials = {
-                    Trial(int(mine["day"][i]), int(mine["capture"][i]), _SWAPPED_GROUPS[int(mine["swapped"][i])]): dict(
-                        zip(folder.measurements, values[i].tolist(), strict=True)
-                    )
+                    Trial(
+                        int(mine["day"][i]), int(mine["capture"][i]), _SWAPPED_GROUPS[int(mine["swapped"][i])]
+                    ): _outcome(folder, values[i], behind[i])
                     for i in rows
                 }
-                folder.take_up(int(view), trials)
-                taken[kind] += len(trials)
+                taken[kind] += folder.take_up(int(view), trials)
     except (KeyError, ValueError, IndexError, TypeError) as problem:
         raise InputError(
             path,
@@ -119,6 +125,25 @@ def take_up_trials(path: Path, folders: Mapping[str, TrialFolder]) -> dict[str, 
             "remove `measured` from the cases file to measure everything again",
         ) from problem
     return taken
+
+
+def _deviations(folder: TrialFolder, outcome: Outcome) -> list[float]:
+    """Return the deviations behind all values that fold, in one row."""
+    return [
+        value for name, count in folder.folded.items() for value in outcome.deviations.get(name, [math.nan] * count)
+    ]
+
+
+def _outcome(folder: TrialFolder, errors: NDArray[np.float64], row: NDArray[np.float64]) -> Outcome:
+    """Return a trial from its errors, and the deviations of its row; without those if the row has another length."""
+    ends = np.cumsum([0, *folder.folded.values()])
+    whole = len(row) == ends[-1]
+    deviations = {
+        name: row[first:end].tolist()
+        for name, first, end in zip(folder.folded, ends[:-1], ends[1:], strict=True)
+        if whole and math.isfinite(errors[folder.measurements.index(name)])
+    }
+    return Outcome(dict(zip(folder.measurements, errors.tolist(), strict=True)), {}, deviations)
 
 
 def _place(trial: Trial) -> tuple[int, int, str]:

@@ -27,6 +27,7 @@ from mitsim.study.virtual.plan import race_rules
 from mitsim.study.virtual.race import ALL, Raced, run_race
 from mitsim.study.virtual.screening import screen
 from mitsim.study.virtual.stated import state_view
+from mitsim.study.virtual.trial_errors import stated_errors_of_trials
 from mitsim.views import View
 from mitsim.views.view_scores import screening_risk
 from tests.proofs.case_trials import CaseTrials, days, keep_trials, measured_choice, measured_truth, trials_by_kind
@@ -39,6 +40,7 @@ Floats = NDArray[np.float64]
 class StatedView:
     """A view's statements, by measurement, and the ``errors`` (measurement, world) in other worlds that judge them.
 
+    Errors of zones are those of parts at the limit of their tolerance, as in the statements.
     ``why`` is the reason why the view was stated.
     """
 
@@ -120,4 +122,5 @@ def _stated(case: PartCase, trials_of_kind: dict[str, CaseTrials], view: View, w
     table = StatementTable(trials=tool.study.file.statement.trials, pairs=0)
     statements = state_view(tool.study, view, tool.runner, tool.trials, tool.unknowns, table)
     apart.measure([view], {view.number: days(count)})
-    return StatedView(view.number, why, tuple(statements), apart.trials.errors(view.number, days(count)))
+    errors = stated_errors_of_trials(apart.study.task, apart.trials, view.number, days(count))
+    return StatedView(view.number, why, tuple(statements), errors)

@@ -105,6 +105,25 @@ def test_a_file_of_other_trials_is_not_taken_up(tmp_path):
     assert np.isnan(same.known(3)[Trial(1 << 20)].errors["one"])
 
 
+def test_deviations_are_kept_with_their_trials(tmp_path):
+    names, folded = ["size", "place", "flat"], {"place": 2, "flat": 3}
+    mine = TrialFolder(tmp_path / "mine", "a" * 16, names, folded)
+    deviations = {"place": [0.25, -1.5], "flat": [0.5, np.nan, 2.0]}
+    mine.add(3, Trial(0), Outcome(dict.fromkeys(names, 0.25), {}, deviations))
+    mine.add(3, Trial(1), Outcome({"size": 0.25, "place": np.nan, "flat": 0.5}, {}, {"flat": [1.0, 2.0, 3.0]}))
+    write_trials(tmp_path / "case.nc", {"tool": mine}, [3])
+    same = TrialFolder(tmp_path / "same", "a" * 16, names, folded)
+    assert take_up_trials(tmp_path / "case.nc", {"tool": same}) == {"tool": 2}
+    for name in folded:
+        kept, first = (one.deviations(3, [Trial(0), Trial(1)], name) for one in (same, mine))
+        np.testing.assert_array_equal(kept, first)
+    # trials that were kept without them are measured again
+    bare = TrialFolder(tmp_path / "bare", "a" * 16, names)
+    bare.add(3, Trial(0), Outcome(dict.fromkeys(names, 0.25)))
+    write_trials(tmp_path / "bare.nc", {"tool": bare}, [3])
+    assert take_up_trials(tmp_path / "bare.nc", {"tool": TrialFolder(tmp_path, "a" * 16, names, folded)})["tool"] == 0
+
+
 @pytest.mark.parametrize("content", [b"", b"no netCDF", b"CDF\x01" + bytes(200)])
 def test_a_file_that_is_none_is_refused(tmp_path, content):
     (tmp_path / "case.nc").write_bytes(content)

@@ -9,6 +9,7 @@ import pytest
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
+from characterisation.tasks.folded import folded_value
 from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, StudyFile, open_study
 from mitsim.study.calibration.accuracy import measured_points
@@ -24,7 +25,7 @@ from mitsim.views.view_scores import score_candidates
 from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
-DISTANCE = "pillar1_pillar2_distance"
+DISTANCE, ANGLE = "pillar1_pillar2_distance", "plane_pillar1_angle"
 
 
 def study_of(sensor, **more):
@@ -139,12 +140,19 @@ def test_what_is_beyond_the_map_is_added_in_predicted_uncertainties(drawn):
     study, plain, view = drawn
     maker = MappedMeasurements(study, study_unknowns(study, ("noise", BEYOND)))
     jobs = [Job(view, Trial(day)) for day in range(3)] + [Job(view, Trial(1, capture=1))]
-    without, with_it = ([outcome.errors[DISTANCE] for _, outcome in one.run(jobs)] for one in (plain, maker))
+    outcomes = [[outcome for _, outcome in one.run(jobs)] for one in (plain, maker)]
+    without, with_it = ([outcome.errors[DISTANCE] for outcome in some] for some in outcomes)
     added = np.subtract(with_it, without)
     sizes = beyond_map().of(study.sensor)
     assert (np.abs(added) <= maker._predicted[view.number][DISTANCE] * sizes.size[-1] * (1 + 1e-9)).all()
     assert len(set(added[:3].round(12).tolist())) == 3
     assert added[3] == pytest.approx(added[1], abs=1e-9)  # of one day: it does not average out
+    # an angle of nominally 0 is moved as a vector, and so stays above 0
+    folded = folded_value(study.task, ANGLE)
+    vectors = [[np.reshape(one.deviations[ANGLE], folded.shape) for one in some] for some in outcomes]
+    moves = folded.size(np.subtract(*vectors))
+    assert moves[3] == pytest.approx(moves[1], abs=1e-9) and (moves > 0).all()
+    assert [one.errors[ANGLE] for one in outcomes[1]] == pytest.approx(folded.size(np.array(vectors[1])))
 
 
 def test_rendered_trials_do_not_depend_on_what_is_beyond_the_map():

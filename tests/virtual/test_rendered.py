@@ -249,7 +249,7 @@ def test_a_statement_from_a_few_trials(coarse_n10, tmp_path):
     study = study_of(coarse_n10, statement={"trials": 6, "pairs": 2}, unknowns={"pose": {"told_mm": 0.1}})
     unknowns = study_unknowns(study)
     maker = measurements_of(study, unknowns)
-    trials = TrialFolder(tmp_path, trial_digest(study, unknowns, "render"), list(study.task.measurements))
+    trials = TrialFolder.of(tmp_path, trial_digest(study, unknowns, "render"), study.task)
     view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
     stated = state_view(study, view, maker, trials, unknowns, study.file.statement)
     assert [one.measurement for one in stated] == list(study.task.measurements)
@@ -266,7 +266,7 @@ def test_a_statement_from_a_few_trials(coarse_n10, tmp_path):
             assert not list(jobs)
             return iter(())
 
-    again = TrialFolder(tmp_path, trial_digest(study, unknowns, "render"), list(study.task.measurements))
+    again = TrialFolder.of(tmp_path, trial_digest(study, unknowns, "render"), study.task)
     assert state_view(study, view, Nobody(), again, unknowns, study.file.statement) == stated
     document = statement_document(study, view, stated, unknowns, "render")
     missing = [one["name"] for one in document["influences"] if not one["included"]]

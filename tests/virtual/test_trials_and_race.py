@@ -1,14 +1,19 @@
 """Trials that are kept, and races between views whose truth is known; nothing is rendered."""
 
 import json
+import math
+import tomllib
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import xarray as xr
 
+from characterisation.files.documents import validate
+from characterisation.tasks.task_file import Task
 from mitsim.study.virtual.race import ALL, FIRST, Job, RaceRules, run_race, shortlist
 from mitsim.study.virtual.race_table import raced_errors, with_race
+from mitsim.study.virtual.trial_errors import errors_of_trials, stated_errors_of_trials
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
 
@@ -188,6 +193,72 @@ def test_reasons_are_kept_with_their_trials_and_old_lines_have_none(tmp_path):
     again = TrialFolder(tmp_path, "d", NAMES)
     assert again.reasons(3, [Trial(0), Trial(1), Trial(2)], "angle") == ["plane: 3 points"]
     assert again.reasons(3, [Trial(0), Trial(1)], "radius") == []
+
+
+FOLDED = {"angle": 3}
+
+
+def test_deviations_are_kept_to_the_last_bit_with_their_gaps(tmp_path):
+    trials = TrialFolder(tmp_path, "d", NAMES, FOLDED)
+    behind = [0.1 + 1e-17, math.nan, -1 / 3]
+    trials.add(3, Trial(0), Outcome({"radius": 0.1, "angle": 0.2}, {}, {"angle": behind}))
+    trials.add(3, Trial(1), Outcome({"radius": 0.1, "angle": math.nan}, {"angle": "plane: 3 points"}))
+    again = TrialFolder(tmp_path, "d", NAMES, FOLDED).deviations(3, [Trial(0), Trial(1)], "angle")
+    np.testing.assert_array_equal(again, [behind, [math.nan] * 3])
+
+
+@pytest.mark.parametrize(
+    "kept", [{}, {"angle": [1.0, 2.0]}, {"angle": "abc"}, {"angle": 3.0}, {"angle": [1, 2, 1e999]}]
+)
+def test_a_kept_trial_without_its_deviations_is_measured_again(tmp_path, kept):
+    trials = TrialFolder(tmp_path, "d", NAMES, FOLDED)
+    trials.add(3, Trial(0), Outcome({"radius": 0.1, "angle": 0.2}, {}, {"angle": [1.0, 2.0, 3.0]}))
+    path = tmp_path / "view_0003.jsonl"
+    good = path.read_text()
+    line = {"day": 1, "capture": 0, "swapped": "", "errors": [0.1, 0.2], "deviations": kept}
+    path.write_text(good + json.dumps(line) + "\n")
+    assert list(TrialFolder(tmp_path, "d", NAMES, FOLDED).known(3)) == [Trial(0)]
+    other = TrialFolder(tmp_path / "other", "d", NAMES, FOLDED)
+    outcomes = {Trial(1): Outcome({"radius": 0.1, "angle": 0.2}), Trial(2): Outcome({"radius": 0.1, "angle": math.nan})}
+    assert other.take_up(3, outcomes) == 1 and list(other.known(3)) == [Trial(2)]
+
+
+ZONES = """
+[features]
+ball = { kind = "sphere", point_mm = [0, 0, 0], radius_mm = 5 }
+[measurements.place]
+kind = "position"
+features = ["ball"]
+nominal = 0
+unit = "mm"
+tolerance = 20
+[measurements.size]
+kind = "radius"
+features = ["ball"]
+nominal = 5
+unit = "mm"
+tolerance = 20
+"""
+
+
+def test_repeats_and_redrawn_trials_are_about_the_same_part(tmp_path):
+    """On every day the part deviates in one direction: an equal error of another capture is read alike."""
+    task = validate("task.toml", tomllib.loads(ZONES), Task)
+    trials, rng = TrialFolder.of(tmp_path, "d", task), np.random.default_rng(1)
+    assert trials.folded == {"place": 3}
+    days = [Trial(day) for day in range(400)]
+    for day in days:
+        error = rng.standard_normal(3)
+        outcome = Outcome({"place": 2 * float(np.linalg.norm(error)), "size": 0.5}, {}, {"place": error.tolist()})
+        trials.add(3, day, outcome)
+        trials.add(3, Trial(day.day, 1), outcome)
+        trials.add(3, Trial(day.day, 0, "pose"), outcome)
+    place, size = errors_of_trials(task, trials, 3, days)
+    assert place.stated.mean() == pytest.approx(0.2, abs=4 * 2 / 20)  # 2 sigma^2 / r for r = 10
+    assert place.stated.std() == pytest.approx(2, rel=0.15)
+    np.testing.assert_array_equal(size, np.full(400, 0.5))
+    for other in ([Trial(day.day, 1) for day in days], [Trial(day.day, 0, "pose") for day in days]):
+        np.testing.assert_array_equal(stated_errors_of_trials(task, trials, 3, other)[0], place.stated)
 
 
 def test_trials_of_another_study_are_moved_aside_and_not_used(tmp_path):

@@ -32,6 +32,7 @@ from characterisation.files.datasets import Schema, Variable, read_dataset
 from characterisation.files.errors import InputError
 from characterisation.statements.decision import demand, tolerance_of
 from characterisation.statements.statement import Statement
+from characterisation.tasks.folded import folded_values
 from characterisation.tasks.task_file import Task
 from mitsim.maps.campaign.run import write_netcdf
 from mitsim.running.executor import Executor
@@ -204,6 +205,7 @@ def _screened(candidate: CandidateSensor, folder: Path) -> SensorResult:
     able = scores["uncertainty_possible"].transpose("measurement", "view").values.astype(bool) & (u > 0)
     best = np.where(able, screening_risk(scores), np.inf).argmin(axis=1)
     least = np.take_along_axis(np.where(able, u, np.inf), best[:, None], axis=1)[:, 0]
+    least = least * stated_shares(study.task)
     demands = [
         _screened_demand(study.task, name, float(size))
         for name, size in zip(study.task.measurements, least, strict=True)
@@ -233,6 +235,15 @@ def _kept(path: Path, digest: str) -> xr.Dataset | None:
     except InputError:
         return None
     return scores if scores.attrs.get("digest") == digest else None
+
+
+def stated_shares(task: Task) -> Floats:
+    """Return the stated over the predicted standard uncertainty of every measurement, for errors of equal size.
+
+    Screening predicts the error of a nominal part; the statement of a zone is about a part at its limit.
+    """
+    folded = folded_values(task)
+    return np.array([folded[name].far_share() if name in folded else 1.0 for name in task.measurements])
 
 
 def screened_errors(u: float) -> Floats:
@@ -275,7 +286,7 @@ def _prepared(one: SensorResult, folder: Path, workers: Executor | None) -> _Wor
     virtual_measurements = measurements_of(study, unknowns)
     runner = spread_over(workers, study, unknowns, virtual_measurements)
     digest = trial_digest(study, unknowns, runner.source)
-    trials = TrialFolder(folder / "trials", digest, list(study.task.measurements))
+    trials = TrialFolder.of(folder / "trials", digest, study.task)
     return _Workspace(candidate, unknowns, virtual_measurements, runner, trials, digest, folder)
 
 

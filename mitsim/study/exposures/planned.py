@@ -62,7 +62,7 @@ class Exposed:
         """Return the folder of the trials: ``own`` for the sensor's own exposure, otherwise one inside ``folder``."""
         if self.planned is None:
             return own
-        return TrialFolder(folder / "planned_trials", self.digest, list(study.task.measurements))
+        return TrialFolder.of(folder / "planned_trials", self.digest, study.task)
 
 
 def exposed_for(

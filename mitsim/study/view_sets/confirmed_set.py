@@ -31,6 +31,7 @@ from mitsim.study.exposures.planned import with_exposure
 from mitsim.study.view_sets.joined import JoinedMeasurements
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import digits
+from mitsim.study.virtual.trial_errors import errors_of_trials
 from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import SET_DAYS, Trial
 
@@ -163,7 +164,7 @@ def state_set(
     decided_by = with_exposure(
         digest, None, ["set", list(chosen.views), table.joining, list(table.pose_known), _JOINING_VERSION]
     )
-    trials = TrialFolder(folder / "set_trials" / decided_by, decided_by, list(study.task.measurements))
+    trials = TrialFolder.of(folder / "set_trials" / decided_by, decided_by, study.task)
     by_number = {view.number: view for view in study.views}
     runner = JoinedMeasurements(renderer, [by_number[number] for number in chosen.views], table)
     days = [SET_DAYS + k for k in range(table.trials)]
@@ -171,7 +172,7 @@ def state_set(
     for day, outcome in track(runner.run(missing), "confirm the set", len(missing)):
         trials.add(0, Trial(day), outcome)
     wanted = [Trial(day) for day in days]
-    found = trials.errors(0, wanted)
+    found = errors_of_trials(study.task, trials, 0, wanted)
     return [
         replace(
             statement(name, asked.unit, found[m], tolerance_of(study.task, name)),

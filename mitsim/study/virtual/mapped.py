@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
 from characterisation.tasks.evaluation import measure
+from characterisation.tasks.folded import folded_values
 from mitsim.decode.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import one_ahead
 from mitsim.maps.prediction import CharacterisedScene, Predictor
@@ -63,6 +64,7 @@ class MappedMeasurements:
         self._has_form = any(unknowns.table.form.features.values())
         self._beyond_sizes = beyond_map().of(study.sensor) if BEYOND in unknowns.varied else None
         self._predicted: dict[int, dict[str, float]] = {}
+        self._folded = folded_values(study.task)
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
         """Return the jobs sorted by view."""
@@ -111,17 +113,24 @@ class MappedMeasurements:
             self._predicted[view.number] = dict(zip(scores["measurement"].values.tolist(), row, strict=True))
 
     def _with_beyond(self, found: Outcome, view: View, world: World) -> Outcome:
-        """Add effects outside the map; NaN if screening rates a measurement as impossible."""
+        """Add effects outside the map; NaN if screening rates a measurement as impossible.
+
+        An effect on a value that folds is a deviation in a random direction.
+        """
         if self._beyond_sizes is None:
             return found
         sizes = self._beyond_sizes.draw(np.random.default_rng(world.beyond), len(found.errors))
         predicted = self._predicted[view.number]
-        errors = {
-            name: error + predicted[name] * size
-            for (name, error), size in zip(found.errors.items(), sizes, strict=True)
-        }
+        added = {name: predicted[name] * float(size) for name, size in zip(found.errors, sizes, strict=True)}
+        errors = {name: error + added[name] for name, error in found.errors.items()}
+        deviations = {}
+        for name, rows in found.deviations.items():
+            folded = self._folded[name]
+            moved = folded.moved(np.reshape(rows, folded.shape), added[name], world.beyond)
+            errors[name] = folded.error(moved)
+            deviations[name] = moved.ravel().tolist()
         impossible = {name: _NOT_PREDICTED for name in errors if not np.isfinite(predicted[name])}
-        return Outcome(errors, impossible | dict(found.reasons))
+        return Outcome(errors, impossible | dict(found.reasons), deviations)
 
     def _scene(self, finish: int) -> CharacterisedScene:
         if finish not in self._characterised:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from characterisation.files.errors import InputError
+from characterisation.tasks.folded import folded_values
 from mitsim.capture.simulated.indirect_light import IndirectLight
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.maps.campaign.plan import sensor_checksum
@@ -113,6 +114,9 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: 
             np.array([v.world_from_sensor.matrix().round(9) for v in study.views]).tobytes()
         ).hexdigest(),
     }
+    folded = folded_values(study.task)
+    if folded:
+        content["deviations"] = {name: one.shape for name, one in folded.items()}
     if separate_light or not unknowns.pooled:
         content["apart"] = [separate_light, unknowns.pooled]
     if source == "map":

@@ -16,6 +16,7 @@ from characterisation.files.atomic_io import json_values, write_json
 from characterisation.statements.budget import budget
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import common_losses, losses
+from characterisation.statements.one_sided import stated_errors
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
 from mitsim.running.progress import track
@@ -25,6 +26,7 @@ from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable, Study
 from mitsim.study.virtual.influences import influences
 from mitsim.study.virtual.race import Job, TrialRunner
+from mitsim.study.virtual.trial_errors import errors_of_trials, stated_errors_of_trials
 from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, STATEMENT_DAYS, Trial, Unknowns
 from mitsim.views import View
@@ -46,22 +48,23 @@ def state_view(
     missing = [Job(view, trial) for trial in wanted if trial not in trials.known(view.number)]
     for job, outcome in track(runner.run(runner.in_order(missing)), f"state view {view.number}", len(missing)):
         trials.add(view.number, job.trial, outcome)
-    found = trials.errors(view.number, base)
-    second = trials.errors(view.number, repeats)
-    again = {group: trials.errors(view.number, some) for group, some in swapped.items()}
+    by_trial = errors_of_trials(study.task, trials, view.number, base)
+    second = stated_errors_of_trials(study.task, trials, view.number, repeats)
+    again = {group: stated_errors_of_trials(study.task, trials, view.number, some) for group, some in swapped.items()}
     out = []
     for m, (name, asked) in enumerate(study.task.measurements.items()):
-        known = found[m][[math.isfinite(error) for error in found[m]]]
+        found = stated_errors(by_trial[m])
+        known = found[[math.isfinite(error) for error in found]]
         lines = (
             budget(
-                found[m, : len(pairs)],
+                found[: len(pairs)],
                 {group: errors[m] for group, errors in again.items()},
                 float(known.var(ddof=1)) if len(known) > 1 else None,
             )
             if pairs and len(known) > 1
             else ()
         )
-        stated = statement(name, asked.unit, found[m], tolerance_of(study.task, name), lines, second[m])
+        stated = statement(name, asked.unit, by_trial[m], tolerance_of(study.task, name), lines, second[m])
         out.append(replace(stated, losses=losses(trials.reasons(view.number, base, name))))
     return out
 

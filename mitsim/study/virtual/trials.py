@@ -3,6 +3,9 @@
 A file starts with a digest of everything that determines a trial: sensor, part, task, unknowns, pose, and how captures
 are made. It is used only with the same digest; a file with another digest is moved aside, never overwritten. If a line
 is incomplete, because of a kill or a full disk, it is dropped and its trial is repeated.
+
+Of a value that folds, such as a zone, a trial keeps the deviations from nominal that it measured. A statement adds them
+to the deviation of a part at its limit (:mod:`mitsim.study.virtual.trial_errors`).
 """
 
 from __future__ import annotations
@@ -20,6 +23,8 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.tasks.evaluation import Measured
+from characterisation.tasks.folded import folded_values
+from characterisation.tasks.task_file import Task
 from mitsim.study.virtual.world import GROUPS, Trial
 
 
@@ -27,11 +32,13 @@ from mitsim.study.virtual.world import GROUPS, Trial
 class Outcome:
     """Outcome of a virtual measurement: ``errors`` in mm or deg, NaN without a value, by measurement.
 
-    ``reasons`` says why a measurement has no value.
+    ``reasons`` says why a measurement has no value. ``deviations`` are those (k m,) from nominal behind a value that
+    folds, row by row (:mod:`characterisation.tasks.deviations`); NaN where a form has no points.
     """
 
     errors: Mapping[str, float]
     reasons: Mapping[str, str] = field(default_factory=dict)
+    deviations: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, measured: Mapping[str, Measured]) -> Outcome:
@@ -39,6 +46,7 @@ class Outcome:
         return cls(
             {name: float(one.error) for name, one in measured.items()},
             {name: one.reason for name, one in measured.items() if not one.possible},
+            {name: one.deviations.ravel().tolist() for name, one in measured.items() if one.deviations is not None},
         )
 
 
@@ -47,11 +55,24 @@ _MOST_DAYS = 2**62
 
 
 class TrialFolder:
-    """Trials of one study in a folder, one file for each view; ``digest`` identifies the study."""
+    """Trials of one study in a folder, one file for each view; ``digest`` identifies the study.
 
-    def __init__(self, folder: str | Path, digest: str, measurements: Sequence[str]) -> None:
+    ``folded`` has the number of deviations of every measurement whose values fold. A kept trial that lacks them is
+    measured again.
+    """
+
+    def __init__(
+        self, folder: str | Path, digest: str, measurements: Sequence[str], folded: Mapping[str, int] | None = None
+    ) -> None:
         self.folder, self.digest, self.measurements = Path(folder), digest, tuple(measurements)
+        self.folded = dict(folded or {})
         self._known: dict[int, dict[Trial, Outcome]] = {}
+
+    @classmethod
+    def of(cls, folder: str | Path, digest: str, task: Task) -> TrialFolder:
+        """Return the trials of a task in a folder."""
+        folded = {name: math.prod(one.shape) for name, one in folded_values(task).items()}
+        return cls(folder, digest, list(task.measurements), folded)
 
     def known(self, view: int) -> dict[Trial, Outcome]:
         """Return the finished trials of a view; the file is read once."""
@@ -59,24 +80,32 @@ class TrialFolder:
             self._known[view] = self._read(view)
         return self._known[view]
 
-    def take_up(self, view: int, trials: Mapping[Trial, Mapping[str, float]]) -> None:
-        """Add trials whose errors are kept elsewhere; they are not written again."""
+    def take_up(self, view: int, trials: Mapping[Trial, Outcome]) -> int:
+        """Add trials that are kept elsewhere, and return their number; they are not written again.
+
+        Trials without the deviations behind their values are left out.
+        """
         known = self.known(view)
-        for trial, errors in trials.items():
-            known.setdefault(trial, Outcome(dict(errors)))
+        whole = {trial: outcome for trial, outcome in trials.items() if self._whole(outcome)}
+        for trial, outcome in whole.items():
+            known.setdefault(trial, outcome)
+        return len(whole)
 
     def add(self, view: int, trial: Trial, outcome: Outcome) -> None:
         """Keep a finished trial; it is on the disk when this function returns."""
         known, path = self.known(view), self._path(view)
         values = {name: float(outcome.errors[name]) for name in self.measurements}
-        line = {
+        deviations = {name: list(outcome.deviations[name]) for name in self.folded if name in outcome.deviations}
+        line: dict[str, Any] = {
             "day": trial.day,
             "capture": trial.capture,
             "swapped": trial.swapped,
-            "errors": [value if math.isfinite(value) else None for value in values.values()],
+            "errors": [_number(value) for value in values.values()],
         }
         if outcome.reasons:
             line["reasons"] = dict(outcome.reasons)
+        if deviations:
+            line["deviations"] = {name: [_number(one) for one in some] for name, some in deviations.items()}
         try:
             fresh = not path.exists()
             if fresh:
@@ -89,12 +118,17 @@ class TrialFolder:
                 os.fsync(stream.fileno())
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(path)) from None
-        known[trial] = Outcome(values, dict(outcome.reasons))
+        known[trial] = Outcome(values, dict(outcome.reasons), deviations)
 
     def errors(self, view: int, trials: Sequence[Trial]) -> NDArray[np.float64]:
         """Return the errors (measurements, trials) of finished trials of a view."""
         known = self.known(view)
         return np.array([[known[trial].errors[name] for trial in trials] for name in self.measurements], float)
+
+    def deviations(self, view: int, trials: Sequence[Trial], measurement: str) -> NDArray[np.float64]:
+        """Return the deviations (trials, k m) behind a value that folds; NaN in trials without a value."""
+        known, none = self.known(view), [math.nan] * self.folded[measurement]
+        return np.array([known[trial].deviations.get(measurement, none) for trial in trials], float)
 
     def reasons(self, view: int, trials: Sequence[Trial], measurement: str) -> list[str]:
         """Return the known reasons why a measurement has no value in finished trials of a view."""
@@ -141,6 +175,10 @@ class TrialFolder:
             trial = Trial(int(table["day"]), int(table["capture"]), str(table["swapped"]))
             values = [math.nan if value is None else float(value) for value in table["errors"]]
             reasons = {str(name): str(reason) for name, reason in table.get("reasons", {}).items()}
+            deviations = {
+                str(name): [math.nan if value is None else float(value) for value in some]
+                for name, some in table.get("deviations", {}).items()
+            }
         except (
             AttributeError,
             TypeError,
@@ -156,7 +194,21 @@ class TrialFolder:
             return None
         if not (0 <= trial.day < _MOST_DAYS and 0 <= trial.capture < _MOST_DAYS):
             return None
-        return trial, Outcome(dict(zip(self.measurements, values, strict=True)), reasons)
+        outcome = Outcome(dict(zip(self.measurements, values, strict=True)), reasons, deviations)
+        return (trial, outcome) if self._whole(outcome) else None
+
+    def _whole(self, outcome: Outcome) -> bool:
+        """Return whether every value that folds has its deviations, and no infinite number is among them."""
+        return all(
+            len(outcome.deviations.get(name, ())) == count
+            and not any(math.isinf(value) for value in outcome.deviations[name])
+            for name, count in self.folded.items()
+            if math.isfinite(outcome.errors[name])
+        )
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _parsed(line: str) -> Any:
