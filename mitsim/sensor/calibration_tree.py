@@ -30,6 +30,7 @@ from scipy.io import loadmat, whosmat
 
 from characterisation.checked_files import read_bounded
 from characterisation.errors import InputError, nearest
+from mitsim.sensor.mat_structure import check_mat
 
 #: endings of names in MATLAB's toolbox and similar programs: one camera, the cameras of a pair, camera and projector
 _ENDINGS = ("", "_left", "_right", "_cam", "_proj", "_camera", "_projector")
@@ -110,6 +111,7 @@ def read_tree(files: list[Path]) -> CalibrationTree:
 def _read(file: Path) -> dict[str, Any]:
     data = read_bounded(file, _KINDS, "" if file.exists() else _beside(file), largest=_LARGEST)
     if file.suffix.lower() == ".mat":
+        check_mat(file, data, 8 * _MOST_NUMBERS)
         try:
             sizes = [math.prod(shape) for _, shape, _ in whosmat(BytesIO(data))]
             if sum(sizes) > _MOST_NUMBERS:
