@@ -13,6 +13,7 @@ import math
 import struct
 import zlib
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from characterisation.errors import InputError
@@ -185,7 +186,7 @@ def _check_sparse(read: _Bytes, data: memoryview, shape: tuple[int, ...], parts:
             raise read.fault("a sparse matrix without its indices")
         found.append(struct.unpack(f"{read.order}{len(content) // 4}i", content))
     rows, starts = found
-    rising = all(a <= b for a, b in zip(starts, starts[1:], strict=False))
+    rising = all(a <= b for a, b in pairwise(starts))
     if len(starts) != shape[1] + 1 or starts[0] != 0 or not rising or starts[-1] > len(rows):
         raise read.fault("a sparse matrix whose columns do not follow one another")
     if not all(0 <= row < shape[0] for row in rows[: starts[-1]]):
