@@ -24,8 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.checked_files import read_bounded
+from characterisation.documents import shown
 from characterisation.errors import InputError
 from mitsim.capture.png import LONGEST_SIDE_PX
+from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import Transform
 
@@ -122,8 +124,8 @@ class _Fields:
 
     def fault(self, field: str, allowed: str) -> InputError:
         value = self.get(field)
-        found = "nothing" if value is None else repr(value)
-        return InputError(self.path, self.base + field, found if len(found) <= 80 else found[:77] + "...", allowed)
+        found = "nothing" if value is None else shown(value, self.path)
+        return InputError(self.path, self.base + field, found, allowed)
 
 
 def _calibration(fields: _Fields, path: Path) -> DepthaiCalibration:
@@ -142,9 +144,13 @@ def _calibration(fields: _Fields, path: Path) -> DepthaiCalibration:
         if not each.get("width") and not each.get("height"):
             continue  # a socket without a camera
         cameras[socket] = _camera(each)
+        check_camera(cameras[socket], path, f"cameraData.{socket}.intrinsicMatrix")
         to = each.integer("extrinsics.toCameraSocket", -1, 100)
         if to >= 0 and each.get("extrinsics.rotationMatrix"):
             steps[socket] = (to, _extrinsics(each), _translation(each, "extrinsics.specTranslation"))
+    if not cameras:
+        hint = "the device was not calibrated, or another file of it has the calibration of the factory"
+        raise InputError(path, "cameraData", "no cameras in this calibration", "the cameras of a pair", hint)
     left = fields.integer("stereoRectificationData.leftCameraSocket", 0, 100)
     right = fields.integer("stereoRectificationData.rightCameraSocket", 0, 100)
     for side, socket in (("left", left), ("right", right)):

@@ -109,6 +109,8 @@ def read_organised_cloud(
     rig, found = _seen_by(points, path, given, camera, turn)
     settings |= found
     points = rig.reference.sensor_from_camera.points(points).astype(np.float32)
+    if given is not None and given.notes:
+        settings["warnings"] = list(given.notes)
     if given is not None and given.range_mm is not None:
         settings |= {"near_mm": given.range_mm[0], "far_mm": given.range_mm[1]}
     return Capture(
