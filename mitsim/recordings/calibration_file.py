@@ -135,8 +135,25 @@ def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], w
     camera = calibrated.rig.reference if name is None else cameras[name]
     if (camera.width, camera.height) != size:
         allowed = f"{camera.width} x {camera.height} px, as the calibration says"
-        raise InputError(where, "size", f"{size[0]} x {size[1]} px", allowed)
+        raise InputError(where, "size", f"{size[0]} x {size[1]} px", allowed, _scaled_hint(camera, size))
     return camera
+
+
+def _scaled_hint(camera: Camera, size: tuple[int, int]) -> str:
+    """Return the optics of images scaled from the calibrated size, as a hint; empty if the sides differ in scale.
+
+    Pixel centres lie at integers.
+    """
+    scale = size[0] / camera.width
+    if abs(scale * camera.height - size[1]) > 1:
+        return ""
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    centre = [round((place + 0.5) * scale - 0.5, 3) for place in (cx, cy)]
+    focal = [round(each * scale, 3) for each in (fx, fy)]
+    return (
+        f"if the images are scaled by {scale:g}, give a TOML with [cameras.NAME]: width = {size[0]}, "
+        f"height = {size[1]}, focal_px = {focal}, principal_px = {centre}, and the same distortion"
+    )
 
 
 def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:

@@ -51,7 +51,7 @@ def with_usual_names(tree: dict[str, Any]) -> dict[str, Any]:
     for name, holder in [("", tree), *((name, value) for name, value in tree.items() if isinstance(value, dict))]:
         if isinstance(holder.get("CameraParameters1"), dict):
             out |= _toolbox_pair(holder, name)
-        elif found := _toolbox_camera(holder, name, "", {}):
+        elif found := _toolbox_camera(holder, name, "1", {}):
             out |= found
             if not name:  # its pixels count from 1, so it is no K of OpenCV
                 out.pop("K", None)

@@ -51,9 +51,14 @@ UNITS_MM = {
 #: names under which files state their unit of length
 _UNIT_NAMES = ("unit", "units", "length_unit", "world_units", "WorldUnits", "translation_unit", "baseline_unit")
 
+#: units of other quantities that may have the same name
+_NOT_LENGTHS = ("px", "pixel", "pixels", "deg", "degree", "degrees", "rad", "radian", "radians", "none")
+
 #: OpenCV's lens models by the names that programs give them
 _MODELS = {
-    **dict.fromkeys(("plumb_bob", "radtan", "rational_polynomial", "none", "pinhole", "perspective"), "perspective"),
+    **dict.fromkeys(
+        ("plumb_bob", "radtan", "rational_polynomial", "brown_conrady", "none", "pinhole", "perspective"), "perspective"
+    ),
     **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt", "kb4"), "fisheye"),
 }
 
@@ -210,13 +215,22 @@ def of_images(
     )
 
 
-def lens_model(table: dict[str, Any], where: str | Path, given: str | None = None) -> str | None:
+def lens_model(
+    table: dict[str, Any], where: str | Path, given: str | None = None, straight: bool = False
+) -> str | None:
     """Return ``perspective`` or ``fisheye`` if a table states the lens model; None if it does not.
+
+    Parameters
+    ----------
+    given
+        Model that the sensor file gives.
+    straight
+        Whether all coefficients are zero, so that the distortion model does not matter.
 
     Raises
     ------
     InputError
-        If the model is none of OpenCV's, or contradicts the ``given`` one.
+        If the model is none of OpenCV's, or contradicts the given one.
     """
     found: str | None = None
     for name in ("camera_model", "distortion_model"):
@@ -224,7 +238,7 @@ def lens_model(table: dict[str, Any], where: str | Path, given: str | None = Non
         if not isinstance(text, str) or not text:
             continue
         known = _MODELS.get(text.lower())
-        other = text.lower() in _OTHER_MODELS if name == "camera_model" else known is None
+        other = text.lower() in _OTHER_MODELS if name == "camera_model" else known is None and not straight
         if other and given is None:
             hint = 'if the coefficients are OpenCV\'s, say so in a sensor file: model = "perspective" or "fisheye"'
             raise InputError(where, name, repr(text), f"OpenCV's models: {', '.join(_MODELS)}", hint)
@@ -246,6 +260,8 @@ def unit_mm(table: dict[str, Any], where: str | Path) -> float | None:
         text = table.get(name)
         if isinstance(text, str) and text:
             unit = UNITS_MM.get(text.lower(), UNITS_MM.get(text.lower().removesuffix("s")))
+            if unit is None and text.lower() in _NOT_LENGTHS:
+                continue
             if unit is None:
                 hint = "say the unit in a sensor file: [calibration] with to_mm"
                 raise InputError(where, name, repr(text), ", ".join(UNITS_MM), hint)

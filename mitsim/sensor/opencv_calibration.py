@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 from characterisation.documents import Document, validate
 from characterisation.errors import InputError, nearest
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
+from mitsim.sensor.calibration_programs import vector
 from mitsim.sensor.calibration_qualifiers import (
     baseline_note,
     lens_model,
@@ -223,14 +224,17 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
     matrix = values.find(name, place, "matrix", ((3, 3),), needed="focal_px" not in own)
     table = {} if matrix is None else matrix.table
     values.tables.append(table)
+    found = values.find(name, place, "distortion", ((0,), (4,), (5,), (8,), (12,), (14,)), needed=False)
+    distortion = np.empty(0) if found is None else found.value
     model = None
     if place < 2:
-        model = lens_model(table, file if matrix is None else matrix.file, calibration_table.model)
-    model = model or (calibration_table.model if place < 2 else None) or "perspective"
-    counts = ((4,),) if model == "fisheye" else ((4,), (5,), (8,), (12,), (14,))
-    distortion = values.find(name, place, "distortion", ((0,), *counts), needed=False)
-    size = _size(values, name, place)
-    out: dict[str, Any] = {"model": model, "distortion": [] if distortion is None else distortion.value.tolist()}
+        stating = file if matrix is None else matrix.file
+        model = lens_model(table, stating, calibration_table.model, not distortion.any()) or calibration_table.model
+    model = model or "perspective"
+    if model == "fisheye" and len(distortion) not in (0, 4):
+        raise InputError(file, f"distortion of {name}", f"{len(distortion)} numbers", "4, as of a fisheye lens")
+    size = _size(values, name, place, table)
+    out: dict[str, Any] = {"model": model, "distortion": distortion.tolist()}
     if matrix is not None:
         K = _checked_matrix(matrix.value, name, file)
         read_out = read_out_of(table, matrix.file)
@@ -255,12 +259,18 @@ def _checked_matrix(K: NDArray[np.float64], name: str, file: str) -> NDArray[np.
     return K
 
 
-def _size(values: _Values, name: str, place: int) -> tuple[int, int] | None:
-    """Return the image size (width, height) [px] of an eye that the files state; None without one."""
+def _size(values: _Values, name: str, place: int, table: dict[str, Any]) -> tuple[int, int] | None:
+    """Return the image size (width, height) [px] of an eye that the files state; None without one.
+
+    ``table`` has the matrix of the eye; an ``image_width`` and ``image_height`` beside the matrix come first.
+    """
     size = values.find(name, place, "size", ((2,),), needed=False)
     if size is not None:
         return int(size.value[0]), int(size.value[1])
+    beside = [vector(table.get(key), 1) for key in ("image_width", "image_height")]
     own_file = values.calibration_table.keys.get(name, EyeKeys()).file
+    if beside[0] is not None and beside[1] is not None and (place < 2 or own_file or table is not values.tables[0]):
+        return int(beside[0][0]), int(beside[1][0])
     if place == 2 and not own_file:
         return None
     sides = [values.tree.find(f"{own_file}:{key}" if own_file else key) for key in ("image_width", "image_height")]

@@ -85,15 +85,16 @@ def _documents(file: Path, text: str, allowed: str) -> list[Any]:
 
     for event in yaml.parse(text, Loader=_LOADER):
         match event:
-            case yaml.DocumentStartEvent():
-                anchors.clear()
             case yaml.ScalarEvent():
-                value = event.value if event.style or event.tag else _scalar(event.value)
-                if event.tag and event.tag.endswith((":float", ":int")):
-                    value = _scalar(event.value)
+                is_key = bool(open_nodes) and open_nodes[-1].expects_key
+                is_number = (event.tag or "").endswith((":float", ":int"))
+                is_text = is_key or (bool(event.style or event.tag) and not is_number)
+                value = event.value if is_text else _scalar(event.value)
                 if event.anchor:
                     anchors[event.anchor] = (value, 1)
                 put(value, 1)
+            case yaml.DocumentStartEvent():
+                anchors.clear()
             case yaml.AliasEvent():
                 if event.anchor not in anchors:  # unknown, or an alias inside its own value
                     raise InputError(file, "", f"an alias of an unknown value: *{event.anchor}", allowed)
@@ -120,6 +121,11 @@ class _Node:
         self.items: list[Any] = []
         self.count = 1
 
+    @property
+    def expects_key(self) -> bool:
+        """Return whether the next value is a key of a map."""
+        return self.is_map and len(self.items) % 2 == 0
+
     def add(self, value: Any, count: int) -> None:
         self.items.append(value)
         self.count += count
@@ -134,6 +140,8 @@ class _Node:
             if name in out:
                 raise InputError(self.file, name, f"the key twice in the map of line {self.line}", "each key once")
             out[name] = value
+        if isinstance(out.get("<<"), dict):  # a merge key: its map's keys come after those of this map
+            out = {**out.pop("<<"), **out}
         return matrix_of(out) if {"rows", "cols", "data"} <= set(out) else out
 
 
@@ -146,7 +154,8 @@ def matrix_of(table: dict[str, Any]) -> Any:
     try:
         channels = int(re.sub(r"\D", "", str(table.get("dt", ""))) or 1)
         shape = int(table["rows"]), int(table["cols"]), *([channels] if channels > 1 else [])
-        return np.asarray(table["data"], float).reshape(shape)
+        numbers = np.asarray(table["data"], np.float32 if str(table.get("dt", "")).endswith("f") else float)
+        return numbers.astype(float).reshape(shape)
     except (ValueError, TypeError, OverflowError):
         return "a matrix that cannot be read"
 
