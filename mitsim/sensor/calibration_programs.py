@@ -124,22 +124,29 @@ def _toolbox_pair(pair: dict[str, Any], name: str) -> dict[str, Any]:
     for number, camera in zip("12", cameras, strict=True):
         if isinstance(camera, dict):
             out |= _toolbox_camera(camera, _dotted(name, f"CameraParameters{number}"), number, units)
-    pose, sources = pair.get("PoseCamera2"), (_dotted(name, "PoseCamera2"),)
+    motion, sources = _toolbox_pose(pair)
+    if motion is not None:
+        names = tuple(_dotted(name, source) for source in sources)
+        out |= {"+R": Composed(motion[0], names, units), "+T": Composed(motion[1], names, units)}
+    return out
+
+
+def _toolbox_pose(
+    pair: dict[str, Any],
+) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]] | None, tuple[str, ...]]:
+    """Return R and T from the first to the second camera, and the names of their sources; None without a pose."""
+    pose = pair.get("PoseCamera2")
     if isinstance(pose, dict):
-        pose = pose.get("A", pose)
+        turn, shift = vector(pose.get("R"), 9), vector(pose.get("Translation"), 3)
+        if turn is not None and shift is not None:
+            return (turn.reshape(3, 3), shift), ("PoseCamera2",)
+        pose = pose.get("A")
     motion = vector(pose, 16)
     if motion is not None:
-        R, T = motion.reshape(4, 4)[:3, :3], motion.reshape(4, 4)[:3, 3]
-    elif isinstance(pose, dict):
-        turn, shift = vector(pose.get("R"), 9), vector(pose.get("Translation"), 3)
-        R, T = (None, None) if turn is None or shift is None else (turn.reshape(3, 3), shift)
-    else:
-        turn, shift = vector(pair.get("RotationOfCamera2"), 9), vector(pair.get("TranslationOfCamera2"), 3)
-        R, T = (None, None) if turn is None or shift is None else (turn.reshape(3, 3).T, shift)
-        sources = (_dotted(name, "RotationOfCamera2"), _dotted(name, "TranslationOfCamera2"))
-    if R is not None and T is not None:
-        out |= {"+R": Composed(R, sources, units), "+T": Composed(T, sources, units)}
-    return out
+        return (motion.reshape(4, 4)[:3, :3], motion.reshape(4, 4)[:3, 3]), ("PoseCamera2",)
+    names = "RotationOfCamera2", "TranslationOfCamera2"
+    turn, shift = vector(pair.get(names[0]), 9), vector(pair.get(names[1]), 3)
+    return (None if turn is None or shift is None else (turn.reshape(3, 3).T, shift)), names
 
 
 def _toolbox_camera(camera: dict[str, Any], name: str, number: str, units: dict[str, Any]) -> dict[str, Any]:

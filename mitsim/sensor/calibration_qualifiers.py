@@ -139,7 +139,8 @@ def read_out_of(table: dict[str, Any], where: str | Path) -> ReadOut | None:
     InputError
         If a stated value is not a whole number of pixels.
     """
-    roi = table.get("roi") if isinstance(table.get("roi"), dict) else {}
+    stated = table.get("roi")
+    roi: dict[str, Any] = stated if isinstance(stated, dict) else {}
     values = []
     for holder, name, field in (
         *((roi, name, f"roi.{name}") for name in ("x_offset", "y_offset", "width", "height")),
@@ -295,6 +296,6 @@ def rectified_pair(
             return None
         turns.append(R.reshape(3, 3))
         shifts.append(np.array([P[3] / P[0], P[7] / P[5], 0.0]))
-    if np.array_equal(*shifts):
+    if np.array_equal(shifts[0], shifts[1]):
         return None
     return turns[1].T @ turns[0], turns[1].T @ (shifts[1] - shifts[0])

@@ -86,11 +86,12 @@ class CalibrationTree:
             value, table = _stepped(self.values[i], name)
             if value is None:
                 continue
+            self.seen.add((i, name))
             if isinstance(value, Composed):
                 self.seen.update((i, source) for source in value.sources)
-                value, table = value.value, value.table
-            self.seen.add((i, name))
-            found.append((path, value, table))
+                found.append((path, value.value, value.table))
+            else:
+                found.append((path, value, table))
         if not found:
             return None
         first, value, _ = found[0]

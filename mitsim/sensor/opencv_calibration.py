@@ -239,8 +239,8 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
         K = _checked_matrix(matrix.value, name, file)
         read_out = read_out_of(table, matrix.file)
         if read_out is not None:
-            given = (own.get("width"), own.get("height"))
-            images = (given[0], given[1]) if all(isinstance(side, int) for side in given) else values.size
+            width, height = own.get("width"), own.get("height")
+            images = (width, height) if isinstance(width, int) and isinstance(height, int) else values.size
             K, size, note = of_images(K, size, read_out, images)
             if note:
                 values.notes.append(f"calibration {matrix.file.name}: {name}: {note}")
