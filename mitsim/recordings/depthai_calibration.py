@@ -36,6 +36,9 @@ _FISHEYE, _PERSPECTIVE = 1, 0
 
 _CM = 10.0
 
+#: socket that means none, as does -1
+_NO_SOCKET = 255
+
 
 @dataclass(frozen=True)
 class DepthaiCalibration:
@@ -151,12 +154,14 @@ def _calibration(fields: _Fields, path: Path) -> DepthaiCalibration:
     if not cameras:
         hint = "the device was not calibrated, or another file of it has the calibration of the factory"
         raise InputError(path, "cameraData", "no cameras in this calibration", "the cameras of a pair", hint)
-    left = fields.integer("stereoRectificationData.leftCameraSocket", 0, 100)
-    right = fields.integer("stereoRectificationData.rightCameraSocket", 0, 100)
+    left = fields.integer("stereoRectificationData.leftCameraSocket", -1, _NO_SOCKET)
+    right = fields.integer("stereoRectificationData.rightCameraSocket", -1, _NO_SOCKET)
     for side, socket in (("left", left), ("right", right)):
         if socket not in cameras:
             known = ", ".join(map(str, cameras)) or "none"
-            raise InputError(path, f"stereoRectificationData.{side}CameraSocket", socket, f"one of cameraData: {known}")
+            field = f"stereoRectificationData.{side}CameraSocket"
+            found = f"{socket}: no pair of cameras" if socket in (-1, _NO_SOCKET) else socket
+            raise InputError(path, field, found, f"one of cameraData: {known}")
     motion, spec = _between(left, right, steps, path)
     name = fields.get("productName") or fields.get("boardName")
     return DepthaiCalibration(cameras, left, right, motion, spec, name if isinstance(name, str) and name else "depthai")

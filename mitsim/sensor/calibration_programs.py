@@ -10,6 +10,8 @@ sources and the table that qualifies it (:mod:`mitsim.sensor.calibration_qualifi
   are transposed; ``K`` and ``PoseCamera2`` (R2022b and later) act on column vectors.
 - Kalibr (``camchain.yaml``): K is (fu, fv, pu, pv); ``T_cn_cnm1`` takes coordinates of the camera before to this
   one, in metres.
+- ORB-SLAM, librealsense and others: ``fx``, ``fy``, ``cx`` (or ``ppx``), ``cy`` and ``k1``, ``k2``, ``p1``, ``p2``,
+  ``k3`` as single numbers, in a map or behind ``Camera.``.
 - ROS: a message ``sensor_msgs/CameraInfo`` has the values of a calibration file as flat lists, under one letter each.
 """
 
@@ -47,7 +49,7 @@ class Composed:
 def with_usual_names(tree: dict[str, Any]) -> dict[str, Any]:
     """Return the tree of one file, with composed values under names that begin with a plus."""
     out = _of_message(tree)
-    out |= _bouguet(out) | _kalibr(out)
+    out |= _single_numbers(out) | _bouguet(out) | _kalibr(out)
     for name, holder in [("", tree), *((name, value) for name, value in tree.items() if isinstance(value, dict))]:
         if isinstance(holder.get("CameraParameters1"), dict):
             out |= _toolbox_pair(holder, name)
@@ -69,6 +71,37 @@ def _of_message(tree: dict[str, Any]) -> dict[str, Any]:
         numbers = vector(tree[name], None if letter == "d" else math.prod(shape))
         out[usual] = tree[name] if numbers is None else numbers.reshape(shape)
     return out | {"image_width": tree["width"], "image_height": tree["height"]}
+
+
+def _single_numbers(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the first camera whose values are single numbers."""
+    maps = [(f"{name}.", value, "") for name, value in tree.items() if isinstance(value, dict)]
+    for source, table, before in (("", tree, ""), ("", tree, "Camera."), ("", tree, "Camera1."), *maps):
+        fx, fy, cx, cy = (_number(table, before, *names) for names in (("fx",), ("fy",), ("cx", "ppx"), ("cy", "ppy")))
+        if fx is None or fy is None or cx is None or cy is None:
+            continue
+        lens = {"camera_model": table.get(f"{before}type") or table.get(f"{before}camera_model")} | table
+        fisheye = str(lens["camera_model"]).lower().startswith("kannala")
+        usual = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        bent = [_number(table, before, name) for name in usual]
+        least = max((index + 1 for index, value in enumerate(bent) if value is not None), default=0)
+        count = next(each for each in (0, 4, 5, 8) if each >= least)
+        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        out = {
+            "+K": Composed(matrix, (f"{source}{before}fx",), lens),
+            "+D1": Composed(np.array([value or 0.0 for value in bent[:count]]), (), lens),
+        }
+        width, height = _number(table, before, "width"), _number(table, before, "height")
+        if width is not None and height is not None:
+            out["+size"] = Composed(np.array([width, height]), (), lens)
+        return out
+    return {}
+
+
+def _number(table: dict[str, Any], before: str, *names: str) -> float | None:
+    """Return the first of several names that has one finite number."""
+    found = (vector(table.get(f"{before}{name}"), 1) for name in names)
+    return next((float(each[0]) for each in found if each is not None), None)
 
 
 def _bouguet(tree: dict[str, Any]) -> dict[str, Any]:

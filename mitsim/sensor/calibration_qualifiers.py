@@ -59,7 +59,7 @@ _MODELS = {
     **dict.fromkeys(
         ("plumb_bob", "radtan", "rational_polynomial", "brown_conrady", "none", "pinhole", "perspective"), "perspective"
     ),
-    **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt", "kb4"), "fisheye"),
+    **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt", "kannalabrandt8", "kb4"), "fisheye"),
 }
 
 #: values of ``camera_model`` that are none of OpenCV's; other texts there may name a device

@@ -361,3 +361,21 @@ def test_files_of_one_name_in_two_folders(tmp_path):
     text = '[calibration]\nfile = ["left/info.yaml", "right/info.yaml"]\ncameras = ["a"]\nprojector = false\n'
     (tmp_path / "my.toml").write_text(text + '[calibration.keys.a]\nfile = "right/info.yaml"\n')
     np.testing.assert_array_equal(read_calibration(tmp_path / "my.toml").rig.reference.matrix, K2)
+
+
+@pytest.mark.parametrize("before", ["", "Camera.", "inner"])
+def test_values_that_are_single_numbers(tmp_path, before):
+    """As ORB-SLAM and librealsense write them; the order of distortion is OpenCV's, whatever that of the file."""
+    names = {"k3": D[4], "p2": D[3], "p1": D[2], "k2": D[1], "k1": D[0], "fx": 600.0, "fy": 601.2, "cx": 322.3}
+    names |= {"cy": 241.7, "width": 640, "height": 480}
+    table = {before: {name: float(value) for name, value in names.items()}}
+    if before != "inner":
+        table = {f"{before}{name}": float(value) for name, value in names.items()}
+    read = read_calibration(saved(tmp_path / "a.yaml", table))
+    sees(read.rig.reference, K, D)
+    assert read.rig.reference.width == 640 and read.notes == ()
+    if before == "Camera.":
+        bent = {"Camera.type": "KannalaBrandt8", "Camera.k4": 0.001}
+        camera = read_calibration(saved(tmp_path / "b.yaml", table | bent)).rig.reference
+        assert camera.model == "fisheye"
+        np.testing.assert_array_equal(camera.distortion, [D[0], D[1], D[4], 0.001])
