@@ -214,6 +214,9 @@ def _explain(
                 field = f"{field}.{key}".removeprefix(".")
                 return InputError(where, field, shown(fault["input"][key], where), allowed, also)
             return InputError(where, field, shown(fault["input"], where), allowed, also)
+        case "model_type" | "model_attributes_type" | "dict_type":
+            keys = ", ".join(_keys_at(model, fault["loc"]))
+            return InputError(where, field, shown(fault["input"], where), "a table" + f": {keys}" * bool(keys), also)
         case "int_parsing_size" | "int_type" if isinstance(fault["input"], int):
             return InputError(where, field, "a whole number of too many digits", "-2^63 to 2^63 - 1", also)
         case _:

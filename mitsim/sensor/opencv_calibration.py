@@ -208,11 +208,16 @@ class _Values:
     def all_missing(self) -> InputError:
         """Return one error that names all missing values."""
         files = ", ".join(dict.fromkeys(str(file) for file in self.tree.files))
-        found = "; ".join(" or ".join(key for key in names if "+" not in key) for _, _, names in self.missing)
+        found = "; ".join(_some([key for key in names if "+" not in key]) for _, _, names in self.missing)
         allowed = ", ".join(f"the {what} of {name}" for name, what, _ in self.missing)
         keys = "; ".join(f"in [calibration.keys.{name}], as {what}" for name, what, _ in self.missing)
         known = ", ".join(self.tree.names()[:20])
         return InputError(files, found, "nothing", allowed, f"the file has {known}: give the name to use {keys}")
+
+
+def _some(names: list[str]) -> str:
+    """Return the first of many names, for a message."""
+    return " or ".join([*names[:4], *(["another usual name"] if len(names) > 4 else [])])
 
 
 def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[str, Any]:

@@ -154,3 +154,12 @@ def test_a_value_is_shown_as_its_file_has_it():
         validate("a.toml", table, Even)
     with pytest.raises(InputError, match=r'found \{"width": 2, "rows": \{"a": \[true\]\}\}; allowed: no rows'):
         validate("a.json", table, Even)
+
+
+def test_a_value_in_place_of_a_table_gets_the_keys_of_the_table():
+    for table, place in (
+        (TABLE | {"cameras": {"left": 3}}, "cameras.left: found 3; allowed: a table: width, focal, model"),
+        (TABLE | {"cameras": [1]}, r"cameras: found \[1\]; allowed: a table"),
+    ):
+        with pytest.raises(InputError, match=place):
+            validate("a.toml", table, Whole)
