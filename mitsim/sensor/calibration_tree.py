@@ -21,6 +21,7 @@ from zipfile import ZipFile
 import cv2
 import numpy as np
 from scipy.io import loadmat, whosmat
+from scipy.io.matlab import MatlabOpaque
 
 from characterisation.checked_files import read_bounded
 from characterisation.errors import InputError, nearest
@@ -138,7 +139,7 @@ def _read(file: Path) -> list[dict[str, Any]]:
     if file.suffix.lower() == ".mat":
         check_mat(file, data, 8 * _MOST_NUMBERS)
         try:
-            sizes = [math.prod(shape) for _, shape, _ in whosmat(BytesIO(data))]
+            sizes = [math.prod(shape or ()) for _, shape, _ in whosmat(BytesIO(data))]
             if sum(sizes) > _MOST_NUMBERS:
                 raise InputError(file, "size", f"{sum(sizes):,} numbers", f"up to {_MOST_NUMBERS:,}")
             read = loadmat(BytesIO(data), simplify_cells=True)
@@ -148,7 +149,12 @@ def _read(file: Path) -> list[dict[str, Any]]:
             raise
         except Exception as error:  # the reader raises any exception on damaged bytes
             raise InputError(file, "", f"a file that is not MATLAB's ({error})", _KINDS) from None
-        return [{name: value for name, value in read.items() if not name.startswith("__")}]
+        values = {name: value for name, value in read.items() if not name.startswith("__")}
+        plain = {name: value for name, value in values.items() if not isinstance(value, MatlabOpaque)}
+        if values and not plain:
+            hint = "save it as a structure: s = toStruct(stereoParams); save('stereo.mat', 's', '-v7')"
+            raise InputError(file, "", "an object that only MATLAB can read", "numbers and structures", hint)
+        return [plain]
     if file.suffix.lower() == ".npz":
         try:
             with ZipFile(BytesIO(data)) as packed:

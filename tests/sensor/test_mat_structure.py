@@ -88,3 +88,19 @@ def test_packed_variables_do_not_unpack_to_gigabytes(tmp_path):
     savemat(tmp_path / "a.mat", {"K": np.zeros(1_000_000)}, do_compression=True)
     with pytest.raises(InputError, match="unpacked"):
         check_mat(tmp_path / "a.mat", (tmp_path / "a.mat").read_bytes(), 1 << 20)
+
+
+def test_an_object_of_the_toolbox_gets_the_commands_that_save_it(tmp_path):
+    """Of an object MATLAB writes three names and bytes of its own."""
+
+    def element(kind, content):
+        return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
+
+    data = bytes(saved(tmp_path / "a.mat", K=np.eye(3)))
+    names = b"".join(element(1, name) for name in (b"stereoParams", b"MCOS", b"stereoParameters"))
+    made = element(14, element(6, struct.pack("<II", 17, 0)) + names + data[128:])
+    (tmp_path / "a.mat").write_bytes(data[:128] + made)
+    with pytest.raises(InputError, match=r"an object that only MATLAB can read.*toStruct\(stereoParams\)"):
+        read_tree([tmp_path / "a.mat"])
+    (tmp_path / "a.mat").write_bytes(data + made)  # with numbers beside the object
+    assert read_tree([tmp_path / "a.mat"]).names() == ["K"]
