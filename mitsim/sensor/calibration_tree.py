@@ -137,9 +137,9 @@ def _read(file: Path) -> list[dict[str, Any]]:
     """Return the names and values of each document of a file."""
     data = read_bounded(file, _KINDS, "" if file.exists() else _beside(file), largest=_LARGEST)
     if file.suffix.lower() == ".mat":
-        check_mat(file, data, 8 * _MOST_NUMBERS)
+        checked = check_mat(file, data, _MOST_NUMBERS)
         try:
-            sizes = [math.prod(shape or ()) for _, shape, _ in whosmat(BytesIO(data))]
+            sizes = [] if checked else [math.prod(shape) for _, shape, _ in whosmat(BytesIO(data))]
             if sum(sizes) > _MOST_NUMBERS:
                 raise InputError(file, "size", f"{sum(sizes):,} numbers", f"up to {_MOST_NUMBERS:,}")
             read = loadmat(BytesIO(data), simplify_cells=True)

@@ -35,13 +35,13 @@ _DEEPEST = 32
 _KIND = "a whole file of MATLAB, level 5"
 
 
-def check_mat(file: Path, data: bytes, largest: int) -> None:
-    """Check the bytes of a file of level 5; files of other levels pass unchecked.
+def check_mat(file: Path, data: bytes, most: int) -> bool:
+    """Check the bytes of a file of level 5; return False for files of other levels, which pass unchecked.
 
     Parameters
     ----------
-    largest
-        Largest unpacked size of one variable [bytes].
+    most
+        Largest number of values in the file.
 
     Raises
     ------
@@ -49,20 +49,21 @@ def check_mat(file: Path, data: bytes, largest: int) -> None:
         If an element has a type, size or place that the format does not allow, or is nested too deep.
     """
     if len(data) < 128 or 0 in data[:4]:  # level 4 begins with a small number; other files SciPy refuses itself
-        return
+        return False
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None or data[124:126] not in (b"\x00\x01", b"\x01\x00"):
-        return
-    _check_variables(_Bytes(file, order, largest), data)
+        return False
+    _check_variables(_Bytes(file, order, most), data)
+    return True
 
 
 @dataclass(frozen=True)
 class _Bytes:
-    """Reads elements of a ``file`` in one ``order`` of bytes."""
+    """Reads elements of a ``file`` in one ``order`` of bytes; ``most`` values are allowed in it."""
 
     file: Path
     order: str
-    largest: int
+    most: int
 
     def fault(self, found: str) -> InputError:
         return InputError(self.file, "", f"a damaged file: {found}", _KIND, "save it again, with the option -v7")
@@ -85,28 +86,31 @@ class _Bytes:
 
 
 def _check_variables(read: _Bytes, data: bytes) -> None:
-    rest = memoryview(data)[128:]
+    rest, total = memoryview(data)[128:], 0
     while len(rest):
         kind, content, rest = read.element(rest)
         if kind == _COMPRESSED:
             unpack = zlib.decompressobj()
             try:
-                unpacked = unpack.decompress(content, read.largest)
+                unpacked = unpack.decompress(content, 8 * read.most)
             except zlib.error as error:
                 raise read.fault(f"packed bytes that do not unpack ({error})") from None
             if unpack.unconsumed_tail:
-                raise InputError(read.file, "size", f"over {read.largest:,} bytes unpacked", f"up to {read.largest:,}")
+                raise InputError(read.file, "size", f"over {8 * read.most:,} bytes unpacked", "fewer")
             kind, content, _ = read.element(memoryview(unpacked))
         if kind != _MATRIX:
             raise read.fault(f"an element of type {kind} in place of a variable")
-        _check_matrix(read, content, 0)
+        total += _check_matrix(read, content, 0)
+        if total > read.most:
+            raise InputError(read.file, "size", f"over {read.most:,} values", f"up to {read.most:,}")
 
 
-def _check_matrix(read: _Bytes, data: memoryview, depth: int) -> None:
+def _check_matrix(read: _Bytes, data: memoryview, depth: int) -> int:
+    """Check an array and those in it; return the number of values."""
     if depth > _DEEPEST:
         raise read.fault(f"values nested over {_DEEPEST} deep")
     if not len(data):  # an empty cell
-        return
+        return 0
     kind, flags, rest = read.element(data)
     if kind != _UINT32 or len(flags) != 8:
         raise read.fault("a variable without its class")
@@ -114,23 +118,24 @@ def _check_matrix(read: _Bytes, data: memoryview, depth: int) -> None:
     parts = 2 if word & _COMPLEX else 1
     array = word & 0xFF
     if array == _OPAQUE:  # an object: three names, and the bytes that only MATLAB can read
+        inside = 0
         while len(rest):
             kind, content, rest = read.element(rest)
             if kind == _MATRIX:
-                _check_matrix(read, content, depth + 1)
+                inside += _check_matrix(read, content, depth + 1)
             elif kind not in (_INT8, _UINT8, _UTF8):
                 raise read.fault("an object without a class")
-        return
+        return inside
     kind, sides, rest = read.element(rest)
     if kind not in (_INT32, _UINT32) or len(sides) % 4 or not 8 <= len(sides) <= 128:
         raise read.fault("a variable without its size")
     shape = struct.unpack(f"{read.order}{len(sides) // 4}i", sides)
-    if min(shape) < 0 or math.prod(shape) > read.largest:
+    if min(shape) < 0 or math.prod(shape) > read.most:
         raise read.fault(f"a variable of {' x '.join(map(str, shape))}")
     kind, _, rest = read.element(rest)
     if kind not in (_INT8, _UINT8, _UTF8):
         raise read.fault("a variable without a name")
-    count = math.prod(shape)
+    count = int(math.prod(shape))
     if array in _NUMERIC:
         for _ in range(parts):
             rest = _check_numbers(read, rest, count)
@@ -146,9 +151,10 @@ def _check_matrix(read: _Bytes, data: memoryview, depth: int) -> None:
             kind, content, rest = read.element(rest)
             if kind != _MATRIX:
                 raise read.fault(f"an element of type {kind} in place of a value")
-            _check_matrix(read, content, depth + 1)
+            count += _check_matrix(read, content, depth + 1)
     else:
         raise read.fault(f"an array of class {array}")
+    return count
 
 
 def _check_numbers(read: _Bytes, data: memoryview, count: int) -> memoryview:

@@ -87,7 +87,7 @@ def test_row_indices_of_sparse_matrices_stay_inside(tmp_path):
 def test_packed_variables_do_not_unpack_to_gigabytes(tmp_path):
     savemat(tmp_path / "a.mat", {"K": np.zeros(1_000_000)}, do_compression=True)
     with pytest.raises(InputError, match="unpacked"):
-        check_mat(tmp_path / "a.mat", (tmp_path / "a.mat").read_bytes(), 1 << 20)
+        check_mat(tmp_path / "a.mat", (tmp_path / "a.mat").read_bytes(), 1 << 16)
 
 
 def test_an_object_of_the_toolbox_gets_the_commands_that_save_it(tmp_path):
