@@ -164,7 +164,7 @@ def test_the_sensor_stands_on_the_z_axis_with_its_baseline_along_x(n10):
     [
         ({"axes": [PAN]}, "axes", "at least 2"),
         ({"axes": [PAN, TILT, TURN, {**TURN, "name": "more"}]}, "axes", "at most 3"),
-        ({"axes": [PAN, PAN]}, "", "axes with different names"),
+        ({"axes": [PAN, PAN]}, "axes", "axes with different names"),
         ({"axes": [PAN, {**TILT, "limits_deg": [10, -10]}]}, "axes.1", "lower limit"),
         ({"axes": [PAN, {**TILT, "point": [0, 0, 0]}]}, "axes.1.point", "unknown key"),
         ({"part_rotation": [0, 0, 0]}, "part_rotation", "did you mean 'part_rotation_deg'"),

@@ -1,17 +1,18 @@
 """Read TOML documents (studies, tasks, campaigns, sensors) into checked, frozen models.
 
-A document is a subclass of :class:`Document`. For an unknown key the error names the nearest known key. For a wrong
+A document is a subclass of :class:`Document`. For an unknown key the error lists the keys of its table. For a wrong
 type or value it names the file, the field, the value found and the allowed values.
 """
 
 from __future__ import annotations
 
 import copy
+import json
 import re
 import tomllib
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, WithJsonSchema
 
@@ -112,7 +113,7 @@ def validate(where: str | Path, table: dict[str, Any], model: type[Model]) -> Mo
     try:
         return model.model_validate(table)
     except ValidationError as error:
-        raise _explain(where, table, error, missing_keys(table, model)) from None
+        raise _explain(where, table, model, error, missing_keys(table, model)) from None
 
 
 def missing_keys(table: dict[str, Any], model: type[Document]) -> list[str]:
@@ -173,7 +174,9 @@ def _location(table: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(out)
 
 
-def _explain(where: str | Path, table: dict[str, Any], error: ValidationError, missing: list[str]) -> InputError:
+def _explain(
+    where: str | Path, table: dict[str, Any], model: type[Document], error: ValidationError, missing: list[str]
+) -> InputError:
     faults = error.errors()
     # a misspelt key usually makes the correct key "missing" too: report the misspelling first, as the cause
     order = {"extra_forbidden": 0, "missing": 2, "union_tag_not_found": 2}
@@ -185,13 +188,11 @@ def _explain(where: str | Path, table: dict[str, Any], error: ValidationError, m
     match fault["type"]:
         case "extra_forbidden":
             key = str(location[-1])
-            table_of = field.rpartition(".")[0]
-            beside = [each.rpartition(".")[2] for each in missing if each.rpartition(".")[0] == table_of]
-            meant = nearest(key, beside + sorted(_keys_beside()))
+            known = _keys_at(model, fault["loc"][:-1])
+            meant = nearest(key, known)
             others = [each for each in missing if f"{each.rpartition('.')[2]!r}" not in meant]
             also = f"Also missing: {', '.join(others)}" if others else ""
-            allowed = "the keys in docs/reference/formats"
-            return InputError(where, field, "an unknown key", allowed, _joined(meant, also))
+            return InputError(where, field, "an unknown key", ", ".join(known) or "no keys", _joined(meant, also))
         case "missing" | "union_tag_not_found":
             if len(missing) < 2:
                 return InputError(where, missing[0] if missing else field, "nothing", "a value: this key is required")
@@ -202,40 +203,94 @@ def _explain(where: str | Path, table: dict[str, Any], error: ValidationError, m
             return InputError(
                 where,
                 key,
-                _shown(context["tag"]),
+                shown(context["tag"], where),
                 ", ".join(map(repr, known)),
                 _joined(nearest(str(context["tag"]), known), also),
             )
         case "value_error":
-            return InputError(where, field, _shown(fault["input"]), str(context.get("error", fault["msg"])), also)
+            allowed = str(context.get("error", fault["msg"]))
+            key = allowed.partition(" ")[0]  # a rule of several keys names the first
+            if isinstance(fault["input"], dict) and key in fault["input"]:
+                field = f"{field}.{key}".removeprefix(".")
+                return InputError(where, field, shown(fault["input"][key], where), allowed, also)
+            return InputError(where, field, shown(fault["input"], where), allowed, also)
+        case "model_type" | "model_attributes_type" | "dict_type":
+            keys = ", ".join(_keys_at(model, fault["loc"]))
+            return InputError(where, field, shown(fault["input"], where), "a table" + f": {keys}" * bool(keys), also)
         case "int_parsing_size" | "int_type" if isinstance(fault["input"], int):
             return InputError(where, field, "a whole number of too many digits", "-2^63 to 2^63 - 1", also)
         case _:
             allowed = fault["msg"].removeprefix("Input should be ")
-            return InputError(where, field, _shown(fault["input"]), allowed, also)
+            return InputError(where, field, shown(fault["input"], where), allowed, also)
 
 
 def _joined(*sentences: str) -> str:
     return " ".join(sentence for sentence in sentences if sentence)
 
 
-def _keys_beside() -> set[str]:
-    """Return the field names of all document models, among which to find the nearest to a misspelt key."""
-    return {name for model in _all_models(Document) for name in model.model_fields}
+def _keys_at(model: type[Document], location: tuple[Any, ...]) -> list[str]:
+    """Return the keys that a model allows in the table at a pydantic location.
+
+    Parameters
+    ----------
+    location
+        Keys, indices, and between them the names of validators and of the table variants that pydantic chose.
+    """
+    here: list[Any] = [model]
+    for part in location:
+        here = [each for option in here for each in _options(option)]
+        models = [each for each in here if isinstance(each, type) and issubclass(each, BaseModel)]
+        variants = [each for each in models if part in _tags(each)]
+        inside = [each.model_fields[part].annotation for each in models if part in each.model_fields]
+        values = [get_args(each)[-1] for each in here if get_origin(each) is dict]
+        items = [part_of for each in here if get_origin(each) in (list, tuple, set) for part_of in get_args(each)]
+        if isinstance(part, int):
+            here = items
+        elif part != "[key]" and not str(part).startswith("function-"):
+            here = variants or inside or values or here
+    here = [each for option in here for each in _options(option)]
+    models = [each for each in here if isinstance(each, type) and issubclass(each, BaseModel)]
+    return list(dict.fromkeys(name for each in models for name in each.model_fields))
 
 
-def _all_models(model: type[Document]) -> Iterable[type[Document]]:
-    for child in model.__subclasses__():
-        yield child
-        yield from _all_models(child)
+def _options(annotation: Any) -> list[Any]:
+    """Return the types that an annotation stands for: the members of a union, without ``Annotated``."""
+    if get_origin(annotation) is Annotated:
+        return _options(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, UnionType):
+        return [each for member in get_args(annotation) for each in _options(member)]
+    return [annotation]
 
 
-def _shown(value: Any) -> str:
+def _tags(model: type[BaseModel]) -> set[str]:
+    """Return the values and the name by which pydantic tells a table variant from others."""
+    literals = [field.annotation for field in model.model_fields.values() if get_origin(field.annotation) is Literal]
+    return {model.__name__, *(value for each in literals for value in get_args(each))}
+
+
+def shown(value: Any, where: str | Path = "") -> str:
+    """Return a value as its file has it, shortened: in JSON for a ``.json`` file, otherwise in TOML."""
     try:
-        text = repr(value)
-    except (ValueError, RecursionError):  # an integer of thousands of digits, or nesting as deep
+        text = _in_json(value) if str(where).lower().endswith(".json") else _in_toml(value)
+    except (ValueError, TypeError, RecursionError):  # an integer of thousands of digits, or nesting as deep
         text = f"a {type(value).__name__} too long to show"
     return text if len(text) <= 80 else text[:77] + "..."
+
+
+def _in_json(value: Any) -> str:
+    return repr(value) if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
+
+
+def _in_toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_in_toml(each)}" for key, each in value.items()) + " }" if value else "{}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(_in_toml, value)) + "]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if value is None:
+        return "nothing"
+    return repr(value) if isinstance(value, (str, int, float)) else str(value)
 
 
 def _neighbours(path: Path) -> str:

@@ -5,13 +5,15 @@ and T of each camera and of the projector -> the tables ``[cameras.NAME]`` and `
 
 R and T are those of ``cv2.stereoCalibrate``: a point X in the frame of the first camera is R X + T in the frame of the
 other eye (camera or projector). The other eye's pose in the sensor frame is therefore R^T, -R^T T. R may be a rotation
-vector. Numbers may be matrices of OpenCV or plain lists.
+vector. Numbers may be matrices of OpenCV or plain lists. A pair of ROS has neither: they follow from the rectifications
+of the two cameras. Values that qualify these numbers are those of :mod:`mitsim.sensor.calibration_qualifiers`.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,7 +25,16 @@ from scipy.spatial.transform import Rotation
 from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError, nearest
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
-from mitsim.sensor.calibration_tree import CalibrationTree, read_tree
+from mitsim.sensor.calibration_programs import vector
+from mitsim.sensor.calibration_qualifiers import (
+    baseline_note,
+    lens_model,
+    of_images,
+    read_out_of,
+    rectified_pair,
+    unit_mm,
+)
+from mitsim.sensor.calibration_tree import CalibrationTree, Found, read_tree
 
 
 class EyeKeys(Document):
@@ -44,26 +55,33 @@ class CalibrationTable(Document):
     """Source of the geometry of cameras and projector, in place of their own keys.
 
     - ``file``: one or several, beside the sensor file.
-    - ``to_mm``: their unit of length in mm.
+    - ``to_mm``: their unit of length in mm; by default the unit that the file or its format states, else 1.
     - ``cameras``: names, the reference camera first.
     - ``projector``: whether the files also calibrate it.
-    - ``model`` of the cameras' lenses.
+    - ``model`` of the cameras' lenses; by default the one that the file states, else perspective.
     - ``keys`` of each camera, and of ``projector``, if the file does not use the usual names.
     """
 
     file: str | Annotated[list[str], Field(min_length=1, max_length=8)]
-    to_mm: Annotated[float, Field(gt=0, le=1e6)] = 1.0
+    to_mm: Annotated[float, Field(gt=0, le=1e6)] | None = None
     cameras: list[str] = Field(default=["camera"], min_length=1, max_length=2)
     projector: bool = True
-    model: Literal["perspective", "fisheye"] = "perspective"
+    model: Literal["perspective", "fisheye"] | None = None
     keys: dict[str, EyeKeys] = Field(default={})
 
 
-def with_calibration(path: Path, table: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+def with_calibration(
+    path: Path, table: dict[str, Any], size: tuple[int, int] | None = None
+) -> tuple[dict[str, Any], list[str]]:
     """Return a sensor file's table completed with the optics of its ``[calibration]`` files, and warnings.
 
     Keys that the sensor file itself gives for a camera or the projector, such as its width, take precedence. The
-    warnings name values that look like optics and were not read.
+    warnings name values that look like optics and were not read, and what was made of a part of the imager.
+
+    Parameters
+    ----------
+    size
+        (width, height) [px] of the cameras' images, if known.
 
     Raises
     ------
@@ -81,7 +99,8 @@ def with_calibration(path: Path, table: dict[str, Any]) -> tuple[dict[str, Any],
     for name, keys in calibration_table.keys.items():
         if keys.file is not None and keys.file not in named:
             raise InputError(path, f"calibration.keys.{name}.file", repr(keys.file), " | ".join(named))
-    values = _Values(read_tree([path.parent / name for name in named]), calibration_table)
+    tree = read_tree([path.parent / name for name in named])
+    values = _Values(tree, _with_files_of_ros(calibration_table, named, tree), size)
     out = dict(table)
     out["cameras"] = {}
     for index, name in enumerate(calibration_table.cameras):
@@ -97,7 +116,31 @@ def with_calibration(path: Path, table: dict[str, Any]) -> tuple[dict[str, Any],
         for name in eyes
         if not (out["projector"] if name == "projector" else out["cameras"][name]).get("distortion")
     ]
-    return out, _notes(values.tree, straight)
+    return out, [*values.notes, *_notes(values.tree, straight)]
+
+
+def has_pair(path: Path) -> bool:
+    """Return whether a calibration file has matrices of two cameras, and the pose of the second.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    tree = read_tree([path])
+    return all(any(tree.find(key) for key in USUAL_NAMES[what][1]) for what in ("matrix", "rotation", "translation"))
+
+
+def _with_files_of_ros(
+    calibration_table: CalibrationTable, named: list[str], tree: CalibrationTree
+) -> CalibrationTable:
+    """Return the table; files of ROS, each of which has one camera, are given to the cameras in their order."""
+    cameras = calibration_table.cameras
+    alone = [{"camera_matrix", "projection_matrix"} <= set(values) for values in tree.values]
+    if calibration_table.keys or not len(cameras) == len(named) == len(alone) == 2 or not all(alone):
+        return calibration_table
+    keys = {name: EyeKeys(file=file) for name, file in zip(cameras, named, strict=True)}
+    return calibration_table.model_copy(update={"keys": keys})
 
 
 def _notes(tree: CalibrationTree, straight: list[str]) -> list[str]:
@@ -106,8 +149,9 @@ def _notes(tree: CalibrationTree, straight: list[str]) -> list[str]:
     if not unread:
         return []
     without = f"; {' and '.join(straight)} without distortion" if straight else ""
+    files = ", ".join(dict.fromkeys(file.name for file in tree.files))
     return [
-        f"calibration {', '.join(file.name for file in tree.files)}: values not read: {', '.join(unread)}{without}. "
+        f"calibration {files}: values not read: {', '.join(unread)}{without}. "
         "If it belongs to the rig, name it in [calibration.keys.NAME] of the sensor file"
     ]
 
@@ -125,16 +169,23 @@ def _own(table: dict[str, Any], *names: str) -> dict[str, Any]:
 
 
 class _Values:
-    """Values of a calibration by request; missing values are collected and reported together."""
+    """Values of a calibration by request; missing values are collected and reported together.
 
-    def __init__(self, tree: CalibrationTree, calibration_table: CalibrationTable) -> None:
-        self.tree, self.calibration_table = tree, calibration_table
+    ``tables`` that qualify the matrices found, by eye; ``size`` of the images, if known.
+    """
+
+    def __init__(
+        self, tree: CalibrationTree, calibration_table: CalibrationTable, size: tuple[int, int] | None
+    ) -> None:
+        self.tree, self.calibration_table, self.size = tree, calibration_table, size
         self.missing: list[tuple[str, str, Names]] = []
+        self.tables: list[dict[str, Any]] = []
+        self.notes: list[str] = []
 
     def find(
         self, name: str, place: int, what: str, shapes: tuple[tuple[int, ...], ...], needed: bool = True
-    ) -> NDArray[np.float64] | None:
-        """Return one value of an eye; None if it is missing."""
+    ) -> Found | None:
+        """Return one value of an eye as an array of one of the shapes; None if it is missing."""
         keys = self.calibration_table.keys.get(name, EyeKeys())
         given = getattr(keys, what)
         names = (given,) if given else USUAL_NAMES[what][place]
@@ -148,19 +199,25 @@ class _Values:
         for key in names:
             found = self.tree.find(key)
             if found is not None:
-                return _numbers(found[1], found[0], key.rpartition(":")[2].removeprefix("+"), shapes)
+                name_in_file = key.rpartition(":")[2].removeprefix("+")
+                return replace(found, value=_numbers(found.value, found.file, name_in_file, shapes))
         if needed or given:
             self.missing.append((name, what, names))
         return None
 
     def all_missing(self) -> InputError:
         """Return one error that names all missing values."""
-        files = ", ".join(str(file) for file in self.tree.files)
-        found = "; ".join(" or ".join(key for key in names if "+" not in key) for _, _, names in self.missing)
+        files = ", ".join(dict.fromkeys(str(file) for file in self.tree.files))
+        found = "; ".join(_some([key for key in names if "+" not in key]) for _, _, names in self.missing)
         allowed = ", ".join(f"the {what} of {name}" for name, what, _ in self.missing)
         keys = "; ".join(f"in [calibration.keys.{name}], as {what}" for name, what, _ in self.missing)
         known = ", ".join(self.tree.names()[:20])
         return InputError(files, found, "nothing", allowed, f"the file has {known}: give the name to use {keys}")
+
+
+def _some(names: list[str]) -> str:
+    """Return the first of many names, for a message."""
+    return " or ".join([*names[:4], *(["another usual name"] if len(names) > 4 else [])])
 
 
 def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[str, Any]:
@@ -168,45 +225,96 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
 
     The sensor file's ``own`` keys may be missing in the calibration.
     """
-    calibration_table, file = values.calibration_table, ", ".join(str(each) for each in values.tree.files)
-    counts = ((4,),) if calibration_table.model == "fisheye" and place < 2 else ((4,), (5,), (8,), (12,), (14,))
-    K = values.find(name, place, "matrix", ((3, 3),), needed="focal_px" not in own)
-    distortion = values.find(name, place, "distortion", ((0,), *counts), needed=False)
-    size = values.find(name, place, "size", ((2,),), needed=False)
-    R = T = None
-    if place > 0:
-        R = values.find(name, place, "rotation", ((3, 3), (3,), (3, 1), (1, 3)), "rotation_deg" not in own)
-        T = values.find(name, place, "translation", ((3,),), "position_mm" not in own)
-    out: dict[str, Any] = {"model": calibration_table.model if place < 2 else "perspective"}
-    out["distortion"] = [] if distortion is None else distortion.tolist()
-    if K is not None:
-        if abs(K[0, 1]) > 1e-9 and K[0, 0] > 0:
-            hint = "calibrate without skew: est_alpha = 0 in MATLAB's toolbox"
-            raise InputError(file, f"matrix of {name}", f"a skew of {K[0, 1]:.3g} px", "fx 0 cx, 0 fy cy, 0 0 1", hint)
-        if K[0, 0] <= 0 or K[1, 1] <= 0 or abs(K[2, 2] - 1) > 1e-9:
-            raise InputError(file, f"matrix of {name}", np.round(K, 3).tolist(), "fx 0 cx, 0 fy cy, 0 0 1")
+    calibration_table, file = values.calibration_table, ", ".join(dict.fromkeys(map(str, values.tree.files)))
+    matrix = values.find(name, place, "matrix", ((3, 3),), needed="focal_px" not in own)
+    table = {} if matrix is None else matrix.table
+    values.tables.append(table)
+    found = values.find(name, place, "distortion", ((0,), (4,), (5,), (8,), (12,), (14,)), needed=False)
+    distortion = np.empty(0) if found is None else found.value
+    model = None
+    if place < 2:
+        stating = file if matrix is None else matrix.file
+        model = lens_model(table, stating, calibration_table.model, not distortion.any()) or calibration_table.model
+    model = model or "perspective"
+    if model == "fisheye" and len(distortion) not in (0, 4):
+        raise InputError(file, f"distortion of {name}", f"{len(distortion)} numbers", "4, as of a fisheye lens")
+    size = _size(values, name, place, table)
+    out: dict[str, Any] = {"model": model, "distortion": distortion.tolist()}
+    if matrix is not None:
+        K = _checked_matrix(matrix.value, name, file)
+        read_out = read_out_of(table, matrix.file)
+        if read_out is not None:
+            width, height = own.get("width"), own.get("height")
+            images = (width, height) if isinstance(width, int) and isinstance(height, int) else values.size
+            K, size, note = of_images(K, size, read_out, images)
+            if note:
+                values.notes.append(f"calibration {matrix.file.name}: {name}: {note}")
         out |= {"focal_px": [float(K[0, 0]), float(K[1, 1])], "principal_px": [float(K[0, 2]), float(K[1, 2])]}
     if size is not None:
-        out |= {"width": int(size[0]), "height": int(size[1])}
-    elif place < 2 or calibration_table.keys.get(name, EyeKeys()).file:
-        own_file = calibration_table.keys.get(name, EyeKeys()).file
-        found = [values.tree.find(f"{own_file}:{key}" if own_file else key) for key in ("image_width", "image_height")]
-        if found[0] is not None and found[1] is not None:
-            shapes: tuple[tuple[int, ...], ...] = ((1,),)
-            width, height = (_numbers([each[1]], each[0], "image_width", shapes) for each in found if each)
-            out |= {"width": int(width[0]), "height": int(height[0])}
-    if R is None or T is None:
-        return out
+        out |= {"width": size[0], "height": size[1]}
+    return out | (_pose(values, name, place, own) if place > 0 else {})
+
+
+def _checked_matrix(K: NDArray[np.float64], name: str, file: str) -> NDArray[np.float64]:
+    if abs(K[0, 1]) > 1e-9 and K[0, 0] > 0:
+        hint = "calibrate without skew: est_alpha = 0 in MATLAB's toolbox"
+        raise InputError(file, f"matrix of {name}", f"a skew of {K[0, 1]:.3g} px", "fx 0 cx, 0 fy cy, 0 0 1", hint)
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or abs(K[2, 2] - 1) > 1e-9:
+        raise InputError(file, f"matrix of {name}", np.round(K, 3).tolist(), "fx 0 cx, 0 fy cy, 0 0 1")
+    return K
+
+
+def _size(values: _Values, name: str, place: int, table: dict[str, Any]) -> tuple[int, int] | None:
+    """Return the image size (width, height) [px] of an eye that the files state; None without one.
+
+    ``table`` has the matrix of the eye; an ``image_width`` and ``image_height`` beside the matrix come first.
+    """
+    size = values.find(name, place, "size", ((2,),), needed=False)
+    if size is not None:
+        return int(size.value[0]), int(size.value[1])
+    beside = [vector(table.get(key), 1) for key in ("image_width", "image_height")]
+    own_file = values.calibration_table.keys.get(name, EyeKeys()).file
+    if beside[0] is not None and beside[1] is not None and (place < 2 or own_file or table is not values.tables[0]):
+        return int(beside[0][0]), int(beside[1][0])
+    if place == 2 and not own_file:
+        return None
+    sides = [values.tree.find(f"{own_file}:{key}" if own_file else key) for key in ("image_width", "image_height")]
+    if sides[0] is None or sides[1] is None:
+        return None
+    width, height = (_numbers([each.value], each.file, "image_width", ((1,),)) for each in sides if each)
+    return int(width[0]), int(height[0])
+
+
+def _pose(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[str, Any]:
+    """Return the keys of the pose of a second eye: of R and T, or of the rectifications of a pair of ROS."""
+    file = ", ".join(dict.fromkeys(map(str, values.tree.files)))
+    pair = rectified_pair(values.tables[0], values.tables[-1])
+    needed = pair is None
+    shapes = ((3, 3), (3,), (3, 1), (1, 3))
+    rotation = values.find(name, place, "rotation", shapes, needed and "rotation_deg" not in own)
+    translation = values.find(name, place, "translation", ((3,),), needed and "position_mm" not in own)
+    if rotation is not None and translation is not None:
+        R, T = rotation.value, translation.value
+        stated = unit_mm(translation.table, translation.file)
+    elif pair is not None:
+        (R, T), stated = pair, 1000.0
+    else:
+        return {}
     if R.size == 3:
         R = np.asarray(Rotation.from_rotvec(R.reshape(3)).as_matrix())
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
         raise InputError(file, f"rotation of {name}", np.round(R, 4).tolist(), "a rotation matrix, 3 x 3, by rows")
+    given = values.calibration_table.to_mm
+    T = T * (given or stated or 1.0)
+    if given is not None and stated is not None and given != stated:
+        values.notes.append(f"calibration: to_mm = {given:g} is used, though the file states {stated:g} mm")
+    if note := baseline_note(name, float(np.linalg.norm(T))):
+        values.notes.append(f"calibration: {note}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # at 90 deg about y the angles are not unique; any solution is valid
         turn = Rotation.from_matrix(R.T)
-        out["rotation_deg"] = turn.as_euler("xyz", degrees=True).tolist()
-    out["position_mm"] = (-turn.apply(T) * calibration_table.to_mm).tolist()
-    return out
+        angles = turn.as_euler("xyz", degrees=True).tolist()
+    return {"rotation_deg": angles, "position_mm": (-turn.apply(T)).tolist()}
 
 
 def _numbers(value: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:

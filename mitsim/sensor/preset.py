@@ -208,8 +208,10 @@ def load_sensor(name: str | Path) -> Sensor:
     return sensor_of(path, table)
 
 
-def sensor_table(name: str | Path) -> tuple[Path, dict[str, Any], list[str]]:
+def sensor_table(name: str | Path, size: tuple[int, int] | None = None) -> tuple[Path, dict[str, Any], list[str]]:
     """Return the path of a preset or sensor file, its unchecked table with the calibration filled in, and warnings.
+
+    ``size`` (width, height) [px] of the images, if known, tells whether they show a part of the calibrated imager.
 
     Raises
     ------
@@ -217,7 +219,7 @@ def sensor_table(name: str | Path) -> tuple[Path, dict[str, Any], list[str]]:
         For an unknown name, or a file or calibration that cannot be read.
     """
     path, written = written_table(name)
-    return path, *with_calibration(path, with_lenses(path, written))
+    return path, *with_calibration(path, with_lenses(path, written), size)
 
 
 def written_table(name: str | Path) -> tuple[Path, dict[str, Any]]:

@@ -89,7 +89,7 @@ def load_recorded_rig(name: str | Path, size: tuple[int, int] | None = None) -> 
     InputError
         For an unknown name, or a file that does not describe a rig; the error names all missing keys.
     """
-    path, table, notes = sensor_table(name)
+    path, table, notes = sensor_table(name, size)
     table = _sized(table, size)
     lacking = lacking_keys(table)
     if not lacking:

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from characterisation.files.documents import Document, Name
+from mitsim.sensor.calibration_qualifiers import check_intrinsics
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
@@ -45,9 +46,6 @@ CameraName = Annotated[str, AfterValidator(_camera_name)]
 #: largest number of pixels of a camera or projector; a capture of this size takes 2 GB of memory
 MOST_PIXELS = 50_000_000
 
-#: focal length over the longer side: fields of view from 169 deg to 0.06 deg
-_FOCAL_SHARE = (0.05, 1000.0)
-
 
 class OpticsTable(Document):
     """A camera's or projector's geometry: OpenCV's model, and its pose in the sensor frame."""
@@ -65,12 +63,7 @@ class OpticsTable(Document):
     def _possible(self) -> OpticsTable:
         if self.width * self.height > MOST_PIXELS:
             raise ValueError(f"at most {MOST_PIXELS:,} pixels, not {self.width} x {self.height}")
-        side = max(self.width, self.height)
-        low, high = (share * side for share in _FOCAL_SHARE)
-        if not all(low <= focal <= high for focal in self.focal_px):
-            raise ValueError(f"focal_px from {low:g} to {high:g} for images of {self.width} x {self.height} px")
-        if not all(abs(place) <= 20 * side for place in self.principal_px):
-            raise ValueError(f"principal_px within {20 * side:g} px of the image's corner")
+        check_intrinsics(self.focal_px, self.principal_px, self.width, self.height)
         if not all(abs(place) <= 1e5 for place in self.position_mm):
             raise ValueError("position_mm within 100 m of the sensor's frame")
         return self

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from characterisation.files.documents import Document, missing_keys, validate
 from characterisation.files.errors import InputError
@@ -97,3 +97,69 @@ def test_another_fault_is_told_first_and_what_is_missing_beside_it():
     table["cameras"]["left"]["widht"] = 3
     with pytest.raises(InputError, match=r"cameras.left.widht: .*did you mean 'width'\? Also missing: name$"):
         validate("a.toml", table, Whole)
+
+
+class Elsewhere(Document):
+    scale: float = 1.0
+    widht: float = 1.0
+
+
+@pytest.mark.parametrize(
+    ("place", "field", "allowed"),
+    [
+        ([], "scale", "name, cameras, exposure, groups, note"),
+        (["cameras", "left"], "cameras.left.scale", "width, focal, model"),
+        (["groups", 0], "groups.0.scale", "width, focal, model"),
+        (["exposure"], "exposure.scale", "rule, seconds"),
+    ],
+)
+def test_an_unknown_key_gets_the_keys_of_its_own_table(place, field, allowed):
+    """Another document has this key: the hint was to write the key that is refused."""
+    table = copy.deepcopy(TABLE)
+    inner = table
+    for part in place:
+        inner = inner[part]
+    inner["scale"] = 2.0
+    with pytest.raises(InputError) as caught:
+        validate("a.toml", table, Whole)
+    assert (caught.value.field, caught.value.allowed) == (field, allowed)
+    assert "'scale'" not in caught.value.hint
+
+
+def test_the_variant_of_a_table_gives_its_own_keys_and_the_nearest_of_them():
+    table = copy.deepcopy(TABLE) | {"exposure": {"rule": "automatic", "seconds": 0.1, "levle": 1}}
+    with pytest.raises(InputError, match=r"exposure\.\w+: found an unknown key; allowed: rule, level"):
+        validate("a.toml", table, Whole)
+
+
+class Even(Document):
+    width: int
+    rows: dict[str, list[bool]] = Field(default={})
+
+    @model_validator(mode="after")
+    def _even(self) -> Even:
+        if self.width % 2:
+            raise ValueError("width of an even number")
+        if self.rows:
+            raise ValueError("no rows here")
+        return self
+
+
+def test_a_value_is_shown_as_its_file_has_it():
+    """A rule of a whole table names the key, and shows no Python."""
+    with pytest.raises(InputError, match=r"^a\.toml: width: found 3; allowed: width of an even number$"):
+        validate("a.toml", {"width": 3}, Even)
+    table = {"width": 2, "rows": {"a": [True]}}
+    with pytest.raises(InputError, match=r"found \{ width = 2, rows = \{ a = \[true\] \} \}; allowed: no rows"):
+        validate("a.toml", table, Even)
+    with pytest.raises(InputError, match=r'found \{"width": 2, "rows": \{"a": \[true\]\}\}; allowed: no rows'):
+        validate("a.json", table, Even)
+
+
+def test_a_value_in_place_of_a_table_gets_the_keys_of_the_table():
+    for table, place in (
+        (TABLE | {"cameras": {"left": 3}}, "cameras.left: found 3; allowed: a table: width, focal, model"),
+        (TABLE | {"cameras": [1]}, r"cameras: found \[1\]; allowed: a table"),
+    ):
+        with pytest.raises(InputError, match=place):
+            validate("a.toml", table, Whole)

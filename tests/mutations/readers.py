@@ -194,6 +194,45 @@ def _opencv(suffix):
     return make
 
 
+def _ros(folder):
+    path = folder / "calibration.yaml"
+    matrix = "  rows: 3\n  cols: 3\n  data: [600.0, 0.0, 320.0, 0.0, 600.0, 240.0, 0.0, 0.0, 1.0]\n"
+    path.write_text(
+        "image_width: 640\nimage_height: 480\ndistortion_model: plumb_bob\nbinning_x: 2\nbinning_y: 2\n"
+        f"camera_matrix:\n{matrix}roi:\n  x_offset: 64\n  y_offset: 40\n  width: 320\n  height: 240\n"
+        "distortion_coefficients:\n- -0.1\n- 0.01\n- 0.0\n- 0.0\n- 0.0\n",
+        encoding="utf-8",
+    )
+    return path
+
+
+def _kalibr(folder):
+    path = folder / "camchain.yaml"
+    camera = "  camera_model: pinhole\n  intrinsics: [600.0, 601.2, 322.3, 241.7]\n  resolution: [640, 480]\n"
+    camera += "  distortion_model: radtan\n  distortion_coeffs: [-0.1, 0.01, 0.0, 0.0]\n"
+    step = "  T_cn_cnm1:\n  - [1.0, 0.0, 0.0, -0.06]\n  - [0.0, 1.0, 0.0, 0.0]\n  - [0.0, 0.0, 1.0, 0.0]\n"
+    path.write_text(f"cam0:\n{camera}cam1:\n{camera}{step}  - [0.0, 0.0, 0.0, 1.0]\n", encoding="utf-8")
+    return path
+
+
+def _toolbox(folder):
+    from scipy.io import savemat
+
+    camera = {"K": np.array([[600.0, 0, 321], [0, 600, 241], [0, 0, 1]]), "RadialDistortion": [0.1, 0.0]}
+    camera |= {"TangentialDistortion": [0.0, 0.0], "ImageSize": [480.0, 640.0], "WorldUnits": "millimeters"}
+    pose = np.eye(4)
+    pose[0, 3] = -60
+    pair = {"CameraParameters1": camera, "CameraParameters2": camera, "PoseCamera2": {"A": pose}}
+    savemat(folder / "stereo.mat", {"s": pair})
+    return folder / "stereo.mat"
+
+
+def _read_cameras(path):
+    from mitsim.capture.recordings.calibration_file import read_calibration
+
+    read_calibration(path, (160, 120))
+
+
 _CALIBRATION = {
     "K1": np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]),
     "D1": np.zeros(5),
@@ -488,6 +527,9 @@ READERS: dict[str, Reader] = {
     "calibration.json": Reader(_opencv(".json"), _read_calibration),
     "calibration.mat": Reader(_matlab, _read_calibration),
     "calibration.npz": Reader(_npz, _read_calibration),
+    "calibration.yaml of ROS": Reader(_ros, _read_cameras),
+    "camchain.yaml": Reader(_kalibr, _read_cameras),
+    "stereo.mat": Reader(_toolbox, _read_cameras),
     "heights.npy": Reader(_heights(".npy"), _read_heights),
     "heights.csv": Reader(_heights(".csv"), _read_heights),
     "profile.csv": Reader(_profile, _read_profile),

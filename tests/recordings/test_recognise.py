@@ -158,7 +158,7 @@ def test_presets_and_depthai_are_calibrations_too(tmp_path):
         ("a.json", {"cameras": []}, "cameras"),
         ("a.toml", "name = 3", "cameras|name"),
         ("a.toml", TOML.replace("64", "sixty-four"), "not TOML"),
-        ("a.yml", "hello", "OpenCV cannot read"),
+        ("a.yml", "hello", "text without names"),
         ("a.csv", "1,2", "the ending '.csv'"),
         ("a", "1", "the ending ''"),
     ],

@@ -132,7 +132,7 @@ def test_scenes_in_other_encodings(tmp_path, encoding):
 )
 def test_calibrations_nested_deep(tmp_path, name, text):
     (tmp_path / name).write_text(text, encoding="utf-8")
-    refused(read_tree, [tmp_path / name], match="nested over")
+    refused(read_tree, [tmp_path / name], match="nested over|maximum nesting|sequence entries are not allowed")
 
 
 @pytest.mark.timeout(60)
@@ -140,9 +140,9 @@ def test_a_calibration_with_a_line_left_of_its_first_key_ends(tmp_path):
     """OpenCV would read such a line without end."""
     path = tmp_path / "a.yml"
     path.write_text("%YAML:1.0\n---\n   rows: 3\n   cols: 3\nD1:-matrix\n   rows: 3\n", encoding="utf-8")
-    refused(read_tree, [path], match="indented less than the first")
+    refused(read_tree, [path], match="not YAML .*in line 5")
     path.write_text("%YAML:1.0\n# optics\n---\n   rows: 3\n\n   cols: 4\n...\n", encoding="utf-8")
-    assert read_tree([path]).find("cols")[1] == 4
+    assert read_tree([path]).find("cols").value == 4
 
 
 def test_a_packed_calibration_does_not_unpack_to_gigabytes(tmp_path):

@@ -135,7 +135,7 @@ def test_an_old_folder_still_loads(taken):
     ("key", "value", "told"),
     [
         ("decoder", {"far_mm": "far"}, r"decoder\.far_mm: found 'far'"),
-        ("decoder", {"far_mm": 1.0}, r"decoder: .*near_mm under far_mm"),
+        ("decoder", {"far_mm": 1.0}, r"decoder\.near_mm: .*near_mm under far_mm"),
         ("decoder", {"colour": 1}, r"decoder\.colour"),
         ("decoder", {"far_mm": float("nan")}, r"decoder\.far_mm"),
         ("imager", {"full_well_e": 0}, r"imager\.full_well_e: found 0"),

@@ -7,7 +7,7 @@ a small JSON              ``fx fy cx cy width height``, and optionally ``distort
 DepthAI                   JSON with ``cameraData``: its left and right camera
 a capture's               ``calibration.json`` of a capture folder
 an Ensenso's              ``*_calib.json`` of a recording: left and right camera, manufacturer's rectification
-OpenCV                    YAML, XML or JSON of FileStorage, under the usual names
+others                    YAML, XML or JSON of OpenCV, ROS, Kalibr; .mat, .npz, under the usual names
 ========================= ============================================================
 """
 
@@ -29,8 +29,9 @@ from mitsim.capture.calibration import CalibrationDocument, rig_of
 from mitsim.capture.recordings.depthai_calibration import is_depthai_calibration, read_depthai_calibration
 from mitsim.capture.recordings.nxlib_calibration import nxlib_rig
 from mitsim.capture.recordings.nxlib_tree import NxLibTree
+from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.opencv_calibration import CalibrationTable, with_calibration
+from mitsim.sensor.opencv_calibration import CalibrationTable, has_pair, with_calibration
 from mitsim.sensor.preset import presets
 from mitsim.sensor.recorded_rig import load_recorded_rig
 from mitsim.sensor.sensor_file import OpticsTable
@@ -86,8 +87,15 @@ def read_calibration(source: str | Path, size: tuple[int, int] | None = None) ->
     Raises
     ------
     InputError
-        If there is no such file, or it has none of the formats above.
+        If there is no such file, it has none of the formats above, or its numbers cannot belong to its images.
     """
+    read = _read(source, size)
+    for name, camera in read.rig.cameras.items():
+        check_camera(camera, source, f"cameras.{name}")
+    return read
+
+
+def _read(source: str | Path, size: tuple[int, int] | None) -> Calibrated:
     path = Path(source)
     if path.suffix.lower() == ".toml" or str(source) in presets():
         return _of_toml(path, size)
@@ -127,15 +135,32 @@ def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], w
     camera = calibrated.rig.reference if name is None else cameras[name]
     if (camera.width, camera.height) != size:
         allowed = f"{camera.width} x {camera.height} px, as the calibration says"
-        raise InputError(where, "size", f"{size[0]} x {size[1]} px", allowed)
+        raise InputError(where, "size", f"{size[0]} x {size[1]} px", allowed, _scaled_hint(camera, size))
     return camera
+
+
+def _scaled_hint(camera: Camera, size: tuple[int, int]) -> str:
+    """Return the optics of images scaled from the calibrated size, as a hint; empty if the sides differ in scale.
+
+    Pixel centres lie at integers.
+    """
+    scale = size[0] / camera.width
+    if abs(scale * camera.height - size[1]) > 1:
+        return ""
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    centre = [round((place + 0.5) * scale - 0.5, 3) for place in (cx, cy)]
+    focal = [round(each * scale, 3) for each in (fx, fy)]
+    return (
+        f"if the images are scaled by {scale:g}, give a TOML with [cameras.NAME]: width = {size[0]}, "
+        f"height = {size[1]}, focal_px = {focal}, principal_px = {centre}, and the same distortion"
+    )
 
 
 def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
     if path.suffix.lower() == ".toml":
         written = read_toml(path, _Written).model_extra or {}
         if "technology" not in written:
-            optics, notes = with_calibration(path, written)
+            optics, notes = with_calibration(path, written, size)
             table = validate(path, _sized(optics, size), RigFile)
             rig = Rig({name: each.camera() for name, each in table.cameras.items()})
             return Calibrated(rig, table.name, notes=tuple(notes))
@@ -145,11 +170,9 @@ def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
 
 def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:
     """Read a pair if the file has the second camera, else one camera."""
-    asked = {"file": path.name, "projector": False}
-    try:
-        table, notes = with_calibration(path, {"calibration": {**asked, "cameras": ["left", "right"]}})
-    except InputError:
-        table, notes = with_calibration(path, {"calibration": {**asked, "cameras": ["camera"]}})
+    cameras = ["left", "right"] if has_pair(path) else ["camera"]
+    asked = {"file": path.name, "projector": False, "cameras": cameras}
+    table, notes = with_calibration(path, {"calibration": asked}, size)
     read = validate(path, _sized(table, size), RigFile)
     return Calibrated(Rig({name: each.camera() for name, each in read.cameras.items()}), "", notes=tuple(notes))
 

@@ -9,6 +9,7 @@ The image uses the camera's own pixels: if the calibration has lens distortion, 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -60,7 +61,10 @@ def read_depth_image(
     depth[image == invalid] = np.nan
     if not np.isfinite(depth).any():
         raise InputError(path, "", f"an image with only the level {invalid}", "an image with some depths")
-    settings = {"depth_scale_mm": float(scale_mm), "depth_invalid": int(invalid), "imported_from": path.name}
+    settings: dict[str, Any] = {"depth_scale_mm": float(scale_mm), "depth_invalid": int(invalid)}
+    settings["imported_from"] = path.name
+    if read.notes:
+        settings["warnings"] = list(read.notes)
     if read.range_mm is not None:
         settings |= {"near_mm": read.range_mm[0], "far_mm": read.range_mm[1]}
     return Capture(

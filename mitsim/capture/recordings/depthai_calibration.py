@@ -24,8 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.checked_files import read_bounded
+from characterisation.files.documents import shown
 from characterisation.files.errors import InputError
 from mitsim.capture.png import LONGEST_SIDE_PX
+from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import Transform
 
@@ -33,6 +35,9 @@ from mitsim.sensor.transforms import Transform
 _FISHEYE, _PERSPECTIVE = 1, 0
 
 _CM = 10.0
+
+#: socket that means none, as does -1
+_NO_SOCKET = 255
 
 
 @dataclass(frozen=True)
@@ -122,8 +127,8 @@ class _Fields:
 
     def fault(self, field: str, allowed: str) -> InputError:
         value = self.get(field)
-        found = "nothing" if value is None else repr(value)
-        return InputError(self.path, self.base + field, found if len(found) <= 80 else found[:77] + "...", allowed)
+        found = "nothing" if value is None else shown(value, self.path)
+        return InputError(self.path, self.base + field, found, allowed)
 
 
 def _calibration(fields: _Fields, path: Path) -> DepthaiCalibration:
@@ -142,15 +147,21 @@ def _calibration(fields: _Fields, path: Path) -> DepthaiCalibration:
         if not each.get("width") and not each.get("height"):
             continue  # a socket without a camera
         cameras[socket] = _camera(each)
+        check_camera(cameras[socket], path, f"cameraData.{socket}.intrinsicMatrix")
         to = each.integer("extrinsics.toCameraSocket", -1, 100)
         if to >= 0 and each.get("extrinsics.rotationMatrix"):
             steps[socket] = (to, _extrinsics(each), _translation(each, "extrinsics.specTranslation"))
-    left = fields.integer("stereoRectificationData.leftCameraSocket", 0, 100)
-    right = fields.integer("stereoRectificationData.rightCameraSocket", 0, 100)
+    if not cameras:
+        hint = "the device was not calibrated, or another file of it has the calibration of the factory"
+        raise InputError(path, "cameraData", "no cameras in this calibration", "the cameras of a pair", hint)
+    left = fields.integer("stereoRectificationData.leftCameraSocket", -1, _NO_SOCKET)
+    right = fields.integer("stereoRectificationData.rightCameraSocket", -1, _NO_SOCKET)
     for side, socket in (("left", left), ("right", right)):
         if socket not in cameras:
             known = ", ".join(map(str, cameras)) or "none"
-            raise InputError(path, f"stereoRectificationData.{side}CameraSocket", socket, f"one of cameraData: {known}")
+            field = f"stereoRectificationData.{side}CameraSocket"
+            found = f"{socket}: no pair of cameras" if socket in (-1, _NO_SOCKET) else socket
+            raise InputError(path, field, found, f"one of cameraData: {known}")
     motion, spec = _between(left, right, steps, path)
     name = fields.get("productName") or fields.get("boardName")
     return DepthaiCalibration(cameras, left, right, motion, spec, name if isinstance(name, str) and name else "depthai")

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of
+from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.transforms import Transform
 
@@ -80,6 +81,8 @@ def nxlib_rig(tree: NxLibTree, size: tuple[int, int] | None = None, *, dynamic: 
         )
         for side, place in (("Left", Transform.identity()), ("Right", left_from_right))
     }
+    for side, camera in cameras.items():
+        check_camera(camera, tree.where, f"Calibration/Monocular/{side.capitalize()}/Camera")
     return Rig(cameras, rectification=rectification)
 
 

@@ -109,6 +109,8 @@ def read_organised_cloud(
     rig, found = _seen_by(points, path, given, camera, turn)
     settings |= found
     points = rig.reference.sensor_from_camera.points(points).astype(np.float32)
+    if given is not None and given.notes:
+        settings["warnings"] = list(given.notes)
     if given is not None and given.range_mm is not None:
         settings |= {"near_mm": given.range_mm[0], "far_mm": given.range_mm[1]}
     return Capture(
@@ -129,12 +131,12 @@ def _on_grid(
     """Return the points (H, W, 3) as in the file, its own settings, and the given calibration."""
     data = read_bounded(path, "a PLY or PCD file")
     hint = "save it organised, a point or NaN for each pixel, or give the camera of its pixels: --calibration"
-    given = None if calibration is None else read_calibration(calibration)
     if data.startswith(b"ply"):
         read = decode_ply(data, path)
         if any(line.startswith("comment mitsim ") for line in read.lines):
             raise InputError(path, "", "a cloud written by mitsim", "a cloud of another program", "it needs no import")
         size = read.size
+        given = None if calibration is None else read_calibration(calibration, size)
         if size is None and given is not None:
             eye = given.rig.reference if camera is None else given.rig.cameras.get(camera, given.rig.reference)
             size = eye.width, eye.height
@@ -144,6 +146,8 @@ def _on_grid(
             raise InputError(path, "", found, allowed, hint)
         return read.points.reshape(size[1], size[0], 3).copy(), {}, given
     points, header = decode_pcd(data, path)
+    grid = (points.shape[1], points.shape[0]) if points.shape[0] > 1 else None
+    given = None if calibration is None else read_calibration(calibration, grid)
     if (
         points.shape[0] == 1
         and given is not None

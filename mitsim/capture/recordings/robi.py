@@ -24,6 +24,7 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.grey_image import read_grey
+from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.transforms import Transform
 
@@ -165,6 +166,8 @@ def _rig(tables: dict[str, Path], numbers: dict[str, dict[str, float]]) -> Rig:
         "left": Camera(left, np.zeros(5), width, height),
         "right": Camera(right, np.zeros(5), width, height, beside),
     }
+    for name, camera in cameras.items():
+        check_camera(camera, tables[name])
     return Rig(cameras, None, Rectification(left, right, np.eye(3), np.eye(3), baseline, width, height))
 
 

@@ -1,0 +1,227 @@
+"""Compose the usual values of a calibration from those that other programs than OpenCV store.
+
+Signal chain: names and values of one file -> values in OpenCV's form under names that begin with a plus, each with its
+sources and the table that qualifies it (:mod:`mitsim.sensor.calibration_qualifiers`).
+
+- Camera calibration toolbox of MATLAB (Bouguet; ``Calib_Results.mat``, ``Calib_Results_stereo.mat``): K is composed of
+  ``fc``, ``cc`` and ``alpha_c``, ``kc`` is in OpenCV's order, ``om`` is a rotation vector, and pixels count from 0.
+- Computer Vision Toolbox of MATLAB: a structure made by ``toStruct``. Pixels count from 1, and sizes are (rows,
+  columns). ``IntrinsicMatrix``, ``RotationOfCamera2`` and ``TranslationOfCamera2`` act on row vectors, so the matrices
+  are transposed; ``K`` and ``PoseCamera2`` (R2022b and later) act on column vectors.
+- Kalibr (``camchain.yaml``): K is (fu, fv, pu, pv); ``T_cn_cnm1`` takes coordinates of the camera before to this
+  one, in metres.
+- ORB-SLAM, librealsense and others: ``fx``, ``fy``, ``cx`` (or ``ppx``), ``cy`` and ``k1``, ``k2``, ``p1``, ``p2``,
+  ``k3`` as single numbers, in a map or behind ``Camera.``.
+- ROS: a message ``sensor_msgs/CameraInfo`` has the values of a calibration file as flat lists, under one letter each.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: endings of names in MATLAB's toolbox and similar programs: one camera, the cameras of a pair, camera and projector
+_ENDINGS = ("", "_left", "_right", "_cam", "_proj", "_camera", "_projector")
+
+#: fields of a message of ROS, their shapes, and the names in a calibration file of ROS
+_MESSAGE = {
+    "k": ((3, 3), "camera_matrix"),
+    "d": ((-1,), "distortion_coefficients"),
+    "r": ((3, 3), "rectification_matrix"),
+    "p": ((3, 4), "projection_matrix"),
+}
+
+
+@dataclass(frozen=True)
+class Composed:
+    """A ``value`` in OpenCV's form, the dotted names of its ``sources``, and the ``table`` that qualifies it."""
+
+    value: NDArray[np.float64]
+    sources: tuple[str, ...]
+    table: dict[str, Any]
+
+
+def with_usual_names(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the tree of one file, with composed values under names that begin with a plus."""
+    out = _of_message(tree)
+    out |= _single_numbers(out) | _bouguet(out) | _kalibr(out)
+    for name, holder in [("", tree), *((name, value) for name, value in tree.items() if isinstance(value, dict))]:
+        if isinstance(holder.get("CameraParameters1"), dict):
+            out |= _toolbox_pair(holder, name)
+        elif found := _toolbox_camera(holder, name, "1", {}):
+            out |= found
+            if not name:  # its pixels count from 1, so it is no K of OpenCV
+                out.pop("K", None)
+    return out
+
+
+def _of_message(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the tree; the fields of a message of ROS are renamed, since its R is no rotation between two cameras."""
+    letters = {name.lower(): name for name in tree if name.lower() in _MESSAGE}
+    if not {"k", "d", "p"} <= set(letters) or not {"width", "height", "distortion_model"} <= set(tree):
+        return dict(tree)
+    out = {name: value for name, value in tree.items() if name not in letters.values()}
+    for letter, name in letters.items():
+        shape, usual = _MESSAGE[letter]
+        numbers = vector(tree[name], None if letter == "d" else math.prod(shape))
+        out[usual] = tree[name] if numbers is None else numbers.reshape(shape)
+    return out | {"image_width": tree["width"], "image_height": tree["height"]}
+
+
+def _single_numbers(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the first camera whose values are single numbers."""
+    maps = [(f"{name}.", value, "") for name, value in tree.items() if isinstance(value, dict)]
+    for source, table, before in (("", tree, ""), ("", tree, "Camera."), ("", tree, "Camera1."), *maps):
+        fx, fy, cx, cy = (_number(table, before, *names) for names in (("fx",), ("fy",), ("cx", "ppx"), ("cy", "ppy")))
+        if fx is None or fy is None or cx is None or cy is None:
+            continue
+        lens = {"camera_model": table.get(f"{before}type") or table.get(f"{before}camera_model")} | table
+        fisheye = str(lens["camera_model"]).lower().startswith("kannala")
+        usual = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        bent = [_number(table, before, name) for name in usual]
+        least = max((index + 1 for index, value in enumerate(bent) if value is not None), default=0)
+        count = next(each for each in (0, 4, 5, 8) if each >= least)
+        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        out = {
+            "+K": Composed(matrix, (f"{source}{before}fx",), lens),
+            "+D1": Composed(np.array([value or 0.0 for value in bent[:count]]), (), lens),
+        }
+        width, height = _number(table, before, "width"), _number(table, before, "height")
+        if width is not None and height is not None:
+            out["+size"] = Composed(np.array([width, height]), (), lens)
+        return out
+    return {}
+
+
+def _number(table: dict[str, Any], before: str, *names: str) -> float | None:
+    """Return the first of several names that has one finite number."""
+    found = (vector(table.get(f"{before}{name}"), 1) for name in names)
+    return next((float(each[0]) for each in found if each is not None), None)
+
+
+def _bouguet(tree: dict[str, Any]) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for ending in _ENDINGS:
+        fc, cc = (vector(tree.get(f"{name}{ending}"), 2) for name in ("fc", "cc"))
+        if fc is None or cc is None:
+            continue
+        alpha = np.ravel(tree.get(f"alpha_c{ending}", 0.0))
+        skew = float(alpha[0]) * fc[0] if alpha.size == 1 and alpha.dtype.kind in "fiu" else math.nan
+        sources = tuple(f"{part}{ending}" for part in ("fc", "cc", "alpha_c", "KK"))
+        out[f"+K{ending}"] = Composed(np.array([[fc[0], skew, cc[0]], [0, fc[1], cc[1]], [0, 0, 1]]), sources, tree)
+    width, height = (vector(tree.get(name), 1) for name in ("nx", "ny"))
+    if width is not None and height is not None:
+        out["+size"] = Composed(np.concatenate([width, height]), ("nx", "ny"), tree)
+    return out
+
+
+def _kalibr(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of the first two cameras of a chain."""
+    names = sorted(
+        (name for name, value in tree.items() if re.fullmatch(r"cam\d+", name) and isinstance(value, dict)),
+        key=lambda name: int(name[3:]),
+    )
+    out: dict[str, Any] = {}
+    for number, name in zip("12", names, strict=False):
+        camera = tree[name]
+        numbers = vector(camera.get("intrinsics"))
+        if numbers is None or "camera_model" not in camera or len(numbers) < 4:
+            return {}
+        fx, fy, cx, cy = numbers[-4:]  # the parameters of other models, which are refused, precede them
+        out[f"+K{number}"] = Composed(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), (f"{name}.intrinsics",), camera)
+        bent = vector(camera.get("distortion_coeffs"))
+        if bent is not None:
+            out[f"+D{number}"] = Composed(bent, (f"{name}.distortion_coeffs",), camera)
+        size = vector(camera.get("resolution"), 2)
+        if size is not None:
+            out["+size" if number == "1" else "+size2"] = Composed(size, (f"{name}.resolution",), camera)
+        step = vector(camera.get("T_cn_cnm1"), 16)
+        if number == "2" and step is not None:
+            motion, metres = step.reshape(4, 4), {"unit": "m"}
+            out["+R"] = Composed(motion[:3, :3], (f"{name}.T_cn_cnm1",), metres)
+            out["+T"] = Composed(motion[:3, 3], (f"{name}.T_cn_cnm1",), metres)
+    return out
+
+
+def _toolbox_pair(pair: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return the values of a stereo structure of the Computer Vision Toolbox."""
+    out: dict[str, Any] = {}
+    cameras = [pair.get(f"CameraParameters{number}") for number in "12"]
+    stated = [each.get("WorldUnits") for each in (*cameras, pair) if isinstance(each, dict)]
+    units = next(({"unit": unit} for unit in stated if isinstance(unit, str) and unit), {})
+    for number, camera in zip("12", cameras, strict=True):
+        if isinstance(camera, dict):
+            out |= _toolbox_camera(camera, _dotted(name, f"CameraParameters{number}"), number, units)
+    motion, sources = _toolbox_pose(pair)
+    if motion is not None:
+        names = tuple(_dotted(name, source) for source in sources)
+        out |= {"+R": Composed(motion[0], names, units), "+T": Composed(motion[1], names, units)}
+    return out
+
+
+def _toolbox_pose(
+    pair: dict[str, Any],
+) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]] | None, tuple[str, ...]]:
+    """Return R and T from the first to the second camera, and the names of their sources; None without a pose."""
+    pose = pair.get("PoseCamera2")
+    if isinstance(pose, dict):
+        turn, shift = vector(pose.get("R"), 9), vector(pose.get("Translation"), 3)
+        if turn is not None and shift is not None:
+            return (turn.reshape(3, 3), shift), ("PoseCamera2",)
+        pose = pose.get("A")
+    motion = vector(pose, 16)
+    if motion is not None:
+        return (motion.reshape(4, 4)[:3, :3], motion.reshape(4, 4)[:3, 3]), ("PoseCamera2",)
+    names = "RotationOfCamera2", "TranslationOfCamera2"
+    turn, shift = vector(pair.get(names[0]), 9), vector(pair.get(names[1]), 3)
+    return (None if turn is None or shift is None else (turn.reshape(3, 3).T, shift)), names
+
+
+def _toolbox_camera(camera: dict[str, Any], name: str, number: str, units: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of one camera of the Computer Vision Toolbox; empty if the table is no such camera."""
+    inner = camera.get("Intrinsics")
+    camera = camera | inner if isinstance(inner, dict) else camera
+    radial, tangential = (vector(camera.get(f"{kind}Distortion")) for kind in ("Radial", "Tangential"))
+    if radial is None or not 2 <= len(radial) <= 3:
+        return {}
+    columns, rows = vector(camera.get("K"), 9), vector(camera.get("IntrinsicMatrix"), 9)
+    focal, centre = (vector(camera.get(part), 2) for part in ("FocalLength", "PrincipalPoint"))
+    if columns is not None:
+        K = columns.reshape(3, 3)
+    elif rows is not None:
+        K = rows.reshape(3, 3).T
+    elif focal is not None and centre is not None:
+        skew = vector(camera.get("Skew", 0.0), 1)
+        aslant = math.nan if skew is None else skew[0]
+        K = np.array([[focal[0], aslant, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
+    else:
+        return {}
+    straight = np.zeros(2) if tangential is None or len(tangential) != 2 else tangential
+    bent = np.concatenate([radial[:2], straight, radial[2:], np.zeros(3 - len(radial))])
+    matrix = K - [[0, 0, 1], [0, 0, 1], [0, 0, 0]]
+    sources = (name,) if name else tuple(camera)
+    out = {f"+K{number}": Composed(matrix, sources, units), f"+D{number}": Composed(bent, sources, units)}
+    size = vector(camera.get("ImageSize"), 2)
+    if size is not None:
+        out["+size2" if number == "2" else "+size"] = Composed(size[::-1], sources, units)
+    return out
+
+
+def _dotted(*names: str) -> str:
+    return ".".join(name for name in names if name)
+
+
+def vector(value: Any, size: int | None = None) -> NDArray[np.float64] | None:
+    """Return a value as finite numbers (n,), by rows; None if it is anything else, or has another ``size``."""
+    if value is None:
+        return None
+    try:
+        numbers = np.asarray(value, float).reshape(-1)
+    except (ValueError, TypeError):
+        return None
+    return numbers if np.isfinite(numbers).all() and (size is None or len(numbers) == size) else None

@@ -1,0 +1,204 @@
+"""Check the structure of MATLAB files before SciPy reads them, since its C code trusts what a file says.
+
+SciPy looks up the type of a data element in a table without a check of its bounds: one changed bit, such as the mark of
+complex numbers, ends the process. After this check every element has a type that its place allows, lies inside its
+matrix, and holds as many numbers as the matrix has.
+
+Format: "MAT-File Format", MathWorks, R2023b, level 5; files of level 4 have no nested elements and need no check.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+from characterisation.files.errors import InputError
+
+#: type codes of data elements (table 1-1 of the format)
+_INT8, _UINT8, _INT32, _UINT32, _MATRIX, _COMPRESSED, _UTF8 = 1, 2, 5, 6, 14, 15, 16
+_BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8}
+_TEXT_BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 16: 1, 17: 2, 18: 4}
+
+#: classes of arrays (table 1-3); the numeric ones run from double to uint64
+_CELL, _STRUCT, _OBJECT, _CHAR, _SPARSE, _FUNCTION, _OPAQUE = 1, 2, 3, 4, 5, 16, 17
+_NUMERIC = range(6, 16)
+
+_COMPLEX = 0x0800
+
+#: deepest nesting of cells and structures
+_DEEPEST = 32
+
+_KIND = "a whole file of MATLAB, level 5"
+
+
+def check_mat(file: Path, data: bytes, most: int) -> bool:
+    """Check the bytes of a file of level 5; return False for files of other levels, which pass unchecked.
+
+    Parameters
+    ----------
+    most
+        Largest number of values in the file.
+
+    Raises
+    ------
+    InputError
+        If an element has a type, size or place that the format does not allow, or is nested too deep.
+    """
+    if len(data) < 128 or 0 in data[:4]:  # level 4 begins with a small number; other files SciPy refuses itself
+        return False
+    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
+    if order is None or data[124:126] not in (b"\x00\x01", b"\x01\x00"):
+        return False
+    _check_variables(_Bytes(file, order, most), data)
+    return True
+
+
+@dataclass(frozen=True)
+class _Bytes:
+    """Reads elements of a ``file`` in one ``order`` of bytes; ``most`` values are allowed in it."""
+
+    file: Path
+    order: str
+    most: int
+
+    def fault(self, found: str) -> InputError:
+        return InputError(self.file, "", f"a damaged file: {found}", _KIND, "save it again, with the option -v7")
+
+    def element(self, data: memoryview) -> tuple[int, memoryview, memoryview]:
+        """Return type and content of the first element, and the bytes after it."""
+        if len(data) < 8:
+            raise self.fault("an element is cut off")
+        kind, size = struct.unpack_from(f"{self.order}II", data)
+        if kind >> 16:  # a small element: its size is in the upper half of the type
+            kind, size, start, end = kind & 0xFFFF, kind >> 16, 4, 8
+            if size > 4:
+                raise self.fault(f"a small element of {size} bytes")
+        else:
+            start = 8
+            end = start + size if kind == _COMPRESSED else start + -(-size // 8) * 8
+            if start + size > len(data):
+                raise self.fault(f"an element of {size} bytes where {len(data) - start} are left")
+        return kind, data[start : start + size], data[min(end, len(data)) :]
+
+
+def _check_variables(read: _Bytes, data: bytes) -> None:
+    rest, total = memoryview(data)[128:], 0
+    while len(rest):
+        kind, content, rest = read.element(rest)
+        if kind == _COMPRESSED:
+            unpack = zlib.decompressobj()
+            try:
+                unpacked = unpack.decompress(content, 8 * read.most)
+            except zlib.error as error:
+                raise read.fault(f"packed bytes that do not unpack ({error})") from None
+            if unpack.unconsumed_tail:
+                raise InputError(read.file, "size", f"over {8 * read.most:,} bytes unpacked", "fewer")
+            kind, content, _ = read.element(memoryview(unpacked))
+        if kind != _MATRIX:
+            raise read.fault(f"an element of type {kind} in place of a variable")
+        total += _check_matrix(read, content, 0)
+        if total > read.most:
+            raise InputError(read.file, "size", f"over {read.most:,} values", f"up to {read.most:,}")
+
+
+def _check_matrix(read: _Bytes, data: memoryview, depth: int) -> int:
+    """Check an array and those in it; return the number of values."""
+    if depth > _DEEPEST:
+        raise read.fault(f"values nested over {_DEEPEST} deep")
+    if not len(data):  # an empty cell
+        return 0
+    kind, flags, rest = read.element(data)
+    if kind != _UINT32 or len(flags) != 8:
+        raise read.fault("a variable without its class")
+    word = struct.unpack_from(f"{read.order}I", flags)[0]
+    parts = 2 if word & _COMPLEX else 1
+    array = word & 0xFF
+    if array == _OPAQUE:  # an object: three names, and the bytes that only MATLAB can read
+        inside = 0
+        while len(rest):
+            kind, content, rest = read.element(rest)
+            if kind == _MATRIX:
+                inside += _check_matrix(read, content, depth + 1)
+            elif kind not in (_INT8, _UINT8, _UTF8):
+                raise read.fault("an object without a class")
+        return inside
+    kind, sides, rest = read.element(rest)
+    if kind not in (_INT32, _UINT32) or len(sides) % 4 or not 8 <= len(sides) <= 128:
+        raise read.fault("a variable without its size")
+    shape = struct.unpack(f"{read.order}{len(sides) // 4}i", sides)
+    if min(shape) < 0 or math.prod(shape) > read.most:
+        raise read.fault(f"a variable of {' x '.join(map(str, shape))}")
+    kind, _, rest = read.element(rest)
+    if kind not in (_INT8, _UINT8, _UTF8):
+        raise read.fault("a variable without a name")
+    count = int(math.prod(shape))
+    if array in _NUMERIC:
+        for _ in range(parts):
+            rest = _check_numbers(read, rest, count)
+    elif array == _CHAR:
+        kind, text, rest = read.element(rest)
+        if kind not in _TEXT_BYTES or len(text) % _TEXT_BYTES[kind] or len(text) // _TEXT_BYTES[kind] > 4 * count:
+            raise read.fault("text of the wrong type or length")
+    elif array == _SPARSE:
+        _check_sparse(read, rest, shape, parts)
+    elif array in (_CELL, _STRUCT, _OBJECT, _FUNCTION):
+        rest = _check_fields(read, rest, array)
+        while len(rest):
+            kind, content, rest = read.element(rest)
+            if kind != _MATRIX:
+                raise read.fault(f"an element of type {kind} in place of a value")
+            count += _check_matrix(read, content, depth + 1)
+    else:
+        raise read.fault(f"an array of class {array}")
+    return count
+
+
+def _check_numbers(read: _Bytes, data: memoryview, count: int) -> memoryview:
+    kind, numbers, rest = read.element(data)
+    if kind not in _BYTES:
+        raise read.fault(f"numbers of type {kind}")
+    if len(numbers) != count * _BYTES[kind]:
+        raise read.fault(f"{len(numbers) / _BYTES[kind]:g} numbers in place of {count}")
+    return rest
+
+
+def _check_fields(read: _Bytes, data: memoryview, array: int) -> memoryview:
+    """Check the class name and the field names of a structure or object; a cell has none."""
+    if array == _OBJECT:
+        kind, _, data = read.element(data)
+        if kind not in (_INT8, _UINT8, _UTF8):
+            raise read.fault("an object without a class")
+    if array in (_STRUCT, _OBJECT):
+        kind, length, data = read.element(data)
+        longest = struct.unpack(f"{read.order}i", length)[0] if kind in (_INT32, _UINT32) and len(length) == 4 else 0
+        kind, names, data = read.element(data)
+        if longest < 1 or kind not in (_INT8, _UINT8, _UTF8) or len(names) % longest:
+            raise read.fault("a structure without names of its fields")
+    return data
+
+
+def _check_sparse(read: _Bytes, data: memoryview, shape: tuple[int, ...], parts: int) -> None:
+    """Check the row indices and the column starts of a sparse matrix: they are addresses in its arrays."""
+    if len(shape) != 2:
+        raise read.fault("a sparse matrix of more than two dimensions")
+    found = []
+    for _ in range(2):
+        kind, content, data = read.element(data)
+        if kind not in (_INT32, _UINT32) or len(content) % 4:
+            raise read.fault("a sparse matrix without its indices")
+        found.append(struct.unpack(f"{read.order}{len(content) // 4}i", content))
+    rows, starts = found
+    rising = all(a <= b for a, b in pairwise(starts))
+    if len(starts) != shape[1] + 1 or starts[0] != 0 or not rising or starts[-1] > len(rows):
+        raise read.fault("a sparse matrix whose columns do not follow one another")
+    if not all(0 <= row < shape[0] for row in rows[: starts[-1]]):
+        raise read.fault("a sparse matrix with rows outside it")
+    for _ in range(parts):
+        kind, numbers, data = read.element(data)
+        # of true and false MATLAB writes one byte each, whatever type it states
+        if kind not in _BYTES or (len(numbers) != starts[-1] and len(numbers) < starts[-1] * _BYTES[kind]):
+            raise read.fault("a sparse matrix with too few numbers")
