@@ -277,14 +277,15 @@ def score(
     Example: mitsim score scenes/two_pillars/study.toml -o runs/scores
     """
     start(variant)
-    from mitsim.campaign.plan import sensor_checksum
     from mitsim.prediction import Predictor
     from mitsim.progress import say
     from mitsim.reconstruction.cloud import sensor_geometry
     from mitsim.report.best_views import best_views
     from mitsim.run_study import claim, score_study
     from mitsim.study import read_study, report_lays
-    from mitsim.virtual.study_digest import study_digest, with_scene_files
+    from mitsim.virtual.plan import trial_digest
+    from mitsim.virtual.study_digest import study_digest
+    from mitsim.virtual.study_unknowns import study_unknowns
 
     check_folder(output)
     chosen = read_study(study, map_file, asking(yes))
@@ -293,10 +294,11 @@ def score(
         if name not in chosen.task.measurements:
             raise InputError("--measurement", "", name, ", ".join(chosen.task.measurements))
     assert chosen.performance_map is not None
-    claim(output, "score", study_digest(chosen, with_scene_files(sensor_checksum(chosen.sensor), chosen)))
+    unknowns = study_unknowns(chosen)
+    claim(output, "score", study_digest(chosen, trial_digest(chosen, unknowns, "screening")))
     geometry = sensor_geometry(chosen.sensor)
     predictor = Predictor.of_sensor(chosen.sensor, geometry)
-    scores, *_ = score_study(chosen, predictor, chosen.performance_map, output)
+    scores, *_ = score_study(chosen, predictor, chosen.performance_map, output, unknowns)
     for name in measurement or chosen.task.measurements:
         print(best_views(scores, name, top))
     say(f"scores: {output / 'scores.csv'}\nposes: {output / 'poses'}")

@@ -23,7 +23,7 @@ from mitsim.virtual.plan import measurements_of, trial_digest
 from mitsim.virtual.screening import screen
 from mitsim.virtual.spread_out import spread_over
 from mitsim.virtual.stated import state_view, statement_document
-from mitsim.virtual.study_digest import study_digest, with_scene_files
+from mitsim.virtual.study_digest import study_digest
 from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
 
@@ -193,7 +193,7 @@ def stated_view(
     """
     unknowns = study_unknowns(study)
     virtual_measurements = measurements_of(study, unknowns)
-    digest = with_scene_files(trial_digest(study, unknowns, virtual_measurements.source), study)
+    digest = trial_digest(study, unknowns, virtual_measurements.source)
     runner = spread_over(workers, study, unknowns, virtual_measurements)
     claim(folder, f"budget of view {view.number}", study_digest(study, digest))
     exposed = exposed_for(study, view, virtual_measurements, runner, digest, folder)

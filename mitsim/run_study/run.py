@@ -48,7 +48,7 @@ from mitsim.virtual.race_table import raced_errors, with_race
 from mitsim.virtual.rendered import RenderedMeasurements
 from mitsim.virtual.spread_out import spread_over
 from mitsim.virtual.stated import state_view, statement_document, write_statement
-from mitsim.virtual.study_digest import study_digest, with_scene_files
+from mitsim.virtual.study_digest import study_digest
 from mitsim.virtual.study_unknowns import study_unknowns
 from mitsim.virtual.trials import TrialFolder
 from mitsim.virtual.world import Unknowns
@@ -91,7 +91,7 @@ def run_study(
     unknowns = study_unknowns(study)
     virtual_measurements = measurements_of(study, unknowns)
     runner = spread_over(workers, study, unknowns, virtual_measurements)
-    digest = with_scene_files(trial_digest(study, unknowns, virtual_measurements.source), study)
+    digest = trial_digest(study, unknowns, virtual_measurements.source)
     claim(folder, "run", study_digest(study, digest))
     (folder / "clouds").mkdir(parents=True, exist_ok=True)
     (folder / "captures").mkdir(exist_ok=True)

@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from characterisation.checked_files import dataset_digest
 from mitsim.campaign.plan import sensor_checksum
 from mitsim.errors import InputError
+from mitsim.scene.xml_check import scene_files
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.simulation.indirect_light import IndirectLight
 from mitsim.simulation.rendering import Rendering
@@ -80,19 +82,16 @@ def race_rules(table: RaceTable, minutes: float | None = None) -> RaceRules:
 
 
 def map_digest(study: Study) -> str:
-    """Return sixteen hexadecimal digits of the performance map's values, or an empty string without a map."""
-    if study.performance_map is None:
-        return ""
-    digest = hashlib.sha256(repr(study.performance_map.data.attrs).encode())
-    for name in sorted(map(str, study.performance_map.data.variables)):
-        values = study.performance_map.data[name].values
-        text = values.dtype.kind in "OU"
-        digest.update(name.encode() + (repr(values.tolist()).encode() if text else values.tobytes()))
-    return digest.hexdigest()[:16]
+    """Return sixteen hexadecimal digits of the content of the performance map, or an empty string without a map."""
+    return "" if study.performance_map is None else dataset_digest(study.performance_map.data)[:16]
 
 
 def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: bool = False) -> str:
-    """Return sixteen hexadecimal digits of everything that determines a trial."""
+    """Return sixteen hexadecimal digits of everything that determines a trial.
+
+    These are sensor, calibration, unknowns, task, views, the scene with its meshes and textures, and, for clouds drawn
+    from the map, the map.
+    """
     file = study.file
     content = {
         "version": TRIAL_VERSION,
@@ -112,12 +111,25 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: 
             np.array([v.world_from_sensor.matrix().round(9) for v in study.views]).tobytes()
         ).hexdigest(),
     }
+    if named := _named_files(study):
+        content["files"] = named
     if separate_light or not unknowns.pooled:
         content["apart"] = [separate_light, unknowns.pooled]
     if source == "map":
-        assert study.performance_map is not None
-        content["map"] = hashlib.sha256(repr(study.performance_map.data.attrs).encode()).hexdigest()
+        content["map"] = map_digest(study)
+        content["score"] = file.score.model_dump(mode="json")  # effects outside the map are multiples of a screened u
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def _named_files(study: Study) -> list[str]:
+    """Return the SHA-256 of the files that the scene names: a mesh may change while the text of the scene stays."""
+    parameters = {name: str(value) for name, value in study.file.parameters.items()}
+    _, *named = scene_files(Path(study.scene.where), parameters)
+    digests = []
+    for path in named:
+        with path.open("rb") as stream:
+            digests.append(hashlib.file_digest(stream, "sha256").hexdigest())
+    return digests
 
 
 def _varied(unknowns: Unknowns, source: str) -> list[str]:
