@@ -171,13 +171,16 @@ def budget(
     """
     start(variant)
     from mitsim.campaign.executor import executor_of
-    from mitsim.interface.studies import open_study, stated_view, study_view
-    from mitsim.study import with_plan
+    from mitsim.run_study import Session
+    from mitsim.study import read_study, with_plan
     from mitsim.virtual.stated import write_statement
 
     check_folder(output)
-    chosen = with_plan(open_study(study, ask=asking(yes)), plan)
-    stated = stated_view(chosen, study_view(chosen, view, "--view"), output, executor_of(scheduler, processes))
+    chosen = with_plan(read_study(study, ask=asking(yes)), plan)
+    seen_from = chosen.view(view, "--view")
+    session = Session(chosen, output, executor_of(scheduler, processes))
+    session.claim(f"budget of view {view}")
+    stated = session.state(seen_from)
     write_statement(output / "statement.json", stated.document)
     _tell_statement(stated.statements, output)
 
@@ -215,19 +218,16 @@ def exposures(
     from characterisation.atomic_io import write_json
     from mitsim.exposures.exposure_plan import PlanRules
     from mitsim.exposures.planned import plan_document, plan_in_words, plan_table, plan_view, rendered, write_plan_csv
-    from mitsim.interface.studies import study_view
     from mitsim.progress import say
+    from mitsim.run_study import Session
     from mitsim.study import ExposureTable, read_study
-    from mitsim.virtual.plan import measurements_of
-    from mitsim.virtual.study_unknowns import study_unknowns
 
     check_folder(output)
     chosen = read_study(study, mapped=False)  # the view is rendered
-    shown = study_view(chosen, view, "--view")
+    shown = chosen.view(view, "--view")
     table = chosen.file.exposure or ExposureTable()
     rules = PlanRules(most or table.most, within or table.within)
-    renderer = rendered(chosen, measurements_of(chosen, study_unknowns(chosen)))
-    plan = plan_view(chosen, renderer, shown, rules)
+    plan = plan_view(rendered(Session(chosen).measurements), shown, rules)
     document = plan_document(chosen, plan)
     write_json(output / "exposures.json", document)
     write_plan_csv(output / "exposures.csv", plan)
@@ -277,15 +277,10 @@ def score(
     Example: mitsim score scenes/two_pillars/study.toml -o runs/scores
     """
     start(variant)
-    from mitsim.prediction import Predictor
     from mitsim.progress import say
-    from mitsim.reconstruction.cloud import sensor_geometry
     from mitsim.report.best_views import best_views
-    from mitsim.run_study import claim, score_study
+    from mitsim.run_study import Session, score_study
     from mitsim.study import read_study, report_lays
-    from mitsim.virtual.plan import trial_digest
-    from mitsim.virtual.study_digest import study_digest
-    from mitsim.virtual.study_unknowns import study_unknowns
 
     check_folder(output)
     chosen = read_study(study, map_file, asking(yes))
@@ -293,12 +288,9 @@ def score(
     for name in measurement or ():
         if name not in chosen.task.measurements:
             raise InputError("--measurement", "", name, ", ".join(chosen.task.measurements))
-    assert chosen.performance_map is not None
-    unknowns = study_unknowns(chosen)
-    claim(output, "score", study_digest(chosen, trial_digest(chosen, unknowns, "screening")))
-    geometry = sensor_geometry(chosen.sensor)
-    predictor = Predictor.of_sensor(chosen.sensor, geometry)
-    scores, *_ = score_study(chosen, predictor, chosen.performance_map, output, unknowns)
+    session = Session(chosen, output)
+    session.claim("score")
+    scores, *_ = score_study(session)
     for name in measurement or chosen.task.measurements:
         print(best_views(scores, name, top))
     say(f"scores: {output / 'scores.csv'}\nposes: {output / 'poses'}")

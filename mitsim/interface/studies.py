@@ -3,37 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import xarray as xr
 
 from characterisation.errors import InputError
 from characterisation.statements.statement import Statement
-from mitsim.campaign.executor import Executor
-from mitsim.exposures.planned import exposed_for
-from mitsim.prediction import Predictor
-from mitsim.reconstruction.cloud import sensor_geometry
-from mitsim.run_study import claim
+from mitsim.run_study.session import Session
 from mitsim.study import StatementTable, Study, read_study
-from mitsim.views import View
-from mitsim.virtual.plan import measurements_of, trial_digest
-from mitsim.virtual.screening import screen
-from mitsim.virtual.spread_out import spread_over
-from mitsim.virtual.stated import state_view, statement_document
-from mitsim.virtual.study_digest import study_digest
-from mitsim.virtual.study_unknowns import study_unknowns
-from mitsim.virtual.trials import TrialFolder
-
-
-@dataclass(frozen=True)
-class StatedView:
-    """Statements of every measurement from one view, and the ``document`` of ``statement.json``."""
-
-    statements: list[Statement]
-    document: dict[str, Any]
 
 
 def open_study(
@@ -125,8 +104,7 @@ def score(study: Study) -> xr.Dataset:
             "a performance map",
             "open the study with performance_map=''",
         )
-    predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
-    return screen(study, predictor, study.performance_map)[0]
+    return Session(study).screen()[0]
 
 
 def statement(
@@ -178,44 +156,11 @@ def statement(
     table = StatementTable(
         trials=_checked("trials", most, 2), pairs=_checked("pairs", own.pairs if pairs is None else pairs, 0)
     )
-    if folder is not None:
-        return stated_view(study, study_view(study, view, "statement: view"), Path(folder), table=table).statements
-    with TemporaryDirectory() as place:
-        return stated_view(study, study_view(study, view, "statement: view"), Path(place), table=table).statements
-
-
-def stated_view(
-    study: Study, view: View, folder: Path, workers: Executor | None = None, table: StatementTable | None = None
-) -> StatedView:
-    """State one view, with its trials kept in ``folder``, as ``mitsim budget`` does.
-
-    ``workers`` run the trials; without them, this process does. ``table`` replaces the study's own numbers.
-    """
-    unknowns = study_unknowns(study)
-    virtual_measurements = measurements_of(study, unknowns)
-    digest = trial_digest(study, unknowns, virtual_measurements.source)
-    runner = spread_over(workers, study, unknowns, virtual_measurements)
-    claim(folder, f"budget of view {view.number}", study_digest(study, digest))
-    exposed = exposed_for(study, view, virtual_measurements, runner, digest, folder)
-    trials = TrialFolder(folder / "trials", exposed.digest, list(study.task.measurements))
-    stated = state_view(study, view, exposed.runner, trials, unknowns, table or study.file.statement)
-    return StatedView(
-        stated, statement_document(study, view, stated, unknowns, virtual_measurements.source, exposed.planned)
-    )
-
-
-def study_view(study: Study, number: int, where: str) -> View:
-    """Return the candidate view with a number.
-
-    Raises
-    ------
-    InputError
-        If the study has no such view.
-    """
-    known = {one.number: one for one in study.views}
-    if number not in known:
-        raise InputError(where, "", number, f"{min(known)} to {max(known)}, the views of this study")
-    return known[number]
+    chosen = study.view(view, "statement: view")
+    with nullcontext(folder) if folder is not None else TemporaryDirectory() as place:
+        session = Session(study, place)
+        session.claim(f"budget of view {view}")
+        return session.state(chosen, table).statements
 
 
 def _checked(name: str, value: int, least: int) -> int:

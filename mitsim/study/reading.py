@@ -67,6 +67,19 @@ class Study:
         """Return the candidate views that the sensor can take."""
         return self.candidates.views
 
+    def view(self, number: int, where: str = "view") -> View:
+        """Return the candidate view with a number; ``where`` names the argument in the error.
+
+        Raises
+        ------
+        InputError
+            If the study has no such view.
+        """
+        known = {one.number: one for one in self.views}
+        if number not in known:
+            raise InputError(where, "", number, f"{min(known)} to {max(known)}, the views of this study")
+        return known[number]
+
     @property
     def unknowns(self) -> UnknownsTable:
         """Return the unknowns: values of the study, else of the sensor, else the defaults."""

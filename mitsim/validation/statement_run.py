@@ -19,24 +19,27 @@ from numpy.typing import NDArray
 
 from characterisation.statements.statement import Statement
 from mitsim.campaign.executor import Executor
-from mitsim.prediction import Predictor
 from mitsim.progress import say
-from mitsim.reconstruction.cloud import sensor_geometry
+from mitsim.run_study.session import Session
 from mitsim.study import StatementTable, Study
-from mitsim.validation.case_trials import CaseTrials, days, keep_trials, measured_choice, measured_truth, trials_by_kind
+from mitsim.validation.case_trials import (
+    days,
+    keep_trials,
+    measure_worlds,
+    measured_choice,
+    measured_truth,
+    trials_by_kind,
+)
 from mitsim.validation.part_cases import PartCase
 from mitsim.view_scores import screening_risk
 from mitsim.views import View
-from mitsim.virtual.plan import race_rules
-from mitsim.virtual.race import ALL, Raced, run_race
-from mitsim.virtual.screening import screen
-from mitsim.virtual.stated import state_view
+from mitsim.virtual.race import ALL, Raced
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class StatedView:
+class JudgedView:
     """A view's statements, by measurement, and the ``errors`` (measurement, world) in other worlds that judge them.
 
     ``why`` is the reason why the view was stated.
@@ -66,7 +69,7 @@ class JudgedCase:
     scores: xr.Dataset
     raced: Raced | None
     choice: Floats | None
-    stated: tuple[StatedView, ...]
+    stated: tuple[JudgedView, ...]
 
 
 def run_cases(cases: Sequence[PartCase], folder: str | Path, workers: Executor | None = None) -> list[JudgedCase]:
@@ -79,14 +82,11 @@ def run_case(case: PartCase, folder: Path, workers: Executor | None = None) -> J
     say(f"case: {case.name}")
     study = case.open()
     trials_of_kind = trials_by_kind(case, study, folder, workers)
-    assert study.performance_map is not None
-    predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
-    scores, _ = screen(study, predictor, study.performance_map)
+    tool = trials_of_kind["tool"]
+    scores, _ = tool.screen()
     raced = None
     if case.table.raced:
-        few, tool = study.views[: case.file.raced_candidates], trials_of_kind["tool"]
-        few_scores = scores.sel(view=[view.number for view in few])
-        raced = run_race(few, few_scores, tool.runner, tool.trials, race_rules(study.file.race))
+        raced = tool.race(scores.sel(view=[view.number for view in study.views[: case.file.raced_candidates]]))
     truth = measured_truth(case, trials_of_kind["truth"])
     choice = None if raced is None else measured_choice(case, trials_of_kind["choice"])
     chosen = None if raced is None else raced.leaders().get(ALL)
@@ -115,9 +115,9 @@ def _to_state(case: PartCase, study: Study, scores: xr.Dataset, chosen: int | No
     return [(by_number[number], why) for number, why in [(first, "chosen"), *((others[i], "at random") for i in drawn)]]
 
 
-def _stated(case: PartCase, trials_of_kind: dict[str, CaseTrials], view: View, why: str) -> StatedView:
+def _stated(case: PartCase, trials_of_kind: dict[str, Session], view: View, why: str) -> JudgedView:
     tool, apart, count = trials_of_kind["tool"], trials_of_kind["apart"], case.file.stated_worlds
     table = StatementTable(trials=tool.study.file.statement.trials, pairs=0)
-    statements = state_view(tool.study, view, tool.runner, tool.trials, tool.unknowns, table)
-    apart.measure([view], {view.number: days(count)})
-    return StatedView(view.number, why, tuple(statements), apart.trials.errors(view.number, days(count)))
+    stated = tool.state(view, table)
+    measure_worlds(case, "apart", apart, [view], {view.number: days(count)})
+    return JudgedView(view.number, why, tuple(stated.statements), apart.trials.errors(view.number, days(count)))
