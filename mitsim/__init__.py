@@ -32,7 +32,7 @@ _NAMES = {
     "load_sensor": "mitsim.interface.captures",
     "look_at": "mitsim.interface.poses",
     "measure": "mitsim.interface.measurements",
-    "open_study": "mitsim.interface.studies",
+    "open_study": "mitsim.study.reading",
     "performance_map": "mitsim.interface.maps",
     "predict": "mitsim.interface.maps",
     "read_capture": "mitsim.interface.captures",
@@ -65,12 +65,13 @@ if TYPE_CHECKING:
     from mitsim.interface.maps import performance_map, predict
     from mitsim.interface.measurements import label, measure, read_task
     from mitsim.interface.poses import look_at
-    from mitsim.interface.studies import open_study, score, statement
+    from mitsim.interface.studies import score, statement
     from mitsim.measuring.result import Result
     from mitsim.scene.load import Scene
     from mitsim.sensor.preset import Sensor
     from mitsim.sensor.transforms import Transform
     from mitsim.study import Study
+    from mitsim.study.reading import open_study
 
 __all__ = [
     "BudgetLine",

@@ -71,10 +71,10 @@ def run(
     from mitsim.report.page import write_report
     from mitsim.report.run_folder import read_run
     from mitsim.run_study import run_study
-    from mitsim.study import read_study, report_lays, with_plan
+    from mitsim.study import open_study, report_lays, with_plan
 
     check_folder(output)
-    chosen = with_plan(read_study(study, ask=asking(yes)), plan)
+    chosen = with_plan(open_study(study, ask=asking(yes)), plan)
     keep_finished(output, overwrite, "run.json")
     report_lays(chosen)
     stated = run_study(chosen, output, minutes, executor_of(scheduler, processes))
@@ -172,11 +172,11 @@ def budget(
     start(variant)
     from mitsim.campaign.executor import executor_of
     from mitsim.run_study import Session
-    from mitsim.study import read_study, with_plan
+    from mitsim.study import open_study, with_plan
     from mitsim.virtual.stated import write_statement
 
     check_folder(output)
-    chosen = with_plan(read_study(study, ask=asking(yes)), plan)
+    chosen = with_plan(open_study(study, ask=asking(yes)), plan)
     seen_from = chosen.view(view, "--view")
     session = Session(chosen, output, executor_of(scheduler, processes))
     session.claim(f"budget of view {view}")
@@ -220,10 +220,10 @@ def exposures(
     from mitsim.exposures.planned import plan_document, plan_in_words, plan_table, plan_view, rendered, write_plan_csv
     from mitsim.progress import say
     from mitsim.run_study import Session
-    from mitsim.study import ExposureTable, read_study
+    from mitsim.study import ExposureTable, open_study
 
     check_folder(output)
-    chosen = read_study(study, mapped=False)  # the view is rendered
+    chosen = open_study(study, mapped=False)  # the view is rendered
     shown = chosen.view(view, "--view")
     table = chosen.file.exposure or ExposureTable()
     rules = PlanRules(most or table.most, within or table.within)
@@ -280,10 +280,10 @@ def score(
     from mitsim.progress import say
     from mitsim.report.best_views import best_views
     from mitsim.run_study import Session, score_study
-    from mitsim.study import read_study, report_lays
+    from mitsim.study import open_study, report_lays
 
     check_folder(output)
-    chosen = read_study(study, map_file, asking(yes))
+    chosen = open_study(study, performance_map=map_file, ask=asking(yes))
     report_lays(chosen)
     for name in measurement or ():
         if name not in chosen.task.measurements:

@@ -1,8 +1,7 @@
-"""Open studies, score the views of a part with a map, and state the uncertainty of one view by virtual measurements."""
+"""Score the views of a part with a map, and state the uncertainty of one view by virtual measurements."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,46 +11,7 @@ import xarray as xr
 from characterisation.errors import InputError
 from characterisation.statements.statement import Statement
 from mitsim.run_study.session import Session
-from mitsim.study import StatementTable, Study, read_study
-
-
-def open_study(
-    path: str | Path, *, performance_map: str | Path | None = None, ask: Callable[[str], bool] | None = None
-) -> Study:
-    """Open a study TOML file with everything it names: part, task, sensor, map and candidate views.
-
-    Parameters
-    ----------
-    path
-        The file; the reference of file formats lists its keys.
-    performance_map
-        A ``map.nc``, or a sensor whose map is shipped with mitsim, instead of the study's own. ``""`` selects the
-        study's own map, or that of its sensor if the study names a campaign.
-    ask
-        Called with a question if the map lacks a finish of the part; if it returns True, the finish is characterised
-        immediately.
-
-    Returns
-    -------
-    Study
-        ``views``, each with its ``number``, ``world_from_sensor`` and ``standoff`` [mm]; ``scene``, ``task``,
-        ``sensor`` and ``performance_map``.
-
-    Raises
-    ------
-    InputError
-        For anything that would stop the study later.
-
-    Examples
-    --------
-    >>> import mitsim as ms
-    >>> study = ms.open_study("study.toml")
-    >>> study.sensor.name, list(study.task.measurements)[:2]
-    ('ensenso-n10', ['point1_point2_distance', 'plane_pillar1_angle'])
-    >>> study.views[0].number
-    0
-    """
-    return read_study(path, None if performance_map is None else str(performance_map), ask)
+from mitsim.study import StatementTable, Study
 
 
 def score(study: Study) -> xr.Dataset:
@@ -60,7 +20,7 @@ def score(study: Study) -> xr.Dataset:
     Parameters
     ----------
     study
-        From :func:`open_study`.
+        From :func:`mitsim.open_study`.
 
     Returns
     -------
@@ -118,7 +78,7 @@ def statement(
     Parameters
     ----------
     study
-        From :func:`open_study`.
+        From :func:`mitsim.open_study`.
     view
         Number of the view.
     trials

@@ -34,7 +34,7 @@ from mitsim.simulation.render_residual import (
 )
 from mitsim.simulation.rendering import Rendering
 from mitsim.simulation.simulate import SimulatedSensor
-from mitsim.study import read_study
+from mitsim.study import open_study
 from tests.smaller_sensors import narrow_search
 
 AXIS = np.array([0.0, 0.0, 1.0])
@@ -254,7 +254,7 @@ def test_a_campaign_and_a_study_refuse_an_exposure_that_follows_the_scene(tmp_pa
     (tmp_path / "study.toml").write_text(study)
     for refused in (
         lambda: read_campaign(scenes / "coupon/campaign.toml", sensor),
-        lambda: read_study(tmp_path / "study.toml"),
+        lambda: open_study(tmp_path / "study.toml"),
     ):
         with pytest.raises(InputError, match="F depends on the rest of the view") as caught:
             refused()
