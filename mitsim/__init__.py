@@ -20,7 +20,7 @@ _NAMES = {
     "MissingEnvironmentError": "characterisation.errors",
     "PerformanceMap": "characterisation.maps.performance_map",
     "PointCloud": "characterisation.point_cloud",
-    "Result": "mitsim.measuring.result",
+    "Result": "characterisation.tasks.result",
     "Scene": "mitsim.scene.load",
     "Sensor": "mitsim.sensor.preset",
     "Statement": "characterisation.statements.statement",
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
     from characterisation.statements.budget import BudgetLine
     from characterisation.statements.statement import Statement
+    from characterisation.tasks.result import Result
     from characterisation.tasks.task_file import Task
     from mitsim.capture.capture import Capture
     from mitsim.interface.captures import (
@@ -66,7 +67,6 @@ if TYPE_CHECKING:
     from mitsim.interface.measurements import label, measure, read_task
     from mitsim.interface.poses import look_at
     from mitsim.interface.studies import score, statement
-    from mitsim.measuring.result import Result
     from mitsim.scene.load import Scene
     from mitsim.sensor.preset import Sensor
     from mitsim.sensor.transforms import Transform

@@ -12,8 +12,8 @@ from mitsim.commands.options import Clouds, DecodedAs, Defines, Json, Variant, c
 from mitsim.errors import InputError
 
 if TYPE_CHECKING:
+    from characterisation.tasks.result import Result
     from mitsim.measuring.clouds import InputCloud
-    from mitsim.measuring.result import Result
 
 _WINDOW = "NAME=COLUMN,ROW,WIDTH,HEIGHT"
 

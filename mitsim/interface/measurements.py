@@ -9,12 +9,12 @@ from numpy.typing import ArrayLike
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud
 from characterisation.tasks import task_reading
+from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.task_reading import check_features
 from mitsim.interface.poses import as_pose
 from mitsim.measuring.clouds import margin_of
 from mitsim.measuring.of_task import labelled_cloud, measure_labelled
-from mitsim.measuring.result import Result
 from mitsim.scene.load import Scene
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform

@@ -24,8 +24,8 @@ from characterisation.acceptance.vdi_2634 import flatness_error, probing_error, 
 from characterisation.coupon.patches import Coupon
 from characterisation.errors import InputError, nearest
 from characterisation.point_cloud import PointCloud
+from characterisation.tasks.result import Result, failed
 from mitsim.measuring.request import check_unique, parse_numbers, parse_window
-from mitsim.measuring.result import Result, failed
 from mitsim.measuring.windows import LEAST_POINTS, window_points, window_slices
 from mitsim.sensor.roi import Roi
 

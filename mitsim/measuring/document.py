@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mitsim.measuring.result import NOT_INCLUDED, Repeatability, Result
+from characterisation.tasks.result import Result
+from mitsim.measuring.result import NOT_INCLUDED, Repeatability
 from mitsim.version import __version__
 
 #: significant digits of an uncertainty. A value has as many decimals as its uncertainty, at least 3 and at most 6

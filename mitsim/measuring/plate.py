@@ -32,9 +32,9 @@ from characterisation.features.fits import fit_plane
 from characterisation.features.robust_fit import SMALLEST_SCALE, FitError
 from characterisation.features.surfaces import tangents
 from characterisation.point_cloud import PointCloud, ViewGrid
+from characterisation.tasks.result import Result, failed
 from mitsim.capture.capture import Capture
 from mitsim.decode.dot_centres import dot_centres, resample_to_grid
-from mitsim.measuring.result import Result, failed
 from mitsim.measuring.windows import window_slices
 from mitsim.sensor.roi import Roi
 

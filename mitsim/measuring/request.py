@@ -23,9 +23,9 @@ from characterisation.acceptance.cloud_difference import (
 )
 from characterisation.documents import checked_name
 from characterisation.errors import InputError
+from characterisation.tasks.result import Result, failed
 from mitsim.measuring.clouds import InputCloud
 from mitsim.measuring.plate import Plate, image_on_grid, measure_plate
-from mitsim.measuring.result import Result, failed
 from mitsim.measuring.windows import PairKind, Shape, WindowPlan, measure_windows, window_slices
 from mitsim.report.measured_figures import difference_figure, distance_figure
 from mitsim.sensor.roi import Roi

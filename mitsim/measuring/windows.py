@@ -36,7 +36,7 @@ from characterisation.tasks.definitions import (
     point_plane_distance,
 )
 from characterisation.tasks.evaluation import evaluate
-from mitsim.measuring.result import Result, failed
+from characterisation.tasks.result import Result, failed
 from mitsim.sensor.roi import Roi
 
 Shape = Literal["plane", "sphere", "cylinder"]

@@ -10,12 +10,13 @@ from test_docs import FORMATS, JSON_MODELS, first_column
 from characterisation.statements.budget import BudgetLine
 from characterisation.statements.decision import plus_minus
 from characterisation.statements.statement import statement
+from characterisation.tasks.result import Result
 from mitsim.exposures.exposure_plan import ExposurePlan
 from mitsim.exposures.exposure_sweep import ExposureResult, FeatureResult
 from mitsim.exposures.planned import plan_document, write_plan_csv
 from mitsim.hardware.stage_connection import BAUD
 from mitsim.measuring.document import measured_document
-from mitsim.measuring.result import Repeatability, Result
+from mitsim.measuring.result import Repeatability
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import UnknownsTable

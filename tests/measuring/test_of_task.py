@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from characterisation.errors import InputError
+from characterisation.tasks.result import Result
 from mitsim.measuring.of_task import corrected, read_pose, read_view_statement
-from mitsim.measuring.result import Result
 from mitsim.sensor.transforms import Transform, look_at
 
 POSE = look_at([0, -450, 250], [0, 0, 0], [0, 0, 1])

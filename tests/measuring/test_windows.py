@@ -9,8 +9,9 @@ from seen_shapes import GRID, cloud_of, cylinder, plane, sphere
 from characterisation.errors import InputError
 from characterisation.features.fits import fit_cylinder
 from characterisation.features.starts import cylinder_start
+from characterisation.tasks.result import Result
 from mitsim.measuring.document import repeatability_table
-from mitsim.measuring.result import Result, repeatability
+from mitsim.measuring.result import repeatability
 from mitsim.measuring.windows import WindowPlan, measure_windows
 from mitsim.sensor.roi import Roi
 
