@@ -7,6 +7,8 @@ import pytest
 import trimesh
 
 from characterisation.maps.performance_map import PerformanceMap
+from mitsim.campaign.executor import Pool
+from mitsim.run_study import Session
 from mitsim.study import StudyFile, open_study
 from mitsim.validation.case_trials import trials_by_kind
 from mitsim.validation.part_cases import read_part_cases
@@ -117,3 +119,14 @@ def test_kept_trials_of_a_case_are_not_those_of_another_mesh(folder):
     ball(part / "right.ply", 9, 40)
     after = digests()
     assert not set(before.values()) & set(after.values())
+
+
+def test_workers_prepare_a_part_anew_if_its_mesh_has_changed(folder):
+    def order_digest():
+        study = open_study(folder / "study.toml", StudyFile.model_validate(STUDY))
+        return Session(study, folder, workers=Pool(2)).runner._order.digest
+
+    before = order_digest()
+    assert order_digest() == before
+    ball(folder / "right.ply", 9, 40)
+    assert order_digest() != before
