@@ -6,6 +6,7 @@ a pipe waits forever.
 
 from __future__ import annotations
 
+import hashlib
 import re
 import stat
 import xml.etree.ElementTree as ElementTree
@@ -68,6 +69,18 @@ def scene_files(path: Path, parameters: Mapping[str, str]) -> list[Path]:
         beside = [folder / name for folder in folders if name and is_file(folder / name)]
         found |= dict.fromkeys(beside or ([Path(name)] if is_file(name) else []))
     return list(found)
+
+
+def named_digests(path: Path, parameters: Mapping[str, str]) -> list[str]:
+    """Return the SHA-256 of every file that a scene names (:func:`scene_files`), without the XML itself.
+
+    A mesh may change while the text of the scene stays the same.
+    """
+    digests = []
+    for file in scene_files(path, parameters)[1:]:
+        with file.open("rb") as stream:
+            digests.append(hashlib.file_digest(stream, "sha256").hexdigest())
+    return digests
 
 
 def _filled_in(text: str, values: Mapping[str, str]) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from characterisation.checked_files import dataset_digest
 from mitsim.campaign.plan import sensor_checksum
 from mitsim.errors import InputError
-from mitsim.scene.xml_check import scene_files
+from mitsim.scene.xml_check import named_digests
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.simulation.indirect_light import IndirectLight
 from mitsim.simulation.rendering import Rendering
@@ -111,7 +111,7 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: 
             np.array([v.world_from_sensor.matrix().round(9) for v in study.views]).tobytes()
         ).hexdigest(),
     }
-    if named := _named_files(study):
+    if named := named_digests(Path(study.scene.where), {name: str(value) for name, value in file.parameters.items()}):
         content["files"] = named
     if separate_light or not unknowns.pooled:
         content["apart"] = [separate_light, unknowns.pooled]
@@ -119,17 +119,6 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: 
         content["map"] = map_digest(study)
         content["score"] = file.score.model_dump(mode="json")  # effects outside the map are multiples of a screened u
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
-
-
-def _named_files(study: Study) -> list[str]:
-    """Return the SHA-256 of the files that the scene names: a mesh may change while the text of the scene stays."""
-    parameters = {name: str(value) for name, value in study.file.parameters.items()}
-    _, *named = scene_files(Path(study.scene.where), parameters)
-    digests = []
-    for path in named:
-        with path.open("rb") as stream:
-            digests.append(hashlib.file_digest(stream, "sha256").hexdigest())
-    return digests
 
 
 def _varied(unknowns: Unknowns, source: str) -> list[str]:

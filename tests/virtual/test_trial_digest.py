@@ -1,4 +1,4 @@
-"""The digest of a trial changes with everything that a trial depends on, and with nothing else."""
+"""The digests of trials and captures change with everything that these depend on, and with nothing else."""
 
 import shutil
 from dataclasses import replace
@@ -8,7 +8,9 @@ import trimesh
 
 from characterisation.maps.performance_map import PerformanceMap
 from mitsim.campaign.executor import Pool
+from mitsim.campaign.many import origin_of
 from mitsim.run_study import Session
+from mitsim.sensor.preset import load_sensor
 from mitsim.study import StudyFile, open_study
 from mitsim.validation.case_trials import trials_by_kind
 from mitsim.validation.part_cases import read_part_cases
@@ -87,6 +89,15 @@ def test_a_mesh_of_another_parameter_belongs_to_it(folder):
     before, other = digest(folder), digest(folder, parameters={"mesh": "small"})
     ball(folder / "small.ply", 9, -40)
     assert digest(folder) == before and digest(folder, parameters={"mesh": "small"}) != other
+
+
+@pytest.mark.parametrize("mesh", ["small.ply", "right.ply"])
+def test_a_mesh_belongs_to_a_capture_that_is_rendered_of_it(folder, mesh):
+    shutil.copy(folder / "meshes" / "left.ply", folder / "small.ply")
+    sensor, of_small = load_sensor("ensenso-n10"), {"mesh": "small"}
+    before = origin_of(folder / "balls.xml", sensor, of_small)
+    ball(folder / mesh, 9, 40)
+    assert origin_of(folder / "balls.xml", sensor, of_small) != before
 
 
 def test_the_values_of_the_map_belong_to_it_if_clouds_are_drawn_from_them(folder):
