@@ -1,4 +1,4 @@
-"""Describe one measured number with its unit and uncertainty, and its repeatability over several clouds.
+"""Describe one measured number: its value with unit, uncertainty and nominal value, or the reason why there is none.
 
 Signal chain: measurements of several clouds -> grouped by name -> mean, standard deviation, and root mean square of the
 uncertainties.
@@ -63,6 +63,11 @@ class Result:
         return self.value - self.nominal
 
 
+def failed(name: str, unit: str, reason: str, points: int = 0, points_given: int = 0) -> Result:
+    """Return the result of a measurement that was not possible, with its reason."""
+    return Result(name, unit, math.nan, points=points, points_given=points_given, reason=reason)
+
+
 @dataclass(frozen=True)
 class Repeatability:
     """One measurement over several clouds, in ``unit``.
@@ -81,11 +86,6 @@ class Repeatability:
     deviation: float
     uncertainty: float
     nominal: float
-
-
-def failed(name: str, unit: str, reason: str, points: int = 0, points_given: int = 0) -> Result:
-    """Return the result of a measurement that was not possible, with its reason."""
-    return Result(name, unit, math.nan, points=points, points_given=points_given, reason=reason)
 
 
 def repeatability(clouds: Sequence[Sequence[Result]]) -> list[Repeatability]:

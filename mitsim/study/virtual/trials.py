@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
-from characterisation.tasks.evaluation import Measured
+from characterisation.tasks.result import Result
 from mitsim.study.virtual.world import GROUPS, Trial
 
 
@@ -34,7 +34,7 @@ class Outcome:
     reasons: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, measured: Mapping[str, Measured]) -> Outcome:
+    def of(cls, measured: Mapping[str, Result]) -> Outcome:
         """Return the errors of a cloud's measurements, and the reasons of those without a value."""
         return cls(
             {name: float(one.error) for name, one in measured.items()},
