@@ -128,7 +128,7 @@ def render(
         depth,
         Noise.parse(noise),
         truth,
-        origin_of(scene, chosen),
+        origin_of(scene, chosen, definitions(define)),
     ).digest()
     remove_partial_beside(output)
     if digest_of(output, "render") == digest:
