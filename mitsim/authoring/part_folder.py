@@ -24,7 +24,6 @@ from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from mitsim.authoring.drawing_task import DrawnTask, drawn_task
 from mitsim.authoring.face import Face, Torus
 from mitsim.authoring.naming import with_names
-from mitsim.authoring.part21 import read_step_text
 from mitsim.authoring.product_information import read_product_information
 from mitsim.authoring.read_mesh import STEP, check_part_file, check_size, read_mesh
 from mitsim.authoring.read_step import CHORD_MM, read_step
@@ -105,11 +104,11 @@ def read_part(path: str | Path, units: str | None = None, angle_deg: float = 20.
     if path.suffix.lower() not in STEP:
         mesh = read_mesh(path, units)
         made = segment_mesh(mesh.vertices, mesh.triangles, angle_deg, None, str(path))
-        return Part(with_names(made.faces), made.remarks)
-    drawn = read_step(path, chord_mm)
+        return Part(with_names(made.faces), [*mesh.remarks, *made.remarks])
+    drawn = read_step(path, chord_mm, units)
     check_size(path, np.concatenate([face.vertices for face in drawn.faces]))
     faces = with_names(drawn.faces)
-    information = read_product_information(read_step_text(path))
+    information = read_product_information(drawn.text)
     return Part(faces, drawn.remarks, drawn_task(information, faces) if information.found else None)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import subprocess
 import sys
 import tempfile
@@ -22,7 +23,8 @@ import numpy as np
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from mitsim.authoring import step_worker
 from mitsim.authoring.face import Face, Floats, Ints, Surface, Torus, outward_normals, same_surface, surface_distance
-from mitsim.authoring.part21 import read_step_text
+from mitsim.authoring.part21 import StepText, read_step_text
+from mitsim.authoring.units import UNITS, step_units, unit_words
 from mitsim.errors import InputError
 
 #: default mesh of STEP without a sensor: distance from the true surface [mm], and angle between facets [rad]. The angle
@@ -41,11 +43,12 @@ _INSTALL = 'pip install "cadquery-ocp-novtk<8" (or "mitsim[step]"), or save the 
 
 @dataclass(frozen=True)
 class Drawn:
-    """Faces of a STEP file, remarks about their processing, and whether they bound closed bodies."""
+    """Faces of a STEP file, remarks about their processing, whether they bound closed bodies, and the file's text."""
 
     faces: list[Face]
     remarks: list[str]
     closed: bool
+    text: StepText
 
 
 def step_installed() -> bool:
@@ -53,17 +56,22 @@ def step_installed() -> bool:
     return importlib.util.find_spec("OCP") is not None
 
 
-def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
+def read_step(path: str | Path, chord_mm: float = CHORD_MM, units: str | None = None) -> Drawn:
     """Read the faces of a STEP file, in mm, meshed to ``chord_mm``.
+
+    ``units`` (``mm``, ``m``, ``inch``) of a file that does not state its own; mm if None.
 
     Raises
     ------
     InputError
-        If the file cannot be read, contains no faces, or the required library is not installed.
+        If the file cannot be read, contains no faces, states another unit than ``units``, or the required library is
+        not installed.
     """
     path = Path(path)
     if not step_installed():
         raise InputError(path, "", "a STEP file, which needs OpenCASCADE", "an STL, PLY or OBJ file", _INSTALL)
+    text = read_step_text(path)
+    scale, unit_remarks = _scale(path, text, units)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "faces.npz"
         command = [
@@ -73,6 +81,7 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
             str(out),
             repr(max(chord_mm / 2, FINEST_MM)),  # OpenCASCADE exceeds the requested value by a factor of up to 2
             repr(BEND),
+            repr(scale),
         ]
         try:
             done = subprocess.run(command, capture_output=True, timeout=_SECONDS, check=False)
@@ -84,35 +93,51 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
         if done.returncode != 0 or not out.exists():
             raise InputError(path, "", "a file that OpenCASCADE cannot read", "a STEP file (AP203, AP214 or AP242)")
         with np.load(out) as data:
-            text = json.loads(data["text"].tobytes())
+            read = json.loads(data["text"].tobytes())
             arrays = {key: data[key] for key in ("vertices", "normals", "triangles")}
-    names = _names(path)
+    names = _names(text)
     faces, vertex, triangle = [], 0, 0
-    for record in text["faces"]:
+    for record in read["faces"]:
         points, corners = record["counts"]
         here, there = slice(vertex, vertex + points), slice(triangle, triangle + corners)
         vertex, triangle = vertex + points, triangle + corners
         face = _face(record, arrays["vertices"][here], arrays["normals"][here], arrays["triangles"][there])
         faces.append(replace(face, drawn_name=names.get(record["entity"], "")))
     joined = _joined(faces)
-    remarks = []
+    remarks = unit_remarks
     if len(joined) < len(faces):
         remarks.append(f"{len(faces)} faces in the file, {len(joined)} after those of one surface were joined")
-    if text["lost"]:
-        remarks.append(f"{text['lost']} faces could not be meshed and are left out")
+    if read["lost"]:
+        remarks.append(f"{read['lost']} faces could not be meshed and are left out")
     bodies = len({face.body for face in faces})
     if bodies > 1:
         remarks.append(f"{bodies} bodies, each with its own faces")
-    closed = all(record["closed"] for record in text["faces"])
+    closed = all(record["closed"] for record in read["faces"])
     if not closed:
         remarks.append("the file has surfaces that bound no solid: mitsim check reports visible backs")
-    return Drawn(joined, remarks, closed)
+    return Drawn(joined, remarks, closed, text)
 
 
-def _names(path: Path) -> dict[int, str]:
+def _scale(path: Path, text: StepText, units: str | None) -> tuple[float, list[str]]:
+    """Return the size [mm] of the unit that OpenCASCADE takes for mm, 1 for a file with its own, and a remark.
+
+    OpenCASCADE converts the lengths of each context that states a unit, and takes all others as mm.
+    """
+    stated = step_units(text)
+    if not stated:
+        if units is None:
+            return 1.0, [f"{path.name} states no unit of length: mm assumed; --units m or --units inch changes it"]
+        return UNITS[units], []
+    if units is not None and not all(math.isclose(one, UNITS[units]) for one in stated):
+        words = " and ".join(map(unit_words, stated))
+        hint = "leave out --units: the file's dimensions and tolerances have units of their own, too"
+        raise InputError("--units", "", repr(units), f"{words}, the unit that {path.name} states", hint)
+    return 1.0, []
+
+
+def _names(text: StepText) -> dict[int, str]:
     """Return the names of the faces by the number of their entity."""
     found = {}
-    text = read_step_text(path)
     for entity in text.all("ADVANCED_FACE", "FACE_SURFACE"):
         values = entity.of("ADVANCED_FACE", "FACE_SURFACE")
         if values and isinstance(values[0], str):

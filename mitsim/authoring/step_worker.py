@@ -8,7 +8,9 @@ B-splines, extrusions and revolutions within :data:`SAME_MM` of a simple surface
 
 ::
 
-    python -m mitsim.authoring.step_worker PART.step OUT.npz CHORD_MM BEND_RAD
+    python -m mitsim.authoring.step_worker PART.step OUT.npz CHORD_MM BEND_RAD UNIT_MM
+
+UNIT_MM is the size of the unit that OpenCASCADE takes for mm: 1, except in a file that states no unit.
 
 It imports no package of ``mitsim``, so that it starts quickly.
 """
@@ -109,8 +111,8 @@ def srgb(colour: Any) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def surface_of(face: Any) -> dict[str, Any]:
-    """Return the surface of a face as kind and numbers, in mm; ``freeform`` if it is not a simple one."""
+def surface_of(face: Any, tolerance: float = SAME_MM) -> dict[str, Any]:
+    """Return the surface of a face as kind and numbers; ``freeform`` if none is simple within ``tolerance``."""
     from OCP.BRep import BRep_Tool
     from OCP.BRepAdaptor import BRepAdaptor_Surface
     from OCP.GeomAbs import GeomAbs_SurfaceType as Kinds
@@ -139,12 +141,18 @@ def surface_of(face: Any) -> dict[str, Any]:
         ("sphere", gp_Sphere(), known.IsSphere),
     ):
         try:
-            found = asked(SAME_MM, one)
+            found = asked(tolerance, one)
         except Exception:  # OpenCASCADE fails for some splines
             continue
         if found:
             return simple(name, one)
     return {"kind": "freeform"}
+
+
+def in_mm(surface: dict[str, Any], unit_mm: float) -> dict[str, Any]:
+    """Return the numbers of a surface in mm."""
+    lengths = {key: surface[key] * unit_mm for key in ("radius", "tube") if key in surface}
+    return surface | lengths | ({"point": [unit_mm * one for one in surface["point"]]} if "point" in surface else {})
 
 
 def simple(kind: str, surface: Any) -> dict[str, Any]:
@@ -226,8 +234,8 @@ def triangles_of(face: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     return points, normals if facing >= 0 else -normals, corners
 
 
-def convert(path: str, out: str, chord_mm: float, bend: float) -> None:
-    """Write the faces of a STEP file as an NPZ of arrays and a JSON text ``faces``."""
+def convert(path: str, out: str, chord_mm: float, bend: float, unit_mm: float = 1.0) -> None:
+    """Write the faces of a STEP file as an NPZ of arrays and a JSON text ``faces``, lengths times ``unit_mm``."""
     from OCP.IFSelect import IFSelect_RetDone
     from OCP.STEPCAFControl import STEPCAFControl_Reader
     from OCP.TCollection import TCollection_ExtendedString
@@ -269,7 +277,7 @@ def convert(path: str, out: str, chord_mm: float, bend: float) -> None:
     arrays: dict[str, list[np.ndarray]] = {"vertices": [], "normals": [], "triangles": []}
     lost = body = 0
     for name, shape, part_colour in bodies(document):
-        mesh(shape, chord_mm, bend)
+        mesh(shape, chord_mm / unit_mm, bend)
         edges = TopTools_IndexedMapOfShape()
         TopExp.MapShapes_s(shape, TopAbs_EDGE, edges)
         groups = [(one, subshapes(one, TopAbs_FACE)) for one in subshapes(shape, TopAbs_SOLID)]
@@ -285,7 +293,7 @@ def convert(path: str, out: str, chord_mm: float, bend: float) -> None:
                 colour = shape_colour(colours, bare[0]) or shape_colour(colours, bare[1]) or part_colour
                 faces.append(
                     {
-                        **surface_of(face),
+                        **in_mm(surface_of(face, SAME_MM / unit_mm), unit_mm),
                         "entity": entity(face),
                         "part": name,
                         "body": body,
@@ -296,7 +304,7 @@ def convert(path: str, out: str, chord_mm: float, bend: float) -> None:
                     }
                 )
                 for key, value in zip(arrays, made, strict=True):
-                    arrays[key].append(value)
+                    arrays[key].append(value * unit_mm if key == "vertices" else value)
             body += bool(members)
     if not faces:
         sys.exit("it holds no faces")
@@ -309,4 +317,4 @@ def convert(path: str, out: str, chord_mm: float, bend: float) -> None:
 
 
 if __name__ == "__main__":
-    convert(sys.argv[1], sys.argv[2], float(sys.argv[3]), float(sys.argv[4]))
+    convert(sys.argv[1], sys.argv[2], *map(float, sys.argv[3:6]))
