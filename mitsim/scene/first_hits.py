@@ -53,7 +53,7 @@ class Hits:
     Attributes
     ----------
     shape
-        (n,) index of the shape; -1 for none.
+        (n,) index of the shape, of the instance for a shape in a group; -1 for none.
     front
         (n,) whether the ray meets the reflecting side.
     normal
@@ -80,7 +80,8 @@ def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.fl
     two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
     front = ~behind | two_sided
     normal = dr.select(behind, -surface.n, surface.n)
-    shape_id_of_ray = dr.select(surface.is_valid(), dr.reinterpret_array(mi.UInt32, surface.shape), 0)
+    inside, instance = (dr.reinterpret_array(mi.UInt32, one) for one in (surface.shape, surface.instance))
+    shape_id_of_ray = dr.select(surface.is_valid(), dr.select(instance != 0, instance, inside), 0)
     distance = dr.select(surface.is_valid(), surface.t, dr.nan)
     dr.eval(front, normal, shape_id_of_ray, distance)
     ids = np.array(shape_id_of_ray)

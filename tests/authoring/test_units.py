@@ -1,4 +1,4 @@
-"""Units of length that a part's file states, in each format; files that state none; options that contradict the file."""
+"""Units of length that a part's file states, in each format; files without one; options that contradict it."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def box_3mf(path, unit):
         packed.writestr(
             "3D/3dmodel.model",
             f'<model {unit} xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"><resources>'
-            f'<object id="1" type="model"><mesh><vertices>{vertices}</vertices><triangles>{triangles}</triangles></mesh>'
-            '</object></resources><build><item objectid="1"/></build></model>',
+            f'<object id="1" type="model"><mesh><vertices>{vertices}</vertices>'
+            f'<triangles>{triangles}</triangles></mesh></object></resources><build><item objectid="1"/></build></model>',
         )
     return path
 
@@ -60,7 +60,7 @@ def test_a_3mf_file_is_in_the_unit_that_it_states(tmp_path, unit, length_mm):
 
 
 def test_an_unknown_unit_of_a_3mf_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match="'furlong'.*micron"):
+    with pytest.raises(InputError, match=r"'furlong'.*micron"):
         read_mesh(box_3mf(tmp_path / "box.3mf", 'unit="furlong"'))
 
 
@@ -155,5 +155,5 @@ def test_a_step_file_that_states_its_unit_refuses_another(tmp_path):
         part = read_part(path, units)
         assert radius(part) == pytest.approx(2 * 25.4)
         assert not any("unit" in one for one in part.remarks)
-    with pytest.raises(InputError, match="inch, the unit that pin.step states"):
+    with pytest.raises(InputError, match=r"inch, the unit that pin\.step states"):
         read_part(path, "mm")
