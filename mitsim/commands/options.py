@@ -6,13 +6,16 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from mitsim.commands.folder_lock import lock_folder, remove_partial_beside
 from mitsim.errors import InputError
+
+if TYPE_CHECKING:
+    from characterisation.point_cloud import PointCloud
 
 Out = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")]
 OutCloud = Annotated[Path, typer.Option("--output", "-o", help="Point cloud to write, a PLY file.")]
@@ -69,6 +72,14 @@ def asking(yes: bool, others: str = "") -> Callable[[str], bool] | None:
         return answers[0]
 
     return ask
+
+
+def print_reasons(cloud: PointCloud) -> None:
+    """Print how many pixels of a cloud are valid, and how many have no point for each reason."""
+    if not cloud.valid.any():
+        print(f"valid\t0 of {cloud.status.size}")
+    for reason, count in cloud.reasons().items():
+        print(f"{reason}\t{count}")
 
 
 class Group(TyperGroup):

@@ -99,7 +99,8 @@ def part(
     file: Annotated[Path, typer.Argument(help="STEP file, or a mesh: STL, OBJ, PLY, OFF, 3MF or glTF.")],
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Scene folder to write.")] = None,
     units: Annotated[
-        str | None, typer.Option(help="Unit of a file that does not state it: mm, m or inch; default: that of the file, else mm.")
+        str | None,
+        typer.Option(help="Unit of a file that does not state it: mm, m or inch; default: that of the file, else mm."),
     ] = None,
     metal: Annotated[str | None, typer.Option(help="Metal of all faces; default aluminium.")] = None,
     process: Annotated[str | None, typer.Option(help="Machining process of all faces; default ground.")] = None,

@@ -105,6 +105,7 @@ def render(
     from mitsim.capture.folder import check_free, read_capture, write_capture
     from mitsim.interface import captures as interface
     from mitsim.progress import say
+    from mitsim.scene.first_hits import sees_nothing
     from mitsim.sensor.noise_sources import Noise
     from mitsim.simulation.render_residual import LIMIT, render_residual
     from mitsim.simulation.rendering import Rendering
@@ -141,6 +142,12 @@ def render(
     first = next(iter(chosen.rig.cameras))
     residual = render_residual(simulated, loaded, pose, first, Rendering(samples, depth), seed=seed)
     capture.settings["render_residual"] = asdict(residual) if isfinite(residual.noise) else None
+    blind = [name if name == "projector" else f"camera {name}" for name in sees_nothing(loaded, chosen.rig, pose)]
+    unseen = (
+        [f"no pixel of the {', '.join(blind)} shows the part: check --position, --target and --roll"] if blind else []
+    )
+    if unseen:
+        capture.settings["warnings"] = [*capture.settings.get("warnings", []), *unseen]
     capture.settings["deviation"] = asdict(moved)
     capture.settings["render"] = {"digest": digest}
     known = {}
@@ -154,6 +161,8 @@ def render(
         finishes = [one for one in loaded.finishes if one and one.scatter]
         for source in dict.fromkeys(f"{one}: {one.scatter.provenance}" for one in finishes if one.scatter):
             say(source)
+    for warning in unseen:
+        say(f"warning: {warning}")
     say(f"{residual}" + (f"; over {LIMIT}: increase --samples" if residual.worst > LIMIT else ""))
     say(f"capture: {output}")
 

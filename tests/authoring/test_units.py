@@ -37,7 +37,8 @@ def box_3mf(path, unit):
             "3D/3dmodel.model",
             f'<model {unit} xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"><resources>'
             f'<object id="1" type="model"><mesh><vertices>{vertices}</vertices>'
-            f'<triangles>{triangles}</triangles></mesh></object></resources><build><item objectid="1"/></build></model>',
+            f"<triangles>{triangles}</triangles></mesh></object></resources>"
+            '<build><item objectid="1"/></build></model>',
         )
     return path
 
