@@ -13,7 +13,10 @@ import math
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 from collections import defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,10 +29,14 @@ from mitsim.authoring.face import Face, Floats, Ints, Surface, Torus, outward_no
 from mitsim.authoring.part21 import StepText, read_step_text
 from mitsim.authoring.units import UNITS, step_units, unit_words
 from mitsim.errors import InputError
+from mitsim.progress import say_progress
 
 #: default mesh of STEP without a sensor: distance from the true surface [mm], and angle between facets [rad]. The angle
 #: only keeps small round faces round, since the normals are exact
 CHORD_MM, BEND = 0.01, 0.2
+
+#: seconds between lines of progress
+_LINE_EVERY_S = 5.0
 
 #: halves of one surface agree within this [mm]; a CAD program's own tolerance is 1e-3 to 1e-5
 ONE_SURFACE_MM = 1e-3
@@ -39,6 +46,20 @@ FINEST_MM = 1e-4
 
 _SECONDS = 3600
 _INSTALL = 'pip install "cadquery-ocp-novtk<8" (or "mitsim[step]"), or save the part as STL'
+
+
+@dataclass(frozen=True)
+class Fineness:
+    """How fine a mesh is: the chord error [mm] of its faces.
+
+    - ``chord_mm`` of faces that a task can measure.
+    - ``others_mm`` of tori and free forms; None for the same.
+    - ``most`` triangles of a file, beyond which the largest faces become coarser, measured ones first; None: no limit.
+    """
+
+    chord_mm: float = CHORD_MM
+    others_mm: float | None = None
+    most: int | None = None
 
 
 @dataclass(frozen=True)
@@ -56,8 +77,11 @@ def step_installed() -> bool:
     return importlib.util.find_spec("OCP") is not None
 
 
-def read_step(path: str | Path, chord_mm: float = CHORD_MM, units: str | None = None) -> Drawn:
-    """Read the faces of a STEP file, in mm, meshed to ``chord_mm``.
+_DEFAULT = Fineness()
+
+
+def read_step(path: str | Path, fineness: Fineness = _DEFAULT, units: str | None = None) -> Drawn:
+    """Read the faces of a STEP file, in mm, meshed as finely as asked, and report the progress.
 
     ``units`` (``mm``, ``m``, ``inch``) of a file that does not state its own; mm if None.
 
@@ -79,15 +103,14 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM, units: str | None = 
             step_worker.__file__,
             str(path),
             str(out),
-            repr(max(chord_mm / 2, FINEST_MM)),  # OpenCASCADE exceeds the requested value by a factor of up to 2
+            repr(_requested(fineness.chord_mm)),
             repr(BEND),
             repr(scale),
+            repr(_requested(fineness.others_mm or fineness.chord_mm)),
+            repr(fineness.most or 0),
         ]
-        try:
-            done = subprocess.run(command, capture_output=True, timeout=_SECONDS, check=False)
-        except subprocess.TimeoutExpired:
-            raise InputError(path, "", "a part that cannot be meshed within an hour", "a simpler one") from None
-        if b"ImportError" in done.stderr or b"ModuleNotFoundError" in done.stderr:
+        done = run_worker(command, path)
+        if "ImportError" in done.stderr or "ModuleNotFoundError" in done.stderr:
             found = "a STEP file, and an unsupported version of OpenCASCADE"
             raise InputError(path, "", found, "an STL, PLY or OBJ file", _INSTALL)
         if done.returncode != 0 or not out.exists():
@@ -112,10 +135,64 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM, units: str | None = 
     bodies = len({face.body for face in faces})
     if bodies > 1:
         remarks.append(f"{bodies} bodies, each with its own faces")
+    if read["chord_mm"] > 1.01 * _requested(fineness.chord_mm):
+        coarse = 2 * read["chord_mm"]
+        remarks.append(
+            f"the largest curved faces are meshed to {coarse:.2g} mm instead of {fineness.chord_mm:.2g} mm, which would"
+            f" take over {fineness.most:,} triangles; --chord has no such limit"
+        )
     closed = all(record["closed"] for record in read["faces"])
     if not closed:
         remarks.append("the file has surfaces that bound no solid: mitsim check reports visible backs")
     return Drawn(joined, remarks, closed, text)
+
+
+def _requested(chord_mm: float) -> float:
+    """Return the chord to request [mm]: OpenCASCADE exceeds it by a factor of up to 2."""
+    return max(chord_mm / 2, FINEST_MM)
+
+
+def run_worker(command: list[str], path: Path) -> subprocess.CompletedProcess[str]:
+    """Run the process that reads ``path``, and report its progress.
+
+    Raises
+    ------
+    InputError
+        If it takes more than an hour.
+    """
+    with (
+        tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, errors="replace") as process,
+    ):
+        over = threading.Event()
+        limit = threading.Timer(_SECONDS, lambda: (over.set(), process.kill()))
+        limit.start()
+        try:
+            assert process.stdout is not None
+            _report(process.stdout, path)
+            code = process.wait()
+        finally:
+            limit.cancel()
+            process.kill()
+        if over.is_set():
+            raise InputError(path, "", "a part that cannot be meshed within an hour", "a simpler one")
+        errors.seek(0)
+        return subprocess.CompletedProcess(command, code, "", errors.read())
+
+
+def _report(lines: Iterable[str], path: Path) -> None:
+    """Report how many triangles are made, and the time that the others will take."""
+    start = last = time.monotonic()
+    say_progress(f"{path.name}: reading and meshing its faces")
+    for line in lines:
+        if not line.startswith(step_worker.TOLD):
+            continue
+        made, total = map(float, line.removeprefix(step_worker.TOLD).split())
+        now = time.monotonic()
+        if now - last >= _LINE_EVERY_S and made < total:
+            left = (now - start) / made * (total - made)
+            say_progress(f"{path.name}: {made:,.0f} of about {total:,.0f} triangles, {left:.0f} s left")
+            last = now
 
 
 def _scale(path: Path, text: StepText, units: str | None) -> tuple[float, list[str]]:

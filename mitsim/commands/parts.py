@@ -125,7 +125,7 @@ def part(
     ] = 20.0,
     sensor: Annotated[
         str | None,
-        typer.Option(help="For a STEP file: mesh it to 1/100 of the noise sigma of this sensor (preset or TOML file)."),
+        typer.Option(help="For a STEP file: mesh it as finely as this sensor resolves (preset or TOML file)."),
     ] = None,
     chord: Annotated[
         float | None, typer.Option(help="For a STEP file: chord error of the mesh [mm]; default 0.01.")
@@ -146,9 +146,9 @@ def part(
 
     Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 1.6 --sensor ensenso-n10 --edit
     """
-    from mitsim.authoring.fineness import chord_for
+    from mitsim.authoring.fineness import fineness_for
     from mitsim.authoring.part_folder import Finishing, described, write_part
-    from mitsim.authoring.read_step import CHORD_MM
+    from mitsim.authoring.read_step import Fineness
     from mitsim.errors import InputError
     from mitsim.progress import say
 
@@ -159,7 +159,7 @@ def part(
         raise InputError("--output", "", "nothing", "a folder to write: -o scenes/NAME")
     if sensor is not None and chord is not None:
         raise InputError("--chord", "", f"{chord:g} together with --sensor", "one of the two")
-    fine = chord if chord is not None else chord_for(sensor) if sensor else CHORD_MM
+    fine = fineness_for(sensor) if sensor else Fineness() if chord is None else Fineness(chord)
     if finish is not None:
         for option, given in (("--metal", metal), ("--process", process), ("--Ra", roughness)):
             if given is not None:

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.authoring.fineness import chord_for, sensor_sigma_mm
+from mitsim.authoring.fineness import fineness_for, sensor_sigma_mm
 from mitsim.authoring.naming import identifier, with_names
 from mitsim.authoring.part_folder import Finishing, finish_names, scene_xml
-from mitsim.authoring.read_step import read_step, step_installed
+from mitsim.authoring.read_step import Fineness, read_step, step_installed
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 from tests.authoring.bracket import bracket, write_step
@@ -127,7 +127,7 @@ def test_a_bore_in_two_halves_is_one_face(tmp_path):
 )
 def test_every_kind_of_surface_comes_with_the_normals_of_the_drawing(tmp_path, shape, kind, name):
     chord = 0.01
-    drawn = read_step(write_step([("one", shape(), None)], tmp_path / "one.step"), chord)
+    drawn = read_step(write_step([("one", shape(), None)], tmp_path / "one.step"), Fineness(chord))
     face = next(face for face in with_names(drawn.faces) if face.kind == kind)
     assert face.name == name
     normals, corners = face.corner_normals(), face.vertices[face.triangles]
@@ -182,10 +182,10 @@ def test_the_sensor_chooses_how_fine_the_mesh_is(tmp_path):
     path = write_step([("one", solid("Cylinder", 10.0, 30.0), None)], tmp_path / "one.step")
     fine = {}
     for name in ("photoneo-phoxi-s", "ensenso-n10"):
-        chord = chord_for(name)
-        assert chord == pytest.approx(sensor_sigma_mm(name) / 100)
-        fine[name] = max(face.sag for face in read_step(path, chord).faces)
-        assert fine[name] <= chord
+        asked = fineness_for(name)
+        assert asked.chord_mm < sensor_sigma_mm(name) / 20
+        fine[name] = max(face.sag for face in read_step(path, asked).faces)
+        assert fine[name] <= asked.chord_mm
     assert fine["photoneo-phoxi-s"] < fine["ensenso-n10"]
 
 

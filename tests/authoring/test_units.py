@@ -11,7 +11,7 @@ import trimesh
 
 from mitsim.authoring.part_folder import read_part
 from mitsim.authoring.read_mesh import read_mesh
-from mitsim.authoring.read_step import step_installed
+from mitsim.authoring.read_step import Fineness, step_installed
 from mitsim.errors import InputError
 from tests.authoring.bracket import write_step
 
@@ -139,7 +139,7 @@ def radius(part):
 @pytest.mark.usefixtures("step_here")
 @pytest.mark.parametrize(("units", "length_mm"), [(None, 1.0), ("mm", 1.0), ("inch", 25.4), ("m", 1000.0)])
 def test_a_step_file_without_units_takes_the_option(tmp_path, units, length_mm):
-    part = read_part(without_units(pin(tmp_path / "pin.step")), units, chord_mm=0.01 * length_mm)
+    part = read_part(without_units(pin(tmp_path / "pin.step")), units, fineness=Fineness(0.01 * length_mm))
     assert radius(part) == pytest.approx(2 * length_mm)
     every = np.concatenate([face.vertices for face in part.faces])
     assert np.ptp(every[:, 2]) == pytest.approx(5 * length_mm)
