@@ -43,7 +43,10 @@ Processes = Annotated[
 ]
 Clouds = Annotated[
     list[Path],
-    typer.Argument(metavar="CLOUD...", help="Point clouds, capture folders (decoded first), or folders of either."),
+    typer.Argument(
+        metavar="CLOUD...",
+        help="Point clouds (.ply, .pcd, .npy, .mat, .xyz), capture folders (decoded first), or folders of either.",
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")]
 DecodedAs = Annotated[str | None, typer.Option(help="Decode captures with the settings of this sensor.")]
