@@ -165,7 +165,12 @@ def run_worker(command: list[str], path: Path) -> subprocess.CompletedProcess[st
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, errors="replace") as process,
     ):
         over = threading.Event()
-        limit = threading.Timer(_SECONDS, lambda: (over.set(), process.kill()))
+
+        def stop() -> None:
+            over.set()
+            process.kill()
+
+        limit = threading.Timer(_SECONDS, stop)
         limit.start()
         try:
             assert process.stdout is not None

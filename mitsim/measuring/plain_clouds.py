@@ -42,7 +42,7 @@ def is_plain(path: Path) -> bool:
     data = read_bounded(path)
     if data.startswith(b"ply"):
         return decode_ply(data, path).size is None
-    return decode_pcd(data, path)[0].shape[0] == 1
+    return bool(decode_pcd(data, path)[0].shape[0] == 1)
 
 
 def read_plain_cloud(path: Path) -> tuple[PointCloud, str]:
@@ -77,9 +77,12 @@ def _through(points: NDArray[np.float64]) -> ViewGrid:
     height, width = points.shape[:2]
     ahead = points[..., 2] > 0
     depth = np.where(ahead, points[..., 2], 1.0)[..., None]
-    rays = np.where(ahead[..., None], points[..., :2] / depth, 0.0).astype(np.float32)
-    pitch = max(width, height)
-    return ViewGrid(pitch, pitch, (width - 1) / 2, (height - 1) / 2, width, height, normalised=rays)
+    rays = np.where(ahead[..., None], points[..., :2] / depth, np.nan)
+    steps = np.linalg.norm(np.diff(rays, axis=1), axis=-1)
+    steps = steps[steps > 0]
+    focal = 1.0 / float(np.median(steps)) if steps.size else 1.0
+    rays = np.nan_to_num(rays).astype(np.float32)
+    return ViewGrid(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, normalised=rays)
 
 
 def _points(path: Path) -> NDArray[np.floating]:

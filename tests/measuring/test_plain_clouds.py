@@ -75,8 +75,8 @@ def test_a_cloud_without_a_camera_is_measured_and_is_a_reference(tmp_path, name)
     ]
     assert values[0]["all distance"] == pytest.approx(602.0, rel=1e-3)
     assert values[0]["all flatness"] < 1e-3
-    assert values[0]["difference median"] == pytest.approx(2.0, abs=1e-3)
-    assert values[1]["difference median"] == pytest.approx(-2.0, abs=1e-3)
+    assert values[0]["difference median"] == pytest.approx(2.0, rel=0.01)  # of rays up to 8 deg from the normal
+    assert values[1]["difference median"] == pytest.approx(-2.0, rel=0.01)
     assert "in mm, which" in there.stderr
 
 
