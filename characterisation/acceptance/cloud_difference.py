@@ -143,38 +143,35 @@ def same_grid(one: ViewGrid, other: ViewGrid) -> bool:
 class _Searched:
     """The points of a reference near the points of a cloud, with trees for their neighbours.
 
-    A box around the cloud's points, larger by twice the farthest counterpart, holds nearly all neighbours that a search
-    can find. A point whose neighbours may lie outside the box is searched in the whole reference.
+    A box around the cloud's points, larger by the distance of the farthest counterpart, holds all points within that
+    distance. The few points with fewer neighbours there are searched in the whole reference.
     """
 
     def __init__(self, surface: Floats, points: Floats, farthest: float) -> None:
-        self.surface, self.margin = surface, 2 * farthest
-        low, high = (
-            (points.min(axis=0) - self.margin, points.max(axis=0) + self.margin) if len(points) else (np.inf, -np.inf)
-        )
+        self.surface = surface
+        margin = farthest * (1 + 1e-6)
+        low, high = (points.min(axis=0) - margin, points.max(axis=0) + margin) if len(points) else (np.inf, -np.inf)
         self.near = surface[((surface >= low) & (surface <= high)).all(axis=1)]
         self.tree = cKDTree(self.near) if len(self.near) else None
         self.whole: cKDTree | None = self.tree if len(self.near) == len(surface) else None
 
-    def with_counterpart(self, points: Floats, farthest: Floats) -> NDArray[np.bool_]:
-        """Return whether points (n, 3) have a point of the reference within ``farthest`` (n,) [mm]."""
-        if self.tree is None or not len(points):
-            return np.zeros(len(points), bool)
-        limit = float(farthest.max()) * (1 + 1e-9)
-        return np.asarray(self.tree.query(points, 1, distance_upper_bound=limit, workers=thread_count())[0] <= farthest)
+    def neighbours(self, points: Floats, farthest: Floats) -> tuple[NDArray[np.bool_], Floats]:
+        """Return which points (n, 3) have a counterpart within ``farthest`` (n,) [mm], and the neighbours of those.
 
-    def neighbours(self, points: Floats) -> Floats:
-        """Return the nearest points (n, NEIGHBOURS, 3) of the reference."""
-        out = np.empty((len(points), NEIGHBOURS, 3))
-        outside = np.ones(len(points), bool)
-        if self.tree is not None and len(self.near) >= NEIGHBOURS:
-            distance, index = self.tree.query(points, NEIGHBOURS, workers=thread_count())
-            out[:] = self.near[index]
-            outside = distance[:, -1] > (self.margin if self.tree is not self.whole else np.inf)
-        if outside.any():
+        The neighbours are the nearest points (m, NEIGHBOURS, 3) of the reference.
+        """
+        if self.tree is None or not len(points):
+            return np.zeros(len(points), bool), np.empty((0, NEIGHBOURS, 3))
+        limit = float(farthest.max()) * (1 + 1e-9)
+        distance, index = self.tree.query(points, NEIGHBOURS, distance_upper_bound=limit, workers=thread_count())
+        met = distance[:, 0] <= farthest
+        few = met & ~np.isfinite(distance[:, -1])
+        if few.any():
             self.whole = self.whole or cKDTree(self.surface)
-            out[outside] = self.surface[self.whole.query(points[outside], NEIGHBOURS, workers=thread_count())[1]]
-        return out
+        out = self.near[np.minimum(index[met], len(self.near) - 1)]
+        if few.any() and self.whole is not None:
+            out[few[met]] = self.surface[self.whole.query(points[few], NEIGHBOURS, workers=thread_count())[1]]
+        return met, out
 
 
 def _to_surface(points: Floats, farthest: Floats, searched: _Searched, viewpoint: Floats) -> Floats:
@@ -183,10 +180,9 @@ def _to_surface(points: Floats, farthest: Floats, searched: _Searched, viewpoint
     The surface at a point is the plane through its nearest points.
     """
     out = np.full(len(points), np.nan)
-    met = searched.with_counterpart(points, farthest)
+    met, patch = searched.neighbours(points, farthest)
     points = points[met]
     away = points - viewpoint
-    patch = searched.neighbours(points)
     middle = patch.mean(axis=1)
     spread = patch - middle[:, None]
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))
