@@ -227,9 +227,7 @@ def test_a_rebuilt_capture_is_as_bright_and_agrees(n10_module, changed, tmp_path
     dim = replace(n10_module, projector=replace(n10_module.projector, flux=0.7 * n10_module.projector.flux))
     recorded = as_recorded(taken(dim, 3))
     write_capture(recorded, tmp_path / "real")
-    found = CliRunner().invoke(
-        app, ["validate", "captures", str(tmp_path / "real"), "-o", str(tmp_path / "out"), "--seed", "5"]
-    )
+    found = CliRunner().invoke(app, ["compare", str(tmp_path / "real"), "-o", str(tmp_path / "out"), "--seed", "5"])
     assert found.exit_code == 0, found.output
     twin = read_capture(tmp_path / "out" / "simulated")
     assert twin.source == "simulated"
@@ -348,6 +346,6 @@ def test_a_specimen_of_few_patches_is_refused(n10_module, real, place, again):
 
 
 def test_a_projector_is_on_or_off(folder, tmp_path):
-    found = CliRunner().invoke(app, ["validate", "captures", str(folder), "-o", str(tmp_path), "--projector", "dim"])
+    found = CliRunner().invoke(app, ["compare", str(folder), "-o", str(tmp_path), "--projector", "dim"])
     assert found.exit_code != 0
     assert isinstance(found.exception, InputError)
