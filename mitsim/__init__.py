@@ -27,6 +27,7 @@ _NAMES = {
     "Study": "mitsim.study",
     "Task": "characterisation.tasks.task_file",
     "Transform": "mitsim.sensor.transforms",
+    "decode": "mitsim.interface.captures",
     "label": "mitsim.interface.measurements",
     "load_scene": "mitsim.interface.captures",
     "load_sensor": "mitsim.interface.captures",
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from characterisation.tasks.task_file import Task
     from mitsim.capture.capture import Capture
     from mitsim.interface.captures import (
+        decode,
         load_scene,
         load_sensor,
         read_capture,
@@ -86,6 +88,7 @@ __all__ = [
     "Study",
     "Task",
     "Transform",
+    "decode",
     "label",
     "load_scene",
     "load_sensor",

@@ -27,6 +27,7 @@ from pydantic import Field
 
 from characterisation.documents import Document
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import read_settings
 from mitsim.capture.png import encode_png
 from mitsim.errors import DeviceError, InputError
 from mitsim.hardware.depthai_camera import DepthaiCamera, DepthaiShot, open_depthai
@@ -142,6 +143,7 @@ def depthai_capture(shot: DepthaiShot) -> DeviceCapture:
     """Return the capture of a DepthAI camera's shot: raw images, and the disparity of its own matcher."""
     size = shot.images["left"].shape[::-1]
     derived = {} if shot.disparity is None else {"disparity": shot.disparity}
+    decoding, records = read_settings(f"camera {shot.model}", shot.settings, "active_stereo")
     capture = Capture(
         sensor=shot.model,
         technology="active_stereo",
@@ -149,7 +151,8 @@ def depthai_capture(shot: DepthaiShot) -> DeviceCapture:
         rig=depthai_rig(shot.calibration, (int(size[0]), int(size[1]))),
         images={name: image[None] for name, image in shot.images.items()},
         bits=8 * shot.images["left"].dtype.itemsize,
-        settings=shot.settings,
+        decoding=decoding,
+        settings=records,
         serial=shot.serial,
         derived=derived,
     )

@@ -5,13 +5,14 @@ A warning is not an error: the capture is still written and decoded according to
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Settings
 from mitsim.capture_checks.image_sanity import image_warnings
 from mitsim.capture_checks.rig_sanity import (
     LARGEST_ROW_ERROR,
@@ -22,11 +23,11 @@ from mitsim.capture_checks.rig_sanity import (
     row_error_warning,
 )
 from mitsim.decode.matching.stereo import stereo_geometry
-from mitsim.reconstruction.cloud import Settings, capture_pattern
-from mitsim.reconstruction.decoder_registry import projector_size
+from mitsim.reconstruction.cloud import decoder_settings
+from mitsim.reconstruction.coded_images import CodedImages
+from mitsim.reconstruction.decoder_registry import Coordinates
+from mitsim.reconstruction.noise import known_noise
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.image_sequence import ImageSequence
-from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
 
 
 @dataclass(frozen=True)
@@ -46,36 +47,50 @@ def capture_warnings(capture: Capture, settings: Settings) -> list[str]:
     return capture_findings(capture, settings).warnings
 
 
-def capture_findings(capture: Capture, settings: Settings) -> Findings:
+def with_warnings(capture: Capture) -> Capture:
+    """Return the capture with the warnings about it added to those that its settings already have."""
+    if capture.technology != "structured_light":
+        return capture
+    settings, _ = decoder_settings(capture)
+    stored = capture.settings.get("warnings", [])
+    warnings = list(dict.fromkeys([*stored, *capture_warnings(capture, settings)]))
+    return replace(capture, settings=capture.settings | ({"warnings": warnings} if warnings else {}))
+
+
+def capture_findings(
+    capture: Capture,
+    settings: Settings,
+    images: CodedImages | None = None,
+    coordinates: Coordinates | None = None,
+) -> Findings:
     """Check the images and calibration of a structured-light capture; other captures have no findings.
 
     A bracket of exposures is not checked. If images do not match their pattern, the calibration is not checked.
+
+    ``images`` and their ``coordinates``: those of the capture, if they are decoded already.
     """
-    exposures = capture.settings.get("exposure_s")
-    if not isinstance(settings, DecoderSettings) or capture.technology != "structured_light":
-        return Findings()
-    if isinstance(exposures, list) and len(exposures) > 1:
-        return Findings()
-    code = capture_pattern(capture)
-    if not isinstance(code, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence):
-        return Findings()
-    size, full_scale = projector_size(capture), 2.0**capture.bits - 1
-    count, matched = len(roles(code, *size)), settings.triangulate == "cameras"
-    stacks = [stack[:count] for stack in capture.images.values()][: 2 if matched else 1]
-    if any(len(stack) < count for stack in stacks):
-        return Findings()  # decoding reports the error
-    out = []
-    for name, stack in zip(capture.images, stacks, strict=False):
-        out += image_warnings(stack, code, size, settings, full_scale, name)
-    if out:
-        return Findings(out)
-    if matched:
+    images = images or CodedImages.of(capture, settings)
+    if images is None or not isinstance(settings, DecoderSettings):
+        return Findings()  # decoding reports missing images
+    if coordinates is None:
         try:
-            return Findings(*pair_warnings(stacks[0], stacks[1], capture.rig, code, size, settings, full_scale))
+            coordinates = images.coordinates(settings, known_noise(capture, None))
+        except InputError:
+            coordinates = {}  # decoding reports the error
+    code, size, full_scale = images.code, images.size, images.full_scale
+    out = []
+    for name, stack in images.stacks.items():
+        out += image_warnings(stack, code, size, settings, full_scale, name, coordinates.get(name, {}))
+    if out or not coordinates:
+        return Findings(out)
+    decoded = [coordinates[name] for name in images.stacks]
+    if settings.triangulate == "cameras":
+        try:
+            return Findings(*pair_warnings(list(images.stacks.values()), decoded, capture.rig, code, size, full_scale))
         except InputError as error:
             return Findings([str(error)])
     along = baseline_warning(capture.rig, code)
-    return Findings(([along] if along else []) + camera_warnings(stacks[0], capture.rig, code, settings, full_scale))
+    return Findings(([along] if along else []) + camera_warnings(decoded[0], capture.rig, settings))
 
 
 def pair_row_error(capture: Capture, cloud: PointCloud) -> float:

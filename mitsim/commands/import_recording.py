@@ -106,6 +106,7 @@ def import_(
     Example: mitsim import recording.zip -o captures/real
     """
     from mitsim.capture.folder import is_written, write_capture
+    from mitsim.capture_checks.sanity import with_warnings
     from mitsim.progress import say
     from mitsim.recordings.recognise import KINDS, ReadOptions, read_recording
     from mitsim.recordings.recording_files import plain_name
@@ -130,7 +131,7 @@ def import_(
         projector=projector,
     )
     imported = read_recording(path, options, kind)
-    capture = imported.capture
+    capture = with_warnings(imported.capture)
     folder = output or Path(plain_name(path.resolve().stem) + "_capture")
     say(f"{path}: {KINDS[imported.kind].name}, of {capture.sensor}, {capture.technology}, {capture.source}")
     for name in SETTINGS_TO_CHECK:

@@ -19,10 +19,12 @@ from characterisation.errors import InputError
 from mitsim.capture import folder
 from mitsim.capture.capture import Capture
 from mitsim.capture.capture_document import capture_schema, schema_text
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.npy import decode_npy, encode_npy
 from mitsim.capture.png import decode_png, encode_png
 from mitsim.sensor.camera import Camera, Rectification, Rig
+from mitsim.sensor.roi import Roi
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT = 24, 16
@@ -45,7 +47,8 @@ def example(dtype=np.uint8, bits: int = 8) -> Capture:
         Rig(cameras, projector, rectification),
         images,
         bits,
-        {"exposure_s": 0.1 + 0.2, "projector_on": True, "note": "µm", "list": [1, None]},
+        Decoding(exposure_s=0.1 + 0.2, pattern=None, read_out={"left": Roi(1, 2, 16, 8)}, near_mm=250.0),
+        {"projector_on": True, "note": "µm", "list": [1, None]},
         Transform.from_degrees([10, 20, 30], [1, 2, 1e-3]),
         "42",
         maps(),
@@ -64,7 +67,7 @@ def maps() -> dict[str, np.ndarray]:
 
 
 def assert_same(a: Capture, b: Capture) -> None:
-    for name in ("sensor", "technology", "source", "bits", "settings", "serial"):
+    for name in ("sensor", "technology", "source", "bits", "decoding", "settings", "serial"):
         assert getattr(a, name) == getattr(b, name)
     assert (a.world_from_sensor is None) == (b.world_from_sensor is None)
     if a.world_from_sensor and b.world_from_sensor:

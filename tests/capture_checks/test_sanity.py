@@ -12,6 +12,7 @@ from simulated_rigs import images_seen, surface_seen
 
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.capture_checks.rig_sanity import measured_row_error
 from mitsim.capture_checks.sanity import capture_findings, capture_warnings, cloud_warnings, row_error_in_words
 from mitsim.decode.matching.stereo import stereo_geometry
@@ -88,7 +89,7 @@ def taken(code, cameras=None, beamer=None, **other):
         "device",
         Rig(cameras, beamer),
         images,
-        settings={"pattern": code.model_dump(mode="json")},
+        decoding=Decoding(pattern=code),
     )
 
 
@@ -184,7 +185,7 @@ def test_bits_exchanged_with_their_complements_whatever_their_number(bits):
 
 def test_columns_and_rows_exchanged():
     code = sequence(gray("rows"), gray(), "white", "black")
-    spoiled = replace(taken(BOTH), settings={"pattern": code.model_dump(mode="json")})
+    spoiled = replace(taken(BOTH), decoding=Decoding(pattern=code))
     assert "they fit if columns and rows are exchanged in [pattern]" in said(spoiled)
 
 

@@ -116,7 +116,7 @@ def phase(tmp_path_factory):
 
 def test_a_window_has_the_bytes_of_the_whole_image(shown):
     capture = shown.capture()
-    assert "read_out" not in capture.settings
+    assert not capture.decoding.read_out
     whole = shown.cloud(capture)
     rows, columns = (np.flatnonzero(whole.valid.any(axis=axis)) for axis in (1, 0))
     rng = np.random.default_rng(3)
@@ -212,7 +212,7 @@ def test_an_automatic_exposure_is_that_of_the_whole_image(tmp_path):
         simulated.capture(scene, pose, rendering=Rendering(samples=1), seed=1, noise=none, **given)
         for given in ({}, {"around": corners})
     )
-    assert part.settings["exposure_s"] == pytest.approx(whole.settings["exposure_s"], rel=1e-6)
+    assert part.decoding.exposure_s == pytest.approx(whole.decoding.exposure_s, rel=1e-6)
 
 
 def test_a_window_beside_what_was_read_out_shows_nothing(shown):
@@ -225,17 +225,15 @@ def test_a_window_beside_what_was_read_out_shows_nothing(shown):
 @pytest.mark.parametrize(
     ("read_out", "named"),
     [
-        ({"eye": [0, 0, 10, 10]}, "eye"),
-        ({"camera": [400, 0, 100, 10]}, "440 x 320"),
-        ({"camera": [0, -1, 10, 10]}, "440 x 320"),
-        ({"camera": [0, 0, 0, 10]}, "440 x 320"),
-        ({"camera": [0, 0, 10]}, "read_out"),
-        ({"camera": "all"}, "read_out"),
+        ({"eye": Roi(0, 0, 10, 10)}, "eye"),
+        ({"camera": Roi(400, 0, 100, 10)}, "440 x 320"),
+        ({"camera": Roi(0, -1, 10, 10)}, "440 x 320"),
+        ({"camera": Roi(0, 0, 0, 10)}, "440 x 320"),
     ],
 )
 def test_a_region_that_cannot_be_is_refused(phase, read_out, named):
     capture = phase.capture(True)
-    wrong = replace(capture, settings=capture.settings | {"read_out": read_out})
+    wrong = replace(capture, decoding=capture.decoding.model_copy(update={"read_out": read_out}))
     with pytest.raises(InputError, match=re.escape(named)):
         phase.cloud(wrong)
 

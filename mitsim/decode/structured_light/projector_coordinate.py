@@ -29,3 +29,8 @@ class ProjectorCoordinate:
     sigma: NDArray[np.float32]
     modulation: NDArray[np.float32]
     status: NDArray[np.uint8]
+
+    def part(self, region: tuple[slice, slice]) -> ProjectorCoordinate:
+        """Return the coordinate of a region (rows, columns), without copying it."""
+        value, sigma = self.value[region], self.sigma[region]
+        return ProjectorCoordinate(value, sigma, self.modulation[region], self.status[region])
