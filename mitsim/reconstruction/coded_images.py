@@ -19,13 +19,22 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Settings
 from mitsim.decode.grey_levels import MeasuredNoise
 from mitsim.decode.structured_light.decoder import decode_coordinates
-from mitsim.reconstruction.cloud import bracket_exposures, capture_cloud, capture_pattern, decoder_settings
+from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
+from mitsim.reconstruction.cloud import (
+    bracket_exposures,
+    capture_cloud,
+    capture_pattern,
+    decoder_settings,
+    read_out_of,
+)
 from mitsim.reconstruction.decoder_registry import Coordinates, projector_size
 from mitsim.reconstruction.noise import known_noise
 from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.image_role import Axis
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import LightCode, roles
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.roi import Roi
 
 
 @dataclass(frozen=True)
@@ -41,12 +50,15 @@ class CodedImages:
         The code, and width and height of the projector [px].
     full_scale
         Value of a saturated pixel [DN].
+    read_out
+        Region that was read out of each camera, without cameras that were read out completely.
     """
 
     stacks: dict[str, NDArray[np.unsignedinteger[Any]]]
     code: LightCode
     size: tuple[int, int]
     full_scale: float
+    read_out: dict[str, Roi]
 
     @classmethod
     def of(cls, capture: Capture, settings: Settings) -> CodedImages | None:
@@ -67,7 +79,7 @@ class CodedImages:
         stacks = {name: stack[:count] for name, stack in list(capture.images.items())[:cameras]}
         if len(stacks) < cameras or any(len(stack) < count for stack in stacks.values()):
             return None
-        return cls(stacks, code, size, 2.0**capture.bits - 1)
+        return cls(stacks, code, size, 2.0**capture.bits - 1, read_out_of(capture))
 
     def coordinates(self, settings: DecoderSettings, noise: Imager | MeasuredNoise | None) -> Coordinates:
         """Return the projector coordinates (H, W) of each camera, as the cloud is made from them.
@@ -77,9 +89,11 @@ class CodedImages:
         InputError
             If the code is ambiguous over the projector.
         """
-        return {
-            name: decode_coordinates(
-                stack,
+        out: dict[str, dict[Axis, ProjectorCoordinate]] = {}
+        for name, stack in self.stacks.items():
+            region = self.read_out.get(name)
+            found = decode_coordinates(
+                stack if region is None else np.ascontiguousarray(stack[:, *region.slices]),
                 self.code,
                 self.size,
                 settings,
@@ -87,8 +101,11 @@ class CodedImages:
                 imager=noise,
                 interpolate=len(self.stacks) > 1,
             )
-            for name, stack in self.stacks.items()
-        }
+            if region is not None:
+                shape = (stack.shape[1], stack.shape[2])
+                found = {axis: each.placed(shape, region.slices) for axis, each in found.items()}
+            out[name] = found
+        return out
 
 
 def decode(

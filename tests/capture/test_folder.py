@@ -8,6 +8,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -426,6 +427,28 @@ def test_any_bytes_are_refused_in_words(data):
     for text in (data, PNG[:8] + data):
         with pytest.raises(InputError):
             decode_png(text, "x.png")
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_an_image_as_mitsim_writes_it_is_inflated_once(monkeypatch, dtype):
+    """Differences along rows are summed here; OpenCV, which would inflate them again, has no part in it."""
+    image = np.random.default_rng(3).integers(0, np.iinfo(dtype).max, (7, 13), dtype, endpoint=True)
+    data = encode_png(image)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("inflated twice"))
+    found = decode_png(data, "x.png")
+    assert found.dtype == dtype
+    np.testing.assert_array_equal(found, image)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize(
+    "chosen", [cv2.IMWRITE_PNG_FILTER_NONE, cv2.IMWRITE_PNG_FILTER_UP, cv2.IMWRITE_PNG_ALL_FILTERS]
+)
+def test_images_with_any_filter_are_read(dtype, chosen):
+    image = np.cumsum(np.random.default_rng(3).integers(0, 9, (20, 30)), axis=0).astype(dtype)
+    done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_FILTER, chosen])
+    assert done
+    np.testing.assert_array_equal(decode_png(data.tobytes(), "x.png"), image)
 
 
 def test_colour_and_huge_pngs_are_refused():

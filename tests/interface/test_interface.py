@@ -110,6 +110,18 @@ def test_a_rendered_capture_is_decoded_by_the_sensor_that_took_it(workplace):
     assert 0 < np.nanmax(near.points[..., 2]) < 500 < np.nanmax(cloud.points[..., 2])
 
 
+def test_decode_issues_the_warnings_that_the_command_prints(workplace):
+    capture = ms.read_capture("capture")
+    told = "the rig has moved since its calibration"
+    ms.write_capture(replace(capture, settings=capture.settings | {"warnings": [told]}), "moved")
+    with pytest.warns(UserWarning) as warned:
+        cloud = ms.decode(ms.read_capture("moved"))
+    done = CliRunner().invoke(app, ["decode", "moved", "-o", "moved.ply"], catch_exceptions=False)
+    assert [str(one.message) for one in warned] == [told]
+    assert f"warning: {told}" in done.stderr
+    assert np.array_equal(ms.read_cloud("moved.ply").points, cloud.points, equal_nan=True)
+
+
 def test_labels_are_those_of_the_part(workplace):
     sensor = ms.load_sensor("small.toml")
     cloud = ms.label(ms.read_cloud("cloud.ply"), ms.load_scene("matt_white.xml", sensor), sensor, POSE)

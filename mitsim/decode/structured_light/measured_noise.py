@@ -29,9 +29,9 @@ from mitsim.sensor.image_role import Axis, Role
 
 Floats = NDArray[np.float64]
 
-#: approximate number of pixels that are used, in rows and columns at equal steps. Of n squares of a normal residual the
-#: standard deviation follows to 0.82 / sqrt(n): with one residual a pixel and 16 levels to 1.5 %, with more residuals to
-#: less. A harmonic has thousands of pixels for each of its coefficients
+#: approximate number of pixels that are used, in rows and columns at equal steps. From n squared residuals the standard
+#: deviation follows to 0.82 / sqrt(n): to 1.5 % for one residual a pixel and 16 levels, to less for more residuals. A
+#: harmonic has thousands of pixels for each of its coefficients
 _SAMPLED_PIXELS = 50_000
 
 #: least number of pixels for a result, and of pixels of one level

@@ -98,8 +98,12 @@ def decode_structured_light_stereo(
             raise InputError(f"{name} images", "shape", stack.shape, f"(images, {size[0]}, {size[1]})")
 
     def decoded(camera: int, region: Roi) -> ProjectorCoordinate:
-        return decode_coordinates(
-            np.ascontiguousarray((left, right)[camera][:, *region.slices]),
+        stack = (left, right)[camera]
+        shown = context.read_out[camera] or Roi.whole(stack.shape[2], stack.shape[1])
+        # the stripes at the edge of a region are cut: without a region of interest, no stripe of the image is
+        used = shown if context.roi is None else region
+        columns = decode_coordinates(
+            np.ascontiguousarray(stack[:, *used.slices]),
             code,
             projector_size,
             settings,
@@ -107,6 +111,8 @@ def decode_structured_light_stereo(
             imager=context.imager,
             interpolate=True,
         )["columns"]
+        top, left_edge = region.top - used.top, region.left - used.left
+        return columns.part((slice(top, top + region.height), slice(left_edge, left_edge + region.width)))
 
     return cloud_of_pair(decoded, geometry, code, settings, context)
 
