@@ -7,7 +7,9 @@ change between versions.
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from mitsim.version import __version__ as __version__
@@ -106,6 +108,17 @@ __all__ = [
     "write_capture",
     "write_cloud",
 ]
+
+
+class _Interface(ModuleType):
+    """A module whose public names stay: importing the package ``mitsim.decode`` does not replace ``ms.decode``."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _NAMES and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Interface
 
 
 def __getattr__(name: str) -> Any:
