@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.errors import InputError
 from mitsim.capture.decoding import Decoding
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.transforms import Transform
@@ -63,7 +64,8 @@ class Capture:
     Raises
     ------
     ValueError
-        If the source is unknown, an image or map has the wrong shape or type, or a covariance has no pose.
+        If the source is unknown, an image or map has the wrong shape or type, or a covariance has no pose. An
+        InputError if a region was read out of a camera that the capture does not have, or is not inside its image.
     """
 
     sensor: str
@@ -93,5 +95,14 @@ class Capture:
                 raise ValueError(f"map {name!r}: allowed are {', '.join(DERIVED_UNITS)}")
             if values.dtype != np.float32 or values.shape[2:] != ((3,) if name == "points" else ()) or values.ndim < 2:
                 raise ValueError(f"map of {name}: {values.dtype} of shape {values.shape}")
+        for name, region in self.decoding.read_out.items():
+            where = f"capture of {self.sensor}: settings.json"
+            if name not in self.rig.cameras:
+                raise InputError(where, "read_out", repr(name), ", ".join(self.rig.cameras))
+            camera = self.rig.cameras[name]
+            if not region.fits(camera.width, camera.height):
+                found = [region.left, region.top, region.width, region.height]
+                allowed = f"[left, top, width, height] within {camera.width} x {camera.height} pixels"
+                raise InputError(where, f"read_out.{name}", found, allowed)
         if self.pose_covariance is not None and self.world_from_sensor is None:
             raise ValueError("a pose covariance without a pose")

@@ -120,6 +120,11 @@ class Decoding(Document):
             return ()
         return self.exposure_s if isinstance(self.exposure_s, tuple) else (self.exposure_s,)
 
+    @property
+    def bracket_s(self) -> tuple[float, ...] | None:
+        """Return the exposures [s] of a bracket; None for one exposure."""
+        return self.exposures_s if len(self.exposures_s) > 1 else None
+
 
 def read_settings(where: str | Path, table: dict[str, Any], technology: str) -> tuple[Decoding, dict[str, Any]]:
     """Split the table of a ``settings.json`` into what decoding reads and the records.

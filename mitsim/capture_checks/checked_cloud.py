@@ -12,12 +12,12 @@ from pathlib import Path
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Settings
-from mitsim.capture_checks.sanity import capture_findings, cloud_warnings, pair_row_error, row_error_in_words
-from mitsim.reconstruction.cloud import capture_cloud, range_is_known, settings_are_known
+from mitsim.capture_checks.sanity import Findings, cloud_warnings, code_findings, pair_row_error, row_error_in_words
+from mitsim.decode.grey_levels import MeasuredNoise
+from mitsim.reconstruction.cloud import capture_cloud
 from mitsim.reconstruction.coded_images import CodedImages
 from mitsim.reconstruction.depth_range import range_warning, surface_beyond
-from mitsim.reconstruction.noise import known_noise, sigma_source
-from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.reconstruction.noise import sigma_source
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.preset import Sensor, presets
 
@@ -60,12 +60,15 @@ def checked_cloud(
     InputError
         If the settings belong to another technology, or the capture is inconsistent.
     """
-    noise = known_noise(capture, imager)
-    images, coordinates = CodedImages.of(capture, settings), None
-    if images is not None and isinstance(settings, DecoderSettings):
-        coordinates = images.coordinates(settings, noise)
-    found = capture_findings(capture, settings, images, coordinates)
-    cloud = capture_cloud(capture, settings, imager=noise, coordinates=coordinates)
+    images = CodedImages.of(capture, settings, imager)
+    if images is None:
+        noise: Imager | MeasuredNoise | None = imager
+        found = Findings()
+        cloud = capture_cloud(capture, settings, imager=imager)
+    else:
+        noise = images.noise
+        cloud = capture_cloud(capture, settings, imager=noise, coordinates=images.coordinates)
+        found = code_findings(images, capture.rig)
     matched = pair_row_error(capture, cloud)
     warnings = [*capture.settings.get("warnings", []), *found.warnings, *cloud_warnings(matched)]
     beyond = surface_beyond(capture, cloud, settings)
@@ -77,18 +80,3 @@ def checked_cloud(
         warnings.append(range_warning(f"{where}: a surface", beyond.depths, settings, whose, known))
     notes = row_error_in_words(capture, settings, found, matched), sigma_source(capture, cloud, noise)
     return CheckedCloud(cloud, tuple(dict.fromkeys(warnings)), tuple(note for note in notes if note))
-
-
-def settings_in_words(
-    capture: Capture, settings: Settings, sensor: str | None = None, range_mm: tuple[float, float] | None = None
-) -> str:
-    """Describe the depths that are decoded, and whose settings are used.
-
-    ``sensor`` and ``range_mm`` are the user's, as for :func:`mitsim.reconstruction.cloud.decoder_settings`.
-    """
-    known = range_is_known(capture, sensor, range_mm)
-    assumed = "" if known else " (assumed: the capture has no range; set --range)"
-    by = f"settings of {sensor or capture.sensor}"
-    if capture.source == "simulated" and not settings_are_known(capture, sensor):
-        by = "default settings, since settings.json has none (add --sensor FILE for those of its sensor)"
-    return f"{settings.near_mm:g} to {settings.far_mm:g} mm{assumed}; {by}"

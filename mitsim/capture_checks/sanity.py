@@ -25,8 +25,7 @@ from mitsim.capture_checks.rig_sanity import (
 from mitsim.decode.matching.stereo import stereo_geometry
 from mitsim.reconstruction.cloud import decoder_settings
 from mitsim.reconstruction.coded_images import CodedImages
-from mitsim.reconstruction.decoder_registry import Coordinates
-from mitsim.reconstruction.noise import known_noise
+from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 
 
@@ -57,27 +56,22 @@ def with_warnings(capture: Capture) -> Capture:
     return replace(capture, settings=capture.settings | ({"warnings": warnings} if warnings else {}))
 
 
-def capture_findings(
-    capture: Capture,
-    settings: Settings,
-    images: CodedImages | None = None,
-    coordinates: Coordinates | None = None,
-) -> Findings:
+def capture_findings(capture: Capture, settings: Settings) -> Findings:
     """Check the images and calibration of a structured-light capture; other captures have no findings.
 
-    A bracket of exposures is not checked. If images do not match their pattern, the calibration is not checked.
-
-    ``images`` and their ``coordinates``: those of the capture, if they are decoded already.
+    A bracket of exposures is not checked, and images that are missing are reported by decoding.
     """
-    images = images or CodedImages.of(capture, settings)
-    if images is None or not isinstance(settings, DecoderSettings):
-        return Findings()  # decoding reports missing images
-    if coordinates is None:
-        try:
-            coordinates = images.coordinates(settings, known_noise(capture, None))
-        except InputError:
-            coordinates = {}  # decoding reports the error
-    code, size, full_scale = images.code, images.size, images.full_scale
+    images = CodedImages.of(capture, settings)
+    return Findings() if images is None else code_findings(images, capture.rig)
+
+
+def code_findings(images: CodedImages, rig: Rig) -> Findings:
+    """Check coded images and the calibration of their rig; the calibration only if the images match their code."""
+    code, size, settings, full_scale = images.code, images.size, images.settings, images.full_scale
+    try:
+        coordinates = images.coordinates
+    except InputError:
+        coordinates = {}  # decoding reports the error
     out = []
     for name, stack in images.stacks.items():
         out += image_warnings(stack, code, size, settings, full_scale, name, coordinates.get(name, {}))
@@ -86,11 +80,11 @@ def capture_findings(
     decoded = [coordinates[name] for name in images.stacks]
     if settings.triangulate == "cameras":
         try:
-            return Findings(*pair_warnings(list(images.stacks.values()), decoded, capture.rig, code, size, full_scale))
+            return Findings(*pair_warnings(list(images.stacks.values()), decoded, rig, code, size, full_scale))
         except InputError as error:
             return Findings([str(error)])
-    along = baseline_warning(capture.rig, code)
-    return Findings(([along] if along else []) + camera_warnings(decoded[0], capture.rig, settings))
+    along = baseline_warning(rig, code)
+    return Findings(([along] if along else []) + camera_warnings(decoded[0], rig, settings))
 
 
 def pair_row_error(capture: Capture, cloud: PointCloud) -> float:

@@ -45,9 +45,9 @@ def decode(
     from characterisation.cloud_files import write_ply
     from mitsim.capture.folder import read_capture
     from mitsim.capture.workspace import written_frame
-    from mitsim.capture_checks.checked_cloud import checked_cloud, settings_in_words
+    from mitsim.capture_checks.checked_cloud import checked_cloud
     from mitsim.progress import say
-    from mitsim.reconstruction.cloud import decoder_settings, with_options
+    from mitsim.reconstruction.cloud import decoder_settings, settings_in_words, with_options
 
     read = read_capture(capture)
     written = written_frame(read, points_in, capture)

@@ -43,18 +43,19 @@ from mitsim.sensor.roi import Roi, checked_roi
 __all__ = [
     "Geometry",
     "Settings",
-    "bracket_exposures",
     "capture_cloud",
     "capture_geometry",
     "capture_pattern",
     "decoder_settings",
     "in_range",
-    "range_is_known",
-    "read_out_of",
     "sensor_geometry",
-    "settings_are_known",
+    "settings_in_words",
     "with_options",
 ]
+
+
+#: said of a range that nobody has stated
+ASSUMED_RANGE = " (assumed: the capture has no range; set --range)"
 
 
 def decoder_settings(
@@ -132,20 +133,21 @@ def _settings(capture: Capture, sensor: Sensor | str | Path | None) -> tuple[Set
     return validate(_where(capture), defaults, model), None
 
 
-def settings_are_known(capture: Capture, sensor: str | None) -> bool:
-    """Return whether a user, the capture or a preset gives the settings; otherwise those of the technology are used."""
-    return sensor is not None or capture.decoding.decoder is not None or capture.sensor in presets()
+def settings_in_words(
+    capture: Capture, settings: Settings, sensor: str | None = None, range_mm: tuple[float, float] | None = None
+) -> str:
+    """Describe the depths that are decoded, and whose settings are used.
 
-
-def range_is_known(capture: Capture, sensor: str | None, range_mm: tuple[float, float] | None) -> bool:
-    """Return whether a user, a sensor or the capture gives the depths to search; else a matcher uses the default.
-
-    Arguments as for :func:`decoder_settings`. Decoders of codes and of device maps accept all depths: always True.
+    ``sensor`` and ``range_mm`` are the user's, as for :func:`decoder_settings`. Decoders of codes and of device maps
+    accept all depths; a matcher without a range searches the default.
     """
-    if capture.technology not in ("active_stereo", "reference_stereo") or sensor is not None or range_mm is not None:
-        return True
-    stored = capture.decoding
-    return capture.sensor in presets() or any((stored.near_mm, stored.range_mm, stored.decoder))
+    stored, preset = capture.decoding, capture.sensor in presets()
+    known = preset or any((sensor, range_mm, stored.near_mm, stored.range_mm, stored.decoder))
+    assumed = "" if known or not isinstance(settings, MatcherSettings) else ASSUMED_RANGE
+    by = f"settings of {sensor or capture.sensor}"
+    if capture.source == "simulated" and not (sensor or stored.decoder or preset):
+        by = "default settings, since settings.json has none (add --sensor FILE for those of its sensor)"
+    return f"{settings.near_mm:g} to {settings.far_mm:g} mm{assumed}; {by}"
 
 
 def with_options(settings: Settings, block: int | None, contrast: float | None) -> Settings:
@@ -250,7 +252,7 @@ def capture_cloud(
     geometry = geometry or technology.geometry(capture.rig, settings, pattern)
     if roi is not None:
         roi = checked_roi(roi, geometry.grid.width, geometry.grid.height, "capture_cloud")
-    exposures, read_out = bracket_exposures(capture), read_out_of(capture)
+    exposures, read_out = capture.decoding.bracket_s, capture.decoding.read_out
     images, full_scale = capture.images, 2.0**capture.bits - 1
     if exposures is not None and not isinstance(settings, DeviceMapSettings):
         images, full_scale = _merged_exposures(capture, exposures, read_out)
@@ -258,25 +260,6 @@ def capture_cloud(
         settings, imager = settings.at_exposure(min(exposures) / max(exposures)), None
     shown = Images(capture, images, full_scale, imager, roi, read_out, coordinates)
     return technology.decode(shown, geometry, settings, pattern)
-
-
-def read_out_of(capture: Capture) -> dict[str, Roi]:
-    """Return the region that was read out of each camera; cameras that were read out completely are omitted.
-
-    Raises
-    ------
-    InputError
-        If the capture names a camera that it does not have, or a region outside the image.
-    """
-    for name, region in capture.decoding.read_out.items():
-        if name not in capture.rig.cameras:
-            raise InputError(_where(capture), "read_out", repr(name), ", ".join(capture.rig.cameras))
-        camera = capture.rig.cameras[name]
-        if not region.fits(camera.width, camera.height):
-            found = [region.left, region.top, region.width, region.height]
-            allowed = f"[left, top, width, height] within {camera.width} x {camera.height} pixels"
-            raise InputError(_where(capture), f"read_out.{name}", found, allowed)
-    return capture.decoding.read_out
 
 
 def _device_cloud(
@@ -290,12 +273,6 @@ def _device_cloud(
         if roi is None:
             return empty_cloud(map_geometry, capture.sensor, capture.source)
     return technology.decode(Images(capture, {}, 1.0, None, roi, {}), map_geometry, settings, None)
-
-
-def bracket_exposures(capture: Capture) -> tuple[float, ...] | None:
-    """Return the exposures [s] of a capture with several; None for one exposure."""
-    exposures = capture.decoding.exposures_s
-    return exposures if len(exposures) > 1 else None
 
 
 def _merged_exposures(
