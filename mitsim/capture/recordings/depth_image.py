@@ -14,6 +14,7 @@ import numpy as np
 
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import read_grey
 from mitsim.capture.recordings.calibration_file import camera_of, read_calibration
 from mitsim.sensor.camera import Rig
@@ -61,8 +62,7 @@ def read_depth_image(
     if not np.isfinite(depth).any():
         raise InputError(path, "", f"an image with only the level {invalid}", "an image with some depths")
     settings = {"depth_scale_mm": float(scale_mm), "depth_invalid": int(invalid), "imported_from": path.name}
-    if read.range_mm is not None:
-        settings |= {"near_mm": read.range_mm[0], "far_mm": read.range_mm[1]}
+    near, far = read.range_mm or (None, None)
     return Capture(
         sensor=sensor or read.sensor or "depth-camera",
         technology="depth_map",
@@ -70,6 +70,7 @@ def read_depth_image(
         rig=Rig({camera or next(iter(read.rig.cameras)): eye}, read.rig.projector),
         images={},
         bits=16,
+        decoding=Decoding(near_mm=near, far_mm=far),
         settings=settings,
         derived={"depth": depth},
     )
