@@ -100,16 +100,26 @@ def test_statement_has_the_figures_of_the_command(workplace):
 def test_a_rendered_capture_is_decoded_by_the_sensor_that_took_it(workplace):
     sensor = ms.load_sensor("small.toml")
     capture = ms.render(ms.load_scene("matt_white.xml", sensor), sensor, POSE, samples=8, depth=1)
-    cloud = capture.cloud()
-    for same in (capture.cloud(sensor), capture.cloud("small.toml")):
+    cloud = ms.decode(capture)
+    for same in (ms.decode(capture, sensor), ms.decode(capture, "small.toml")):
         assert np.array_equal(same.points, cloud.points, equal_nan=True)
     # the capture keeps the sensor's settings; without them the usual ones are taken, and they are others
-    kept = replace(capture, taken_by=None)
-    assert np.array_equal(kept.cloud().points, cloud.points, equal_nan=True)
-    usual = replace(kept, settings={key: value for key, value in kept.settings.items() if key != "decoder"}).cloud()
+    usual = ms.decode(replace(capture, decoding=capture.decoding.model_copy(update={"decoder": None})))
     assert not np.array_equal(usual.points, cloud.points, equal_nan=True)
-    near = capture.cloud(range_mm=(330, 480))
+    near = ms.decode(capture, range_mm=(330, 480))
     assert 0 < np.nanmax(near.points[..., 2]) < 500 < np.nanmax(cloud.points[..., 2])
+
+
+def test_decode_issues_the_warnings_that_the_command_prints(workplace):
+    capture = ms.read_capture("capture")
+    told = "the rig has moved since its calibration"
+    ms.write_capture(replace(capture, settings=capture.settings | {"warnings": [told]}), "moved")
+    with pytest.warns(UserWarning) as warned:
+        cloud = ms.decode(ms.read_capture("moved"))
+    done = CliRunner().invoke(app, ["decode", "moved", "-o", "moved.ply"], catch_exceptions=False)
+    assert [str(one.message) for one in warned] == [told]
+    assert f"warning: {told}" in done.stderr
+    assert np.array_equal(ms.read_cloud("moved.ply").points, cloud.points, equal_nan=True)
 
 
 def test_labels_are_those_of_the_part(workplace):

@@ -13,6 +13,7 @@ import pytest
 from characterisation.cloud_files import read_ply
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import SETTINGS_OF, read_settings
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
@@ -84,8 +85,7 @@ def taken(request, tmp_path_factory):
 
 def with_settings(capture: Capture, **changed) -> Capture:
     """The capture with other settings; None leaves one out."""
-    settings = {key: value for key, value in (capture.settings | changed).items() if value is not None}
-    return replace(capture, settings=settings)
+    return replace(capture, decoding=capture.decoding.model_copy(update=changed))
 
 
 def test_the_cloud_is_the_same_with_and_without_the_sensor_file(taken, capsys):
@@ -125,7 +125,7 @@ def test_an_old_folder_still_loads(taken):
     old = with_settings(read_capture(taken.folder), decoder=None, imager=None)
     kind = technology_of(old.technology)
     settings, imager = decoder_settings(old)
-    assert isinstance(settings, kind.settings[0])
+    assert isinstance(settings, SETTINGS_OF[old.technology])
     assert (settings.near_mm, settings.far_mm, imager) == (*kind.range_mm, None)
     # a folder of an import has decoder settings and no imager
     assert decoder_settings(with_settings(read_capture(taken.folder), imager=None)) == (taken.sensor.settings, None)
@@ -143,13 +143,10 @@ def test_an_old_folder_still_loads(taken):
     ],
 )
 def test_a_bad_value_is_an_error_that_names_file_and_field(taken, key, value, told):
-    capture = read_capture(taken.folder)
-    bad = with_settings(capture, **{key: capture.settings[key] | value})
-    with pytest.raises(InputError, match=rf"settings\.json: {told}"):
-        decoder_settings(bad)
-    with pytest.raises(InputError, match=rf"settings\.json: {key}"):
-        decoder_settings(with_settings(capture, **{key: 5}))
-    assert decoder_settings(bad, str(taken.file))[0] == taken.sensor.settings
+    written = json.loads((taken.folder / "settings.json").read_text())
+    for bad, words in ((written[key] | value, told), (5, key)):
+        with pytest.raises(InputError, match=rf"settings\.json: {words}"):
+            read_settings("settings.json", written | {key: bad}, taken.sensor.technology)
 
 
 def test_settings_of_another_technology_are_an_error(taken):

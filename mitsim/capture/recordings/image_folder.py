@@ -18,6 +18,7 @@ import numpy as np
 
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import CHANNELS, SUFFIXES, Image, channel_name, is_colour, read_grey
 from mitsim.capture.recordings.image_count import advice
 from mitsim.sensor.camera import Camera
@@ -64,23 +65,20 @@ def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig, channel:
         images[name] = _stack(found, rig.rig.cameras[name], rig.bits, channel)
         colour |= is_colour(found[0])
         names[name] = [path.relative_to(folder).as_posix() for path in found]
-    settings: dict[str, Any] = {
-        "pattern": code.model_dump(),
-        "decoder": decoder.model_dump(),
-        "near_mm": decoder.near_mm,
-        "far_mm": decoder.far_mm,
-        "ambient_image": rig.ambient_image,
-        "imported_from": folder.resolve().name,
-        "files": names,
-        "black_level_dn": rig.black_level,
-        "gamma": rig.gamma,
-    }
+    decoding = Decoding(
+        decoder=decoder,
+        pattern=code,
+        projector_size_px=rig.projector_size if rig.rig.projector is None else None,
+        exposure_s=rig.exposure_s,
+        black_level_dn=rig.black_level,
+        gamma=rig.gamma,
+        ambient_image=rig.ambient_image,
+        near_mm=decoder.near_mm,
+        far_mm=decoder.far_mm,
+    )
+    settings: dict[str, Any] = {"imported_from": folder.resolve().name, "files": names}
     if colour:
         settings["channel"] = channel_name(channel)
-    if rig.exposure_s is not None:
-        settings["exposure_s"] = rig.exposure_s
-    if rig.rig.projector is None:
-        settings["projector_size_px"] = list(rig.projector_size)
     bits = rig.bits
     if bits is None:
         bits = max(bits_of(stack) for stack in images.values())
@@ -93,6 +91,7 @@ def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig, channel:
         rig=rig.rig,
         images=images,
         bits=bits,
+        decoding=decoding,
         settings=settings,
     )
 
