@@ -11,7 +11,7 @@ from typing import Any
 import xarray as xr
 
 from characterisation.files.errors import InputError
-from characterisation.statements.statement import Statement
+from characterisation.statements.statement import Statement, Statements
 from mitsim.decode.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
@@ -131,7 +131,7 @@ def score(study: Study) -> xr.Dataset:
 
 def statement(
     study: Study, view: int, *, trials: int | None = None, pairs: int | None = None, folder: str | Path | None = None
-) -> list[Statement]:
+) -> Statements:
     """State the uncertainty of every measurement from one view, by virtual measurements of it.
 
     Each trial draws calibration, finish, room light, temperature, pose and noise anew, renders, decodes and measures
@@ -156,7 +156,8 @@ def statement(
     Returns
     -------
     list of Statement
-        One for each measurement: ``bias``, ``standard_uncertainty`` and the 95 % ``interval`` of the error, in
+        One for each measurement, in a list whose ``plot()`` draws them: ``bias``, ``standard_uncertainty`` and the 95 %
+        ``interval`` of the error, in
         ``unit`` (mm or deg); ``settled``, whether one significant digit of u is certain; ``budget`` by group of
         unknowns, each a :class:`BudgetLine`; ``verdict``, ``no tolerance`` if the task has none.
 
@@ -178,10 +179,11 @@ def statement(
     table = StatementTable(
         trials=_checked("trials", most, 2), pairs=_checked("pairs", own.pairs if pairs is None else pairs, 0)
     )
+    chosen = study_view(study, view, "statement: view")
     if folder is not None:
-        return stated_view(study, study_view(study, view, "statement: view"), Path(folder), table=table).statements
+        return Statements(stated_view(study, chosen, Path(folder), table=table).statements)
     with TemporaryDirectory() as place:
-        return stated_view(study, study_view(study, view, "statement: view"), Path(place), table=table).statements
+        return Statements(stated_view(study, chosen, Path(place), table=table).statements)
 
 
 def stated_view(
