@@ -27,6 +27,7 @@ _NAMES = {
     "Study": "mitsim.study",
     "Task": "characterisation.tasks.task_file",
     "Transform": "mitsim.sensor.transforms",
+    "Truth": "mitsim.capture.simulated.truth",
     "label": "mitsim.study.measurements",
     "load_scene": "mitsim.decode.captures",
     "load_sensor": "mitsim.decode.captures",
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from characterisation.tasks.result import Result
     from characterisation.tasks.task_file import Task
     from mitsim.capture.capture import Capture
+    from mitsim.capture.simulated.truth import Truth
     from mitsim.decode.captures import (
         load_scene,
         load_sensor,
@@ -86,6 +88,7 @@ __all__ = [
     "Study",
     "Task",
     "Transform",
+    "Truth",
     "label",
     "load_scene",
     "load_sensor",
