@@ -42,6 +42,7 @@ _NAMES = {
     "render": "mitsim.decode.captures",
     "score": "mitsim.study.programs",
     "statement": "mitsim.study.programs",
+    "triangulate": "mitsim.decode.own_code",
     "write_capture": "mitsim.decode.captures",
     "write_cloud": "mitsim.decode.captures",
 }
@@ -65,6 +66,7 @@ if TYPE_CHECKING:
         write_capture,
         write_cloud,
     )
+    from mitsim.decode.own_code import triangulate
     from mitsim.maps.use import performance_map, predict
     from mitsim.scene.load import Scene
     from mitsim.sensor.poses import look_at
@@ -103,6 +105,7 @@ __all__ = [
     "render",
     "score",
     "statement",
+    "triangulate",
     "write_capture",
     "write_cloud",
 ]

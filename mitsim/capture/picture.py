@@ -68,7 +68,7 @@ def draw_capture(capture: Capture, ax: Any, camera: str | None, image: int) -> N
             shown, ax=grid[0].tolist(), label=f"grey level [DN], exponent {STRETCH_EXPONENT}", extend="both", pad=0.02
         )
         bar.outline.set_visible(False)  # type: ignore[operator]
-    return grid[0]
+    return np.asarray(grid[0])
 
 
 def _draw_derived(capture: Capture, ax: Any) -> NDArray[np.object_]:
@@ -85,7 +85,7 @@ def _draw_derived(capture: Capture, ax: Any) -> NDArray[np.object_]:
             )
             figure_of(axes).colorbar(shown, ax=axes, label=f"{name} [{DERIVED_UNITS[name]}]", extend="both", pad=0.02)
             _title(axes, f"{name} by the device: {capture.sensor}, {capture.source}")
-    return grid[0]
+    return np.asarray(grid[0])
 
 
 def _title(axes: Axes, title: str) -> None:

@@ -17,10 +17,10 @@ from characterisation.plots.style import FIELD, SEQUENTIAL, drawing
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
 from mitsim.capture.picture import STRETCH_EXPONENT, grey_limits
-from mitsim.capture.png import encode_png
 from mitsim.report.findings import reason_shares
 from mitsim.running.numbers import percent
 from mitsim.sensor.camera import Camera
+from mitsim.sensor.png import encode_png
 
 LARGEST_WIDTH_PX = 800
 

@@ -167,7 +167,7 @@ def _decode_foreign(path):
 
 
 def _image(folder):
-    from mitsim.capture.png import encode_png
+    from mitsim.sensor.png import encode_png
 
     path = folder / "image.png"
     path.write_bytes(encode_png(np.random.default_rng(1).integers(0, 255, (40, 60)).astype(np.uint8)))

@@ -8,7 +8,7 @@ import pytest
 
 from characterisation.plots.discs import noise_limits
 from characterisation.point_cloud import Status
-from mitsim.capture.png import decode_png
+from mitsim.sensor.png import decode_png
 from mitsim.report import figures
 from mitsim.report.agreement import agreement
 from mitsim.report.cloud_figures import REASONS, camera_images, shrink, window

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
-from mitsim.capture.png import LONGEST_SIDE_PX
 from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.png import LONGEST_SIDE_PX
 from mitsim.sensor.transforms import Transform
 
 #: values of DepthAI's cameraType
