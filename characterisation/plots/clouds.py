@@ -11,7 +11,7 @@ from matplotlib.patches import Patch
 from matplotlib.transforms import ScaledTranslation
 from numpy.typing import NDArray
 
-from characterisation.plots.style import DIVERGING, FIELD, SEQUENTIAL, figure_of
+from characterisation.plots.style import DIVERGING, FIELD, SEQUENTIAL, figure_of, side_bar
 
 #: meaning and colour of each status, by name: Okabe and Ito's palette, and greys of different lightness
 REASONS: dict[str, tuple[str, str]] = {
@@ -93,8 +93,7 @@ def draw_cloud(
         scale = SEQUENTIAL
     shown = axes.imshow(np.ma.masked_invalid(values), cmap=scale, vmin=low, vmax=high, interpolation="nearest")
     axes.set(xlabel="column [px]", ylabel="row [px]")
-    bar = figure_of(axes).colorbar(shown, ax=axes, label=label, extend="both", shrink=0.9, pad=0.02)
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    side_bar(axes, shown, label)
     counts = np.bincount(status[missing].ravel(), minlength=numbers[-1] + 1)
     order = [number for number in np.argsort(-counts, kind="stable").tolist() if counts[number]]
     legend = [

@@ -42,7 +42,11 @@ def label_columns(
     step = float(max(span[1], 0.62 * span[0])) / _ROWS
     aside = _ASIDE * float(span.max())
     from_left = sorted(places, key=lambda name: places[name][0])
-    left, right = from_left[: len(from_left) // 2], from_left[len(from_left) // 2 :]
+    middle = float(low[0] + high[0]) / 2
+    first = sum(bool(places[name][0] < middle) for name in from_left)
+    if max(first, len(from_left) - first) > most:
+        first = len(from_left) // 2
+    left, right = from_left[:first], from_left[first:]
     every = [float(low[1]), float(high[1])]
     for names, x, side, way in ((left, low[0] - aside, "right", -1), (right, high[0] + aside, "left", 1)):
         kept = [name for name in places if name in names][:most]

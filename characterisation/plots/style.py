@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
+from copy import copy
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
+from matplotlib import rcParams
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -56,9 +58,19 @@ STYLE: dict[Any, Any] = {
 }
 
 
-def drawing() -> AbstractContextManager[None]:
-    """Return the context in which every figure is drawn."""
-    return rc_context(STYLE)
+@contextmanager
+def drawing() -> Iterator[None]:
+    """Draw every figure within this context.
+
+    Only the settings of :data:`STYLE` are put back. ``rc_context`` puts back all, among them ``interactive``, which a
+    notebook's backend sets when the first figure is made; no later figure would then be shown.
+    """
+    before = {key: copy(rcParams[key]) for key in STYLE}
+    rcParams.update(STYLE)
+    try:
+        yield
+    finally:
+        rcParams.update(before)
 
 
 @contextmanager
@@ -102,6 +114,12 @@ def figure_of(axes: Axes) -> Figure:
     figure = axes.get_figure(root=True)
     assert figure is not None
     return figure
+
+
+def side_bar(axes: Axes, shown: ScalarMappable, label: str) -> None:
+    """Add a colour scale to the right of axes, as high as they are, for values that may lie beyond its ends."""
+    bar = figure_of(axes).colorbar(shown, cax=axes.inset_axes((1.02, 0.0, 0.03, 1.0)), label=label, extend="both")
+    bar.outline.set_visible(False)  # type: ignore[operator]
 
 
 def bare(axes: Axes) -> None:

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.plots.clouds import depth_limits
-from characterisation.plots.style import SEQUENTIAL, VERMILION, axes_for, figure_of
+from characterisation.plots.style import SEQUENTIAL, VERMILION, axes_for, side_bar
 from mitsim.capture.capture import DERIVED_UNITS, Capture
 
 #: percentiles of the grey values shown as black and white, and the display exponent, since metal is dark but for its
 #: highlights
 STRETCH_PERCENTILES, STRETCH_EXPONENT = (5, 99.9), 0.7
 
-#: width of the picture of a camera, and height of its title and labels [in]
-_WIDTH_IN, _LABELS_IN = 4.8, 0.9
+#: width of the picture of a camera, width of the colour scale, and height of title and legend [in]
+_WIDTH_IN, _SCALE_IN, _LABELS_IN = 4.8, 0.8, 0.55
 
 
 def grey_limits(frames: Sequence[NDArray[np.number[Any]]]) -> tuple[float, float]:
@@ -51,7 +51,8 @@ def draw_capture(capture: Capture, ax: Any, camera: str | None, image: int) -> N
     black, white = grey_limits(list(frames.values()))
     full_scale = 2**capture.bits - 1
     rows, columns = next(iter(frames.values())).shape
-    with axes_for(ax, (1, len(frames)), (_WIDTH_IN * len(frames), _WIDTH_IN * rows / columns + _LABELS_IN)) as grid:
+    size = (_WIDTH_IN * len(frames) + _SCALE_IN, _WIDTH_IN * rows / columns + _LABELS_IN)
+    with axes_for(ax, (1, len(frames)), size) as grid:
         for axes, (name, frame) in zip(grid[0], frames.items(), strict=True):
             norm = PowerNorm(STRETCH_EXPONENT, black, white, clip=True)
             shown = axes.imshow(frame, cmap="gray", norm=norm, interpolation="antialiased")
@@ -64,10 +65,7 @@ def draw_capture(capture: Capture, ax: Any, camera: str | None, image: int) -> N
                 axes.legend(handles=[Patch(facecolor=VERMILION, label=label)], **place)
             number = f", image {image % count + 1} of {count}" if count > 1 else ""
             _title(axes, f"{name}{number}: {capture.sensor}, {capture.source}")
-        bar = figure_of(grid[0, 0]).colorbar(
-            shown, ax=grid[0].tolist(), label=f"grey level [DN], exponent {STRETCH_EXPONENT}", extend="both", pad=0.02
-        )
-        bar.outline.set_visible(False)  # type: ignore[operator]
+        side_bar(grid[0, -1], shown, f"grey level [DN], exponent {STRETCH_EXPONENT}")
     return np.asarray(grid[0])
 
 
@@ -77,13 +75,14 @@ def _draw_derived(capture: Capture, ax: Any) -> NDArray[np.object_]:
         raise InputError(f"capture of {capture.sensor}", "images", "none", "at least one image or map to draw")
     maps = {name: values[..., 2] if name == "points" else values for name, values in capture.derived.items()}
     rows, columns = next(iter(maps.values())).shape
-    with axes_for(ax, (1, len(maps)), (_WIDTH_IN * len(maps), _WIDTH_IN * rows / columns + _LABELS_IN)) as grid:
+    size = ((_WIDTH_IN + _SCALE_IN) * len(maps), _WIDTH_IN * rows / columns + _LABELS_IN)
+    with axes_for(ax, (1, len(maps)), size) as grid:
         for axes, (name, values) in zip(grid[0], maps.items(), strict=True):
             low, high = depth_limits(values)
             shown = axes.imshow(
                 np.ma.masked_invalid(values), cmap=SEQUENTIAL, vmin=low, vmax=high, interpolation="nearest"
             )
-            figure_of(axes).colorbar(shown, ax=axes, label=f"{name} [{DERIVED_UNITS[name]}]", extend="both", pad=0.02)
+            side_bar(axes, shown, f"{name} [{DERIVED_UNITS[name]}]")
             _title(axes, f"{name} by the device: {capture.sensor}, {capture.source}")
     return np.asarray(grid[0])
 

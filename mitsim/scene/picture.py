@@ -110,10 +110,14 @@ def _label_places(scene: Scene, shape: NDArray[np.int16], x: Floats, y: Floats) 
 
 def _directions(axes: Axes, frame: Floats, corner: tuple[float, float], size: float) -> None:
     """Draw the directions x, y and z of the world in a corner, each as long as it appears."""
+    named: list[Floats] = []
     origin = np.array([corner[0] - 1.5 * size, corner[1] + 0.4 * size])
     for number, name in enumerate("xyz"):
         tip = origin + size * frame[:2, number]
         axes.annotate("", tuple(tip), tuple(origin), arrowprops={"arrowstyle": "->", "color": INK, "lw": 0.9})
         way = tip - origin
         beyond = tip + 0.3 * size * way / max(float(np.linalg.norm(way)), 0.2 * size)
+        while any(np.linalg.norm(beyond - other) < 0.25 * size for other in named):
+            beyond = beyond + np.array([0.25 * size, 0.0])  # two directions that look the same
+        named.append(beyond)
         axes.text(float(beyond[0]), float(beyond[1]), name, ha="center", va="center", fontsize=8)

@@ -24,8 +24,8 @@ from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
 from mitsim.sensor.png import decode_png
 
-#: largest number of images, as of an image sequence, and of their pixels: 2 GB on the device
-MOST_IMAGES, MOST_VALUES = 1000, 500_000_000
+#: largest number of images, which take a kernel that grows with them (20 s for 128), and of their pixels, 2 GB
+MOST_IMAGES, MOST_VALUES = 256, 500_000_000
 
 
 class ImageFolder(Document):

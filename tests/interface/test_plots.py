@@ -49,7 +49,7 @@ def test_a_cloud_is_drawn_on_its_pixels_with_the_reasons_of_the_rest(tilted):
     # the most frequent reason first: 40 and 20 of 1200 pixels
     assert texts(axes.get_legend()) == ["saturated: 3.3 %", "in the projector's shadow: 1.7 %"]
     assert axes.get_title() == "my camera, device: 1140 points of 1200 pixels"
-    assert axes.figure.axes[1].get_ylabel() == "depth z, sensor frame [mm]"
+    assert axes.child_axes[0].get_ylabel() == "depth z, sensor frame [mm]"
 
 
 def test_a_complete_cloud_has_no_legend(tilted):
@@ -70,7 +70,7 @@ def test_residuals_of_the_own_plane_are_nothing_and_of_another_have_a_sign(tilte
 
     axes = tilted.plot(plane=Nearer())
     np.testing.assert_allclose(axes.images[1].get_array().compressed(), 2.0, atol=1e-3)
-    assert axes.figure.axes[1].get_ylabel() == "distance from the plane [mm]"
+    assert axes.child_axes[0].get_ylabel() == "distance from the plane [mm]"
 
 
 def test_axes_of_the_caller_are_used_and_no_state_is_left(tilted):
@@ -124,7 +124,7 @@ def test_a_capture_without_images_shows_the_map_of_the_device(bright):
     mapped = Capture(**{**vars(bright), "images": {}, "derived": {"depth": depth}})
     (axes,) = mapped.plot()
     assert axes.images[0].get_array().count() == 40 * 320
-    assert axes.figure.axes[1].get_ylabel() == "depth [mm]"
+    assert axes.child_axes[0].get_ylabel() == "depth [mm]"
     with pytest.raises(ms.InputError, match="at least one image or map"):
         Capture(**{**vars(bright), "images": {}}).plot()
 

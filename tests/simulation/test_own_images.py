@@ -207,7 +207,7 @@ def test_recorded_images_of_an_own_code_are_imported_in_order(gray, tmp_path):
         (np.full((4, 6), 1.01), "found 1.01 to 1.01; allowed: values from 0 to 1"),
         (np.full((4, 6), np.nan), "found nan to nan"),
         (np.full((4, 6), 200), "found values of int64; allowed: uint8 or uint16"),
-        (np.zeros((1001, 4, 6), np.uint8), "found 1001 images of 6 x 4 px; allowed: up to 1000"),
+        (np.zeros((257, 4, 6), np.uint8), "found 257 images of 6 x 4 px; allowed: up to 256"),
     ],
 )
 def test_images_that_are_none_are_refused(images, told):
