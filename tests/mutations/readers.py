@@ -180,6 +180,12 @@ def _read_image(path):
     read_grey(path)
 
 
+def _read_projector_image(path):
+    from mitsim.sensor.projector_images import read_images
+
+    read_images(path.parent, 60, 40)
+
+
 def _opencv(suffix):
     def make(folder):
         import cv2
@@ -482,6 +488,7 @@ READERS: dict[str, Reader] = {
     "cloud.ply": Reader(_cloud, _read_cloud),
     "foreign.ply": Reader(_foreign, _decode_foreign),
     "image.png": Reader(_image, _read_image),
+    "image.png of a projector": Reader(_image, _read_projector_image),
     "calibration.yml": Reader(_opencv(".yml"), _read_calibration),
     "calibration.xml": Reader(_opencv(".xml"), _read_calibration),
     "calibration.json": Reader(_opencv(".json"), _read_calibration),
