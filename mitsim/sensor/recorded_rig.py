@@ -23,6 +23,7 @@ from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, sensor_of, sensor_table, written_table
+from mitsim.sensor.projector_images import ProjectorImages
 from mitsim.sensor.recorded_keys import for_recordings, lacking_keys
 from mitsim.sensor.sensor_file import SensorFile
 
@@ -43,7 +44,7 @@ class RecordedRig:
     technology: str
     rig: Rig
     projector_size: tuple[int, int]
-    pattern: DotPattern | LightCode | AmplitudeModulation
+    pattern: DotPattern | LightCode | ProjectorImages | AmplitudeModulation
     settings: MatcherSettings | DecoderSettings | TimeOfFlightSettings
     bits: int | None
     black_level: float
