@@ -29,7 +29,7 @@ def surface_seen(camera, *, depth=500.0, tilt=0.1, ball=True):
 
 def images_seen(code, camera, projector, points, *, full=255, noise=1.0, seed=1, gamma=1.0, texture=0.25):
     """Images (P, H, W) of a code by exact projection on a printed surface, blurred over the footprint of a pixel."""
-    place = projector.project(points)
+    place = np.nan_to_num(projector.project(points), nan=-99.0)  # beyond the fold of its distortion: dark
     lit = ((place > -0.5) & (place < [projector.width - 0.5, projector.height - 0.5])).all(axis=-1)
     x, y, _ = np.moveaxis(points, -1, 0)
     albedo = 0.6 + texture * np.sin(x / 13.5) * np.cos(y / 17.3)

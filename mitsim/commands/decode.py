@@ -45,7 +45,13 @@ def decode(
     from characterisation.cloud_files import write_ply
     from mitsim.capture.folder import read_capture
     from mitsim.capture.workspace import written_frame
-    from mitsim.capture_checks.sanity import capture_findings, cloud_warnings, pair_row_error, row_error_in_words
+    from mitsim.capture_checks.sanity import (
+        capture_findings,
+        cloud_warnings,
+        pair_row_error,
+        row_error_in_words,
+        uncalibrated_in_words,
+    )
     from mitsim.progress import say
     from mitsim.reconstruction.cloud import (
         capture_cloud,
@@ -81,6 +87,9 @@ def decode(
     source = sigma_source(read, cloud, noise)
     if source:
         say(source)
+    lost = uncalibrated_in_words(cloud)
+    if lost:
+        say(f"warning: {lost}")
     beyond = surface_beyond(read, cloud, settings)
     if beyond is not None:
         known = f"a coarse search over a wider range finds it in {100 * beyond.share:.0f} % of the pixels"

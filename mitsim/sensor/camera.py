@@ -91,6 +91,24 @@ class Camera:
         rays = np.stack([x, y, np.ones_like(x)], axis=-1) / np.sqrt(x * x + y * y + 1)[:, None]
         return np.asarray(rays.reshape(*pixels.shape[:-1], 3))
 
+    def rays_to_fold(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return :meth:`rays` of pixels (..., 2), with the direction at the fold in place of NaN.
+
+        For outlines of the field of view, and for simulated images, which have no missing pixels.
+        """
+        rays = self.rays(pixels)
+        lost = np.isnan(rays[..., 0])
+        if not lost.any():
+            return rays
+        inverse = inverse_fold_radii(self.distortion, self.model)
+        column, row = np.moveaxis(pixels[lost] - self._at(np.zeros((1, 2))), -1, 0)
+        angle = np.arctan2(row / self.matrix[1, 1], column / self.matrix[0, 0])
+        around = 2 * np.pi * np.arange(len(inverse)) / len(inverse)
+        radius = 0.999 / np.maximum(np.interp(angle, around, inverse, period=2 * np.pi), 1e-3)
+        local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones_like(angle)], axis=-1)
+        rays[lost] = local / np.linalg.norm(local, axis=-1, keepdims=True)
+        return rays
+
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return pixel positions (..., 2), as (column, row), of points (..., 3) in the *sensor* frame [mm].
 
@@ -165,7 +183,8 @@ class Camera:
             for _ in range(_NEWTON_STEPS * (1 if step < _STEPS else 4)):
                 width = 1e-6 * (1e-3 + np.abs(ideal).max(axis=1, keepdims=True))
                 by_x, by_y = (
-                    (self._at(ideal + width * unit) - self._at(ideal - width * unit)) / (2 * width) for unit in np.eye(2)
+                    (self._at(ideal + width * unit) - self._at(ideal - width * unit)) / (2 * width)
+                    for unit in np.eye(2)
                 )
                 off = wanted - self._at(ideal)
                 determinant = by_x[:, 0] * by_y[:, 1] - by_x[:, 1] * by_y[:, 0]
