@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
-from scipy.stats import trim_mean
 
 from characterisation.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
@@ -23,7 +22,7 @@ from mitsim.decode.matching.row_error import row_error
 from mitsim.decode.matching.stereo import StereoGeometry, stereo_geometry
 from mitsim.decode.structured_light.decoder import decode_coordinates
 from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
-from mitsim.decode.structured_light.two_cameras import find_coordinates
+from mitsim.decode.structured_light.two_cameras import LARGEST_STEP_PX, find_coordinates
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
@@ -218,7 +217,11 @@ def pair_warnings(
         contradiction, other_order = _texture_contradiction((textures[0], textures[1]), columns, rig, geometry)
         if contradiction:
             fits = exchangeable and other_order
-            return [exchanged if fits else f"{contradiction}: check that the calibration belongs to these images"], np.nan, ""
+            return (
+                [exchanged if fits else f"{contradiction}: check that the calibration belongs to these images"],
+                np.nan,
+                "",
+            )
     if matches.doubtful:
         if exchangeable and not _Matches.of(found[::-1], geometry).doubtful:
             return [exchanged], float("nan"), ""
@@ -226,7 +229,15 @@ def pair_warnings(
     offset, source = matches.row_error, "by the code of the rows"
     if textures is not None:
         source = "by the texture of the surface"
-        offset = textured_row_error((textures[0], textures[1]), columns, geometry)
+        offset, variation = textured_row_error((textures[0], textures[1]), columns, geometry)
+        if variation > _LARGEST_SPREAD + 0.5 * abs(offset if np.isfinite(offset) else 0.0):
+            swapped = textured_row_error((textures[1], textures[0]), columns[::-1], geometry) if exchangeable else None
+            if swapped is not None and abs(swapped[0]) < LARGEST_ROW_ERROR and not swapped[1] > _LARGEST_SPREAD:
+                return [exchanged], float("nan"), ""
+            told = (
+                f"the rows of the two cameras vary by {variation:.1f} px over the image, by the texture of the surface"
+            )
+            return [f"{told}: check that the calibration belongs to these images"], float("nan"), ""
     if not np.isfinite(offset):
         return [], offset, ""
     return (
@@ -387,9 +398,10 @@ def _row_by_code(
         return np.asarray(map_coordinates(found[1]["rows"].value, raw[::-1], order=1, cval=np.nan))
 
     v = np.asarray(map_coordinates(found[0]["rows"].value, mine[::-1], order=1, cval=np.nan))
-    # a median over as many rows as a stripe has is zero; the mean is right for every width of the stripes
+    # in high stripes the median change is zero; the mean is right for every height, without steps between surfaces
     slope = (at_right(_SLOPE_ROWS) - at_right(-_SLOPE_ROWS)) / (2 * _SLOPE_ROWS)
-    usual = float(trim_mean(slope[np.isfinite(slope)], 0.1)) if np.isfinite(slope).any() else float("nan")
+    plausible = slope[np.abs(slope) <= LARGEST_STEP_PX / 2 + _half_stripe(found[1]["rows"]) / _SLOPE_ROWS]
+    usual = float(np.mean(plausible)) if plausible.size else float("nan")
     return ((v - at_right(0.0)) / usual if abs(usual) > 1e-3 else np.full(len(v), np.nan)), usual
 
 

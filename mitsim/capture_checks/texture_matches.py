@@ -34,8 +34,8 @@ _SMOOTH, _LEAST_SHARE, LEAST_BLOCKS = 0.03, 0.6, 8
 def texture_matches(textures: tuple[Floats, Floats], columns: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
     """Return pixels (n, 2) of the first raw image, and (n, 2) of the second that show the same texture.
 
-    ``textures`` [DN] and ``columns`` [projector px], (H, W) each, NaN where unknown. Pixels are (column, row); no rows if
-    fewer than :data:`LEAST_BLOCKS` blocks match, or their offsets do not agree.
+    ``textures`` [DN] and ``columns`` [projector px], (H, W) each, NaN where unknown. Pixels are (column, row). They are
+    empty if fewer than :data:`LEAST_BLOCKS` blocks match, or their offsets do not agree.
     """
     none = np.empty((0, 2)), np.empty((0, 2))
     known = [each[np.isfinite(each)] for each in columns]
@@ -92,7 +92,7 @@ def _averaged(values: Floats, step: int) -> Floats:
 
 
 def _block_offsets(first: Floats, second: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return middles (row, step) of the blocks of ``first`` (H, n) that ``second`` (H', n) has once; row offsets (k,)."""
+    """Return row and step of the middles, and row offsets, (k,) each, of blocks of ``first`` (H, n) in ``second``."""
     out = []
     for left in range(0, first.shape[1] - _BLOCK + 1, _BLOCK):
         other = second[:, left : left + _BLOCK]
@@ -127,9 +127,7 @@ def _block_offsets(first: Floats, second: Floats) -> tuple[Floats, Floats, Float
     return rows, steps, offsets
 
 
-def _correlations(
-    own: Floats, known: NDArray[np.bool_], there: Floats, there_known: NDArray[np.bool_]
-) -> Floats:
+def _correlations(own: Floats, known: NDArray[np.bool_], there: Floats, there_known: NDArray[np.bool_]) -> Floats:
     """Return the correlation coefficients (k,) of a block (n,) with blocks (k, n), over the pixels known in both."""
     both = (there_known & known).astype(float)
     a, b = np.where(known, own, 0.0), np.where(there_known, there, 0.0)

@@ -86,7 +86,7 @@ class Camera:
             ideal = cv2.fisheye.undistortPoints(flat, self.matrix, self.distortion.reshape(-1, 1), criteria=_EXACT)
         else:
             ideal = cv2.undistortPointsIter(flat, self.matrix, self.distortion, np.eye(3), np.eye(3), _EXACT)
-        ideal = self._unique(ideal.reshape(-1, 2), flat[:, 0])
+        ideal = self._unique(np.asarray(ideal.reshape(-1, 2), np.float64), flat[:, 0])
         x, y = ideal.T
         rays = np.stack([x, y, np.ones_like(x)], axis=-1) / np.sqrt(x * x + y * y + 1)[:, None]
         return np.asarray(rays.reshape(*pixels.shape[:-1], 3))
@@ -151,7 +151,7 @@ class Camera:
         radii = inverse_fold_radii(self.distortion, self.model)
         with np.errstate(all="ignore"):
             exact = np.abs(self._at(ideal) - pixels).max(axis=1) < _ROUND_TRIP_PX
-            failed = np.flatnonzero(~(exact & before_fold(*ideal.T, radii)))
+            failed = np.flatnonzero(~(exact & before_fold(ideal[:, 0], ideal[:, 1], radii)))
         if not failed.size:
             return ideal
         ideal = ideal.copy()
@@ -196,7 +196,7 @@ class Camera:
                     axis=1,
                 )
         exact = np.abs(self._at(ideal) - pixels).max(axis=1) < _ROUND_TRIP_PX
-        return np.where((exact & before_fold(*ideal.T, radii))[:, None], ideal, np.nan)
+        return np.where((exact & before_fold(ideal[:, 0], ideal[:, 1], radii))[:, None], ideal, np.nan)
 
     def _by_opencv(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return pixel positions (n, 2) of points (n, 1, 3) in the camera frame."""

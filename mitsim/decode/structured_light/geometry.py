@@ -269,7 +269,7 @@ def _shorten(
     pixels = projector.project(camera.centre + ray[outside] / tried[..., None])
     size = np.array([projector.width, projector.height])
     with np.errstate(invalid="ignore"):
-        inside = ((pixels > -_FIELD_MARGIN * size) & (pixels < (1 + _FIELD_MARGIN) * size)).all(axis=-1)
+        inside = np.all((pixels > -_FIELD_MARGIN * size) & (pixels < (1 + _FIELD_MARGIN) * size), axis=-1)
     run, longest = np.zeros(inside.shape[1], int), np.zeros(inside.shape[1], int)
     last = np.zeros(inside.shape[1], int)
     for index, row in enumerate(inside):
