@@ -11,8 +11,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from mitsim.sensor.light_code import roles, value
 
-#: a print without repetition, in place of waves
-SPECKS = "specks"
+#: prints in place of waves: without repetition, and lines that repeat every few pixels
+SPECKS, LINES = "specks", "lines"
 
 
 @lru_cache(maxsize=4)
@@ -39,6 +39,8 @@ def images_seen(code, camera, projector, points, *, full=255, noise=1.0, seed=1,
     if texture is SPECKS:
         print_px = gaussian_filter(np.random.default_rng(0).normal(size=(512, 512)), 2.0, mode="wrap")
         albedo = 0.6 + 0.12 * map_coordinates(print_px / print_px.std(), [y + 256, x + 256], order=1, mode="grid-wrap")
+    elif texture is LINES:
+        albedo = 0.6 + 0.15 * np.sign(np.sin(1.2 * y))
     else:
         albedo = 0.6 + texture * np.sin(x / 13.5) * np.cos(y / 17.3)
     draw, out = np.random.default_rng(seed), []

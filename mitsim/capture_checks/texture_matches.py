@@ -22,10 +22,7 @@ COMPARED_ROWS, _STEPS = 400, 400
 _BLOCK, _FILLED = 24, 0.7
 
 #: least correlation of a block; largest correlation at another offset, and largest share of (1 - that) of its 1 - best
-_LEAST, _OTHER, _DISTINCT = 0.8, 0.9, 0.5
-
-#: offsets that belong to the same maximum [rows]
-_SAME = 6
+_LEAST, _OTHER, _DISTINCT = 0.8, 0.6, 0.5
 
 #: largest deviation of an offset from a plane over the image, as a share of the rows; least share and number of blocks
 _SMOOTH, _LEAST_SHARE, LEAST_BLOCKS = 0.03, 0.6, 8
@@ -112,8 +109,7 @@ def _block_offsets(first: Floats, second: Floats) -> tuple[Floats, Floats, Float
             score = _correlations(own, known, there, there_known)
             score[~enough] = -1
             best = int(np.argmax(score))
-            others = np.abs(np.arange(len(score)) - best) > _SAME
-            second_best = max(float(score[others].max(initial=-1.0)), 0.0)
+            second_best = max(_beside_maximum(score, best), 0.0)
             if score[best] < _LEAST or second_best > _OTHER or not 0 < best < len(score) - 1:
                 continue
             if 1 - score[best] > _DISTINCT * (1 - second_best):
@@ -125,6 +121,15 @@ def _block_offsets(first: Floats, second: Floats) -> tuple[Floats, Floats, Float
             out.append((top + middle, left + middle, best + shift - top))
     rows, steps, offsets = np.array(out, float).reshape(-1, 3).T
     return rows, steps, offsets
+
+
+def _beside_maximum(score: Floats, best: int) -> float:
+    """Return the largest score (n,) outside the maximum at ``best``, which ends where the score rises again."""
+    falls = np.diff(score)
+    rises_after, rises_before = np.flatnonzero(falls[best:] > 0), np.flatnonzero(falls[:best] < 0)
+    after = score[best + rises_after[0] :] if rises_after.size else score[:0]
+    before = score[: rises_before[-1] + 1] if rises_before.size else score[:0]
+    return float(max(after.max(initial=-1.0), before.max(initial=-1.0)))
 
 
 def _correlations(own: Floats, known: NDArray[np.bool_], there: Floats, there_known: NDArray[np.bool_]) -> Floats:

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from pydantic import TypeAdapter
-from simulated_rigs import SPECKS, images_seen, surface_seen
+from simulated_rigs import LINES, SPECKS, images_seen, surface_seen
 
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
@@ -326,6 +326,13 @@ def test_columns_alone_reveal_exchanged_cameras_and_another_rig(name):
 def test_a_blank_surface_gives_no_reason_to_doubt_a_pair(name, noise):
     capture = taken(COLUMNS[name], pair(), texture=0.0, noise=noise)
     assert said(capture, PAIRED) == ""
+
+
+@pytest.mark.parametrize("turn", [-6.0, -20.0])
+@pytest.mark.parametrize("texture", [LINES, 0.25])
+def test_prints_that_repeat_give_no_reason_to_doubt_a_pair(turn, texture):
+    cameras = {"left": camera(), "right": camera(60.0 - 4.0 * turn, (1.5, turn, 2.0))}
+    assert said(taken(COLUMNS["stripes of 4"], cameras, texture=texture), PAIRED) == ""
 
 
 @pytest.mark.parametrize("off", [0.0, 1.2])
