@@ -98,12 +98,13 @@ def camera_warnings(
     except InputError:
         return []
     rays = eye.sensor_from_camera.directions(eye.rays(eye.pixel_grid()[places]))
-    known = np.all([each.status == Status.VALID for each in found.values()], axis=0)
+    known = np.all([each.status == Status.VALID for each in found.values()], axis=0) & np.isfinite(rays).all(axis=-1)
     if known.mean() < 0.005:
         return []
     coordinates = {axis: each.value[known] for axis, each in found.items()}
     depth, miss = _meeting(eye, projector, rays[known], coordinates)
-    behind = float(np.mean(~(depth > 0)))
+    solved = depth[~np.isnan(depth)]  # without light beyond the fold of the projector's distortion
+    behind = float(np.mean(~(solved > 0))) if solved.size else 0.0
     doubt = "check that the calibration belongs to these images, and that R and T are those of cv2.stereoCalibrate"
     out = []
     if behind > _BEHIND:
@@ -176,7 +177,7 @@ def _meeting(eye: Camera, projector: Camera, rays: Floats, coordinates: dict[Axi
         np.full_like(value, end) for end in (0.0, (projector.height if axis == "columns" else projector.width) - 1.0)
     ]
     pixels = [np.stack([value, end] if axis == "columns" else [end, value], axis=-1) for end in ends]
-    one, other = (projector.sensor_from_camera.directions(projector.rays(each)) for each in pixels)
+    one, other = (projector.sensor_from_camera.directions(projector.rays_to_fold(each)) for each in pixels)
     normal = np.cross(one, other)
     with np.errstate(invalid="ignore", divide="ignore"):
         return -(normal @ start) / np.einsum("ij,ij->i", normal, rays), np.zeros(len(rays))
