@@ -275,7 +275,7 @@ class _RowErrors:
 
     def fits(self, step: float) -> bool:
         """Return whether the calibration explains the matches, whose rows are accurate to a share of ``step`` [px]."""
-        return self.behind <= 0.5 and self.spread <= _LARGEST_SPREAD * (1 + step) + 0.5 * min(abs(self.median), _MOVED)
+        return self.behind <= 0.5 and self.spread <= _LARGEST_SPREAD * step + 0.5 * min(abs(self.median), _MOVED)
 
     def __str__(self) -> str:
         if self.behind > 0.5:
