@@ -45,7 +45,13 @@ def decode(
     from characterisation.cloud_files import write_ply
     from mitsim.capture.folder import read_capture
     from mitsim.capture.workspace import written_frame
-    from mitsim.decode.checks.sanity import capture_findings, cloud_warnings, pair_row_error, row_error_in_words
+    from mitsim.decode.checks.sanity import (
+        capture_findings,
+        cloud_warnings,
+        pair_row_error,
+        row_error_in_words,
+        uncalibrated_in_words,
+    )
     from mitsim.decode.cloud import capture_cloud, decoder_settings, range_is_known, settings_are_known, with_options
     from mitsim.decode.depth_range import range_warning, surface_beyond
     from mitsim.decode.noise import known_noise, sigma_source
@@ -75,6 +81,9 @@ def decode(
     source = sigma_source(read, cloud, noise)
     if source:
         say(source)
+    lost = uncalibrated_in_words(cloud)
+    if lost:
+        say(f"warning: {lost}")
     beyond = surface_beyond(read, cloud, settings)
     if beyond is not None:
         known = f"a coarse search over a wider range finds it in {100 * beyond.share:.0f} % of the pixels"

@@ -38,6 +38,7 @@ REASONS: dict[Status, tuple[str, str]] = {
     Status.PHASE_INCONSISTENT: ("phase inconsistent", "#9467bd"),
     Status.INTERREFLECTION: ("interreflection", "#8c564b"),
     Status.DROPPED: ("lost at random, 1 − F", "#e69f00"),
+    Status.UNCALIBRATED: ("no unique ray by the calibration", "#0072b2"),
 }
 
 
