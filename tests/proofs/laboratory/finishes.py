@@ -21,6 +21,9 @@ from typing import Any, Literal
 from characterisation.files.errors import InputError
 from mitsim.scene.materials import Finish
 from mitsim.scene.surface.metals import normal_reflectance, refractive_index
+from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN
+from mitsim.scene.surface.roughness import ALPHA_LARGEST
+from mitsim.scene.surface.scatter import Deviation
 
 Family = Literal["white", "mitsim", "ward", "ggx_diffuse", "ggx", "beckmann"]
 
@@ -55,10 +58,10 @@ class Surface:
         return self.diffuse_share == 1.0
 
 
-def surface_of(finish: Finish | None, family: Family, wavelength_nm: float, reflected: float, where: str) -> Surface:
-    """Return the material of a face whose finish was loaded with the deviation of a world.
-
-    ``reflected`` is the factor of that deviation on the light of a metal [1].
+def surface_of(
+    finish: Finish | None, family: Family, wavelength_nm: float, deviation: Deviation, where: str
+) -> Surface:
+    """Return the material of a face in a world, from its finish at the best estimate and the world's deviation.
 
     Raises
     ------
@@ -68,19 +71,23 @@ def surface_of(finish: Finish | None, family: Family, wavelength_nm: float, refl
     if finish is not None and finish.name == "matt_white":
         if family != "white":
             raise InputError(where, "families", f"{family!r} with a matt white face", "metal faces, or 'white'")
-        return Surface(float(finish.description["reflectance"]["value"]))
+        reflectance = float(finish.description["reflectance"]["value"])
+        return Surface(reflectance * deviation.reflected(reflectance))
     if finish is None or finish.scatter is None or "/" not in finish.name:
         raise InputError(where, "", f"a face with the finish {finish}", "machined metal or matt white")
     metal, scatter = finish.name.partition("/")[0], finish.scatter
-    bright = reflected * normal_reflectance(metal, wavelength_nm)
-    alpha = (scatter.alpha_u, scatter.alpha_v)
-    lobe = Surface(
-        bright, 0.0, refractive_index(metal, wavelength_nm), reflected, alpha, alpha, height_um=scatter.height_um
+    bright = normal_reflectance(metal, wavelength_nm)
+    reflected = deviation.reflected(bright)
+    along_u, along_v = (
+        min(deviation.width(alpha, scatter.alpha_factor), ALPHA_LARGEST) for alpha in (scatter.alpha_u, scatter.alpha_v)
     )
+    alpha, index = (along_u, along_v), refractive_index(metal, wavelength_nm)
+    lobe = Surface(bright * reflected, 0.0, index, reflected, alpha, alpha, height_um=scatter.height_um)
     match family:
         case "mitsim":
-            share, beckmann = scatter.wide_angle, scatter.beckmann
-            return replace(lobe, diffuse_share=share, beckmann=beckmann, ggx_alpha=scatter.ggx_alpha)
+            narrower = (GGX_PER_BECKMANN * along_u, GGX_PER_BECKMANN * along_v)
+            wide = deviation.share(scatter.wide_angle, scatter.wide_angle_range)
+            return replace(lobe, diffuse_share=wide, beckmann=scatter.beckmann, ggx_alpha=narrower)
         case "ward":
             share = WARD_DIFFUSE / (WARD_DIFFUSE + WARD_SPECULAR)
             return replace(lobe, diffuse_share=share, beckmann=1.0, beckmann_alpha=WARD_ALPHA)

@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
+from scipy.ndimage import gaussian_filter
 
 from characterisation.region_of_interest import Roi
 from mitsim.sensor.camera import Camera
@@ -43,13 +44,16 @@ _FINER = 2
 _MARGIN = 0.04
 
 #: surfaces on a light path
-SURFACES = 5
+SURFACES = 4
 
 #: light paths traced at once
 _AT_ONCE = 1 << 22
 
 #: light paths a pixel for the light of the room
 _ROOM_PATHS = 16
+
+#: standard deviation of the mean over noisy interreflections [px]
+_SMOOTHING_PX = 1.2
 
 #: patterns that are sums of others within this, relative to white, are not rendered
 _SUM_ERROR = 1e-6
@@ -97,23 +101,30 @@ class IdealProjector:
             "irradiance": image,
         }
 
-    def image(self, projector: Projector, optics: Camera, pattern: Images, beside: tuple[float, float]) -> Images:
-        """Return the image [W] that a pinhole ``beside`` the axis [mm] emits of a pattern (H, W), values 0..1."""
+    def image(self, emitted: Images, optics: Camera, offset: NDArray[np.float64]) -> Images:
+        """Return the image of this pinhole for light (H, W) of real optics.
+
+        ``offset`` (2,) is that of its place from the axis, over the distance of the plane of focus [1].
+        """
         shifted = self.matrix
-        shifted[:2, 2] -= np.array(beside) / projector.focus_mm * shifted[0, 0]
+        shifted[:2, 2] -= offset * shifted[0, 0]
         size = (self.width, self.height)
         column, row = cv2.initUndistortRectifyMap(
             optics.matrix, optics.distortion, np.eye(3), shifted, size, cv2.CV_32FC1
         )
-        light = projector.black_level + (1 - projector.black_level) * pattern**projector.gamma
-        light = cv2.remap(light.astype(np.float32), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        light *= (column >= -0.5) & (column <= optics.width - 0.5) & (row >= -0.5) & (row <= optics.height - 0.5)
-        if projector.corner_illumination < 1:
-            centre = optics.matrix[:2, 2]
-            farthest = np.hypot(*np.maximum(centre, [optics.width - 1, optics.height - 1] - centre))
-            share = np.hypot(column - centre[0], row - centre[1]) / farthest
-            light *= (1 + (projector.corner_illumination**-0.5 - 1) * share**2) ** -2
-        return np.asarray(light * (projector.plane_irradiance / np.pi), np.float32)
+        return cv2.remap(emitted, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+
+
+def emitted_light(projector: Projector, optics: Camera, patterns: Images) -> Images:
+    """Return what a projector emits of patterns (P, H, W), values 0..1: the image of Mitsuba's emitter [W]."""
+    values = patterns if projector.gamma == 1 else patterns**projector.gamma
+    y, x = np.mgrid[: optics.height, : optics.width]
+    centre = optics.matrix[:2, 2]
+    farthest = np.hypot(*np.maximum(centre, [optics.width - 1, optics.height - 1] - centre))
+    share = np.hypot(x - centre[0], y - centre[1]) / farthest
+    loss = (1 + (projector.corner_illumination**-0.5 - 1) * share**2) ** -2
+    white = (projector.plane_irradiance / np.pi * loss).astype(np.float32)
+    return np.asarray((projector.black_level + (1 - projector.black_level) * values) * white, np.float32)
 
 
 def tangents(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -150,6 +161,10 @@ class RayBundle:
     right: NDArray[np.float32]
     below: NDArray[np.float32]
 
+    def only(self, chosen: NDArray[np.bool_]) -> RayBundle:
+        """Return the rays of some pixels (n,)."""
+        return RayBundle(self.origin, self.corner[chosen], self.right[chosen], self.below[chosen])
+
     @property
     def middle(self) -> NDArray[np.float32]:
         """Return the directions (n, 3) of the pixels' centres."""
@@ -170,11 +185,17 @@ class RayBundle:
 
 
 def mean_radiance(scene: Any, rays: RayBundle, paths: int, surfaces: int, seed: int) -> NDArray[np.float32]:
-    """Return the radiance (n,) of pixels: the mean over ``paths`` light paths of each, stratified over its area."""
+    """Return the radiance (n,) of pixels: the mean over ``paths`` light paths of each, stratified over its area.
+
+    Paths of one seed begin alike, so that the difference between two numbers of ``surfaces`` has only the light that
+    more surfaces add.
+    """
     import drjit as dr
     import mitsuba as mi
 
     side = max(round(np.sqrt(paths)), 1)
+    if not len(rays.corner):
+        return np.zeros(0, np.float32)
     integrator = mi.load_dict({"type": "path", "max_depth": surfaces + 1, "rr_depth": 100})
     count, spp = len(rays.corner), side * side
     total = np.zeros(count, np.float32)
@@ -184,7 +205,7 @@ def mean_radiance(scene: Any, rays: RayBundle, paths: int, surfaces: int, seed: 
         corner, right, below = (mi.Vector3f(each[part].T) for each in (rays.corner, rays.right, rays.below))
         size = (min(first + at_once, count) - first) * spp
         sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed + first, size)
+        sampler.seed(dr.opaque(mi.UInt32, seed + first), size)  # a number would be compiled into the kernel
         lane = dr.arange(mi.UInt32, size)
         per_pixel, per_side = dr.opaque(mi.UInt32, spp), dr.opaque(mi.UInt32, side)
         pixel = lane // per_pixel
@@ -209,7 +230,7 @@ def independent(patterns: Images) -> tuple[list[int], NDArray[np.float64]]:
     for size in range(1, len(patterns)):
         chosen = sorted(order[:size].tolist())
         weights = np.linalg.lstsq(thin[chosen].T, thin.T, rcond=None)[0].T
-        if np.abs(weights @ thin[chosen] - thin).max() < _SUM_ERROR:
+        if np.abs(weights @ thin[chosen] - thin).max() < _SUM_ERROR * thin.max():
             return chosen, weights
     return list(range(len(patterns))), np.eye(len(patterns))
 
@@ -231,32 +252,35 @@ def light_on(
     world_from_sensor: Transform,
     paths: int,
     seed: int,
-) -> dict[str, Images]:
-    """Return the radiance (P, n) of each camera's pixels under each pattern [W / (mm^2 sr)].
+) -> dict[str, tuple[Images, Images]]:
+    """Return the light of each camera's pixels under each pattern: direct, and interreflected, (P, n) of each name.
 
-    All patterns have the same light paths. ``paths`` is their number for each pixel, over the whole aperture.
+    In W / (mm^2 sr). All patterns have the same light paths. ``paths`` is their number for each pixel, over the whole
+    aperture.
     """
     import mitsuba as mi
 
-    # a projector that is not linear has the sums of what it emits, not of its values
-    emitted = lamp.projector.black_level + (1 - lamp.projector.black_level) * lamp.patterns**lamp.projector.gamma
+    emitted = emitted_light(lamp.projector, lamp.optics, lamp.patterns)
     chosen, weights = independent(emitted) if len(emitted) > 1 else ([0], np.eye(1))
     points = APERTURE if lamp.projector.aperture_mm > 0 else APERTURE[:1]
     each = max(round(paths / len(points)), 1)
     world_from_lamp = world_from_sensor @ lamp.optics.sensor_from_camera
-    out = {name: np.zeros((len(chosen), len(one.corner)), np.float32) for name, one in rays.items()}
+    out = {name: np.zeros((2, len(chosen), len(one.corner)), np.float32) for name, one in rays.items()}
     for number, point in enumerate(points):
         beside = (point[0] * lamp.projector.aperture_mm / 2, point[1] * lamp.projector.aperture_mm / 2)
         place = world_from_lamp @ Transform(np.eye(3), np.array([*beside, 0.0]))
         part.light["projector.to_world"] = mi.AffineTransform4f(mitsuba_to_world(place))
         for index, pattern in enumerate(chosen):
-            image = ideal.image(lamp.projector, lamp.optics, lamp.patterns[pattern], beside)
+            image = ideal.image(emitted[pattern], lamp.optics, np.array(beside) / lamp.projector.focus_mm)
             part.light["projector.irradiance.data"] = mi.TensorXf(image[..., None])
             part.light.update()
             for camera, (name, bundle) in enumerate(rays.items()):
                 stream = int(np.random.SeedSequence([seed, number, camera]).generate_state(1)[0] >> 1)
-                out[name][index] += mean_radiance(part.lit, bundle, each, SURFACES, stream) / len(points)
-    return {name: np.asarray(np.maximum(weights @ images, 0), np.float32) for name, images in out.items()}
+                direct = mean_radiance(part.lit, bundle, each, 1, stream)
+                every = mean_radiance(part.lit, bundle, each, SURFACES, stream)
+                out[name][0, index] += direct / len(points)
+                out[name][1, index] += (every - direct) / len(points)
+    return {name: tuple(np.float32(weights) @ images for images in both) for name, both in out.items()}
 
 
 def room_light_on(part: LaboratoryPart, rays: Mapping[str, RayBundle], seed: int) -> dict[str, NDArray[np.float32]]:
@@ -268,6 +292,21 @@ def room_light_on(part: LaboratoryPart, rays: Mapping[str, RayBundle], seed: int
     for camera, (name, bundle) in enumerate(rays.items()):
         met = part.shapes_met(bundle.origin, bundle.middle) >= 0
         out[name] = mean_radiance(part.room, bundle, _ROOM_PATHS, 2, seed + 97 * camera) * met
+    return out
+
+
+def smoothed(light: Images, shape: NDArray[np.intp]) -> Images:
+    """Return interreflections (P, h, w) as the mean with a Gaussian over the pixels of one shape (h, w), -1 for none.
+
+    Two rough faces have spread this light over many pixels, save beside the edge that they share. Unlike direct light
+    it is noisy.
+    """
+    out = light.copy()
+    for index in range(shape.max(initial=-1) + 1):
+        mask = shape == index
+        weight = gaussian_filter(mask.astype(np.float32), _SMOOTHING_PX)
+        for image, source in zip(out, light, strict=True):
+            image[mask] = (gaussian_filter(np.where(mask, source, 0), _SMOOTHING_PX)[mask]) / weight[mask]
     return out
 
 

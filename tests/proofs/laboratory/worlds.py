@@ -11,11 +11,13 @@ tool's, as it would be with a real sensor.
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
@@ -23,8 +25,6 @@ from characterisation.tasks.evaluation import measure
 from mitsim.capture.capture import Capture
 from mitsim.decode.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
-from mitsim.scene.load import load_scene
-from mitsim.scene.surface.metals import normal_reflectance
 from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import RandomDots
@@ -39,7 +39,7 @@ from tests.proofs.laboratory.decoders import decoded
 from tests.proofs.laboratory.finishes import Surface, surface_of
 from tests.proofs.laboratory.imager import Exposed, grey_levels, speckle_contrast
 from tests.proofs.laboratory.masks import another_mask
-from tests.proofs.laboratory.optics import IdealProjector, Lamp, RayBundle, light_on, regions, room_light_on
+from tests.proofs.laboratory.optics import IdealProjector, Lamp, RayBundle, light_on, regions, room_light_on, smoothed
 from tests.proofs.laboratory.part import LaboratoryPart
 
 #: offset of the seed of the laboratory's worlds from the study's: no trial of a tool shares one
@@ -84,37 +84,34 @@ class Laboratory:
         self.predictor = Predictor.of_sensor(sensor, self.geometry)
         self.patterns = sensor.patterns()
         self.ideal = IdealProjector.around(sensor.projector.optics)
-        surfaces = self.surfaces(0)
+        scene = self.study.scene
+        self.finishes = dict(zip(scene.names, scene.finishes, strict=True))
+        surfaces = self.surfaces(-1)
         self.part = LaboratoryPart(row.scene_path, row.scene.parameters, surfaces, self.ideal.description())
+        # Dr.Jit compiles a material call for the materials of every scene in memory: only the laboratory's stay
+        names = self.part.names
+        alone = replace(scene, mitsuba=self.part.lit, names=names, finishes=tuple(self.finishes[n] for n in names))
+        self.study = replace(self.study, scene=alone)
+        del scene
+        gc.collect()
 
     def surfaces(self, number: int) -> dict[str, Surface]:
-        """Return the materials of all faces in a world, by shape."""
-        scene, ranges = self.study.scene, self.unknowns.table.finish
-        names = sorted({finish.name + str(finish.roughness) for finish in scene.finishes if finish is not None})
-        rng = np.random.default_rng([self.unknowns.seed, 11, number])
-        drawn = np.clip(rng.standard_normal((len(names), 3)), -LARGEST_DEVIATION, LARGEST_DEVIATION)
-        scale = np.array([ranges.alpha, ranges.wide_angle, ranges.reflectance])
-        by_bsdf = dict(zip(self._bsdf_ids(), [finish for finish in scene.finishes], strict=True))
-        deviation = {
-            bsdf: Deviation(*(drawn[names.index(finish.name + str(finish.roughness))] * scale).tolist())
-            for bsdf, finish in by_bsdf.items()
-            if finish is not None
-        }
-        given = {key: str(value) for key, value in self.row.scene.parameters.items()}
-        loaded = load_scene(scene.where, self.sensor.wavelength_nm, given, lambda name: deviation[name])
-        out = {}
-        for name, finish, bsdf in zip(loaded.names, loaded.finishes, self._bsdf_ids(), strict=True):
-            reflected = 1.0
-            if finish is not None and "/" in finish.name:
-                bright = normal_reflectance(finish.name.partition("/")[0], self.sensor.wavelength_nm)
-                reflected = deviation[bsdf].reflected(bright)
-            out[name] = surface_of(
-                finish, self.row.family, self.sensor.wavelength_nm, reflected, f"{scene.where}: {name}"
-            )
-        return out
+        """Return the materials of all faces in a world, by shape.
 
-    def _bsdf_ids(self) -> list[str]:
-        return [shape.bsdf().id() for shape in self.study.scene.shapes]
+        Faces of one finish deviate alike, by the unknowns of the study. World -1 has the best estimates.
+        """
+        ranges = self.unknowns.table.finish
+        finishes = list(dict.fromkeys(self.finishes.values()))
+        rng = np.random.default_rng([self.unknowns.seed, 11, max(number, 0)])
+        drawn = np.clip(rng.standard_normal((len(finishes), 3)), -LARGEST_DEVIATION, LARGEST_DEVIATION)
+        drawn *= [ranges.alpha, ranges.wide_angle, ranges.reflectance] if number >= 0 else 0.0
+        deviation = {finish: Deviation(*one.tolist()) for finish, one in zip(finishes, drawn, strict=True)}
+        return {
+            name: surface_of(
+                finish, self.row.family, self.sensor.wavelength_nm, deviation[finish], f"{self.row.scene_path}: {name}"
+            )
+            for name, finish in self.finishes.items()
+        }
 
     def measure(self, number: int, decoders: Sequence[str]) -> dict[str, Outcome]:
         """Return the outcome of the world of a number by each decoder."""
@@ -142,22 +139,32 @@ class Laboratory:
         rays = {name: RayBundle.of(camera, true, rois[name]) for name, camera in cameras.items()}
         optics = world.rig.projector or self.sensor.projector.optics
         lamp = Lamp(self.sensor.projector, optics, self._patterns(world))
+        met = {name: self._met(bundle, rois[name]) for name, bundle in rays.items()}
+        near = {name: binary_dilation(shape >= 0, iterations=2).ravel() for name, shape in met.items()}
+        rays = {name: bundle.only(near[name]) for name, bundle in rays.items()}
         lit = light_on(self.part, self.ideal, lamp, rays, true, self.row.file.paths, world.seed)
         room = room_light_on(self.part, rays, world.seed)
+
+        def in_image(images: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+            out = {}
+            for name, values in images.items():
+                whole = np.zeros((*values.shape[:-1], near[name].size), np.float32)
+                whole[..., near[name]] = values
+                out[name] = whole.reshape(*values.shape[:-1], rois[name].height, rois[name].width)
+            return out
+
         contrast = {}
-        for name, bundle in rays.items():
-            heights = [surfaces[shape].height_um for shape in self.part.names]
-            known = [speckle_contrast(self.sensor, cameras[name], height) for height in heights]
-            met = self.part.shapes_met(bundle.origin, bundle.middle)
-            contrast[name] = np.where(met >= 0, np.array(known)[met], 0.0).astype(np.float32)
+        for name, shape in met.items():
+            heights = [surfaces[one].height_um for one in self.part.names]
+            known = np.array([speckle_contrast(self.sensor, cameras[name], height) for height in heights])
+            contrast[name] = np.where(shape >= 0, known[shape], 0.0).astype(np.float32)
+        direct, more = (in_image({name: both[k] for name, both in lit.items()}) for k in (0, 1))
+        projected = {name: np.maximum(image + smoothed(more[name], met[name]), 0) for name, image in direct.items()}
+        return Light(rois, projected, in_image(room), contrast)
 
-        def shaped(images: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
-            return {
-                name: image.reshape(*image.shape[:-1], rois[name].height, rois[name].width)
-                for name, image in images.items()
-            }
-
-        return Light(rois, shaped(lit), shaped(room), shaped(contrast))
+    def _met(self, rays: RayBundle, roi: Roi) -> NDArray[np.intp]:
+        """Return the index of the shape (h, w) at the centre of each pixel, -1 for none."""
+        return self.part.shapes_met(rays.origin, rays.middle).reshape(roi.height, roi.width)
 
     def capture(self, number: int, world: World, true: Transform) -> Capture:
         """Return the images of a world, with the nominal calibration."""
