@@ -1,7 +1,8 @@
 """Make masks of random dots with the statistics of a preset, by a way of the laboratory's own.
 
 Signal chain: random phases and amplitudes of a Gaussian spectrum -> inverse Fourier transform, which is Gaussian noise
-with the autocorrelation exp(-tau^2 / 4 s^2) -> threshold -> blur in the Fourier domain. The mean run length of such
+with the autocorrelation exp(-tau^2 / 4 s^2) -> threshold -> blur in the Fourier domain, exp(-s^2 (1 - cos w)): that of the
+discrete Gaussian in whose terms presets state their blur. The mean run length of such
 noise is pi sqrt(2) s (Rice 1944).
 """
 
@@ -22,7 +23,7 @@ def another_mask(pattern: RandomDots, width: int, height: int, seed: int) -> NDA
     noise = np.fft.rfft2(np.random.default_rng([seed, 77]).standard_normal((height, width)))
     smooth = np.fft.irfft2(noise * np.exp(-0.5 * sigma**2 * squared), (height, width))
     spectrum = np.fft.rfft2((smooth > np.quantile(smooth, 1 - pattern.bright_share)).astype(float))
-    spectrum *= np.exp(-0.5 * pattern.blur_px**2 * squared)
+    spectrum *= np.exp(pattern.blur_px**2 * (np.cos(2 * np.pi * rows) + np.cos(2 * np.pi * columns) - 2))
     frames = [
         np.fft.irfft2(spectrum * np.exp(-2j * np.pi * (columns * right + rows * down)), (height, width))
         for right, down in shifts
