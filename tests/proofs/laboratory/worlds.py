@@ -69,14 +69,18 @@ class Laboratory:
     Raises
     ------
     InputError
-        If the sensor modulates its light in time, takes brackets, or chooses its exposure by the scene.
+        If the sensor modulates its light in time, takes brackets, or chooses its exposure by the scene; if a decoder
+        or a family does not suit the case.
     """
 
     def __init__(self, row: Judged) -> None:
         self.row, self.study = row, row.study()
         sensor, where = self.study.sensor, f"sensor {self.study.sensor.name}"
         if isinstance(sensor.pattern, AmplitudeModulation) or sensor.exposure.base_s is None or sensor.exposure.bracket:
-            raise InputError(row.path, where, "its light or its exposure", "a pattern, and one fixed exposure")
+            raise InputError(row.path, where, "light or exposures that no image shows", "patterns and a fixed exposure")
+        others = [decoder for decoder in row.case.decoders if decoder != "ours"]
+        if others and sensor.technology != "active_stereo":
+            raise InputError(row.path, f"cases.{row.case.name}.decoders", others[0], f"'ours' for {sensor.name}")
         self.sensor, self.view = sensor, row.view_of(self.study)
         unknowns = study_unknowns(self.study)
         self.unknowns = replace(unknowns, seed=unknowns.seed + SEED, pooled=False)
