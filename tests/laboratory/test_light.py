@@ -1,4 +1,4 @@
-"""The laboratory's light has closed forms: irradiance of a plane, geometry of projector and camera, a room's radiance."""
+"""The laboratory's light has closed forms: a plane's irradiance, geometry of projector and camera, radiosity."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _started():
 
 
 def part_of(shapes: str, ideal: IdealProjector, folder) -> LaboratoryPart:
-    """A matt part; with ``turned`` it stands as given."""
+    """A matt part of these shapes."""
     path = folder / "part.xml"
     path.write_text(f'<scene version="3.0.0">{shapes}</scene>', encoding="utf-8")
     names = [word.split('"')[1] for word in shapes.split(" id=")[1:]] or []
@@ -99,7 +99,8 @@ def test_a_matt_plane_across_the_axis_returns_rho_e_over_pi_z_squared(tmp_path, 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_every_camera_pixel_sees_the_projector_coordinate_that_opencv_says(tmp_path, axis):
     extent = (160, 120)[axis]
-    ramp = np.broadcast_to(np.arange(extent) / extent if axis == 0 else (np.arange(extent) / extent)[:, None], (120, 160))
+    steps = np.arange(extent) / extent
+    ramp = np.broadcast_to(steps if axis == 0 else steps[:, None], (120, 160))
     patterns = np.stack([np.ones((120, 160)), ramp]).astype(np.float32)
     white, coded = lit(tmp_path, Projector(OPTICS, 2.0, aperture_mm=3.0, focus_mm=400.0), patterns, paths=700)
     shown = seen_by_projector()

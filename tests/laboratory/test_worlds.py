@@ -201,7 +201,8 @@ def test_seeds_are_compared_by_the_largest_u_over_the_least():
     assert np.isnan(spread([1.0, np.nan])) and np.isnan(spread([0.0, 1.0]))
     errors = np.random.default_rng(3).standard_normal(200)
     stated = {
-        seed: [statement("length", "mm", factor * errors, None, (), factor * errors)] for seed, factor in ((1, 1), (2, 3))
+        seed: [statement("length", "mm", factor * errors, None, (), factor * errors)]
+        for seed, factor in ((1, 1), (2, 3))
     }
     line = seeds_table(stated).splitlines()[2]
     assert line.startswith("| length | mm |") and line.count("200 %") == 2

@@ -45,8 +45,8 @@ class LaboratoryCase(Document):
     sensor: str
     views: Annotated[list[int], Field(min_length=1)]
     families: Annotated[list[Family], Field(min_length=1)]
-    masks: Annotated[list[Mask], Field(min_length=1)] = ["preset"]
-    decoders: Annotated[list[Decoder], Field(min_length=1)] = ["ours"]
+    masks: list[Mask] = Field(default=["preset"], min_length=1)
+    decoders: list[Decoder] = Field(default=["ours"], min_length=1)
 
 
 class LaboratoryFile(Document):
@@ -61,7 +61,7 @@ class LaboratoryFile(Document):
     seed: Annotated[int, Field(ge=0)] = 1
     worlds: Annotated[int, Field(ge=1, le=100_000)] = 20
     trials: Annotated[int, Field(ge=2, le=100_000)] = 200
-    paths: Annotated[int, Field(ge=1, le=1_000_000)] = 448
+    paths: Annotated[int, Field(ge=1, le=1_000_000)] = 252
     grid: ViewsTable
     cases: Annotated[list[LaboratoryCase], Field(min_length=1)]
 
@@ -82,6 +82,11 @@ class Judged:
     view: int
     family: Family
     mask: Mask
+
+    @property
+    def name(self) -> tuple[str, int, str]:
+        """Return what its statement and the digest of its worlds belong to: case, view, and kind of scene."""
+        return self.case.name, self.view, "white" if self.family == "white" else "metal"
 
     @property
     def scene(self) -> SceneTable:

@@ -9,7 +9,7 @@ Families:
 - ``mitsim``: the lobes and the wide-angle share that mitsim assumes, without its coherent part and without its
   compensation for lost energy. Both matter at grazing angles only.
 - ``ward``: lightly brushed aluminium as measured by Ward (SIGGRAPH 1992, table 1: rho_d 0.15, rho_s 0.19, alpha 0.088
-  and 0.13). 44 % of the light is diffuse. The total is the reflectance of the metal, since Ward measured in the visible.
+  and 0.13). 44 % of the light is diffuse. The total is the reflectance of the metal: Ward measured in the visible.
 - ``ggx_diffuse``, ``ggx``, ``beckmann``: a single lobe of the alpha that mitsim assumes; in the first 2 % is diffuse.
 """
 

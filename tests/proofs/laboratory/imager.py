@@ -4,10 +4,11 @@ Signal chain: radiance -> lens (Gaussian integrated over each pixel, cos^4) -> s
 light -> electrons -> PRNU -> Poisson -> read and row noise, DSNU, columns -> full well -> companding or gain ->
 rounding.
 
-Speckle, by Goodman (Speckle Phenomena in Optics, 2007): contrast C = (1 + 8 pi^2 (dl h / l^2)^2)^(-1/4) / sqrt(M) for a
-linewidth dl on a surface of rms height h (section 6.2, reflection at normal incidence), averaged over M = pixel area /
-correlation area, 4 (l N)^2 / pi of a circular pupil, and over the pupil of the projector, 1 + (D_projector / D_camera)^2.
-The gain of a pixel is gamma distributed. Positions do not shift.
+Speckle, by Goodman (Speckle Phenomena in Optics, 2007): contrast C = (1 + 8 pi^2 (dl h / l^2)^2)^(-1/4) / sqrt(M) for
+a linewidth dl on a surface of rms height h (section 6.2, reflection at normal incidence). M = (1 + pixel area /
+correlation area) (1 + (D_projector / D_camera)^2) is the mean over the pixel, with 4 (l N)^2 / pi of a circular pupil,
+and over the pupil of the projector. Paint depolarises, which doubles M. The gain of a pixel is gamma distributed.
+Positions do not shift.
 """
 
 from __future__ import annotations

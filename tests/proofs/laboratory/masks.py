@@ -1,9 +1,9 @@
 """Make masks of random dots with the statistics of a preset, by a way of the laboratory's own.
 
 Signal chain: random phases and amplitudes of a Gaussian spectrum -> inverse Fourier transform, which is Gaussian noise
-with the autocorrelation exp(-tau^2 / 4 s^2) -> threshold -> blur in the Fourier domain, exp(-s^2 (1 - cos w)): that of the
-discrete Gaussian in whose terms presets state their blur. The mean run length of such
-noise is pi sqrt(2) s (Rice 1944).
+with the autocorrelation exp(-tau^2 / 4 s^2) -> threshold -> blur in the Fourier domain by exp(-s^2 (1 - cos w)): that
+of the discrete Gaussian in whose terms presets state their blur. The mean run length of such noise is pi sqrt(2) s
+(Rice 1944).
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 """Make light on imagers with stock Mitsuba: its ``path`` integrator, its ``projector`` emitter, its shapes and BSDFs.
 
 Signal chain: camera with distortion -> a bundle of rays through every pixel; projector with distortion, aperture and
-loss toward the corners -> ideal pinhole projectors at points of the aperture -> ``path`` integrator -> radiance of every
-pattern in every pixel [W / (mm^2 sr)].
+loss toward the corners -> ideal pinhole projectors at points of the aperture -> ``path`` integrator -> radiance of
+every pattern in every pixel [W / (mm^2 sr)].
 
 Mitsuba's ``projector`` is a pinhole without distortion, whose axis is the middle of its image. Distortion, principal
 point, black level and corner loss therefore go into its image, which is resampled at twice the resolution. A lens of
-diameter D is seven pinholes of equal variance. From a pinhole beside the axis by a, the image is shifted by f a / focus,
-so that all seven images agree in the plane of focus.
+diameter D is seven pinholes of equal variance. From a pinhole beside the axis by a, the image is shifted by
+f a / focus, so that all seven images agree in the plane of focus.
 
 A flux Phi of an all-white frame gives the irradiance E_1 = Phi fx fy / (W H) on the plane at unit distance. Mitsuba's
 plugin emits pi times its image.
@@ -61,9 +61,9 @@ _SUM_ERROR = 1e-6
 
 @dataclass(frozen=True)
 class IdealProjector:
-    """Pinhole whose axis is the middle of its image: half extents ``across`` and ``down`` of the plane at unit distance.
+    """Pinhole whose axis is the middle of its image, of ``width`` x ``height`` pixels.
 
-    ``width`` x ``height`` are the pixels of its image.
+    ``across`` and ``down`` are half the extents of its image in the plane at unit distance.
     """
 
     across: float
@@ -332,4 +332,3 @@ def regions(
     """Return the region of each camera's image that shows a part with these bounds (2, 3) [mm], world frame."""
     points = world_from_sensor.inverse().points(box_corners(bounds))
     return {name: bounding_region(camera, points, margin) for name, camera in cameras.items()}
-

@@ -112,9 +112,8 @@ def statement_of(row: Judged, folder: Path, workers: Executor | None = None) -> 
     """Return the tool's statement of a row's view in its scene, and reuse trials in the folder."""
     study = row.study()
     unknowns = study_unknowns(study)
-    kind = "white" if row.family == "white" else "metal"
     digest = trial_digest(study, unknowns, measured_by(study))
-    trials = TrialFolder(folder / f"{row.case.name}__{kind}", digest, list(study.task.measurements))
+    trials = TrialFolder(folder / f"{row.case.name}__{row.name[2]}", digest, list(study.task.measurements))
     runner = spread_over(workers, study, unknowns, measurements_of(study, unknowns))
     table = StatementTable(trials=row.file.trials, pairs=0)
     return state_view(study, row.view_of(study), runner, trials, unknowns, table)
@@ -122,34 +121,34 @@ def statement_of(row: Judged, folder: Path, workers: Executor | None = None) -> 
 
 def run_rows(rows: Sequence[Judged], folder: Path, workers: Executor | None = None) -> list[Found]:
     """State and measure every row; reuse what the folder has."""
-    kept, digests = KeptWorlds(folder), {}
+    kept, digests = KeptWorlds(folder), dict[tuple[str, int, str], str]()
     for row in rows:
-        digests[row] = world_digest(row)
+        if row.name not in digests:
+            digests[row.name] = world_digest(row)
     missing = [
         Order(row, numbers)
         for row in rows
-        for numbers in _in_rows([n for n in range(row.file.worlds) if not _is_kept(kept, row, digests[row], n)])
+        for numbers in _in_rows([n for n in range(row.file.worlds) if not _is_kept(kept, row, digests[row.name], n)])
     ]
     if missing:
         say(f"laboratory: {sum(len(order.numbers) for order in missing)} worlds to make")
         done = workers.distribute(missing, lambda one: one, make_worlds) if workers else _here(missing)
         for order, outcomes in track(done, "laboratory", len(missing)):
             for number, outcome in zip(order.numbers, outcomes, strict=True):
-                kept.add(order.row, digests[order.row], number, outcome)
-    stated: dict[tuple[str, int, bool], tuple[Statement, ...]] = {}
+                kept.add(order.row, digests[order.row.name], number, outcome)
+    stated: dict[tuple[str, int, str], tuple[Statement, ...]] = {}
     out = []
     for row in rows:
-        key = (row.case.name, row.view, row.family == "white")
-        if key not in stated:
-            stated[key] = tuple(statement_of(row, folder, workers))
-        names = [one.measurement for one in stated[key]]
+        if row.name not in stated:
+            stated[row.name] = tuple(statement_of(row, folder, workers))
+        names = [one.measurement for one in stated[row.name]]
         for decoder in row.case.decoders:
             worlds = [
-                kept.known[(digests[row], row.view, row.family, row.mask, number, decoder)]
+                kept.known[(digests[row.name], row.view, row.family, row.mask, number, decoder)]
                 for number in range(row.file.worlds)
             ]
             errors = np.array([[world[name] for world in worlds] for name in names])
-            out.append(Found(row, decoder, stated[key], errors))
+            out.append(Found(row, decoder, stated[row.name], errors))
     return out
 
 

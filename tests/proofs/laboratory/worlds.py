@@ -120,9 +120,7 @@ class Laboratory:
     def measure(self, number: int, decoders: Sequence[str]) -> dict[str, Outcome]:
         """Return the outcome of the world of a number by each decoder."""
         world = self.unknowns.draw(Trial(number))
-        true, assumed = (
-            motion.inverse() @ self.view.world_from_sensor for motion in (world.placed, world.assumed)
-        )
+        true, assumed = (motion.inverse() @ self.view.world_from_sensor for motion in (world.placed, world.assumed))
         capture = self.capture(number, world, true)
         labels = self.predictor.quick_labels(self.study.scene, assumed)
         out = {}
