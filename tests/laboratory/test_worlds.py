@@ -105,6 +105,15 @@ def test_a_plane_decodes_to_its_place_within_the_noise(planes, decoder):
     assert abs(height.mean()) < error + 0.05 * disparity
 
 
+def test_fringes_decode_to_the_pillars_of_their_nominal_size(tmp_path):
+    sensor = coarse_sensor("david-sls-3", 4, tmp_path)
+    laboratory = Laboratory(read_cases(cases_file(tmp_path, sensor, paths="7"))[0])
+    laboratory.unknowns = replace(laboratory.unknowns, varied=())
+    errors = laboratory.measure(0, ["ours"])["ours"].errors
+    assert max(abs(errors[name]) for name in errors if name.endswith(("radius", "distance"))) < 0.1
+    assert max(abs(errors[name]) for name in errors if name.endswith("angle")) < 0.3
+
+
 @pytest.fixture(scope="module")
 def judged(tmp_path_factory):
     """Ten worlds of white pillars before a coarse N10, and the folder and rows of the run."""

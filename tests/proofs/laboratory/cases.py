@@ -35,7 +35,8 @@ class SceneTable(Document):
 class LaboratoryCase(Document):
     """One part before one sensor.
 
-    ``masks`` are those of random dots; fringes have one. ``decoders`` are those of :mod:`.decoders`.
+    ``masks`` are those of random dots; fringes have one. ``decoders`` are those of :mod:`.decoders`. ``paths`` replaces
+    that of the file.
     """
 
     name: Annotated[str, Field(pattern=_NAME, max_length=60)]
@@ -47,6 +48,7 @@ class LaboratoryCase(Document):
     families: Annotated[list[Family], Field(min_length=1)]
     masks: list[Mask] = Field(default=["preset"], min_length=1)
     decoders: list[Decoder] = Field(default=["ours"], min_length=1)
+    paths: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
 
 
 class LaboratoryFile(Document):
@@ -87,6 +89,11 @@ class Judged:
     def name(self) -> tuple[str, int, str]:
         """Return what its statement and the digest of its worlds belong to: case, view, and kind of scene."""
         return self.case.name, self.view, "white" if self.family == "white" else "metal"
+
+    @property
+    def paths(self) -> int:
+        """Return the light paths for each pixel and pattern."""
+        return self.file.paths if self.case.paths is None else self.case.paths
 
     @property
     def scene(self) -> SceneTable:

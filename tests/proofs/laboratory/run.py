@@ -102,7 +102,7 @@ def world_digest(row: Judged) -> str:
         "unknowns": study.unknowns.model_dump(mode="json"),
         "covariance": hashlib.sha256(study_unknowns(study).calibration.covariance.tobytes()).hexdigest(),
         "seed": row.file.seed,
-        "paths": row.file.paths,
+        "paths": row.paths,
         "pose": row.view_of(study).world_from_sensor.matrix().round(9).tolist(),
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]

@@ -144,7 +144,7 @@ class Laboratory:
         met = {name: self._met(bundle, rois[name]) for name, bundle in rays.items()}
         near = {name: binary_dilation(shape >= 0, iterations=2).ravel() for name, shape in met.items()}
         rays = {name: bundle.only(near[name]) for name, bundle in rays.items()}
-        lit = light_on(self.part, self.ideal, lamp, rays, true, self.row.file.paths, world.seed)
+        lit = light_on(self.part, self.ideal, lamp, rays, true, self.row.paths, world.seed)
         room = room_light_on(self.part, rays, world.seed)
 
         def in_image(images: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
