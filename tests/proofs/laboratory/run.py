@@ -58,17 +58,22 @@ class Found:
 
 
 class KeptWorlds:
-    """The finished worlds of a folder, in ``worlds.jsonl``; a line that was cut off is dropped."""
+    """The finished worlds of a folder, in ``worlds.jsonl``; from the first invalid line on, lines are dropped."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "worlds.jsonl"
         self.known: dict[Key, dict[str, float]] = {}
         text = self.path.read_text(encoding="utf-8") if self.path.exists() else ""
-        whole = text[: text.rfind("\n") + 1]
-        for line in whole.splitlines():
-            one = json.loads(line)
-            errors = {name: math.nan if value is None else value for name, value in one["errors"].items()}
-            self.known[(one["digest"], one["view"], one["family"], one["mask"], one["world"], one["decoder"])] = errors
+        whole = ""
+        for line in text[: text.rfind("\n") + 1].splitlines(keepends=True):
+            try:
+                one = json.loads(line)
+                errors = {name: math.nan if value is None else float(value) for name, value in one["errors"].items()}
+                key = (one["digest"], one["view"], one["family"], one["mask"], one["world"], one["decoder"])
+            except (ValueError, KeyError, TypeError, AttributeError):
+                break  # lines after an invalid line are not trusted either
+            self.known[key] = errors
+            whole += line
         if whole != text:
             partial = self.path.with_suffix(".partial")
             partial.write_text(whole, encoding="utf-8")

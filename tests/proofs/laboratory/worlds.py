@@ -83,7 +83,7 @@ class Laboratory:
             raise InputError(row.path, f"cases.{row.case.name}.decoders", others[0], f"'ours' for {sensor.name}")
         self.sensor, self.view = sensor, row.view_of(self.study)
         unknowns = study_unknowns(self.study)
-        self.unknowns = replace(unknowns, seed=unknowns.seed + SEED, pooled=False)
+        self.unknowns = replace(unknowns, seed=unknowns.seed + SEED)
         self.geometry = sensor_geometry(sensor)
         self.predictor = Predictor.of_sensor(sensor, self.geometry)
         self.patterns = sensor.patterns()
