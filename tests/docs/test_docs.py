@@ -43,6 +43,7 @@ from mitsim.study.many_captures import ManyFile
 from mitsim.study.run_folder import RunDocument
 from mitsim.study.scoring import pose_columns
 from mitsim.study.statement_file import StatementDocument
+from tests.proofs.laboratory.cases import LaboratoryFile
 from tests.proofs.part_cases import PartCasesFile
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -66,6 +67,7 @@ TOML_MODELS = {
     "study": StudyFile,
     "task": Task,
     "validation": PartCasesFile,
+    "laboratory": LaboratoryFile,
     "many": ManyFile,
     "covariance": CovarianceFile,
     "depthai": DepthaiSettings,

@@ -213,7 +213,66 @@ def maps(
     say(f"constants: {output}")
 
 
-for command in (maps, scores, statements, losses):
+def laboratory(
+    cases: Annotated[Path, typer.Argument(help="TOML file that lists parts, sensors, finishes, masks and decoders.")],
+    output: Out,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="Evaluate only rows whose name CASE__FAMILY contains this text. Repeatable."),
+    ] = None,
+    processes: Processes = 1,
+    variant: Variant = None,
+) -> None:
+    """Compare statements with worlds that an independent renderer, imager and decoder made.
+
+    Continues an interrupted run in the same folder. Writes the page laboratory.md, and prints its table of families.
+
+    Example: python -m tests.proofs laboratory tests/proofs/laboratory/cases.toml -o runs/laboratory
+    """
+    start(variant)
+    from mitsim.running.progress import say
+    from tests.proofs.laboratory.cases import read_cases
+    from tests.proofs.laboratory.page import write_laboratory_page
+    from tests.proofs.laboratory.run import run_rows
+
+    workers = requested_workers(None, processes)
+    rows = read_cases(cases, only or ())
+    check_folder(output)
+    page, table = write_laboratory_page(run_rows(rows, output, workers), output, cases)
+    print(table, end="")
+    say(f"page: {page}")
+
+
+def seeds(
+    study: Annotated[Path, typer.Argument(help="Study TOML file.")],
+    output: Out,
+    view: Annotated[int, typer.Option(min=0, help="Number of the candidate view to state.")],
+    seeds: Annotated[int, typer.Option(min=2, max=100, help="Number of seeds, from 1 on.")] = 5,
+    trials: Annotated[int, typer.Option(min=2, max=1_000_000, help="Trials of each statement.")] = 200,
+    processes: Processes = 1,
+    variant: Variant = None,
+) -> None:
+    """Compare the statements of one view of a study with different seeds.
+
+    Continues an interrupted run in the same folder. Prints u of every measurement by seed.
+
+    Example: python -m tests.proofs seeds scenes/two_pillars/study.toml --view 99 -o runs/seeds
+    """
+    start(variant)
+    from mitsim.study import read_study
+    from tests.proofs.seeds import seeds_table, statements_of_seeds
+
+    workers = requested_workers(None, processes)
+    read = read_study(study, "", mapped=False)
+    by_number = {one.number: one for one in read.views}
+    if view not in by_number:
+        raise InputError("--view", "", view, f"0 to {max(by_number)}")
+    check_folder(output)
+    stated = statements_of_seeds(read, by_number[view], range(1, seeds + 1), trials, output, workers)
+    print(seeds_table(stated), end="")
+
+
+for command in (maps, scores, statements, losses, laboratory, seeds):
     app.command(name=command.__name__)(command)
 
 if __name__ == "__main__":

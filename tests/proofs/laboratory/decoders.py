@@ -1,0 +1,91 @@
+"""Decode the images of a world: by mitsim's decoder, or by OpenCV's stereo matcher as most users call it.
+
+``ours`` is the decoder of the sensor, with its settings. ``sgbm`` draws its block from 5, 7, 9 and 11 px for every
+world; ``sgbm5`` to ``sgbm11`` are one block. Its other settings are those of OpenCV's own sample
+(samples/python/stereo_match.py): P1 = 8 b^2, P2 = 32 b^2, uniqueness 10 %, left-right check 1 px, speckle window 100
+px and range 2 px. It matches the first frame.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from characterisation.point_cloud import PointCloud, Status
+from mitsim.capture.capture import Capture
+from mitsim.decode.cloud import Geometry, capture_cloud
+from mitsim.decode.matching.stereo import StereoGeometry
+from mitsim.sensor.preset import Sensor
+
+Decoder = Literal["ours", "sgbm", "sgbm5", "sgbm7", "sgbm9", "sgbm11"]
+
+BLOCKS = (5, 7, 9, 11)
+
+
+def decoded(capture: Capture, sensor: Sensor, geometry: Geometry, decoder: Decoder, seed: int) -> PointCloud:
+    """Return the cloud of a capture with the nominal calibration of its sensor.
+
+    Raises
+    ------
+    ValueError
+        If plain SGBM shall decode images that are no stereo pair.
+    """
+    if decoder == "ours":
+        return capture_cloud(capture, sensor.settings, geometry, imager=sensor.imager)
+    if not isinstance(geometry, StereoGeometry):
+        raise ValueError(f"{decoder} needs a stereo pair, not the images of a {sensor.technology} sensor")
+    block = int(decoder[4:]) if decoder != "sgbm" else int(np.random.default_rng([seed, 5]).choice(BLOCKS))
+    return plain_sgbm(capture, sensor, geometry, block)
+
+
+def plain_sgbm(capture: Capture, sensor: Sensor, geometry: StereoGeometry, block: int) -> PointCloud:
+    """Return the cloud of a stereo pair by OpenCV's own rectification, matcher and triangulation."""
+    settings, grid = sensor.matcher, geometry.grid
+    assert settings is not None
+    left, right = list(capture.rig.cameras.values())[:2]
+    pose = right.sensor_from_camera.inverse() @ left.sensor_from_camera
+    size = (left.width, left.height)
+    turn_left, turn_right, p_left, p_right, q, *_ = cv2.stereoRectify(
+        left.matrix,
+        left.distortion,
+        right.matrix,
+        right.distortion,
+        size,
+        pose.rotation,
+        pose.translation.reshape(3, 1),
+        flags=0,
+        alpha=-1,
+    )
+    pair = []
+    for camera, turn, p in ((left, turn_left, p_left), (right, turn_right, p_right)):
+        maps = cv2.initUndistortRectifyMap(camera.matrix, camera.distortion, turn, p, size, cv2.CV_32FC1)
+        name = next(name for name, one in capture.rig.cameras.items() if one is camera)
+        frame = np.round(capture.images[name][0] * (255 / (2**capture.bits - 1))).astype(np.uint8)
+        pair.append(cv2.remap(frame, *maps, cv2.INTER_LINEAR))
+    focal, baseline, offset = p_left[0, 0], np.linalg.norm(pose.translation), p_right[0, 2] - p_left[0, 2]
+    nearest, farthest = (focal * baseline / depth - offset for depth in (settings.near_mm, settings.far_mm))
+    first = int(np.floor(farthest)) - 1
+    count = 16 * int(np.ceil((nearest - first + 2) / 16))
+    # columns beyond the left edge, without which the matcher leaves out as many columns as it has disparities
+    border = max(first + count, 0)
+    wide = [cv2.copyMakeBorder(image, 0, 0, border, 0, cv2.BORDER_REPLICATE) for image in pair]
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=first,
+        numDisparities=count,
+        blockSize=block,
+        P1=8 * block**2,
+        P2=32 * block**2,
+        disp12MaxDiff=1,
+        uniquenessRatio=10,
+        speckleWindowSize=100,
+        speckleRange=2,
+    )
+    disparity = matcher.compute(*wide)[:, border:].astype(np.float32) / 16
+    points = cv2.reprojectImageTo3D(disparity, q)
+    valid = (disparity >= first) & (points[..., 2] >= settings.near_mm) & (points[..., 2] <= settings.far_mm)
+    in_sensor = points.astype(float) @ turn_left @ left.sensor_from_camera.rotation.T + left.centre
+    status = np.where(valid, Status.VALID, Status.AMBIGUOUS).astype(np.uint8)
+    cloud = np.where(valid[..., None], in_sensor, np.nan).astype(np.float32)
+    return PointCloud(cloud, status, grid, sensor.name, "simulated", geometry.baseline)

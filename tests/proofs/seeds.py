@@ -1,0 +1,55 @@
+"""Compare the statements of one study made with different seeds.
+
+Signal chain: study -> the same study with the seeds 1 to n -> statement of a view with each -> u and interval of every
+measurement, and how far they lie apart.
+
+A statement is a property of part and sensor. Its seed may change it by no more than its number of trials explains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from characterisation.statements.statement import Statement
+from mitsim.running.executor import Executor
+from mitsim.study import StatementTable, Study
+from mitsim.study.session import Session
+from mitsim.views import View
+from tests.proofs.tables import markdown, number
+
+#: u of all seeds shall lie within this of one another, and widths of intervals within the second [1]
+SAME_U, SAME_INTERVAL = 0.15, 0.20
+
+
+def statements_of_seeds(
+    study: Study, view: View, seeds: Sequence[int], trials: int, folder: Path, workers: Executor | None = None
+) -> dict[int, list[Statement]]:
+    """Return the statements of a view by seed; trials in the folder are reused."""
+    out = {}
+    for seed in seeds:
+        one = replace(study, file=study.file.model_copy(update={"seed": seed}))
+        session = Session(one, folder / f"seed_{seed}", workers)
+        out[seed] = session.state(view, StatementTable(trials=trials, pairs=0)).statements
+    return out
+
+
+def spread(values: Sequence[float]) -> float:
+    """Return the largest of some positive values over the least, less 1; NaN if one is missing."""
+    found = np.asarray(values, float)
+    return float(found.max() / found.min() - 1) if np.isfinite(found).all() and found.min() > 0 else float("nan")
+
+
+def seeds_table(stated: Mapping[int, Sequence[Statement]]) -> str:
+    """Return u of every measurement by seed, and the spread of u and of the widths of the intervals, in Markdown."""
+    body = []
+    for same in zip(*stated.values(), strict=True):
+        u = [one.standard_uncertainty for one in same]
+        widths = [one.interval[1] - one.interval[0] for one in same]
+        ends = (f"{100 * spread(values):.0f} %" for values in (u, widths))
+        body.append([same[0].measurement, same[0].unit, *map(number, u), *ends])
+    head = ["measurement", "unit", *(f"u, seed {seed}" for seed in stated), "largest u over least", "of the widths"]
+    return markdown(head, body)
