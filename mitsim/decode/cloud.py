@@ -27,15 +27,12 @@ from mitsim.decode.grey_levels import MeasuredNoise
 from mitsim.decode.grid_cloud import empty_cloud
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
-from mitsim.sensor.imager import Imager
+from mitsim.sensor.imager import DescribedImager, Imager
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.pattern import DotPattern
-from mitsim.sensor.preset import Sensor, presets
-from mitsim.sensor.recorded_rig import load_recorded_rig
-from mitsim.sensor.sensor_file import ImagerTable
-from mitsim.sensor.written_imager import imager_of
+from mitsim.sensor.preset import Sensor, load_sensor, presets
 
 __all__ = [
     "Geometry",
@@ -78,7 +75,7 @@ class _RangeSettings(Document):
 class _ImagerSettings(Document):
     """The part of a capture's settings with its imager."""
 
-    imager: ImagerTable | None = None
+    imager: DescribedImager | None = None
 
 
 def decoder_settings(
@@ -133,8 +130,8 @@ def _settings(capture: Capture, sensor: str | None) -> tuple[Settings, Imager | 
     name = sensor or (capture.sensor if capture.sensor in presets() else None)
     if name is not None:
         camera = capture.rig.reference
-        recorded = load_recorded_rig(name, (camera.width, camera.height))
-        return recorded.settings, _if_bits_match(recorded.imager, capture.bits)
+        other = load_sensor(name, "decoding", (camera.width, camera.height))
+        return other.settings, _if_bits_match(other.described_imager, capture.bits)
     technology = technology_of(capture.technology)
     near, far = technology.range_mm
     defaults = {"near_mm": capture.settings.get("near_mm", near), "far_mm": capture.settings.get("far_mm", far)}
@@ -153,7 +150,7 @@ def _settings_of_capture(capture: Capture, decoder: Any) -> tuple[Settings, Imag
         create_model("SettingsOfCapture", __base__=_ImagerSettings, decoder=(model, ...)),
     )
     settings: Settings = getattr(validated, "decoder")  # noqa: B009 - a field of a model made just now
-    return settings, None if validated.imager is None else _if_bits_match(imager_of(validated.imager), capture.bits)
+    return settings, _if_bits_match(validated.imager, capture.bits)
 
 
 def _if_bits_match(imager: Imager | None, bits: int) -> Imager | None:

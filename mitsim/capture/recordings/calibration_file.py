@@ -32,8 +32,7 @@ from mitsim.capture.recordings.nxlib_tree import NxLibTree
 from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.opencv_calibration import CalibrationTable, has_pair, with_calibration
-from mitsim.sensor.preset import presets
-from mitsim.sensor.recorded_rig import load_recorded_rig
+from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.sensor_file import OpticsTable
 
 
@@ -164,7 +163,7 @@ def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
             table = validate(path, _sized(optics, size), RigFile)
             rig = Rig({name: each.camera() for name, each in table.cameras.items()})
             return Calibrated(rig, table.name, notes=tuple(notes))
-    sensor = load_recorded_rig(path, size)
+    sensor = load_sensor(path, "decoding", size)
     return Calibrated(sensor.rig, sensor.name, sensor.range_mm, sensor.notes)
 
 

@@ -42,6 +42,7 @@ from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.image_formation import converter
+from mitsim.sensor.imager import imager_table
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import Sensor
@@ -49,7 +50,6 @@ from mitsim.sensor.roi import roi_around
 from mitsim.sensor.speckle import SpeckleField
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.vignetting import camera_illumination
-from mitsim.sensor.written_imager import written_imager
 
 #: margin around the required points [px], for the blur of the lens and the window of the matcher
 _MARGIN_PX = 12
@@ -76,6 +76,7 @@ class SimulatedSensor:
     """
 
     def __init__(self, sensor: Sensor) -> None:
+        sensor.require("simulation")
         self.sensor = sensor
         cameras = sensor.true_rig.cameras
         self.rays = {name: _camera_rays(sensor, camera) for name, camera in cameras.items()}
@@ -293,6 +294,7 @@ class SimulatedSensor:
         Each seed gives another capture from the same pose, with the same speckle.
         """
         noise, sensor, exposures = light.noise, self.sensor, light.exposures
+        assert sensor.pattern is not None  # simulation needs it
         images = {}
         for index, name in enumerate(light.rois):
             _, noise_stream, _ = np.random.SeedSequence([seed, index]).spawn(3)
@@ -308,7 +310,7 @@ class SimulatedSensor:
         }
         adc = converter(sensor.imager, noise)
         settings |= {"black_level_dn": adc.black_level, "gamma": adc.gamma}
-        settings |= {"decoder": sensor.settings.model_dump(mode="json"), "imager": written_imager(sensor.imager)}
+        settings |= {"decoder": sensor.settings.model_dump(mode="json"), "imager": imager_table(sensor.imager)}
         read_out = {
             name: [roi.left, roi.top, roi.width, roi.height]
             for name, roi in light.rois.items()

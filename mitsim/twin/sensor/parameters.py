@@ -214,6 +214,7 @@ def _of_pattern(field: str, squared: bool, spread: float, step: float) -> Parame
 
     def put(sensor: Sensor, x: float) -> Sensor:
         value = float(np.sqrt(max(x, 0.0))) if squared else float(np.exp(x))
+        assert isinstance(sensor.pattern, RandomDots | DiffractionSpots)  # see pattern_parameters
         return replace(sensor, pattern=sensor.pattern.model_copy(update={field: value}))
 
     def get(sensor: Sensor) -> float:
