@@ -32,7 +32,7 @@ _NAMES = {
     "load_sensor": "mitsim.decode.captures",
     "look_at": "mitsim.sensor.poses",
     "measure": "mitsim.study.measurements",
-    "open_study": "mitsim.study.programs",
+    "open_study": "mitsim.study.reading",
     "performance_map": "mitsim.maps.use",
     "predict": "mitsim.maps.use",
     "read_capture": "mitsim.decode.captures",
@@ -70,7 +70,8 @@ if TYPE_CHECKING:
     from mitsim.sensor.transforms import Transform
     from mitsim.study import Study
     from mitsim.study.measurements import label, measure, read_task
-    from mitsim.study.programs import open_study, score, statement
+    from mitsim.study.programs import score, statement
+    from mitsim.study.reading import open_study
 
 __all__ = [
     "BudgetLine",

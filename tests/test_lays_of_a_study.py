@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-from mitsim.study import finishes_of_features, read_study, report_lays
+from mitsim.study import finishes_of_features, open_study, report_lays
 
 
 def test_a_study_names_the_features_whose_marks_have_no_direction(scenes, capsys):
-    study = read_study(scenes / "two_pillars" / "study.toml", mapped=False)
+    study = open_study(scenes / "two_pillars" / "study.toml", mapped=False)
     assert {str(one) for one in finishes_of_features(study).values()} == {
         "aluminium/ground Ra 0.74 um",
         "aluminium/ground Ra 0.37 um",
@@ -18,7 +18,7 @@ def test_a_study_names_the_features_whose_marks_have_no_direction(scenes, capsys
 
 
 def test_a_study_of_matt_faces_says_nothing(scenes, capsys):
-    study = read_study(scenes / "two_pillars" / "study.toml", mapped=False)
+    study = open_study(scenes / "two_pillars" / "study.toml", mapped=False)
     white = replace(study.scene, finishes=[None] * len(study.scene.finishes))
     report_lays(replace(study, scene=white))
     assert capsys.readouterr().err == ""

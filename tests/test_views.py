@@ -18,7 +18,7 @@ from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.sensor.working_volume import depth
-from mitsim.study import read_study
+from mitsim.study import open_study
 from mitsim.views import ViewsTable, candidate_views
 from mitsim.views.candidates import STEP_MM
 from mitsim.views.collision import sensor_box
@@ -251,7 +251,7 @@ def study(folder, scenes, views):
 
 def test_a_study_reads_several_standoffs_and_characterises_all_of_them(tmp_path, scenes):
     views = "subdivisions = 1\nlowest_elevation_deg = 40\nstandoffs_mm = [450, 700]\nclearance_mm = 5"
-    found = read_study(study(tmp_path, scenes, views))
+    found = open_study(study(tmp_path, scenes, views))
     assert {view.standoff for view in found.views} == {450, 700}
     assert found.campaign.distances[0] <= 450 - 100 + 60 and found.campaign.distances[-1] >= 700
     assert found.views is found.candidates.views
@@ -272,7 +272,7 @@ def test_a_study_reads_several_standoffs_and_characterises_all_of_them(tmp_path,
 def test_a_study_refuses_views_that_cannot_be_had(tmp_path, scenes, views, field, message):
     path = study(tmp_path, scenes, views)
     with pytest.raises(InputError, match=message) as caught:
-        read_study(path)
+        open_study(path)
     assert (caught.value.field, caught.value.where) == (field, str(path))
 
 

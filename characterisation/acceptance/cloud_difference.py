@@ -3,6 +3,9 @@
 Signal chain, along rays: distance |V| of each pixel in one cloud -> minus that in the other. To the surface: points of
 one cloud -> nearest points of the other -> the plane through these -> orthogonal distance.
 
+For a window of pixels only the points of the reference near it are searched, and no search extends beyond the distance
+at which a point has no counterpart.
+
 Both are positive where the cloud lies *farther from the sensor* than the reference. The difference along rays assumes
 no surface, and a step gives its full height along the ray. The distance to a surface is smaller by the cosine of the
 incidence angle, and needs no shared grid. Both clouds must be in one frame: they are not aligned to each other.
@@ -10,6 +13,7 @@ incidence angle, and needs no shared grid. Both clouds must be in one frame: the
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,9 +22,15 @@ from scipy.spatial import cKDTree
 
 from characterisation.features.robust_fit import MEDIAN_TO_STD
 from characterisation.files.errors import InputError
+from characterisation.files.threads import thread_count
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, ViewGrid
 
 Floats = NDArray[np.float64]
+
+#: rows and columns of a window of a grid
+Window = tuple[slice, slice]
+
+_ALL = (slice(None), slice(None))
 
 #: number of points of the reference that determine the plane at a point
 NEIGHBOURS = 12
@@ -29,7 +39,7 @@ NEIGHBOURS = 12
 _ASIDE = 1.5
 
 #: number of points processed at once
-_BLOCK = 65536
+_BLOCK = 32768
 
 
 @dataclass(frozen=True)
@@ -50,8 +60,8 @@ class Difference:
     high: float
 
 
-def difference_along_rays(cloud: PointCloud, reference: PointCloud) -> Floats:
-    """Return the difference (H, W) [mm] of two clouds on one grid, NaN where either has no point.
+def difference_along_rays(cloud: PointCloud, reference: PointCloud, window: Window = _ALL) -> Floats:
+    """Return the difference (h, w) [mm] of two clouds on one grid in a window, NaN where either has no point.
 
     Raises
     ------
@@ -67,16 +77,23 @@ def difference_along_rays(cloud: PointCloud, reference: PointCloud) -> Floats:
             "or use the difference to the surface",
         )
     one, other = (
-        np.linalg.norm(each.points.astype(np.float64) - each.grid.origin, axis=-1) for each in (cloud, reference)
+        np.linalg.norm(each.points[window].astype(np.float64) - each.grid.origin, axis=-1)
+        for each in (cloud, reference)
     )
     return np.asarray(one - other)
 
 
-def difference_to_surface(cloud: PointCloud, reference: PointCloud) -> Floats:
-    """Return the difference (H, W) [mm] of a cloud's points from the surface of a reference in the same frame.
+def difference_to_surface(
+    cloud: PointCloud,
+    reference: PointCloud,
+    window: Window = _ALL,
+    progress: Callable[[Sequence[int]], Iterable[int]] = iter,
+) -> Floats:
+    """Return the difference (h, w) [mm] of a cloud's points in a window from the surface of a reference.
 
-    It is NaN where the cloud has no point, or the reference has none within 1 % of the point's distance. It is also NaN
-    beyond the edge of the reference.
+    Both are in one frame. The difference is NaN where the cloud has no point, or the reference has none within 1 % of
+    the point's distance. It is also NaN beyond the edge of the reference. ``progress`` iterates over the starts of the
+    blocks of points, and may report them.
 
     Raises
     ------
@@ -86,13 +103,16 @@ def difference_to_surface(cloud: PointCloud, reference: PointCloud) -> Floats:
     surface = reference.points[reference.valid].astype(np.float64)
     if len(surface) < NEIGHBOURS:
         raise InputError("difference to the surface", "reference", f"{len(surface)} points", f"{NEIGHBOURS} or more")
-    tree = cKDTree(surface)
-    rows, columns = np.nonzero(cloud.valid)
-    out = np.full(cloud.status.shape, np.nan)
-    for start in range(0, len(rows), _BLOCK):
+    valid = cloud.valid[window]
+    points = cloud.points[window][valid].astype(np.float64)
+    farthest = FALSE_SHARE_OF_DISTANCE * np.linalg.norm(points - cloud.grid.origin, axis=1)
+    searched = _Searched(surface, points, float(farthest.max(initial=0.0)))
+    height = np.full(len(points), np.nan)
+    for start in progress(range(0, len(points), _BLOCK)):
         some = slice(start, start + _BLOCK)
-        points = cloud.points[rows[some], columns[some]].astype(np.float64)
-        out[rows[some], columns[some]] = _to_surface(points, surface, tree, cloud.grid.origin)
+        height[some] = _to_surface(points[some], farthest[some], searched, cloud.grid.origin)
+    out = np.full(valid.shape, np.nan)
+    out[valid] = height
     return out
 
 
@@ -120,15 +140,49 @@ def same_grid(one: ViewGrid, other: ViewGrid) -> bool:
     return bool((apart < 0.01 * one.angular_pitch).all())
 
 
-def _to_surface(points: Floats, surface: Floats, tree: cKDTree, viewpoint: Floats) -> Floats:
-    """Return signed distances (n,) of points (n, 3) from a surface (m, 3).
+class _Searched:
+    """The points of a reference near the points of a cloud, with trees for their neighbours.
+
+    A box around the cloud's points, larger by the distance of the farthest counterpart, holds all points within that
+    distance. The few points with fewer neighbours there are searched in the whole reference.
+    """
+
+    def __init__(self, surface: Floats, points: Floats, farthest: float) -> None:
+        self.surface = surface
+        margin = farthest * (1 + 1e-6)
+        low, high = (points.min(axis=0) - margin, points.max(axis=0) + margin) if len(points) else (np.inf, -np.inf)
+        self.near = surface[((surface >= low) & (surface <= high)).all(axis=1)]
+        self.tree = cKDTree(self.near) if len(self.near) else None
+        self.whole: cKDTree | None = self.tree if len(self.near) == len(surface) else None
+
+    def neighbours(self, points: Floats, farthest: Floats) -> tuple[NDArray[np.bool_], Floats]:
+        """Return which points (n, 3) have a counterpart within ``farthest`` (n,) [mm], and the neighbours of those.
+
+        The neighbours are the nearest points (m, NEIGHBOURS, 3) of the reference.
+        """
+        if self.tree is None or not len(points):
+            return np.zeros(len(points), bool), np.empty((0, NEIGHBOURS, 3))
+        limit = float(farthest.max()) * (1 + 1e-9)
+        distance, index = self.tree.query(points, NEIGHBOURS, distance_upper_bound=limit, workers=thread_count())
+        met = distance[:, 0] <= farthest
+        few = met & ~np.isfinite(distance[:, -1])
+        if few.any():
+            self.whole = self.whole or cKDTree(self.surface)
+        out = self.near[np.minimum(index[met], len(self.near) - 1)]
+        if few.any() and self.whole is not None:
+            out[few[met]] = self.surface[self.whole.query(points[few], NEIGHBOURS, workers=thread_count())[1]]
+        return met, out
+
+
+def _to_surface(points: Floats, farthest: Floats, searched: _Searched, viewpoint: Floats) -> Floats:
+    """Return signed distances (n,) of points (n, 3) from a surface, NaN without a counterpart within ``farthest`` (n,).
 
     The surface at a point is the plane through its nearest points.
     """
+    out = np.full(len(points), np.nan)
+    met, patch = searched.neighbours(points, farthest)
+    points = points[met]
     away = points - viewpoint
-    length = np.linalg.norm(away, axis=1)
-    distance, index = tree.query(points, NEIGHBOURS)
-    patch = surface[index]
     middle = patch.mean(axis=1)
     spread = patch - middle[:, None]
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))
@@ -138,8 +192,8 @@ def _to_surface(points: Floats, surface: Floats, tree: cKDTree, viewpoint: Float
     aside = np.linalg.norm(points - height[:, None] * normal - middle, axis=1)
     # the square root of the largest variance of the neighbours is about their distance
     reach = _ASIDE * np.sqrt(values[:, 2] / NEIGHBOURS)
-    far = (distance[:, 0] > FALSE_SHARE_OF_DISTANCE * length) | (aside > reach)
-    return np.where(far, np.nan, height)
+    out[met] = np.where(aside > reach, np.nan, height)
+    return out
 
 
 def _described(grid: ViewGrid) -> str:

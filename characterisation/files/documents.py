@@ -11,6 +11,7 @@ import dataclasses
 import json
 import re
 import tomllib
+import unicodedata
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import UnionType
@@ -54,7 +55,9 @@ def checked_name(name: str) -> str:
     ValueError
         If the name is not allowed; pydantic turns it into an :class:`InputError`.
     """
-    if len(name.encode("utf-8", "replace")) > LONGEST_NAME or not re.fullmatch(_NAME, name):
+    # marks belong to the letter before them, as in Thai and Hindi; none is a letter of its own
+    letters = name[:1] + "".join(one for one in name[1:] if not unicodedata.category(one).startswith("M"))
+    if len(name.encode("utf-8", "replace")) > LONGEST_NAME or not re.fullmatch(_NAME, letters):
         raise ValueError(
             f"a name of at most {LONGEST_NAME} bytes that begins with a letter, digit or underscore, of these, spaces "
             "and . , ( ) # & ' = @ ~ + - %; no / \\ : < > | * ? and no quotation marks"

@@ -42,6 +42,7 @@ from characterisation.tasks.definitions import (
 )
 from characterisation.tasks.deviations import deviations, fold_of
 from characterisation.tasks.places import intersection, mid_plane
+from characterisation.tasks.result import Result, failed
 from characterisation.tasks.task_file import DERIVED, Feature, Measurement, Task
 from characterisation.tasks.task_reading import check_features, read_task
 
@@ -50,7 +51,6 @@ __all__ = [
     "Estimate",
     "Feature",
     "InputQuantity",
-    "Measured",
     "Measurement",
     "MeasurementModel",
     "Task",
@@ -109,20 +109,11 @@ class MeasurementModel:
 
 
 @dataclass(frozen=True)
-class Measured:
-    """Outcome of one measurement in one cloud, in the measurement's unit.
+class _Selected:
+    """Points (n, 3) [mm] of a shape that can lie on it, of ``given`` points with its label; or why they are too few."""
 
-    ``error`` is value minus nominal; ``standard_uncertainty`` is propagated from the fits. If the measurement was not
-    possible, all three are NaN and ``reason`` gives the cause. ``deviations`` (k, m) are those from nominal of a value
-    that folds, in its unit, part frame (:mod:`characterisation.tasks.deviations`); None for any other.
-    """
-
-    value: float
-    error: float
-    standard_uncertainty: float
-    possible: bool
-    reason: str
-    deviations: Array | None = None
+    points: Array | FitError
+    given: int
 
 
 def measurement_model(task: Task, measurement: str, sensor_from_part: ArrayLike | None = None) -> MeasurementModel:
@@ -215,11 +206,18 @@ def fit_features(
     InputError
         If the cloud has no label of that name.
     """
+    return _fits(cloud, task, sensor_from_part, _selected(cloud, task, sensor_from_part, minimum_points))
+
+
+def _fits(
+    cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, selected: Mapping[str, _Selected]
+) -> dict[str, Fit | FitError]:
+    """Fit every feature of a task once: shapes to their selected points, then the figures in their planes."""
     fits: dict[str, Fit | FitError] = {}
-    for name in task.shapes:
+    for name, one in selected.items():
         try:
             surface = task.features[name].nominal(sensor_from_part)
-            fits[name] = fit_surface(_points(cloud, name, surface, minimum_points), surface, cloud.grid.origin)
+            fits[name] = fit_surface(_points(one), surface, cloud.grid.origin)
         except FitError as error:
             fits[name] = error
     for name, feature in task.features.items():
@@ -239,70 +237,87 @@ def fit_features(
     return {name: fits[name] for name in task.features if name in fits}
 
 
-def _points(cloud: PointCloud, name: str, nominal: Surface, minimum_points: int) -> Array:
-    """Return the points (n, 3) of a shape [mm], sensor frame: those with its label that can lie on it."""
-    if name not in cloud.feature_names:
-        known = list(cloud.feature_names)
-        labels = f"labels of the cloud: {', '.join(known) or 'there are none'}"
-        raise InputError("task", f"features.{name}", repr(name), labels, nearest(name, known))
-    points = cloud.of_feature(name)
-    near = points[belonging(points, nominal, cloud.grid.origin)]
-    if len(near) < minimum_points:
-        raise FitError(f"{len(near)} points, at least {minimum_points} are required")
-    if len(near) < LEAST_BELONGING * len(points):
-        share = f"{100 * len(near) / len(points):.0f} % of {len(points)} points"
-        raise FitError(
-            f"only {share} lie near the nominal surface, at least {100 * LEAST_BELONGING:.0f} % are required"
-        )
-    return near
+def _selected(cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimum_points: int) -> dict[str, _Selected]:
+    """Return the points of every shape [mm], sensor frame: those with its label that can lie on it."""
+    selected = {}
+    for name in task.shapes:
+        if name not in cloud.feature_names:
+            known = list(cloud.feature_names)
+            labels = f"labels of the cloud: {', '.join(known) or 'there are none'}"
+            raise InputError("task", f"features.{name}", repr(name), labels, nearest(name, known))
+        points = cloud.of_feature(name)
+        near = points[belonging(points, task.features[name].nominal(sensor_from_part), cloud.grid.origin)]
+        selected[name] = _Selected(near, len(points))
+        if len(near) < minimum_points:
+            few = FitError(f"{len(near)} points, at least {minimum_points} are required")
+            selected[name] = _Selected(few, len(points))
+        elif len(near) < LEAST_BELONGING * len(points):
+            share = f"{100 * len(near) / len(points):.0f} % of {len(points)} points"
+            least = f"at least {100 * LEAST_BELONGING:.0f} % are required"
+            selected[name] = _Selected(FitError(f"only {share} lie near the nominal surface, {least}"), len(points))
+    return selected
+
+
+def _points(selected: _Selected) -> Array:
+    """Return the points of a shape, or raise the error that says why they are too few."""
+    if isinstance(selected.points, FitError):
+        raise selected.points
+    return selected.points
 
 
 def measure(
     cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimum_points: int = 100, propagated: bool = True
-) -> dict[str, Measured]:
+) -> dict[str, Result]:
     """Evaluate all measurements of a task in one labelled cloud; arguments and errors of :func:`fit_features`.
 
-    With ``propagated`` false, the uncertainty is not propagated from the fits, and is NaN.
+    Each feature is fitted once for all measurements. With ``propagated`` false, the uncertainty is not propagated from
+    the fits, and is NaN.
     """
-    fits = fit_features(cloud, task, sensor_from_part, minimum_points)
     motion = np.asarray(sensor_from_part, float)
+    selected = _selected(cloud, task, motion, minimum_points)
+    fits = _fits(cloud, task, motion, selected)
     known: dict[InputQuantity, Estimate | FitError] = {
         InputQuantity("feature", (name,)): fit for name, fit in fits.items()
     }
-    measured = {}
-    for name, measurement in task.measurements.items():
+    results = {}
+    for name in task.measurements:
         model = measurement_model(task, name, motion)
         for quantity in model.inputs:
             if quantity not in known:
-                known[quantity] = _estimate(quantity, cloud, task, fits, motion, minimum_points)
-        measured[name] = _measured(measurement, model, [known[quantity] for quantity in model.inputs], propagated)
-    return measured
+                known[quantity] = _estimate(quantity, cloud, task, fits, selected, motion)
+        given = sum(selected[shape].given for shape in task.shapes_for(name))
+        results[name] = _result(task, name, model, known, fits, given, propagated)
+    return results
 
 
 def measure_points(
     points: Mapping[str, ArrayLike], task: Task, minimum_points: int = 100, propagated: bool = True
-) -> dict[str, Measured]:
+) -> dict[str, Result]:
     """Evaluate all measurements of a task from points (n, 3) [mm] of its shapes, part frame, of one or several views.
 
     Points of several views have no single viewpoint, so distances are orthogonal, as in coordinate metrology. Circles
     and points of edges, forms and poses require one organised cloud, and are not possible.
     """
-    known: dict[InputQuantity, Estimate | FitError] = {}
-    for name in task.shapes:
-        some = np.asarray(points.get(name, np.empty((0, 3))), float)
+    fits: dict[str, Fit | FitError] = {}
+    given = {name: np.asarray(points.get(name, np.empty((0, 3))), float) for name in task.shapes}
+    for name, some in given.items():
         try:
             if len(some) < minimum_points:
                 raise FitError(f"{len(some)} points, at least {minimum_points} are required")
-            known[InputQuantity("feature", (name,))] = fit_surface(some, task.features[name].nominal())
+            fits[name] = fit_surface(some, task.features[name].nominal())
         except FitError as error:
-            known[InputQuantity("feature", (name,))] = error
-    measured = {}
-    for name, measurement in task.measurements.items():
+            fits[name] = error
+    known: dict[InputQuantity, Estimate | FitError] = {
+        InputQuantity("feature", (name,)): fit for name, fit in fits.items()
+    }
+    results = {}
+    for name in task.measurements:
         model = measurement_model(task, name)
-        apart = FitError("it requires one cloud, not the joined points of several views")
-        inputs = [known.get(quantity, apart) for quantity in model.inputs]
-        measured[name] = _measured(measurement, model, inputs, propagated)
-    return measured
+        for quantity in model.inputs:
+            known.setdefault(quantity, FitError("it requires one cloud, not the joined points of several views"))
+        count = sum(len(given[shape]) for shape in task.shapes_for(name))
+        results[name] = _result(task, name, model, known, fits, count, propagated)
+    return results
 
 
 def _estimate(
@@ -310,8 +325,8 @@ def _estimate(
     cloud: PointCloud,
     task: Task,
     fits: Mapping[str, Fit | FitError],
+    selected: Mapping[str, _Selected],
     motion: Array,
-    minimum_points: int,
 ) -> Form | PoseFit | FitError:
     """Fit an input quantity that is not a feature: a form, or a pose."""
     origin = cloud.grid.origin
@@ -319,10 +334,7 @@ def _estimate(
         for name in quantity.features:
             if isinstance(fit := fits[name], FitError):
                 raise FitError(f"{name}: {fit}")
-        points = {
-            name: _points(cloud, name, task.features[name].nominal(motion), minimum_points)
-            for name in quantity.features
-        }
+        points = {name: _points(selected[name]) for name in quantity.features}
         if quantity.kind == "form":
             (name,) = quantity.features
             return fit_form(points[name], cast(PlaneFit | CylinderFit, fits[name]), origin)
@@ -332,22 +344,41 @@ def _estimate(
         return error
 
 
-def _measured(
-    measurement: Measurement, model: MeasurementModel, inputs: Sequence[Estimate | FitError], propagated: bool
-) -> Measured:
-    estimates: list[Estimate] = []
-    for quantity, estimate in zip(model.inputs, inputs, strict=True):
+def _result(
+    task: Task,
+    name: str,
+    model: MeasurementModel,
+    known: Mapping[InputQuantity, Estimate | FitError],
+    fits: Mapping[str, Fit | FitError],
+    given: int,
+    propagated: bool,
+) -> Result:
+    """Evaluate one measurement from its input quantities."""
+    measurement, estimates = task.measurements[name], list[Estimate]()
+    for quantity in model.inputs:
+        estimate = known[quantity]
         if isinstance(estimate, FitError):
             prefix = f"{quantity.features[0]}: " if quantity.kind == "feature" else ""
-            return Measured(np.nan, np.nan, np.nan, False, f"{prefix}{estimate}")
+            return failed(name, measurement.unit, f"{prefix}{estimate}", points_given=given)
         estimates.append(estimate)
     value, uncertainty = evaluate(model.value, estimates) if propagated else (model.value(*estimates), math.nan)
     if not np.isfinite([value, uncertainty] if propagated else value).all():
         why = "an axis lies in a plane, or planes or axes that must intersect are parallel"
-        return Measured(np.nan, np.nan, np.nan, False, f"{measurement.kind} has no value: {why}")
+        return failed(name, measurement.unit, f"{measurement.kind} has no value: {why}", points_given=given)
     scale = np.rad2deg(1.0) if measurement.unit == "deg" else 1.0
     rows = None if model.deviations is None else scale * model.deviations(*estimates)
-    return Measured(value * scale, value * scale - measurement.nominal, uncertainty * scale, True, "", rows)
+    used = [fit.count for feature in task.fitted_for(name) if not isinstance(fit := fits.get(feature), FitError | None)]
+    return Result(
+        name,
+        measurement.unit,
+        value * scale,
+        uncertainty * scale,
+        "fit" if propagated else "none",
+        sum(used),
+        given,
+        measurement.nominal,
+        deviations=rows,
+    )
 
 
 def evaluate(

@@ -1,4 +1,4 @@
-"""Describe one measured number with its unit and uncertainty, and its repeatability over several clouds.
+"""Describe one measured number: its value with unit, uncertainty and nominal value, or the reason why there is none.
 
 Signal chain: measurements of several clouds -> grouped by name -> mean, standard deviation, and root mean square of the
 uncertainties.
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 #: effects that the standard uncertainty of a fit does not include
 NOT_INCLUDED = (
@@ -39,6 +40,8 @@ class Result:
     - ``points``: number of points used, of ``points_given`` in the window; 0 where no points were counted.
     - ``nominal``: nominal value in ``unit``, NaN if there is none.
     - ``bias`` that was subtracted, in ``unit``.
+    - ``deviations`` (k, m) from nominal of a value that folds, in ``unit``, part frame
+      (:mod:`characterisation.tasks.deviations`); None for any other.
     """
 
     name: str
@@ -51,6 +54,7 @@ class Result:
     nominal: float = math.nan
     bias: float = 0.0
     reason: str = ""
+    deviations: NDArray[np.float64] | None = None
 
     @property
     def possible(self) -> bool:
@@ -61,6 +65,11 @@ class Result:
     def error(self) -> float:
         """Value minus nominal, in ``unit``; NaN without either."""
         return self.value - self.nominal
+
+
+def failed(name: str, unit: str, reason: str, points: int = 0, points_given: int = 0) -> Result:
+    """Return the result of a measurement that was not possible, with its reason."""
+    return Result(name, unit, math.nan, points=points, points_given=points_given, reason=reason)
 
 
 @dataclass(frozen=True)
@@ -81,11 +90,6 @@ class Repeatability:
     deviation: float
     uncertainty: float
     nominal: float
-
-
-def failed(name: str, unit: str, reason: str, points: int = 0, points_given: int = 0) -> Result:
-    """Return the result of a measurement that was not possible, with its reason."""
-    return Result(name, unit, math.nan, points=points, points_given=points_given, reason=reason)
 
 
 def repeatability(clouds: Sequence[Sequence[Result]]) -> list[Repeatability]:

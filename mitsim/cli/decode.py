@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from mitsim.cli.options import OutCloud, check_file
+from mitsim.cli.options import OutCloud, check_file, print_reasons
 
 
 def decode(
@@ -82,5 +82,4 @@ def decode(
         say(range_warning(f"{capture}: a surface", beyond.depths, settings, whose, known))
     check_file(output)
     write_ply(cloud, output, written)
-    for reason, count in cloud.reasons().items():
-        print(f"{reason}\t{count}")
+    print_reasons(cloud)

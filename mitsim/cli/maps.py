@@ -29,6 +29,7 @@ from mitsim.cli.options import (
     check_folder,
     definitions,
     pose_of,
+    print_reasons,
     requested_workers,
     start,
 )
@@ -195,5 +196,4 @@ def predict(
     cloud = maps.predict(loaded, chosen, performance_map, pose, seed=seed, correlated=correlated, ask=asking(yes))
     check_file(output)
     write_cloud(cloud, output)
-    for reason, count in cloud.reasons().items():
-        print(f"{reason}\t{count}")
+    print_reasons(cloud)

@@ -131,7 +131,7 @@ def measure(
     if task is not None and scene is not None:
         start(variant)
         of_task = _task(task, scene, pose, view, correct, definitions(define))
-    reference = None if against is None else read_cloud(against, sensor)
+    reference = None if against is None else read_cloud(against, sensor, reference=True)
     paths = cloud_paths(clouds)
     whose: list[tuple[Path, str, str]] = []
     results: list[list[Result]] = []
@@ -139,6 +139,8 @@ def measure(
         if len(paths) > 1:
             say(f"{path} ({number + 1}/{len(paths)})")
         one = read_cloud(path, sensor)
+        if picture is not None and one.cloud.grid.height == 1:
+            raise InputError("--picture", "", f"{path}, a cloud without a grid", "a cloud with rows and columns")
         found, drawn = request.measure(one, reference)
         if of_task is not None:
             found += of_task(one)

@@ -29,6 +29,7 @@ from characterisation.tasks.windows import PairKind, Shape, WindowPlan, measure_
 from mitsim.decode.input_clouds import InputCloud
 from mitsim.decode.plate import Plate, image_on_grid, measure_plate
 from mitsim.report.measured_figures import difference_figure, distance_figure
+from mitsim.running.progress import track_if_long
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -101,10 +102,13 @@ class Request:
         """Return the difference (H, W) [mm] of a cloud from the reference, NaN outside the window."""
         cloud, other = given.cloud, reference.cloud
         rays = self.by == "rays" or (self.by == "auto" and same_grid(cloud.grid, other.grid))
-        values = difference_along_rays(cloud, other) if rays else difference_to_surface(cloud, other)
-        out = np.full(values.shape, np.nan)
         inside = window_slices(self.window, cloud, "difference")
-        out[inside] = values[inside]
+        out = np.full(cloud.status.shape, np.nan)
+        if rays:
+            out[inside] = difference_along_rays(cloud, other, inside)
+        else:
+            progress = partial(track_if_long, label="difference, blocks of points")
+            out[inside] = difference_to_surface(cloud, other, inside, progress)
         return out
 
     def _boxes(self) -> dict[str, Roi]:

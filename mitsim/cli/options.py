@@ -15,6 +15,7 @@ from characterisation.files.errors import InputError
 from mitsim.cli.folder_lock import lock_folder, remove_partial_beside
 
 if TYPE_CHECKING:
+    from characterisation.point_cloud import PointCloud
     from mitsim.running.executor import Executor
 
 Out = Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")]
@@ -43,7 +44,10 @@ Processes = Annotated[
 ]
 Clouds = Annotated[
     list[Path],
-    typer.Argument(metavar="CLOUD...", help="Point clouds, capture folders (decoded first), or folders of either."),
+    typer.Argument(
+        metavar="CLOUD...",
+        help="Point clouds (.ply, .pcd, .npy, .mat, .xyz), capture folders (decoded first), or folders of either.",
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")]
 DecodedAs = Annotated[str | None, typer.Option(help="Decode captures with the settings of this sensor.")]
@@ -72,6 +76,14 @@ def asking(yes: bool, others: str = "") -> Callable[[str], bool] | None:
         return answers[0]
 
     return ask
+
+
+def print_reasons(cloud: PointCloud) -> None:
+    """Print how many pixels of a cloud are valid, and how many have no point for each reason."""
+    if not cloud.valid.any():
+        print(f"valid\t0 of {cloud.status.size}")
+    for reason, count in cloud.reasons().items():
+        print(f"{reason}\t{count}")
 
 
 class Group(TyperGroup):

@@ -96,10 +96,11 @@ def check(
 
 
 def part(
-    file: Annotated[Path, typer.Argument(help="STEP file, or a mesh: STL, OBJ, PLY or glTF.")],
+    file: Annotated[Path, typer.Argument(help="STEP file, or a mesh: STL, OBJ, PLY, OFF, 3MF or glTF.")],
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Scene folder to write.")] = None,
     units: Annotated[
-        str | None, typer.Option(help="Unit of a file that does not state it: mm, m or inch; default mm.")
+        str | None,
+        typer.Option(help="Unit of a file that does not state it: mm, m or inch; default: that of the file, else mm."),
     ] = None,
     metal: Annotated[str | None, typer.Option(help="Metal of all faces; default aluminium.")] = None,
     process: Annotated[str | None, typer.Option(help="Machining process of all faces; default ground.")] = None,
@@ -124,7 +125,7 @@ def part(
     ] = 20.0,
     sensor: Annotated[
         str | None,
-        typer.Option(help="For a STEP file: mesh it to 1/100 of the noise sigma of this sensor (preset or TOML file)."),
+        typer.Option(help="For a STEP file: mesh it as finely as this sensor resolves (preset or TOML file)."),
     ] = None,
     chord: Annotated[
         float | None, typer.Option(help="For a STEP file: chord error of the mesh [mm]; default 0.01.")
@@ -147,9 +148,9 @@ def part(
     """
     from characterisation.files.errors import InputError
     from mitsim.running.progress import say
-    from mitsim.scene.authoring.fineness import chord_for
+    from mitsim.scene.authoring.fineness import fineness_for
     from mitsim.scene.authoring.part_folder import Finishing, described, write_part
-    from mitsim.scene.authoring.read_step import CHORD_MM
+    from mitsim.scene.authoring.read_step import Fineness
 
     if edit and file.suffix.lower() == ".xml":
         _edit(file, sensor, port)
@@ -158,7 +159,7 @@ def part(
         raise InputError("--output", "", "nothing", "a folder to write: -o scenes/NAME")
     if sensor is not None and chord is not None:
         raise InputError("--chord", "", f"{chord:g} together with --sensor", "one of the two")
-    fine = chord if chord is not None else chord_for(sensor) if sensor else CHORD_MM
+    fine = fineness_for(sensor) if sensor else Fineness() if chord is None else Fineness(chord)
     if finish is not None:
         for option, given in (("--metal", metal), ("--process", process), ("--Ra", roughness)):
             if given is not None:

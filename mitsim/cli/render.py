@@ -107,6 +107,7 @@ def render(
     from mitsim.capture.simulated.truth import encode_exr, true_image
     from mitsim.decode import captures as interface
     from mitsim.running.progress import say
+    from mitsim.scene.first_hits import sees_nothing
     from mitsim.scene.surface.scatter import Deviation
     from mitsim.sensor.noise_sources import Noise
     from mitsim.study.many_captures import Job, digest_of, origin_of
@@ -128,7 +129,7 @@ def render(
         depth,
         Noise.parse(noise),
         truth,
-        origin_of(scene, chosen),
+        origin_of(scene, chosen, definitions(define)),
     ).digest()
     remove_partial_beside(output)
     if digest_of(output, "render") == digest:
@@ -141,6 +142,12 @@ def render(
     first = next(iter(chosen.rig.cameras))
     residual = render_residual(simulated, loaded, pose, first, Rendering(samples, depth), seed=seed)
     capture.settings["render_residual"] = asdict(residual) if isfinite(residual.noise) else None
+    blind = [name if name == "projector" else f"camera {name}" for name in sees_nothing(loaded, chosen.rig, pose)]
+    unseen = (
+        [f"no pixel of the {', '.join(blind)} shows the part: check --position, --target and --roll"] if blind else []
+    )
+    if unseen:
+        capture.settings["warnings"] = [*capture.settings.get("warnings", []), *unseen]
     capture.settings["deviation"] = asdict(moved)
     capture.settings["render"] = {"digest": digest}
     known = {}
@@ -154,6 +161,8 @@ def render(
         finishes = [one for one in loaded.finishes if one and one.scatter]
         for source in dict.fromkeys(f"{one}: {one.scatter.provenance}" for one in finishes if one.scatter):
             say(source)
+    for warning in unseen:
+        say(f"warning: {warning}")
     say(f"{residual}" + (f"; over {LIMIT}: increase --samples" if residual.worst > LIMIT else ""))
     say(f"capture: {output}")
 

@@ -69,12 +69,12 @@ def run(
     start(variant)
     from mitsim.report.page import write_report
     from mitsim.running.progress import say
-    from mitsim.study import read_study, report_lays, with_plan
+    from mitsim.study import open_study, report_lays, with_plan
     from mitsim.study.run import run_study
     from mitsim.study.run_folder import read_run
 
     check_folder(output)
-    chosen = with_plan(read_study(study, ask=asking(yes)), plan)
+    chosen = with_plan(open_study(study, ask=asking(yes)), plan)
     keep_finished(output, overwrite, "run.json")
     report_lays(chosen)
     stated = run_study(chosen, output, minutes, requested_workers(scheduler, processes))
@@ -169,13 +169,16 @@ def budget(
     Example: mitsim budget scenes/two_pillars/study.toml --view 12 -o runs/view_12
     """
     start(variant)
-    from mitsim.study import with_plan
-    from mitsim.study.programs import open_study, stated_view, study_view
+    from mitsim.study import open_study, with_plan
+    from mitsim.study.session import Session
     from mitsim.study.virtual.stated import write_statement
 
     check_folder(output)
     chosen = with_plan(open_study(study, ask=asking(yes)), plan)
-    stated = stated_view(chosen, study_view(chosen, view, "--view"), output, requested_workers(scheduler, processes))
+    seen_from = chosen.view(view, "--view")
+    session = Session(chosen, output, requested_workers(scheduler, processes))
+    session.claim(f"budget of view {view}")
+    stated = session.state(seen_from)
     write_statement(output / "statement.json", stated.document)
     _tell_statement(stated.statements, output)
 
@@ -212,7 +215,7 @@ def exposures(
 
     from characterisation.files.atomic_io import write_json
     from mitsim.running.progress import say
-    from mitsim.study import ExposureTable, read_study
+    from mitsim.study import ExposureTable, open_study
     from mitsim.study.exposures.exposure_plan import PlanRules
     from mitsim.study.exposures.planned import (
         plan_document,
@@ -222,17 +225,14 @@ def exposures(
         rendered,
         write_plan_csv,
     )
-    from mitsim.study.programs import study_view
-    from mitsim.study.virtual.plan import measurements_of
-    from mitsim.study.virtual.study_unknowns import study_unknowns
+    from mitsim.study.session import Session
 
     check_folder(output)
-    chosen = read_study(study, mapped=False)  # the view is rendered
-    shown = study_view(chosen, view, "--view")
+    chosen = open_study(study, mapped=False)  # the view is rendered
+    shown = chosen.view(view, "--view")
     table = chosen.file.exposure or ExposureTable()
     rules = PlanRules(most or table.most, within or table.within)
-    renderer = rendered(chosen, measurements_of(chosen, study_unknowns(chosen)))
-    plan = plan_view(chosen, renderer, shown, rules)
+    plan = plan_view(rendered(Session(chosen).measurements), shown, rules)
     document = plan_document(chosen, plan)
     write_json(output / "exposures.json", document)
     write_plan_csv(output / "exposures.csv", plan)
@@ -282,27 +282,21 @@ def score(
     Example: mitsim score scenes/two_pillars/study.toml -o runs/scores
     """
     start(variant)
-    from mitsim.decode.cloud import sensor_geometry
-    from mitsim.maps.campaign.plan import sensor_checksum
-    from mitsim.maps.prediction import Predictor
     from mitsim.report.best_views import best_views
     from mitsim.running.progress import say
-    from mitsim.study import read_study, report_lays
-    from mitsim.study.run import claim
+    from mitsim.study import open_study, report_lays
     from mitsim.study.scoring import score_study
-    from mitsim.study.virtual.study_digest import study_digest, with_scene_files
+    from mitsim.study.session import Session
 
     check_folder(output)
-    chosen = read_study(study, map_file, asking(yes))
+    chosen = open_study(study, performance_map=map_file, ask=asking(yes))
     report_lays(chosen)
     for name in measurement or ():
         if name not in chosen.task.measurements:
             raise InputError("--measurement", "", name, ", ".join(chosen.task.measurements))
-    assert chosen.performance_map is not None
-    claim(output, "score", study_digest(chosen, with_scene_files(sensor_checksum(chosen.sensor), chosen)))
-    geometry = sensor_geometry(chosen.sensor)
-    predictor = Predictor.of_sensor(chosen.sensor, geometry)
-    scores, *_ = score_study(chosen, predictor, chosen.performance_map, output)
+    session = Session(chosen, output)
+    session.claim("score")
+    scores, *_ = score_study(session)
     for name in measurement or chosen.task.measurements:
         print(best_views(scores, name, top))
     say(f"scores: {output / 'scores.csv'}\nposes: {output / 'poses'}")

@@ -1,7 +1,8 @@
 """Read the clouds to measure, from cloud files, capture folders and recordings.
 
 Signal chain: path -> cloud file of ``mitsim decode``; or capture folder, decoded; or recording that ``mitsim import``
-reads without options, decoded -> cloud, and its capture if there is one.
+reads without options, decoded; or points without a camera (:mod:`mitsim.decode.plain_clouds`) -> cloud, and its
+capture if there is one.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from mitsim.capture.folder import read_capture
 from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 from mitsim.decode.cloud import Settings, capture_cloud, decoder_settings
 from mitsim.decode.noise import known_noise
+from mitsim.decode.plain_clouds import is_plain, read_plain_cloud
+from mitsim.running.progress import say
 from mitsim.sensor.matcher import MatcherSettings
 
 #: suffixes of cloud files that are found in a folder
@@ -63,10 +66,11 @@ def cloud_paths(paths: Iterable[Path]) -> list[Path]:
     return out
 
 
-def read_cloud(path: Path, sensor: str | None = None) -> InputCloud:
+def read_cloud(path: Path, sensor: str | None = None, reference: bool = False) -> InputCloud:
     """Read a cloud file, or decode a capture folder or recording.
 
-    ``sensor`` is the preset or sensor file whose settings decode it; by default, those of the capture.
+    ``sensor`` is the preset or sensor file whose settings decode it; by default, those of the capture. The points of a
+    ``reference`` may lie anywhere; those of another cloud with a grid lie on the view rays of its camera.
 
     Raises
     ------
@@ -75,17 +79,33 @@ def read_cloud(path: Path, sensor: str | None = None) -> InputCloud:
     """
     if path.is_file() and _is_mitsim_ply(path):
         return InputCloud(path, read_ply(path), None)
+    if is_plain(path):
+        return _plain(path)
     if (path / "capture.json").exists():
         capture = read_capture(path)
     elif path.exists():
-        capture = read_recording(path, ReadOptions()).capture
+        try:
+            capture = read_recording(path, ReadOptions()).capture
+        except InputError:
+            if not reference or path.suffix.lower() not in _SUFFIXES:
+                raise
+            return _plain(path)
     else:
         raise InputError(
-            path, "", "no such file or folder", "a cloud (.ply, .pcd), a capture folder, or folders of these"
+            path,
+            "",
+            "no such file or folder",
+            "a cloud (.ply, .pcd, .npy, .mat, .xyz), a capture folder, or folders of these",
         )
     settings, imager = decoder_settings(capture, sensor)
     cloud = capture_cloud(capture, settings, imager=known_noise(capture, imager))
     return InputCloud(path, cloud, capture, margin_of(settings))
+
+
+def _plain(path: Path) -> InputCloud:
+    cloud, about = read_plain_cloud(path)
+    say(about)
+    return InputCloud(path, cloud, None)
 
 
 def margin_of(settings: Settings) -> int:

@@ -4,7 +4,7 @@ const data = JSON.parse(document.getElementById('author-data').textContent);
 const scene = new DOMParser().parseFromString(data.xml, 'application/xml');
 const shapeNodes = new Map([...scene.querySelectorAll('scene > shape[id]')].map((node) => [node.getAttribute('id'), node]));
 const defaults = new Map([...scene.querySelectorAll('scene > default')].map((node) => [node.getAttribute('name'), node.getAttribute('value')]));
-const NAME = /^[A-Za-z][A-Za-z0-9_-]{0,79}$/;
+const NAME = /^\p{L}[\p{L}\p{M}\p{N}_-]{0,79}$/u;
 
 const child = (node, name) => [...node.children].find((one) => one.getAttribute('name') === name);
 const written = (node, name) => child(node, name)?.getAttribute('value') ?? '';

@@ -220,7 +220,7 @@ function facePanel() {
         input.value = face.name;
       } else touched();
     }, { id: 'author-name', disabled: !face.node })));
-    parts.push(element('p', { class: 'quiet' }, `${kind ?? 'not measurable: neither plane, cylinder, cone nor sphere'}; box around it ${size} mm, area ${short(face.area)} mm²`));
+    parts.push(element('p', { class: 'quiet' }, `${kind ?? 'not measurable: neither plane, cylinder, cone nor sphere'}; box around it ${size} mm, area ${face.area === null ? 'not known' : `${short(face.area)} mm²`}`));
   } else parts.push(element('p', {}, `${those.length} faces: ${those.map((each) => each.name).join(', ')}`));
   const same = those.every((each) => each.finish === face.finish) ? face.finish : '';
   const options = [...(same ? [] : [['', '(several, or unnamed)']]), ...finishOptions(), ['+', 'a new finish']];
@@ -398,7 +398,7 @@ function download(name, text) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 }
 
-async function save() {
+async function save(last) {
   const texts = fileTexts();
   if (!data.served) {
     Object.entries(texts).forEach(([what, text]) => download(FILE_NAMES[what], text));
@@ -407,7 +407,7 @@ async function save() {
   }
   say('Saving and checking the scene...');
   try {
-    const answer = await fetch(`${location.pathname}save`, { method: 'POST', body: JSON.stringify({ files: texts }) });
+    const answer = await fetch(`${location.pathname}save`, { method: 'POST', body: JSON.stringify({ files: texts, done: last }) });
     const found = await answer.json();
     if (!answer.ok) return say(`Not saved: ${found.fault}`, true);
     data.findings = found.findings;
@@ -419,11 +419,12 @@ async function save() {
   }
 }
 
-place('save').addEventListener('click', save);
+place('save').addEventListener('click', () => save(false));
 place('done')?.addEventListener('click', async () => {
-  if (state.dirty) await save();
+  // a page that is closed while the command checks the scene cannot send another request
+  if (state.dirty) await save(true);
+  else await fetch(`${location.pathname}done`, { method: 'POST', body: '{}' }).catch(() => {});
   if (state.dirty) return;
-  await fetch(`${location.pathname}done`, { method: 'POST', body: '{}' }).catch(() => {});
   say('Done. This page can be closed.');
 });
 addEventListener('beforeunload', (event) => { if (state.dirty) event.preventDefault(); });

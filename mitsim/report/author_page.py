@@ -11,7 +11,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -119,7 +119,7 @@ def page_data(about: Authored, served: str) -> dict[str, Any]:
         "colours": COLOURS,
         "served": served,
         "findings": findings_data(about.found),
-        "solid": solid(about.scene),
+        "solid": solid(about.scene, {one.name for one in about.facts.shapes if np.isnan(one.area)}),
     }
 
 
@@ -152,11 +152,11 @@ def characterised(sensor: str) -> dict[str, list[float]] | None:
     return {name: [] if np.isnan(ends).any() else ends for name, ends in out.items()}
 
 
-def solid(scene: Scene) -> dict[str, Any]:
+def solid(scene: Scene, without_area: Collection[str] = ()) -> dict[str, Any]:
     """Return all faces for the canvas: base64 of ``vertices`` and ``normals`` (planes x, y, z), ``triangles`` (uint32).
 
     ``faces`` holds for each shape its name, its number of triangles, a point on the surface near its centre, its size
-    [mm] and its area.
+    [mm] and its area; null for the shapes ``without_area``, which are drawn as their bounding boxes.
     """
     there = triangles_by_shape(scene)
     every = [there.get(name, np.empty((0, 3, 3))) for name in scene.names]
@@ -169,7 +169,8 @@ def solid(scene: Scene) -> dict[str, Any]:
         normals.append(np.asarray(mesh.vertex_normals))
         triangles.append(np.asarray(mesh.faces) + start)
         start += len(mesh.vertices)
-        faces.append({"name": name, "triangles": len(mesh.faces)} | _measures(corners))
+        unknown = {"area": None} if name in without_area else {}
+        faces.append({"name": name, "triangles": len(mesh.faces)} | _measures(corners) | unknown)
     steps, planes = _planes(vertices), _planes(normals)
     return {
         "box": {"origin": box.origin.tolist(), "step": box.step},

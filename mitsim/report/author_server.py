@@ -24,6 +24,9 @@ from mitsim.scene.authoring.check import read_features
 
 _LARGEST = 64 * 1024**2
 
+#: longest time that a connection may stay silent, since connections are answered one after another [s]
+_SECONDS = 10.0
+
 #: returns the page for a token
 Page = Callable[[str], str]
 Check = Callable[[], list[dict[str, str]]]
@@ -38,6 +41,8 @@ class AuthorServer:
         owner = self
 
         class Handler(BaseHTTPRequestHandler):
+            timeout = _SECONDS
+
             def do_GET(self) -> None:
                 if self._allowed(""):
                     self._answer(200, owner.page(owner.token), "text/html")
@@ -67,13 +72,16 @@ class AuthorServer:
 
             def _answer(self, code: int, text: str, kind: str) -> None:
                 data = text.encode()
-                self.send_response(code)
-                self.send_header("Content-Type", f"{kind}; charset=utf-8")
-                self.send_header("Content-Length", str(len(data)))
-                self.send_header("Cache-Control", "no-store")
-                self.send_header("Referrer-Policy", "no-referrer")
-                self.end_headers()
-                self.wfile.write(data)
+                try:
+                    self.send_response(code)
+                    self.send_header("Content-Type", f"{kind}; charset=utf-8")
+                    self.send_header("Content-Length", str(len(data)))
+                    self.send_header("Cache-Control", "no-store")
+                    self.send_header("Referrer-Policy", "no-referrer")
+                    self.end_headers()
+                    self.wfile.write(data)
+                except OSError:  # the page was closed, or its program hangs
+                    self.close_connection = True
 
             def log_message(self, *_: Any) -> None:
                 pass
@@ -91,9 +99,13 @@ class AuthorServer:
             self._server.server_close()
 
     def save(self, body: bytes) -> tuple[int, dict[str, Any]]:
-        """Check and write the files of a page; return the HTTP status with the findings, or with the fault."""
+        """Check and write the files of a page; return the HTTP status with the findings, or with the fault.
+
+        The user has finished if the request says ``done`` and its files are written.
+        """
         try:
-            sent = json.loads(body)["files"]
+            request = json.loads(body)
+            sent = request["files"]
             texts = {self.names[key]: str(text) for key, text in sent.items() if key in self.names}
         except (ValueError, TypeError, KeyError, AttributeError):
             return 400, {"fault": "the request does not hold the files of this page"}
@@ -112,6 +124,7 @@ class AuthorServer:
                 _restore(self.folder / name, data)
             return 422, {"fault": str(error)}
         self.saved += 1
+        self.done = request.get("done") is True
         return 200, {"findings": found, "written": sorted(texts)}
 
     def _check_texts(self, texts: dict[str, str]) -> None:

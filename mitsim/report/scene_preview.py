@@ -85,7 +85,8 @@ def _colours(facts: SceneFacts, first: Sequence[str]) -> list[str]:
     """Return one colour for each shape, in the order of the scene."""
     shapes = facts.shapes
     order = sorted(
-        range(len(shapes)), key=lambda i: (shapes[i].emitter, shapes[i].name not in first, -shapes[i].area, i)
+        range(len(shapes)),
+        key=lambda i: (shapes[i].emitter, shapes[i].name not in first, -np.nan_to_num(shapes[i].area), i),
     )
     coloured = order if len(order) <= len(COLOURS) else order[: len(COLOURS)]
     own = dict(zip(coloured, COLOURS, strict=False))

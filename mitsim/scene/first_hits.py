@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import vectors_to_device, vectors_to_host
 from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.raycast import PixelRays, cast
-from mitsim.sensor.camera import Rig
+from mitsim.scene.ray_casting.raycast import PixelRays, cast, shapes_met
+from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
@@ -53,7 +53,7 @@ class Hits:
     Attributes
     ----------
     shape
-        (n,) index of the shape; -1 for none.
+        (n,) index of the shape, of the instance for a shape in a group; -1 for none.
     front
         (n,) whether the ray meets the reflecting side.
     normal
@@ -80,7 +80,8 @@ def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.fl
     two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
     front = ~behind | two_sided
     normal = dr.select(behind, -surface.n, surface.n)
-    shape_id_of_ray = dr.select(surface.is_valid(), dr.reinterpret_array(mi.UInt32, surface.shape), 0)
+    inside, instance = (dr.reinterpret_array(mi.UInt32, one) for one in (surface.shape, surface.instance))
+    shape_id_of_ray = dr.select(surface.is_valid(), dr.select(instance != 0, instance, inside), 0)
     distance = dr.select(surface.is_valid(), surface.t, dr.nan)
     dr.eval(front, normal, shape_id_of_ray, distance)
     ids = np.array(shape_id_of_ray)
@@ -93,6 +94,13 @@ def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.fl
     shape = lookup[ids]
     vectors = np.where((shape >= 0)[:, None], vectors_to_host(normal, float), np.nan)
     return Hits(shape, np.array(front, bool) & (shape >= 0), vectors, np.array(distance, float))
+
+
+def sees_nothing(scene: Scene, rig: Rig, world_from_sensor: Transform) -> list[str]:
+    """Return the names of the cameras, and ``projector``, in whose images no pixel shows the scene."""
+    eyes: dict[str, Camera] = rig.cameras | ({"projector": rig.projector} if rig.projector else {})
+    seen = {name: shapes_met(scene, PixelRays.of_camera(eye), world_from_sensor) for name, eye in eyes.items()}
+    return [name for name, shape in seen.items() if not (shape >= 0).any()]
 
 
 def visible_surfaces(scene: Scene, rig: Rig, world_from_sensor: Transform) -> VisibleSurfaces:

@@ -54,7 +54,7 @@ class ShapeFacts:
     lay
         Direction of the machining marks.
     area
-        Surface area [mm^2].
+        Surface area [mm^2]; NaN if Mitsuba does not compute it, as for an instance or a curve.
     bounds
         (2, 3) corners of the bounding box [mm], world frame.
     delta
@@ -151,7 +151,7 @@ def _facts(
         alpha_factor=factor,
         provenance=provenance,
         lay=lay,
-        area=float(np.ravel(shape.surface_area())[0]),
+        area=_area(shape),
         bounds=bounds_of(shape),
         delta=bool(flags & int(mi.BSDFFlags.Delta)) and not flags & smooth,
         two_sided=bool(flags & int(mi.BSDFFlags.BackSide)),
@@ -180,6 +180,14 @@ def _roughness(finish: Finish | None, bsdf: Any) -> tuple[tuple[float, float], f
     if not alphas:
         return (np.nan, np.nan), np.nan, "", "none"
     return (alphas[0], alphas[min(1, len(alphas) - 1)]), np.nan, "written in the scene", "none"
+
+
+def _area(shape: Any) -> float:
+    """Return the area of a shape [mm^2]; NaN if Mitsuba does not compute it."""
+    try:
+        return float(np.ravel(shape.surface_area())[0])
+    except RuntimeError:
+        return float("nan")
 
 
 def _points_on(shape: Any) -> tuple[Floats, Floats]:
@@ -268,7 +276,7 @@ def _emitters(scene: Scene) -> tuple[tuple[str, float], ...]:
     for shape in scene.shapes:
         if shape.is_emitter():
             radiance = _value(shape.emitter(), "radiance.value")
-            out.append(("area", np.pi * radiance * float(np.ravel(shape.surface_area())[0])))
+            out.append(("area", np.pi * radiance * _area(shape)))
     for emitter in scene.mitsuba.emitters():
         if not emitter.flags() & int(mi.EmitterFlags.Surface):
             out.append((emitter.class_name(), 4 * np.pi * _value(emitter, "intensity.value")))
@@ -292,5 +300,7 @@ def _types_in_xml(path: Path) -> dict[str, tuple[str, str]]:
         own = shape.find("bsdf")
         references = [types[str(r.get("id"))] for r in shape.iter("ref") if r.get("id") in types]
         bsdf = str(own.get("type")) if own is not None else references[0] if references else "diffuse (Mitsuba's own)"
+        if shape.get("type") == "instance":
+            bsdf = "as in its group"
         out[str(shape.get("id"))] = (str(shape.get("type")), bsdf)
     return out

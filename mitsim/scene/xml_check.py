@@ -1,4 +1,4 @@
-"""Check a scene XML before Mitsuba parses it, because some content ends the process or stops it.
+"""Check a scene XML before Mitsuba parses it, because some content ends the process or stops it; list its files.
 
 Mitsuba crashes on nesting thousands deep and on bitmaps without a file. BSDFs nested in BSDFs take minutes, and reading
 a pipe waits forever.
@@ -6,13 +6,15 @@ a pipe waits forever.
 
 from __future__ import annotations
 
+import hashlib
 import re
 import stat
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from characterisation.files.checked_files import read_bounded
+from characterisation.files.checked_files import is_file, read_bounded
 from characterisation.files.errors import InputError, nearest
 
 #: limits of one XML: size [bytes], number of elements, depth of nested elements and of nested BSDFs
@@ -20,6 +22,9 @@ LARGEST_XML, MOST_ELEMENTS, DEEPEST, DEEPEST_BSDF = 16 * 1024**2, 200_000, 40, 6
 
 #: largest file that a scene may refer to [bytes]
 LARGEST_NAMED_FILE = 1024**3
+
+#: longest name of a file that a scene may refer to [characters]; PATH_MAX of Linux
+LARGEST_NAME = 4096
 
 #: plugins that read a file; not all of them check that it exists
 _FILE_PLUGINS = {"bitmap", "envmap", "gridvolume", "measured", "ply", "obj", "serialized"}
@@ -30,16 +35,66 @@ _MOST_INCLUDES = 16
 _ENCODING = re.compile(rb"""^[^>]*?encoding\s*=\s*["']([^"']*)["']""")
 
 
-def checked_xml(path: Path, include_depth: int = 0) -> ElementTree.Element:
+def checked_xml(path: Path) -> ElementTree.Element:
     """Read a scene XML and its includes, reject what Mitsuba cannot handle, and return the root element.
-
-    ``include_depth`` is the number of includes that lead to this file.
 
     Raises
     ------
     InputError
         If a file is missing, does not parse, is not UTF-8, or is too large or too deeply nested. Also if it refers to
         something that is not a regular file.
+    """
+    return _with_includes(path)[0][1]
+
+
+def scene_files(path: Path, parameters: Mapping[str, str]) -> list[Path]:
+    """Return every file that determines a scene: its XML first, then includes, meshes, textures and spectra.
+
+    ``parameters`` replace the values of ``<default>`` elements. Names are relative to the folder of the scene or to a
+    ``<path>`` of it, else to the working folder, as for Mitsuba. A missing file is left out, since Mitsuba reports it.
+
+    Raises
+    ------
+    InputError
+        As :func:`checked_xml`.
+    """
+    trees = _with_includes(path)
+    elements = [element for _, root in trees for element in root.iter()]
+    values = {str(e.get("name")): str(e.get("value")) for e in elements if e.tag == "default"} | dict(parameters)
+    folders = [path.parent]
+    folders += [path.parent / _filled_in(str(e.get("value")), values) for e in elements if e.tag == "path"]
+    found = dict.fromkeys(file for file, _ in trees)
+    for element in elements:
+        name = _filled_in(str(element.get("value" if element.tag == "string" else "filename", "")), values)
+        beside = [folder / name for folder in folders if name and is_file(folder / name)]
+        found |= dict.fromkeys(beside or ([Path(name)] if is_file(name) else []))
+    return list(found)
+
+
+def named_digests(path: Path, parameters: Mapping[str, str]) -> list[str]:
+    """Return the SHA-256 of every file that a scene names (:func:`scene_files`), without the XML itself.
+
+    A mesh may change while the text of the scene stays the same.
+    """
+    digests = []
+    for file in scene_files(path, parameters)[1:]:
+        with file.open("rb") as stream:
+            digests.append(hashlib.file_digest(stream, "sha256").hexdigest())
+    return digests
+
+
+def _filled_in(text: str, values: Mapping[str, str]) -> str:
+    """Return an attribute with the values of its parameters, each written as ``$name``."""
+    for _ in range(_MOST_INCLUDES if "$" in text else 0):  # a value may name another parameter
+        for name in sorted(values, key=len, reverse=True):
+            text = text.replace(f"${name}", values[name])[:LARGEST_NAME]
+    return text
+
+
+def _with_includes(path: Path, include_depth: int = 0) -> list[tuple[Path, ElementTree.Element]]:
+    """Return path and checked root element of a scene XML, then those of its includes.
+
+    ``include_depth`` is the number of includes that lead to this file.
     """
     xml_files = _xml_files_beside(path)
     data = read_bounded(path, "a Mitsuba scene XML", nearest(path.name, xml_files), LARGEST_XML)
@@ -56,6 +111,7 @@ def checked_xml(path: Path, include_depth: int = 0) -> ElementTree.Element:
     if "\0" in text:
         raise InputError(path, "", "a null character", "text")
     root = _parsed(path, text)
+    trees = [(path, root)]
     bsdfs: dict[ElementTree.Element, int] = {}
     for parent in root.iter():
         for child in parent:
@@ -73,8 +129,8 @@ def checked_xml(path: Path, include_depth: int = 0) -> ElementTree.Element:
         if element.tag == "include":
             if include_depth >= _MOST_INCLUDES:
                 raise InputError(path, "include", f"files that include one another over {_MOST_INCLUDES} deep", "fewer")
-            checked_xml(path.parent / str(element.get("filename")), include_depth + 1)
-    return root
+            trees += _with_includes(path.parent / str(element.get("filename")), include_depth + 1)
+    return trees
 
 
 def _parsed(path: Path, text: str) -> ElementTree.Element:

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -34,6 +33,7 @@ from mitsim.running.version import __version__
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.scene.surface.scatter import Deviation
+from mitsim.scene.xml_check import named_digests
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
@@ -136,12 +136,11 @@ def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, common: Commo
     """
     file = read_toml(plan, ManyFile)
     jobs: list[Job] = []
-    origin = ""
     for index, finish in enumerate(file.finishes):
         parameters = common.parameters | {name: str(value) for name, value in finish.parameters.items()}
         deviation = Deviation.parse(finish.deviation or common.deviation, f"{plan}: finishes.{finish.name}")
         loaded = load_scene(scene, sensor.wavelength_nm, parameters, deviation)
-        origin = origin or origin_of(Path(scene), sensor)
+        origin = origin_of(Path(scene), sensor, parameters)
         radius = float(np.linalg.norm(loaded.bounds[1] - loaded.bounds[0])) / 2
         standoffs = chosen_standoffs(plan, file.views, sensor, radius)
         found = candidate_views(file.views, sensor, standoffs, loaded.centre, triangles(loaded), where=plan)
@@ -255,12 +254,10 @@ def _scene(path: str, wavelength_nm: float, parameters: tuple[tuple[str, str], .
     return load_scene(path, wavelength_nm, dict(parameters), deviation)
 
 
-def origin_of(scene: Path, sensor: Sensor) -> str:
-    """Return the digest of a sensor, of a scene's XML, and of the files next to it that its values name."""
-    text = scene.read_bytes()
-    named = {match.decode("utf-8", "replace") for match in re.findall(rb'value="([^"]+)"', text)}
-    files = sorted(path for name in named if (path := scene.parent / name).is_file())
-    parts = [sensor_checksum(sensor).encode(), text, *(path.read_bytes() for path in files)]
+def origin_of(scene: Path, sensor: Sensor, parameters: Mapping[str, str]) -> str:
+    """Return the digest of a sensor, of a scene's XML, and of the files that the scene names with its parameters."""
+    parts = [sensor_checksum(sensor).encode(), scene.read_bytes()]
+    parts += [digest.encode() for digest in named_digests(scene, parameters)]
     return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()
 
 

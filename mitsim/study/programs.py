@@ -1,78 +1,17 @@
-"""Open studies, score the views of a part with a map, and state the uncertainty of one view by virtual measurements."""
+"""Score the views of a part with a map, and state the uncertainty of one view by virtual measurements."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import xarray as xr
 
 from characterisation.files.errors import InputError
 from characterisation.statements.statement import Statement
-from mitsim.decode.cloud import sensor_geometry
-from mitsim.maps.prediction import Predictor
-from mitsim.running.executor import Executor
-from mitsim.study import StatementTable, Study, read_study
-from mitsim.study.exposures.planned import exposed_for
-from mitsim.study.run import claim
-from mitsim.study.virtual.plan import measurements_of, trial_digest
-from mitsim.study.virtual.screening import screen
-from mitsim.study.virtual.spread_out import spread_over
-from mitsim.study.virtual.stated import state_view, statement_document
-from mitsim.study.virtual.study_digest import study_digest, with_scene_files
-from mitsim.study.virtual.study_unknowns import study_unknowns
-from mitsim.study.virtual.trials import TrialFolder
-from mitsim.views import View
-
-
-@dataclass(frozen=True)
-class StatedView:
-    """Statements of every measurement from one view, and the ``document`` of ``statement.json``."""
-
-    statements: list[Statement]
-    document: dict[str, Any]
-
-
-def open_study(
-    path: str | Path, *, performance_map: str | Path | None = None, ask: Callable[[str], bool] | None = None
-) -> Study:
-    """Open a study TOML file with everything it names: part, task, sensor, map and candidate views.
-
-    Parameters
-    ----------
-    path
-        The file; the reference of file formats lists its keys.
-    performance_map
-        A ``map.nc``, or a sensor whose map is shipped with mitsim, instead of the study's own. ``""`` selects the
-        study's own map, or that of its sensor if the study names a campaign.
-    ask
-        Called with a question if the map lacks a finish of the part; if it returns True, the finish is characterised
-        immediately.
-
-    Returns
-    -------
-    Study
-        ``views``, each with its ``number``, ``world_from_sensor`` and ``standoff`` [mm]; ``scene``, ``task``,
-        ``sensor`` and ``performance_map``.
-
-    Raises
-    ------
-    InputError
-        For anything that would stop the study later.
-
-    Examples
-    --------
-    >>> import mitsim as ms
-    >>> study = ms.open_study("study.toml")
-    >>> study.sensor.name, list(study.task.measurements)[:2]
-    ('ensenso-n10', ['point1_point2_distance', 'plane_pillar1_angle'])
-    >>> study.views[0].number
-    0
-    """
-    return read_study(path, None if performance_map is None else str(performance_map), ask)
+from mitsim.study import StatementTable, Study
+from mitsim.study.session import Session
 
 
 def score(study: Study) -> xr.Dataset:
@@ -81,7 +20,7 @@ def score(study: Study) -> xr.Dataset:
     Parameters
     ----------
     study
-        From :func:`open_study`.
+        From :func:`mitsim.open_study`.
 
     Returns
     -------
@@ -125,8 +64,7 @@ def score(study: Study) -> xr.Dataset:
             "a performance map",
             "open the study with performance_map=''",
         )
-    predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
-    return screen(study, predictor, study.performance_map)[0]
+    return Session(study).screen()[0]
 
 
 def statement(
@@ -140,7 +78,7 @@ def statement(
     Parameters
     ----------
     study
-        From :func:`open_study`.
+        From :func:`mitsim.open_study`.
     view
         Number of the view.
     trials
@@ -178,44 +116,11 @@ def statement(
     table = StatementTable(
         trials=_checked("trials", most, 2), pairs=_checked("pairs", own.pairs if pairs is None else pairs, 0)
     )
-    if folder is not None:
-        return stated_view(study, study_view(study, view, "statement: view"), Path(folder), table=table).statements
-    with TemporaryDirectory() as place:
-        return stated_view(study, study_view(study, view, "statement: view"), Path(place), table=table).statements
-
-
-def stated_view(
-    study: Study, view: View, folder: Path, workers: Executor | None = None, table: StatementTable | None = None
-) -> StatedView:
-    """State one view, with its trials kept in ``folder``, as ``mitsim budget`` does.
-
-    ``workers`` run the trials; without them, this process does. ``table`` replaces the study's own numbers.
-    """
-    unknowns = study_unknowns(study)
-    virtual_measurements = measurements_of(study, unknowns)
-    digest = with_scene_files(trial_digest(study, unknowns, virtual_measurements.source), study)
-    runner = spread_over(workers, study, unknowns, virtual_measurements)
-    claim(folder, f"budget of view {view.number}", study_digest(study, digest))
-    exposed = exposed_for(study, view, virtual_measurements, runner, digest, folder)
-    trials = TrialFolder.of(folder / "trials", exposed.digest, study.task)
-    stated = state_view(study, view, exposed.runner, trials, unknowns, table or study.file.statement)
-    return StatedView(
-        stated, statement_document(study, view, stated, unknowns, virtual_measurements.source, exposed.planned)
-    )
-
-
-def study_view(study: Study, number: int, where: str) -> View:
-    """Return the candidate view with a number.
-
-    Raises
-    ------
-    InputError
-        If the study has no such view.
-    """
-    known = {one.number: one for one in study.views}
-    if number not in known:
-        raise InputError(where, "", number, f"{min(known)} to {max(known)}, the views of this study")
-    return known[number]
+    chosen = study.view(view, "statement: view")
+    with nullcontext(folder) if folder is not None else TemporaryDirectory() as place:
+        session = Session(study, place)
+        session.claim(f"budget of view {view}")
+        return session.state(chosen, table).statements
 
 
 def _checked(name: str, value: int, least: int) -> int:

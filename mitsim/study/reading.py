@@ -67,46 +67,72 @@ class Study:
         """Return the candidate views that the sensor can take."""
         return self.candidates.views
 
+    def view(self, number: int, where: str = "view") -> View:
+        """Return the candidate view with a number; ``where`` names the argument in the error.
+
+        Raises
+        ------
+        InputError
+            If the study has no such view.
+        """
+        known = {one.number: one for one in self.views}
+        if number not in known:
+            raise InputError(where, "", number, f"{min(known)} to {max(known)}, the views of this study")
+        return known[number]
+
     @property
     def unknowns(self) -> UnknownsTable:
         """Return the unknowns: values of the study, else of the sensor, else the defaults."""
         return unknowns_of(self.sensor.unknowns, self.file.unknowns)
 
 
-def read_study(path: str | Path, map_name: str | None = None, ask: Ask | None = None, mapped: bool = True) -> Study:
-    """Read a study and all files that it names.
+def open_study(
+    path: str | Path,
+    file: StudyFile | None = None,
+    *,
+    performance_map: str | Path | None = None,
+    ask: Ask | None = None,
+    mapped: bool = True,
+) -> Study:
+    """Open a study TOML file with everything it names: part, task, sensor, map and candidate views.
 
     Parameters
     ----------
-    map_name
-        File of a map, or a sensor whose map comes with mitsim, in place of the map in the study. An empty name stands
-        for the study's map, or the map of its sensor, but never for a campaign.
+    path
+        The file; the reference of file formats lists its keys.
+    file
+        Its content, if it is read already or changed; ``path`` is then the place for errors and relative paths.
+    performance_map
+        A ``map.nc``, or a sensor whose map is shipped with mitsim, instead of the study's own. ``""`` selects the
+        study's own map, or that of its sensor if the study names a campaign.
     ask
-        Answers whether finishes that the map lacks may be characterised now; None if nobody can answer.
+        Called with a question if the map lacks a finish of the part; if it returns True, the finish is characterised
+        immediately. None if nobody can answer.
     mapped
-        Whether the map has to contain the finishes of the scene.
+        Whether the map has to contain the finishes of the part; it need not if nobody queries it.
+
+    Returns
+    -------
+    Study
+        ``views``, each with its ``number``, ``world_from_sensor`` and ``standoff`` [mm]; ``scene``, ``task``,
+        ``sensor`` and ``performance_map``.
 
     Raises
     ------
     InputError
-        For any input that would stop the study later. Examples are a finish or standoff that is not characterised, an
+        For anything that would stop the study later. Examples are a finish or standoff that is not characterised, an
         exposure that follows the scene, and candidate views none of which is possible.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> study = ms.open_study("study.toml")
+    >>> study.sensor.name, list(study.task.measurements)[:2]
+    ('ensenso-n10', ['point1_point2_distance', 'plane_pillar1_angle'])
+    >>> study.views[0].number
+    0
     """
-    return open_study(path, read_toml(path, StudyFile), map_name, ask, mapped)
-
-
-def open_study(
-    path: str | Path, file: StudyFile, map_name: str | None = None, ask: Ask | None = None, mapped: bool = True
-) -> Study:
-    """Read all files that a study names; ``path`` is the place of the study, for errors and relative paths.
-
-    Without ``mapped`` the map may lack the scene's finishes, since the caller does not query it.
-
-    Raises
-    ------
-    InputError
-        As :func:`read_study`.
-    """
+    file = read_toml(path, StudyFile) if file is None else file
     path = Path(path)
     folder = path.parent
     own_sensor = folder / file.sensor if file.sensor.endswith(".toml") else file.sensor
@@ -120,8 +146,8 @@ def open_study(
     file = with_limits(path, file, task)
     radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
     standoffs = chosen_standoffs(path, file.views, sensor, radius)
-    campaign, performance_map = None, None
-    if file.characterisation.campaign and map_name is None:
+    campaign, chosen_map = None, None
+    if file.characterisation.campaign and performance_map is None:
         near, far = sensor.working_range_mm
         around = [max(math.floor(standoffs[0] - radius), near), min(math.ceil(standoffs[-1] + radius), far)]
         campaign = read_campaign(folder / file.characterisation.campaign, sensor, around)
@@ -129,7 +155,7 @@ def open_study(
         distances = list(campaign.distances)
     else:
         own = file.characterisation.map or sensor.name
-        if not map_name and not file.characterisation.map and sensor.name not in shipped_maps():
+        if not performance_map and not file.characterisation.map and sensor.name not in shipped_maps():
             raise InputError(
                 path,
                 "characterisation.map",
@@ -137,20 +163,20 @@ def open_study(
                 'map = "map.nc" or campaign = "campaign.toml" in [characterisation]',
                 f"mitsim characterise CAMPAIGN --sensor {own_sensor} -o FOLDER writes FOLDER/map.nc",
             )
-        performance_map = read_map(map_name or own, sensor, "." if map_name else folder)
-        distances = performance_map.data["distance"].values.tolist()
-        known = performance_map.known
+        chosen_map = read_map(performance_map or own, sensor, "." if performance_map else folder)
+        distances = chosen_map.data["distance"].values.tolist()
+        known = chosen_map.known
     _check_finishes(path, scene, task, known)
     if campaign is not None:
         _check_campaign(scene, known)
     reach = characterised_range(path, file.views, sensor, standoffs, distances)
     candidates = candidate_views(file.views, sensor, standoffs, scene.centre, triangles(scene), reach, path)
-    if performance_map is not None and mapped:
+    if chosen_map is not None and mapped:
         view_distances = [view.standoff for view in candidates.views]
         depths = (min(view_distances) - radius, max(view_distances) + radius)
         wanted = NeededFinishes(sensor, scene.where, seen_finishes(scene), depths)
-        performance_map = map_with_finishes(performance_map, wanted, ask)
-    return Study(path, file, scene, task, sensor, candidates, campaign, performance_map)
+        chosen_map = map_with_finishes(chosen_map, wanted, ask)
+    return Study(path, file, scene, task, sensor, candidates, campaign, chosen_map)
 
 
 def finishes_of_features(study: Study) -> dict[str, Finish | None]:

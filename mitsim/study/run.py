@@ -28,18 +28,17 @@ from mitsim.capture.simulated.render_residual import (
     render_residual,
     warn_above_limit,
 )
-from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.maps.campaign.acquire import coupon_residuals, in_turn, simulated_source
 from mitsim.maps.campaign.run import run_campaign, write_netcdf
-from mitsim.maps.prediction import Predictor, performance
+from mitsim.maps.prediction import performance
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say, track
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
-from mitsim.study.exposures.planned import exposed_for
 from mitsim.study.record import Outcome, own_files, run_record
-from mitsim.study.run_files import claim_folder, digests_of
+from mitsim.study.run_files import digests_of
 from mitsim.study.scoring import pose_columns, score_study
+from mitsim.study.session import Session
 from mitsim.study.view_sets.confirmed_set import (
     Search,
     TriedSet,
@@ -48,16 +47,10 @@ from mitsim.study.view_sets.confirmed_set import (
     set_table,
     write_set_csv,
 )
-from mitsim.study.virtual.plan import measurements_of, race_rules, rendering_of, trial_digest
-from mitsim.study.virtual.race import TrialRunner, run_race
+from mitsim.study.virtual.plan import race_rules
 from mitsim.study.virtual.race_table import raced_errors, with_race
 from mitsim.study.virtual.rendered import RenderedMeasurements
-from mitsim.study.virtual.spread_out import spread_over
-from mitsim.study.virtual.stated import state_view, statement_document, write_statement
-from mitsim.study.virtual.study_digest import study_digest, with_scene_files
-from mitsim.study.virtual.study_unknowns import study_unknowns
-from mitsim.study.virtual.trials import TrialFolder
-from mitsim.study.virtual.world import Unknowns
+from mitsim.study.virtual.stated import write_statement
 
 #: number of best views per measurement whose predicted clouds are written to the run folder
 SHOWN = 3
@@ -92,75 +85,57 @@ def run_study(
     list of Statement
         The statement of every measurement from the best view; empty if no view allows every measurement.
     """
-    folder = Path(folder)
-    clock = _Clock()
-    unknowns = study_unknowns(study)
-    virtual_measurements = measurements_of(study, unknowns)
-    runner = spread_over(workers, study, unknowns, virtual_measurements)
-    digest = with_scene_files(trial_digest(study, unknowns, virtual_measurements.source), study)
-    claim(folder, "run", study_digest(study, digest))
+    session, clock = Session(study, folder, workers), _Clock()
+    folder, twin = session.folder, session.renderer
+    session.claim("run")
     (folder / "clouds").mkdir(parents=True, exist_ok=True)
     (folder / "captures").mkdir(exist_ok=True)
-    twin = virtual_measurements if isinstance(virtual_measurements, RenderedMeasurements) else None
     residuals = [] if study.campaign is None or twin is None else coupon_residuals(twin.simulated, study.campaign)
     performance_map = _map(study, twin, folder)
     clock.lap("characterise")
 
-    predictor = virtual_measurements.predictor
-    scores, chosen, search = score_study(study, predictor, performance_map, folder, unknowns)
+    scores, chosen, search = score_study(session, performance_map)
     clock.lap("score")
-    trials = TrialFolder.of(folder / "trials", digest, study.task)
-    raced = run_race(study.views, scores, runner, trials, race_rules(study.file.race, minutes))
+    raced = session.race(scores, race_rules(study.file.race, minutes))
     scores = with_race(scores, raced)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="final_rank")
     write_netcdf(scores, folder / "scores.nc")
     write_netcdf(raced_errors(raced, study.task), folder / "checks.nc")
     clock.lap("race")
     leaders = list(dict.fromkeys(raced.leaders().values()))
-    planned = None
-    if leaders:
-        exposed = exposed_for(study, study.views[leaders[0]], virtual_measurements, runner, digest, folder)
-        planned, runner, trials = exposed.planned, exposed.runner, exposed.trials(study, folder, trials)
-    stated = _state(study, leaders, runner, trials, unknowns, folder, planned)
+    stated = session.state(study.view(leaders[0])) if leaders else None
+    if stated is not None:
+        write_statement(folder / "statement.json", stated.document)
     clock.lap("state")
-    tried = _confirm(study, chosen, search, virtual_measurements, digest, folder)
+    tried = _confirm(session, chosen, search)
     chosen = tried[-1].chosen if tried else chosen
     clock.lap("confirm")
     drawn = sorted({*leaders, *_best(scores), *(chosen.views if chosen else ())})
-    _draw(study, predictor, performance_map, drawn, folder)
+    _draw(session, performance_map, drawn)
     shown = leaders[: study.file.check.views] if twin is not None else []
     if twin is not None:
-        _show(study, twin, shown, folder, {} if planned is None else {leaders[0]: planned})
-        residuals += [_residual(study, twin.simulated, number) for number in shown[:1]]
+        _show(twin, shown, folder, {} if stated is None else {leaders[0]: stated.planned})
+        residuals += [_residual(twin, number) for number in shown[:1]]
     clock.lap("pictures")
     outcome = Outcome(raced, shown, chosen, tried, largest_residual(residuals), clock.steps)
     about = run_record(study, performance_map, outcome)
-    about["files"] = digests_of(folder, own_files(study, drawn, shown, bool(stated)))
+    about["files"] = digests_of(folder, own_files(study, drawn, shown, stated is not None))
     write_json(folder / "run.json", about)
-    return stated
+    return [] if stated is None else stated.statements
 
 
-def claim(folder: Path, command: str, digest: str) -> None:
-    """Reserve a folder for the results of one study, and report where the results of another study were moved to."""
-    moved = claim_folder(folder, command, digest)
-    if moved is not None:
-        say(f"{folder} contained results of another study, seed, version, map or command; they were moved to {moved}")
-
-
-def _confirm(
-    study: Study, chosen: ViewSet | None, search: Search, virtual_measurements: TrialRunner, digest: str, folder: Path
-) -> list[TriedSet]:
+def _confirm(session: Session, chosen: ViewSet | None, search: Search) -> list[TriedSet]:
     """Measure sets of views virtually until one keeps its limits; the best set comes last.
 
     The list is empty without a set, or if measurements are drawn from a map.
     """
-    table = study.file.set
+    study, folder, table = session.study, session.folder, session.study.file.set
     if table is None or chosen is None or not chosen.views or table.trials < 2:
         return []
-    if not isinstance(virtual_measurements, RenderedMeasurements):
+    if session.renderer is None:
         say("the set of views is not confirmed: clouds drawn from a map cannot be joined")
         return []
-    tried = confirmed_set(study, chosen, search, virtual_measurements, digest, folder)
+    tried = confirmed_set(study, chosen, search, session.renderer, session.digest, folder)
     best = tried[-1]
     write_set_csv(folder / "view_set.csv", table, best.chosen, best.stated)
     kept = "keeps its limits" if best.excess(table.limits) <= 1 else "the best set found, misses a limit"
@@ -173,25 +148,6 @@ def _confirm(
     return tried
 
 
-def _state(
-    study: Study,
-    leaders: list[int],
-    runner: TrialRunner,
-    trials: TrialFolder,
-    unknowns: Unknowns,
-    folder: Path,
-    planned: PlannedExposure | None,
-) -> list[Statement]:
-    """State the uncertainty from the best view, which is the first of the leaders, and write the statement."""
-    if not leaders:
-        return []
-    view = study.views[leaders[0]]
-    stated = state_view(study, view, runner, trials, unknowns, study.file.statement)
-    document = statement_document(study, view, stated, unknowns, runner.source, planned)
-    write_statement(folder / "statement.json", document)
-    return stated
-
-
 def _best(scores: xr.Dataset) -> list[int]:
     """Return the numbers of the best views of every measurement, by predicted risk and by V_m."""
     ranks = np.concatenate([scores["uncertainty_rank"].values, scores["rank"].values])
@@ -199,18 +155,17 @@ def _best(scores: xr.Dataset) -> list[int]:
     return sorted({int(view) for view in np.flatnonzero(((ranks <= SHOWN) & able).any(axis=0))})
 
 
-def _draw(
-    study: Study, predictor: Predictor, performance_map: PerformanceMap, numbers: list[int], folder: Path
-) -> None:
+def _draw(session: Session, performance_map: PerformanceMap, numbers: list[int]) -> None:
     """Write a predicted cloud of each of some views."""
+    study, predictor = session.study, session.predictor
     for number in track(numbers, "predict clouds"):
-        view = study.views[number]
-        surfaces = predictor.surfaces(study.scene, view.world_from_sensor)
-        labels, ideal = predictor.labels(study.scene, view.world_from_sensor, surfaces), predictor.ideal(surfaces)
+        pose = study.view(number).world_from_sensor
+        surfaces = predictor.surfaces(study.scene, pose)
+        labels, ideal = predictor.labels(study.scene, pose, surfaces), predictor.ideal(surfaces)
         fraction, sigma = performance(ideal, study.scene, performance_map)
         rng = np.random.default_rng([study.file.seed, number])
         cloud = predictor.draw(study.scene, ideal, labels, fraction, sigma, rng)
-        write_ply(cloud, folder / "clouds" / f"predicted_{number:04d}.ply")
+        write_ply(cloud, session.folder / "clouds" / f"predicted_{number:04d}.ply")
 
 
 def _map(study: Study, twin: RenderedMeasurements | None, folder: Path) -> PerformanceMap:
@@ -222,24 +177,21 @@ def _map(study: Study, twin: RenderedMeasurements | None, folder: Path) -> Perfo
     return run_campaign(study.campaign, in_turn(take, study.campaign), folder)
 
 
-def _residual(study: Study, simulated: SimulatedSensor, number: int) -> RenderResidual:
+def _residual(renderer: RenderedMeasurements, number: int) -> RenderResidual:
     """Return the render noise of a view, rendered as in its trials; takes as long as three trials."""
-    pose, camera = study.views[number].world_from_sensor, next(iter(study.sensor.rig.cameras))
-    found = render_residual(simulated, study.scene, pose, camera, rendering_of(study), seed=study.file.seed)
+    study = renderer.study
+    pose, camera = study.view(number).world_from_sensor, next(iter(study.sensor.rig.cameras))
+    found = render_residual(renderer.simulated, study.scene, pose, camera, renderer.rendering, seed=study.file.seed)
     if found.noise > LIMIT:
         say(f"view {number}: {found}; all trials of a finish share this noise, so it counts as an effect of the finish")
     return warn_above_limit(f"view {number}", found) if found.quadrature > LIMIT else found
 
 
 def _show(
-    study: Study,
-    renderer: RenderedMeasurements,
-    numbers: list[int],
-    folder: Path,
-    planned: dict[int, PlannedExposure],
+    renderer: RenderedMeasurements, numbers: list[int], folder: Path, planned: dict[int, PlannedExposure | None]
 ) -> None:
     """Write image and cloud of some views, rendered with best estimates of all unknowns and planned exposures."""
     for number in track(numbers, "render pictures"):
-        capture, cloud = renderer.exposed_as(planned.get(number)).at_best_estimates(study.views[number])
+        capture, cloud = renderer.exposed_as(planned.get(number)).at_best_estimates(renderer.study.view(number))
         write_capture(capture, folder / "captures" / f"view_{number:04d}", overwrite=True)
         write_ply(cloud, folder / "clouds" / f"rendered_{number:04d}.ply")

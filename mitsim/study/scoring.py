@@ -7,7 +7,6 @@ together (:mod:`characterisation.scores.task_sets`) -> ``scores.csv``, ``scores.
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,31 +22,26 @@ from characterisation.scores.view_score import write_scores
 from characterisation.scores.view_sets import ViewSet
 from characterisation.tasks.evaluation import InputQuantity
 from mitsim.maps.campaign.run import write_netcdf
-from mitsim.maps.prediction import Predictor
 from mitsim.running.progress import say
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.study import Study
 from mitsim.study.scene_geometry import write_scene_geometry
+from mitsim.study.session import Session
 from mitsim.study.view_sets.confirmed_set import Search, joining_in_words
-from mitsim.study.virtual.screening import screen
-from mitsim.study.virtual.world import Unknowns
 from mitsim.views import write_views
 
 
 def score_study(
-    study: Study,
-    predictor: Predictor,
-    performance_map: PerformanceMap,
-    folder: Path,
-    unknowns: Unknowns | None = None,
+    session: Session, performance_map: PerformanceMap | None = None
 ) -> tuple[xr.Dataset, ViewSet | None, Search]:
     """Score all views, choose a set if the study asks for one, and write ``scores``, ``poses`` and ``part.ply``.
 
-    ``unknowns``: see :func:`~mitsim.study.virtual.screening.screen`. Returns the scores, the set, and the function that
-    finds a set for other limits.
+    The map is by default that of the study. Returns the scores, the set, and the function that finds a set for other
+    limits.
     """
+    study, folder = session.study, session.folder
     write_views(folder / "poses", study.candidates, study.file.views, study.sensor.name)
-    scores, inputs = screen(study, predictor, performance_map, unknowns)
+    scores, inputs = session.screen(performance_map)
     search = partial(_set_within, study, inputs)
     chosen = _chosen_set(study, search)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")

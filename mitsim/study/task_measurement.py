@@ -18,12 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from characterisation.features.robust_fit import FitError
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
-from characterisation.tasks.evaluation import fit_features, measure
-from characterisation.tasks.result import Result, failed
+from characterisation.tasks.evaluation import measure
+from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from mitsim.maps.prediction.predictor import EDGE_MARGIN_PX, Predictor
 from mitsim.scene.load import Scene
@@ -128,33 +127,7 @@ def labelled_cloud(cloud: PointCloud, scene: Scene, world_from_sensor: Transform
 
 def measure_labelled(labelled: PointCloud, task: Task, world_from_sensor: Transform) -> list[Result]:
     """Measure a task in a labelled cloud (:func:`labelled_cloud`), whose labels include all shapes of the task."""
-    assert labelled.feature is not None
-    sensor_from_part = world_from_sensor.inverse().matrix()
-    found = measure(labelled, task, sensor_from_part)
-    fits = fit_features(labelled, task, sensor_from_part)
-    used = {name: 0 if isinstance(fit, FitError) else fit.count for name, fit in fits.items()}
-    results = []
-    for name, one in found.items():
-        definition = task.measurements[name]
-        shapes = [labelled.feature_names.index(shape) for shape in task.shapes_for(name)]
-        count = int((np.isin(labelled.feature, shapes) & labelled.valid).sum())
-        if not one.possible:
-            results.append(failed(name, definition.unit, one.reason, points_given=count))
-            continue
-        points = sum(used[feature] for feature in task.fitted_for(name))
-        results.append(
-            Result(
-                name,
-                definition.unit,
-                one.value,
-                one.standard_uncertainty,
-                "fit",
-                points,
-                count,
-                nominal=definition.nominal,
-            )
-        )
-    return results
+    return list(measure(labelled, task, world_from_sensor.inverse().matrix()).values())
 
 
 def corrected(result: Result, statement: ViewStatement) -> Result:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import subprocess
-from types import SimpleNamespace
 
 import pytest
 
 from mitsim.scene.authoring import read_step, step_worker
 
 
-def convert_here(command, **_):
-    """What the command of :func:`read_step.read_step` does, in this process."""
+def convert_here(command, path):
+    """What :func:`read_step.run_worker` does, in this process."""
     _, worker, path, out, *numbers = command
     assert worker == step_worker.__file__
     step_worker.convert(path, out, *map(float, numbers))
-    return subprocess.CompletedProcess(command, 0, b"", b"")
+    return subprocess.CompletedProcess(command, 0, "", "")
 
 
 @pytest.fixture
@@ -24,5 +23,4 @@ def step_here(monkeypatch):
 
     The fixtures of modules, and the tests of files that OpenCASCADE cannot read, start the process that users start.
     """
-    here = SimpleNamespace(run=convert_here, TimeoutExpired=subprocess.TimeoutExpired)
-    monkeypatch.setattr(read_step, "subprocess", here)
+    monkeypatch.setattr(read_step, "run_worker", convert_here)

@@ -103,6 +103,22 @@ def test_what_a_task_knows_becomes_measurements_and_the_rest_is_listed(drawn, tm
     assert "[features.bottom]  # datum A" in text
 
 
+@needs_step
+def test_what_was_converted_is_not_listed_as_left_out(drawn, tmp_path, step_here):
+    """A profile of a plane in a datum frame is measured as its position: a remark, but no loss."""
+    part = write_part(drawn, tmp_path / "made")
+    remarks = part.drawing.remarks()
+    at = remarks.index("Not converted:")
+    lost, remarked = remarks[at + 1 :], remarks[remarks.index("Converted, with a remark:") + 1 : at]
+    made = {one.number for one in part.drawing.measurements.values()}
+    assert any("surface profile 0.45" in one and "front" in one for one in remarked)
+    for line in remarked:
+        assert int(line.split()[0].removeprefix("#")) in made
+    for line in lost:
+        number = line.split()[0]
+        assert not number.startswith("#") or int(number[1:]) not in made, line
+
+
 def numbers(path):
     """Characteristics of a QIF file: (kind, nominal, limits or zone, designator of its datums)."""
     q = "{http://qifstandards.org/xsd/qif3}"
@@ -163,7 +179,6 @@ def test_nists_part_becomes_a_task(ctc, tmp_path, step_here):
     listed = "\n".join(part.drawing.left_out)
     assert "position 0.75" not in listed
     assert [line.split(":")[0].partition(" of ")[0] for line in part.drawing.left_out if "profile" in line] == [
-        "#26 surface profile 1.25 |A|B|C",
         "#26 surface profile 1.25 |A|B|C",
         "#27 surface profile 0.5 |A",
     ]

@@ -20,7 +20,7 @@ from shell import mitsim_here
 
 from mitsim.report.author_page import fair_share
 from mitsim.scene.authoring.read_step import step_installed
-from mitsim.study import read_study
+from mitsim.study import open_study
 from tests.authoring.author import Author
 from tests.authoring.bracket import bracket, write_step
 from tests.report.chromium import BROWSER
@@ -167,7 +167,7 @@ def test_a_bracket_from_step_to_a_study_without_an_editor(served, folder, browse
     root = ElementTree.parse(made / "made.xml").getroot()
     given = {shape.get("id"): shape.find("ref").get("id") for shape in root.iter("shape")}
     assert {name for name, finish in given.items() if finish == "finish_2"} == {"seat_18mm", "boss_20mm"}
-    study = read_study(made / "study.toml")
+    study = open_study(made / "study.toml")
     assert {str(finish) for finish in study.scene.finishes} == {
         "aluminium/ground Ra 0.4 um",
         "aluminium/ground Ra 0.2 um",

@@ -9,10 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.scene.authoring.fineness import chord_for, sensor_sigma_mm
-from mitsim.scene.authoring.naming import identifier, with_names
+from characterisation.files.documents import checked_name
+from mitsim.scene.authoring.check import read_features
+from mitsim.scene.authoring.fineness import fineness_for, sensor_sigma_mm
+from mitsim.scene.authoring.naming import identifier, size, with_names
 from mitsim.scene.authoring.part_folder import Finishing, finish_names, scene_xml
-from mitsim.scene.authoring.read_step import read_step, step_installed
+from mitsim.scene.authoring.read_step import Fineness, read_step, step_installed
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 from tests.authoring.bracket import bracket, write_step
@@ -127,7 +129,7 @@ def test_a_bore_in_two_halves_is_one_face(tmp_path):
 )
 def test_every_kind_of_surface_comes_with_the_normals_of_the_drawing(tmp_path, shape, kind, name):
     chord = 0.01
-    drawn = read_step(write_step([("one", shape(), None)], tmp_path / "one.step"), chord)
+    drawn = read_step(write_step([("one", shape(), None)], tmp_path / "one.step"), Fineness(chord))
     face = next(face for face in with_names(drawn.faces) if face.kind == kind)
     assert face.name == name
     normals, corners = face.corner_normals(), face.vertices[face.triangles]
@@ -173,8 +175,57 @@ def test_a_name_that_a_person_gave_is_kept_and_a_programs_counter_is_not(tmp_pat
     path.write_text(head + "".join(f"ADVANCED_FACE({next(given)},{one}" for one in rest))
     names = {face.name for face in with_names(read_step(path).faces)}
     assert len(names & {"boss_20mm", "bottom", "top"}) == 2
-    assert "sealing_face_20" in names
-    assert identifier("3 Löcher") == "face_3_L_cher"
+    assert "sealing_face_Ø20" in names
+    assert identifier("3 Löcher") == "face_3_Löcher"
+
+
+FOREIGN = ("Dichtfläche", "поверхность", "シール面", "พื้นผิว", "סגר")
+
+
+def test_names_in_any_script_keep_their_letters_in_the_scene_and_the_task(tmp_path):
+    """Plain UTF-8, and the escapes of the standard: \\X2\\, and \\S\\ in a part of ISO 8859."""
+    from OCP.BRepPrimAPI import BRepPrimAPI_MakeBox
+
+    from mitsim.scene.authoring.part_folder import write_part
+
+    path = write_step([("one", BRepPrimAPI_MakeBox(30, 40, 50).Shape(), None)], tmp_path / "one.step")
+    escaped = "\\X2\\" + "シール面".encode("utf-16-be").hex().upper() + "\\X0\\"
+    cyrillic = "\\PE\\" + "".join(f"\\S\\{chr(one & 0x7F)}" for one in "поверхность".encode("iso8859-5"))
+    written = ["Dichtfläche", cyrillic, escaped, "พื้นผิว", "סגר", "孔"]
+    head, *rest = path.read_text().split("ADVANCED_FACE('',")
+    path.write_text(
+        head + "".join(f"ADVANCED_FACE('{name}',{one}" for name, one in zip(written, rest, strict=True)), "utf-8"
+    )
+    write_part(path, tmp_path / "made", None, Finishing())
+    scene = load_scene(tmp_path / "made/made.xml", 850)
+    features = read_features(tmp_path / "made/task.toml").features
+    for name in (*FOREIGN, "孔"):
+        assert name in scene.names
+        assert (tmp_path / "made" / f"{name}.ply").exists()
+        assert checked_name(name) == name
+    assert set(features) == set(scene.names)
+
+
+def test_a_file_in_the_encoding_of_an_older_program_keeps_its_letters(tmp_path):
+    path = write_step([("one", solid("Sphere", 10.0), None)], tmp_path / "one.step")
+    path.write_bytes(path.read_text().replace("ADVANCED_FACE('',", "ADVANCED_FACE('Kugelfläche',").encode("latin-1"))
+    assert [face.name for face in with_names(read_step(path).faces)] == ["Kugelfläche"]
+
+
+@pytest.mark.parametrize("name", ["面" * 50, "ä" * 80, "é" * 61, "พื้" * 40])
+def test_a_long_name_is_cut_between_letters_and_stays_a_name(name):
+    short = identifier(name)
+    assert name.startswith(short)
+    assert checked_name(short) == short
+
+
+@pytest.mark.parametrize(
+    ("length", "text"),
+    [(9.525, "9_53"), (2.675, "2_68"), (1.005, "1_01"), (12.0, "12"), (-0.001, "0"), (-9.525, "-9_53")],
+)
+def test_noise_of_a_file_does_not_decide_the_name_of_a_size(length, text):
+    """3/8 inch is 9.525 mm; a file in inches gives the number before or after it."""
+    assert {size(length + noise) for noise in (-2e-6, -1e-12, 0.0, 1e-12, 2e-6)} == {text}
 
 
 def test_the_sensor_chooses_how_fine_the_mesh_is(tmp_path):
@@ -182,10 +233,10 @@ def test_the_sensor_chooses_how_fine_the_mesh_is(tmp_path):
     path = write_step([("one", solid("Cylinder", 10.0, 30.0), None)], tmp_path / "one.step")
     fine = {}
     for name in ("photoneo-phoxi-s", "ensenso-n10"):
-        chord = chord_for(name)
-        assert chord == pytest.approx(sensor_sigma_mm(name) / 100)
-        fine[name] = max(face.sag for face in read_step(path, chord).faces)
-        assert fine[name] <= chord
+        asked = fineness_for(name)
+        assert asked.chord_mm < sensor_sigma_mm(name) / 20
+        fine[name] = max(face.sag for face in read_step(path, asked).faces)
+        assert fine[name] <= asked.chord_mm
     assert fine["photoneo-phoxi-s"] < fine["ensenso-n10"]
 
 

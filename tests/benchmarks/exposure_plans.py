@@ -54,7 +54,7 @@ def main() -> None:
         shapes, names = needed_shapes(study.task), list(study.task.measurements)
         for number in given.views:
             view, began = study.views[number], time.monotonic()
-            plan = plan_view(study, maker, view, PlanRules())
+            plan = plan_view(maker, view, PlanRules())
             seconds = time.monotonic() - began
             points, errors = {False: [], True: []}, {False: [], True: []}
             days = sorted(

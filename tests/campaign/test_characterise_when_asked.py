@@ -33,7 +33,7 @@ COMMANDS = {"run": [], "budget": ["--view", "1"], "choose": ["--sensors", "ensen
 #: what each command does with the map, once it has it; and an exit code that says that it came so far
 WORK = {
     "run": "mitsim.study.run.run_study",
-    "budget": "mitsim.study.programs.stated_view",
+    "budget": "mitsim.study.session.Session",
     "choose": "mitsim.study.choose.choose_sensor",
 }
 REACHED = 7

@@ -14,7 +14,7 @@ from mitsim.maps.campaign.orders import worker_source
 from mitsim.maps.campaign.run import run_campaign
 from mitsim.running.cluster import Cluster
 from mitsim.study import StudyFile, open_study
-from mitsim.study.virtual.plan import measurements_of
+from mitsim.study.virtual.plan import measurements_of, trial_digest
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.spread_out import SpreadMeasurements
 from mitsim.study.virtual.study_unknowns import study_unknowns
@@ -206,7 +206,7 @@ def test_virtual_measurements_are_the_same_on_a_cluster_though_a_worker_is_kille
     here = measurements_of(study, unknowns)
     jobs = here.in_order(Job(view, Trial(day)) for view in study.views[:2] for day in range(2))
     dask_workers = Cluster(cluster.scheduler_address)
-    there = SpreadMeasurements(dask_workers, study, unknowns, here)
+    there = SpreadMeasurements(dask_workers, here, trial_digest(study, unknowns, "render"))
     workers = dask_workers.client.run(os.getpid)
     killed, found = [], []
     for job, outcome in there.run(jobs):

@@ -71,3 +71,45 @@ def test_the_distribution_is_that_of_the_values_that_are_there(rng):
     assert found.robust_deviation == pytest.approx(0.2, rel=0.06)
     assert (found.low, found.high) == pytest.approx((0.3 - 0.392, 0.3 + 0.392), abs=0.03)
     assert np.isnan(distribution(np.full((3, 3), np.nan), 9).mean)
+
+
+@pytest.mark.parametrize("step", [1, 15])
+def test_a_window_is_that_part_of_the_whole(step, rng):
+    """Also with a reference so sparse that the neighbours of a point lie outside the window's surroundings."""
+    rows, columns = np.ogrid[: GRID.height, : GRID.width]
+    kept = (rows % step == 0) & (columns % step == 0)
+    cloud, reference = plane_cloud(1.0, 0.3, kept=rng.random(kept.shape) < 0.9), plane_cloud(lean=0.3, kept=kept)
+    window = slice(40, 60), slice(30, 55)
+    whole = difference_to_surface(cloud, reference)
+    assert np.isfinite(whole[window]).any()
+    assert np.array_equal(difference_to_surface(cloud, reference, window), whole[window], equal_nan=True)
+    along = difference_along_rays(cloud, reference, window)
+    assert np.array_equal(along, difference_along_rays(cloud, reference)[window], equal_nan=True)
+
+
+def test_the_difference_is_that_of_the_nearest_points_by_exhaustive_search(rng):
+    rows, columns = np.ogrid[: GRID.height, : GRID.width]
+    kept = (rows % 5 == 0) & (columns % 5 == 0)  # 12 neighbours of a point lie within 14 mm, its counterparts within 5
+    cloud, reference = plane_cloud(1.0), plane_cloud(lean=0.02, kept=kept)
+    surface = reference.points[reference.valid].astype(float)
+    window = slice(50, 51), slice(20, 40)
+    found = difference_to_surface(cloud, reference, window)[0]
+    for point, value in zip(cloud.points[50, 20:40].astype(float), found, strict=True):
+        patch = surface[np.argsort(np.linalg.norm(surface - point, axis=1))[:12]]
+        normal = np.linalg.svd(patch - patch.mean(axis=0))[2][2]
+        assert value == pytest.approx((point - patch.mean(axis=0)) @ (normal * np.sign(normal @ point)), abs=1e-9)
+
+
+def test_progress_is_told_of_every_block_of_points():
+    grid = ViewGrid(600.0, 600.0, 199.5, 149.5, 400, 300)
+    told = []
+
+    def progress(starts):
+        told.append(list(starts))
+        return starts
+
+    difference_to_surface(plane_cloud(1.0, grid=grid), plane_cloud(grid=grid), progress=progress)
+    assert len(told) == 1
+    assert len(told[0]) > 3
+    assert told[0][0] == 0
+    assert max(told[0]) < grid.width * grid.height

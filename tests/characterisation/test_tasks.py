@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from characterisation.features.fits import fit_surface
 from characterisation.features.fitted import CylinderFit, PlaneFit
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Cylinder, Plane
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.tasks import evaluation
 from characterisation.tasks.evaluation import (
     Feature,
     axis_angle,
@@ -25,6 +27,8 @@ from characterisation.tasks.evaluation import (
     radius,
     read_task,
 )
+from mitsim.sensor.transforms import Transform
+from mitsim.study.task_measurement import measure_labelled
 
 TASK = Path(__file__).parents[2] / "scenes" / "two_pillars" / "task.toml"
 Z = np.array([0.0, 0.0, 1.0])
@@ -93,7 +97,26 @@ def test_an_ideal_sensor_measures_the_nominal_values(tilt, spin):
     assert all(m.possible and m.reason == "" for m in measured.values())
     for name, outcome in measured.items():  # the cloud is float32: points are rounded by up to 3e-5 mm
         assert abs(outcome.error) < 1e-3, name
-        assert outcome.standard_uncertainty < 1e-3
+        assert outcome.uncertainty < 1e-3
+
+
+def test_each_feature_is_fitted_once_for_all_measurements_and_their_counts(monkeypatch):
+    fitted, matrix = [], pose(50, 20)
+    cloud, task = part_cloud(matrix), read_task(TASK)
+
+    def counted(points, surface, viewpoint):
+        fitted.append(len(points))
+        return fit_surface(points, surface, viewpoint)
+
+    monkeypatch.setattr(evaluation, "fit_surface", counted)
+    pose_of_part = Transform.from_matrix(np.linalg.inv(matrix))
+    results = {one.name: one for one in measure_labelled(cloud, task, pose_of_part)}
+    assert len(fitted) == len(task.shapes)
+    seen = {name: int((cloud.feature == k).sum()) for k, name in enumerate(cloud.feature_names)}
+    radius = results["pillar1_radius"]
+    assert 0 < radius.points <= radius.points_given == seen["pillar1"] and radius.origin == "fit"
+    apart = results["point1_point2_distance"]
+    assert apart.points_given == sum(seen.values()) and apart.points > results["pillar1_pillar2_distance"].points
 
 
 def test_the_standard_uncertainty_is_the_scatter_of_repeated_measurements():
@@ -101,7 +124,7 @@ def test_the_standard_uncertainty_is_the_scatter_of_repeated_measurements():
     outcomes = [measure(part_cloud(matrix, 0.2, seed), task, matrix) for seed in range(runs)]
     for name, measurement in task.measurements.items():
         error = np.array([outcome[name].error for outcome in outcomes])
-        uncertainty = np.array([outcome[name].standard_uncertainty for outcome in outcomes])
+        uncertainty = np.array([outcome[name].uncertainty for outcome in outcomes])
         chi = np.mean((error / uncertainty) ** 2)
         if measurement.unit == "mm":
             assert abs(chi - 1.0) < 4 * np.sqrt(2.0 / runs), name
@@ -122,7 +145,7 @@ def test_a_feature_that_is_hardly_seen_makes_its_measurements_impossible():
     possible = {name for name, outcome in measured.items() if outcome.possible}
     assert possible == {"plane_pillar2_angle", "pillar2_radius"}
     outcome = measured["pillar1_radius"]
-    assert np.isnan([outcome.value, outcome.error, outcome.standard_uncertainty]).all()
+    assert np.isnan([outcome.value, outcome.error, outcome.uncertainty]).all()
     assert outcome.reason == "pillar1: 3 points, at least 100 are required"
     assert isinstance(fit_features(hidden, read_task(TASK), matrix)["pillar1"], FitError)
     assert "needs at least 6" in measure(hidden, read_task(TASK), matrix, minimum_points=0)["pillar1_radius"].reason
@@ -139,7 +162,7 @@ def test_a_surface_most_of_whose_points_are_false_is_not_measured(true, possible
     outcome = measure(replace(cloud, points=points), read_task(TASK), matrix)["pillar1_radius"]
     assert outcome.possible == possible
     if possible:
-        assert abs(outcome.error) < 4 * outcome.standard_uncertainty
+        assert abs(outcome.error) < 4 * outcome.uncertainty
     elif true:
         assert re.fullmatch(
             r"pillar1: only (19|20|21) % of \d+ points lie near the nominal surface, at least 25 % are required",

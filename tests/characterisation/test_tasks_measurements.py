@@ -271,8 +271,8 @@ def test_an_ideal_sensor_measures_the_nominal_values():
     for name, one in measured.items():
         # what hangs on pixels has their uncertainty, everything else that of float32 points
         sampled = {"apart", "from_corner", "from_left", "size", "edge", "place"}
-        assert abs(one.error) < (4 * one.standard_uncertainty if name in sampled else 2e-3), name
-        assert one.standard_uncertainty < (0.1 if name in sampled else 2e-3), name
+        assert abs(one.error) < (4 * one.uncertainty if name in sampled else 2e-3), name
+        assert one.uncertainty < (0.1 if name in sampled else 2e-3), name
 
 
 def test_the_uncertainty_of_every_kind_is_the_scatter_of_repeated_measurements():
@@ -284,7 +284,7 @@ def test_the_uncertainty_of_every_kind_is_the_scatter_of_repeated_measurements()
     for name, count in freedom.items():
         assert all(one[name].possible for one in outcomes), name
         error = np.array([one[name].error for one in outcomes])
-        uncertainty = np.array([one[name].standard_uncertainty for one in outcomes])
+        uncertainty = np.array([one[name].uncertainty for one in outcomes])
         chi = np.mean((error / uncertainty) ** 2)
         # the error of an edge is 1.2 times what is said of it in the worst case (see edges.py)
         assert chi < 1.2**2 * count + 4 * np.sqrt(2 * count / runs), name

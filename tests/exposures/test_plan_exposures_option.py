@@ -29,8 +29,9 @@ def invoked(*arguments):
         return mitsim_here(*arguments, code=(0, 1))
 
 
-def asked(study, _, view, rules):
+def asked(renderer, view, rules):
     """What a plan follows from: two that agree in it are the same to the last bit."""
+    study = renderer.study
     light = {"scene", "parameters", "task", "seed", "unknowns", "measure", "exposure"}
     file = study.file.model_dump(mode="json", include=light)
     return file, study.sensor.name, view.number, view.world_from_sensor.matrix().tolist(), rules

@@ -17,7 +17,7 @@ from characterisation.scores.screening import LEAST_MEASURABLE
 from characterisation.statements.judgement import Regret, Share, falsely_accepted, pooled_share, regret, share, within
 from mitsim.study.virtual.world import FINISH_DAYS
 from mitsim.views.view_scores import screening_risk
-from tests.proofs.statement_run import JudgedCase, StatedView
+from tests.proofs.statement_run import JudgedCase, JudgedView
 
 Floats = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ class Choice:
     judged: bool = True
 
 
-def coverage_of(stated: StatedView) -> list[Share]:
+def coverage_of(stated: JudgedView) -> list[Share]:
     """Share of errors inside the stated interval, of every measurement; of none where nothing could be stated."""
     return [share(known[np.isfinite(known)] > 0) for known in _inside(stated)]
 
@@ -54,7 +54,7 @@ def pooled_coverage(cases: Sequence[JudgedCase]) -> Share:
     return pooled([_inside(stated) for case in cases for stated in case.stated])
 
 
-def false_accepts(stated: StatedView, corrected: bool) -> Floats:
+def false_accepts(stated: JudgedView, corrected: bool) -> Floats:
     """Whether worlds accept a part at an edge of its tolerance (measurement, world); NaN without a value or interval.
 
     By the rule of ISO 14253-1 as the tool applies it, to readings as they are or with the stated bias subtracted.
@@ -104,7 +104,7 @@ def choices_of(case: JudgedCase) -> list[Choice]:
     return out
 
 
-def _inside(stated: StatedView) -> Floats:
+def _inside(stated: JudgedView) -> Floats:
     rows = []
     for one, errors in zip(stated.statements, stated.errors, strict=True):
         known = all(math.isfinite(end) for end in one.interval)

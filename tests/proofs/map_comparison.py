@@ -20,13 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsim.decode.cloud import sensor_geometry
-from mitsim.maps.prediction import Predictor
 from mitsim.running.progress import say, track
+from mitsim.study.session import Session
 from mitsim.study.virtual.beyond_map import CODED, FLIGHT, MATCHED, BeyondMap, Sizes, drawn_sizes, kind_of
 from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.race import Job
-from mitsim.study.virtual.screening import screen
 from mitsim.study.virtual.world import BEYOND
 from tests.proofs.case_trials import days, trials_by_kind
 from tests.proofs.part_cases import PartCase
@@ -73,24 +71,21 @@ class ComparedCase:
 def compare_case(case: PartCase, folder: Path, views: int, worlds: int) -> ComparedCase | None:
     """Draw trials of a case's first views from the map; None without kept rendered trials."""
     study = case.open()
-    case_trials = trials_by_kind(case, study, folder)["truth"]
+    truth = trials_by_kind(case, study, folder)["truth"]
     some, trials = study.views[:views], days(worlds)
-    if any(set(trials) - set(case_trials.trials.known(view.number)) for view in some):
+    if any(set(trials) - set(truth.trials.known(view.number)) for view in some):
         say(f"{case.name}: skipped, since some of its rendered trials are missing")
         return None
     study = replace(study, candidates=replace(study.candidates, views=some))
-    assert study.performance_map is not None
-    scores, _ = screen(study, Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor)), study.performance_map)
-    unknowns = replace(
-        case_trials.unknowns, varied=tuple(group for group in case_trials.unknowns.varied if group != BEYOND)
-    )
+    scores, _ = Session(study).screen()
+    unknowns = replace(truth.unknowns, varied=tuple(group for group in truth.unknowns.varied if group != BEYOND))
     runner = MappedMeasurements(study, unknowns)
     names = tuple(study.task.measurements)
     drawn = np.full((len(names), len(some), worlds), np.nan)
     jobs = [Job(view, trial) for view in some for trial in trials]
     for job, outcome in track(runner.run(runner.in_order(jobs)), case.name, len(jobs)):
         drawn[:, some.index(job.view), job.trial.day] = [outcome.errors[name] for name in names]
-    rendered = np.stack([case_trials.trials.errors(view.number, trials) for view in some], axis=1)
+    rendered = np.stack([truth.trials.errors(view.number, trials) for view in some], axis=1)
     predicted = scores["predicted_uncertainty"].sel(measurement=list(names)).transpose("measurement", "view").values
     return ComparedCase(case, study.sensor.name, kind_of(study.sensor), names, drawn, rendered, predicted)
 

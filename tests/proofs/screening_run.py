@@ -34,15 +34,13 @@ from numpy.typing import NDArray
 from characterisation.point_cloud import Status
 from characterisation.scores.screening import Screened
 from characterisation.statements.selection import chance_after, posterior
-from mitsim.decode.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say
 from mitsim.study import Study
 from mitsim.study.virtual.race import FIRST, first_of_each, prior_risk
-from mitsim.study.virtual.screening import screen
 from mitsim.views.view_scores import RAYS, screening_risk
-from tests.proofs.case_trials import days, keep_trials, measured_truth, trials_by_kind
+from tests.proofs.case_trials import days, keep_trials, measure_worlds, measured_truth, trials_by_kind
 from tests.proofs.part_cases import PartCase
 
 Floats = NDArray[np.float64]
@@ -94,15 +92,13 @@ def screen_case(case: PartCase, folder: Path, workers: Executor | None = None) -
     say(f"case: {case.name}")
     study = case.open()
     trials_of_kind = trials_by_kind(case, study, folder, workers)
-    predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
-    assert study.performance_map is not None
-    scores, _ = screen(study, predictor, study.performance_map)
-    truth = measured_truth(case, trials_of_kind["truth"])[:, :, : case.file.worlds]
     tool, numbers = trials_of_kind["tool"], [view.number for view in study.views]
-    tool.measure(study.views, dict.fromkeys(numbers, days(FIRST)))
+    scores, _ = tool.screen()
+    truth = measured_truth(case, trials_of_kind["truth"])[:, :, : case.file.worlds]
+    measure_worlds(case, "tool", tool, study.views, dict.fromkeys(numbers, days(FIRST)))
     once = np.stack([tool.trials.errors(number, days(FIRST)) for number in numbers], axis=1)
     keep_trials(case, folder, trials_of_kind)
-    return judged(case, study, scores, seen_by_all(study, predictor), truth, once)
+    return judged(case, study, scores, seen_by_all(study, tool.predictor), truth, once)
 
 
 def judged(

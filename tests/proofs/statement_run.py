@@ -18,26 +18,29 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.statements.statement import Statement
-from mitsim.decode.cloud import sensor_geometry
-from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say
 from mitsim.study import StatementTable, Study
-from mitsim.study.virtual.plan import race_rules
-from mitsim.study.virtual.race import ALL, Raced, run_race
-from mitsim.study.virtual.screening import screen
-from mitsim.study.virtual.stated import state_view
+from mitsim.study.session import Session
+from mitsim.study.virtual.race import ALL, Raced
 from mitsim.study.virtual.trial_errors import stated_errors_of_trials
 from mitsim.views import View
 from mitsim.views.view_scores import screening_risk
-from tests.proofs.case_trials import CaseTrials, days, keep_trials, measured_choice, measured_truth, trials_by_kind
+from tests.proofs.case_trials import (
+    days,
+    keep_trials,
+    measure_worlds,
+    measured_choice,
+    measured_truth,
+    trials_by_kind,
+)
 from tests.proofs.part_cases import PartCase
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class StatedView:
+class JudgedView:
     """A view's statements, by measurement, and the ``errors`` (measurement, world) in other worlds that judge them.
 
     Errors of zones are those of parts at the limit of their tolerance, as in the statements.
@@ -68,7 +71,7 @@ class JudgedCase:
     scores: xr.Dataset
     raced: Raced | None
     choice: Floats | None
-    stated: tuple[StatedView, ...]
+    stated: tuple[JudgedView, ...]
 
 
 def run_cases(cases: Sequence[PartCase], folder: str | Path, workers: Executor | None = None) -> list[JudgedCase]:
@@ -81,14 +84,11 @@ def run_case(case: PartCase, folder: Path, workers: Executor | None = None) -> J
     say(f"case: {case.name}")
     study = case.open()
     trials_of_kind = trials_by_kind(case, study, folder, workers)
-    assert study.performance_map is not None
-    predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
-    scores, _ = screen(study, predictor, study.performance_map)
+    tool = trials_of_kind["tool"]
+    scores, _ = tool.screen()
     raced = None
     if case.table.raced:
-        few, tool = study.views[: case.file.raced_candidates], trials_of_kind["tool"]
-        few_scores = scores.sel(view=[view.number for view in few])
-        raced = run_race(few, few_scores, tool.runner, tool.trials, race_rules(study.file.race))
+        raced = tool.race(scores.sel(view=[view.number for view in study.views[: case.file.raced_candidates]]))
     truth = measured_truth(case, trials_of_kind["truth"])
     choice = None if raced is None else measured_choice(case, trials_of_kind["choice"])
     chosen = None if raced is None else raced.leaders().get(ALL)
@@ -117,10 +117,10 @@ def _to_state(case: PartCase, study: Study, scores: xr.Dataset, chosen: int | No
     return [(by_number[number], why) for number, why in [(first, "chosen"), *((others[i], "at random") for i in drawn)]]
 
 
-def _stated(case: PartCase, trials_of_kind: dict[str, CaseTrials], view: View, why: str) -> StatedView:
+def _stated(case: PartCase, trials_of_kind: dict[str, Session], view: View, why: str) -> JudgedView:
     tool, apart, count = trials_of_kind["tool"], trials_of_kind["apart"], case.file.stated_worlds
     table = StatementTable(trials=tool.study.file.statement.trials, pairs=0)
-    statements = state_view(tool.study, view, tool.runner, tool.trials, tool.unknowns, table)
-    apart.measure([view], {view.number: days(count)})
+    stated = tool.state(view, table)
+    measure_worlds(case, "apart", apart, [view], {view.number: days(count)})
     errors = stated_errors_of_trials(apart.study.task, apart.trials, view.number, days(count))
-    return StatedView(view.number, why, tuple(statements), errors)
+    return JudgedView(view.number, why, tuple(stated.statements), errors)

@@ -150,8 +150,9 @@ def test_what_is_wrong_with_a_pcd_is_named(change, told):
         (("element vertex 108", "element vertex -3"), "the line"),
         (("element vertex 108", "element apex 108"), "vertices with x, y and z"),
         (("property float x", "property real x"), "the line 'property real x'"),
-        (("property float x", "property float y"), "the line"),
-        (("property float x", "property list uchar int x"), "one list alone"),
+        (("property float x", "property float y"), "vertices with x, y and z"),
+        (("property float x", "property list uchar int x"), "data that do not fit"),
+        (("property float x", "property list float int x"), "a whole number of items"),
         (("end_header", "the_end"), "without the header"),
     ],
 )
@@ -167,3 +168,71 @@ def test_a_range_grid_that_names_what_is_not_there_is_refused():
     content = ply(SMALL, "ascii", "range_grid")
     with pytest.raises(InputError, match="range_grid: found a vertex number out of range"):
         decode_ply(content[: content.rindex(b"1 ")] + b"1 999\n", "x.ply")
+
+
+@pytest.mark.parametrize("order", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("place", ["before", "after", "between"])
+def test_faces_with_lists_colours_and_names_twice_leave_the_vertices(order, place):
+    """Faces with two lists and a number, as VCGLIB writes them; vertices with two properties of one name, as PCL does.
+
+    The element of PCL's camera, which holds the grid, stands after all.
+    """
+    sign = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}[order]
+    rows = SMALL.reshape(-1, 3)
+
+    def packed(*parts):
+        if order == "ascii":
+            return (" ".join(f"{value!r}" for _, values in parts for value in values) + "\n").encode()
+        return b"".join(np.array(values, sign + kind).tobytes() for kind, values in parts)
+
+    vertex = [
+        f"element vertex {len(rows)}",
+        *(f"property float {axis}" for axis in "xyz"),
+        "property uchar _",
+        "property uchar _",
+    ]
+    vertices = b"".join(packed(("f4", row.tolist()), ("u1", [1, 2])) for row in rows)
+    face = [
+        "element face 2",
+        "property list uchar int vertex_indices",
+        "property uchar red",
+        "property list uchar float texcoord",
+        "property int texnumber",
+    ]
+    faces = b"".join(
+        packed(("u1", [3]), ("i4", [0, 1, 2]), ("u1", [9]), ("u1", [count]), ("f4", [0.5] * count), ("i4", [0]))
+        for count in (6, 2)
+    )
+    camera = ["element camera 1", "property int viewportx", "property int viewporty"]
+    seen = packed(("i4", [SMALL.shape[1], SMALL.shape[0]]))
+    order_of = {
+        "before": [(face, faces), (vertex, vertices), (camera, seen)],
+        "after": [(vertex, vertices), (camera, seen), (face, faces)],
+        "between": [(vertex, vertices), (face, faces), (camera, seen)],
+    }[place]
+    head = ["ply", f"format {order} 1.0", *(line for lines, _ in order_of for line in lines), "end_header\n"]
+    read = decode_ply("\n".join(head).encode() + b"".join(data for _, data in order_of), "x.ply")
+    assert read.size == SMALL.shape[1::-1]
+    np.testing.assert_allclose(read.points.reshape(SMALL.shape), SMALL, rtol=1e-6)
+
+
+def test_vertices_with_a_list_of_their_own_are_read():
+    head = (
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty list uchar int seen\nproperty float y\n"
+        "property float z\nend_header\n"
+    )
+    read = decode_ply(f"{head}1 2 7 8 2 3\n4 0 5 6\n".encode(), "x.ply")
+    assert read.points.tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+SPELLINGS = ["nan", "-nan", "-nan(ind)", "nan(snan)", "NaN", "1.#QNAN", "-1.#IND", "1.#QNAN0", "-1.#IND00", "nan(0x8)"]
+
+
+@pytest.mark.parametrize("nan", SPELLINGS)
+def test_nan_of_every_c_library_is_nan(nan):
+    body = f"1 2 3\n{nan} {nan} {nan}\n-1.#INF00 1.#INF 2\n".encode()
+    head = "\n".join(f"property float {axis}" for axis in "xyz")
+    read = decode_ply(f"ply\nformat ascii 1.0\nelement vertex 3\n{head}\nend_header\n".encode() + body, "x.ply").points
+    fields = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 3\nHEIGHT 1\nDATA ascii\n"
+    for points in (read, decode_pcd(fields.encode() + body, "x.pcd")[0][0]):
+        np.testing.assert_array_equal(points, [[1, 2, 3], [np.nan] * 3, [-np.inf, np.inf, 2]])

@@ -7,6 +7,10 @@ import pytest
 import trimesh
 
 from characterisation.files.errors import InputError
+from mitsim.report.author_page import Authored, page_data
+from mitsim.report.scene_preview import preview_figure
+from mitsim.report.scene_table import as_data, as_text
+from mitsim.scene.authoring.check import findings
 from mitsim.scene.first_hits import trace, visible_surfaces
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
@@ -39,6 +43,56 @@ def test_areas_boxes_and_materials_of_the_artefact(scenes):
     assert shapes["pillar1"].alpha[0] < shapes["plane"].alpha[0]  # Ra 0.37 against 0.74 um
     assert all("prior" in shape.provenance and shape.alpha_factor > 1 for shape in facts.shapes)
     assert not any(shape.delta or shape.two_sided or shape.emitter for shape in facts.shapes)
+
+
+GROUP = f'<shape type="shapegroup" id="g"><shape type="sphere">{TEN}{WHITE}</shape></shape>'
+
+
+def test_an_instance_is_seen_and_its_area_is_not_known(tmp_path, n10):
+    """Two balls of one group on a plate; a ray that meets a ball counts for the instance, not for the shape in it."""
+    aside, wide = (
+        f'<transform name="to_world"><{how}/></transform>' for how in ('translate x="30"', 'scale value="60"')
+    )
+    body = (
+        f'<shape type="disk" id="plate">{wide}{WHITE}</shape>{GROUP}'
+        f'<shape type="instance" id="one"><ref id="g"/></shape>'
+        f'<shape type="instance" id="two">{aside}<ref id="g"/></shape>'
+    )
+    scene = scene_of(tmp_path, body)
+    shapes = {shape.name: shape for shape in inspect(scene).shapes}
+    assert set(shapes) == {"plate", "one", "two"}
+    assert np.isclose(shapes["plate"].area, np.pi * 60**2)
+    for name in ("one", "two"):
+        assert np.isnan(shapes[name].area)
+        assert shapes[name].front_hits > 100
+        assert shapes[name].back_hits == 0
+    down = trace(scene, np.array([[0.0, 0, 50], [30, 0, 50], [-30, 0, 50]]), np.tile([0.0, 0, -1], (3, 1)))
+    assert [scene.names[number] for number in down.shape] == ["one", "two", "plate"]
+    assert np.allclose(down.distance, [40, 40, 50], atol=1e-3)
+
+
+def test_curves_are_checked_and_put_on_the_page(tmp_path, n10):
+    (tmp_path / "wire.txt").write_text("0 0 0 1\n10 0 0 1\n20 5 0 1\n30 5 5 1\n40 0 5 1\n")
+    wires = "".join(
+        f'<shape type="{kind}" id="{kind}"><string name="filename" value="wire.txt"/>{WHITE}</shape>'
+        for kind in ("bsplinecurve", "linearcurve")
+    )
+    scene = scene_of(tmp_path, f'<shape type="cube" id="block">{TEN}{WHITE}</shape>{wires}')
+    facts, pose = inspect(scene), look_at((0, -300, 300), (0, 0, 0), (0, 1, 0))
+    seen = visible_surfaces(scene, n10.rig, pose)
+    found = findings(facts, n10, pose, seen, True)
+    rows = {line.split()[0]: line for line in as_text(facts, seen, found).splitlines() if line}
+    data = {one["name"]: one for one in as_data(facts, seen, found)["features"]}
+    faces = {
+        one["name"]: one for one in page_data(Authored(scene, facts, n10, found, None, None), "")["solid"]["faces"]
+    }
+    for kind in ("bsplinecurve", "linearcurve"):
+        assert "not known" in rows[kind]
+        assert data[kind]["area_mm2"] is None
+        assert data[kind]["pixels"] > 0
+        assert faces[kind]["area"] is None
+    assert faces["block"]["area"] == pytest.approx(6 * 20**2)
+    assert preview_figure(scene, facts, n10, pose, seen, []) is not None
 
 
 def test_points_spread_over_a_shape_lie_on_it_evenly(tmp_path):

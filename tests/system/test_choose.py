@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 import shell
+import trimesh
 from small_study import MEASUREMENTS, few_measurements
 
+from mitsim.study.choose import choose_sensor, read_candidates
 from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
@@ -110,3 +112,39 @@ def test_sensors_that_are_none_are_one_message(chosen, sensors, told):
     folder, _, _ = chosen
     done = mitsim_here("choose", folder / "study.toml", "--sensors", sensors, "-o", folder / "other")
     assert done.returncode == 2 and told in done.stderr and "Traceback" not in done.stderr
+
+
+def test_another_mesh_of_the_same_size_is_measured_anew(tmp_path):
+    """Balls of 30 mm and 29 mm in a box of the same bounds: the text of the scene stays, and so do its views."""
+
+    def ball(radius):
+        mesh = trimesh.creation.icosphere(4, radius)
+        mesh.apply_translation((0, 0, 30))
+        mesh.export(tmp_path / "ball.ply", vertex_normal=True)
+
+    def radius_error(name):
+        candidates, _ = read_candidates(tmp_path / "study.toml", [str(tmp_path / "ensenso-n10.toml")])
+        (result,) = choose_sensor(candidates, tmp_path / name, 1.0, lambda *_: None)
+        return next(row[2].bias for row in result.best() if row is not None)
+
+    coarse_sensor("ensenso-n10", 2, tmp_path)
+    (tmp_path / "balls.xml").write_text(
+        '<scene version="3.0.0"><bsdf type="matt_white" id="white"/>'
+        '<shape type="cube" id="box"><transform name="to_world"><scale x="80" y="80" z="1"/></transform>'
+        '<ref id="white"/></shape><shape type="cylinder" id="post"><point name="p0" x="70" y="0" z="0"/>'
+        '<point name="p1" x="70" y="0" z="65"/><float name="radius" value="3"/><ref id="white"/></shape>'
+        '<shape type="ply" id="ball"><string name="filename" value="ball.ply"/><ref id="white"/></shape></scene>'
+    )
+    (tmp_path / "task.toml").write_text(
+        '[features.ball]\nkind = "sphere"\npoint_mm = [0, 0, 30]\nradius_mm = 30\n'
+        '[measurements.radius]\nkind = "radius"\nfeatures = ["ball"]\nnominal = 30\nunit = "mm"\n'
+    )
+    (tmp_path / "study.toml").write_text(
+        STUDY.replace(f"{SCENES / 'matt_white.xml'}", "balls.xml").replace('"ensenso-n10"', '"ensenso-n10.toml"')
+        + "pairs = 0\n"
+    )
+    ball(30)
+    large = radius_error("kept")
+    ball(29)
+    small = radius_error("kept")
+    assert small == radius_error("new") != large

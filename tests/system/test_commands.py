@@ -239,3 +239,22 @@ def test_a_broken_png_is_named(tmp_path):
     done = mitsim_here("decode", tmp_path / "capture", "-o", tmp_path / "cloud.ply", code=2)
     assert "left_000.png" in done.stderr
     assert not (tmp_path / "cloud.ply").exists()
+
+
+def test_a_rendering_that_shows_nothing_of_the_part_says_so(tmp_path):
+    """The camera looks away; the capture repeats it when it is decoded, and no number is missing or "nan"."""
+    sensor = coarse_sensor("ensenso-n10", 8, tmp_path)
+    scene = ROOT / "scenes/two_pillars/two_pillars.xml"
+    view = ["--sensor", sensor, "--samples", 1, "--depth", 1]
+    done = mitsim(
+        "render", scene, "--position", 0, -400, 300, "--target", 0, -4000, 300, *view, "-o", tmp_path / "away"
+    )
+    assert "warning: no pixel of the camera left, camera right, projector shows the part" in done.stderr
+    assert "no pixel is lit" in done.stderr
+    assert "nan" not in done.stderr
+    pixels = read_capture(tmp_path / "away").images["left"][0].size
+    decoded = mitsim("decode", tmp_path / "away", "-o", tmp_path / "away.ply")
+    assert decoded.stdout.splitlines()[0] == f"valid\t0 of {pixels}"
+    assert "shows the part" in decoded.stderr
+    seen = mitsim("render", scene, "--position", 0, -400, 300, *view, "-o", tmp_path / "seen")
+    assert "warning: no pixel" not in seen.stderr

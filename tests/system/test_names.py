@@ -16,6 +16,7 @@ SCENES = Path(__file__).parents[2] / "scenes"
 PRESET = Path(__file__).parents[2] / "mitsim" / "sensor" / "presets" / "ensenso-n10.toml"
 
 HOSTILE = (
+    "\u0301a",  # a mark without a letter before it
     "../../evil",
     "/tmp/evil",
     "N10/lab 2",
@@ -40,7 +41,8 @@ HOSTILE = (
 
 
 @pytest.mark.parametrize(
-    "name", ["ensenso-n10", "pillar1_radius", "Größe 2", "N10 (lab #2)", "a.b", "1", "Ø 20 +- 0.1"]
+    "name",
+    ["ensenso-n10", "pillar1_radius", "Größe 2", "N10 (lab #2)", "a.b", "1", "Ø 20 +- 0.1", "シール面", "พื้นผิว", "मुख"],
 )
 def test_usual_names_are_names(name):
     assert checked_name(name) == name

@@ -29,7 +29,7 @@ from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import mean_run_length
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
-from mitsim.study import read_study
+from mitsim.study import open_study
 from tests.smaller_sensors import narrow_search
 
 AXIS = np.array([0.0, 0.0, 1.0])
@@ -249,7 +249,7 @@ def test_a_campaign_and_a_study_refuse_an_exposure_that_follows_the_scene(tmp_pa
     (tmp_path / "study.toml").write_text(study)
     for refused in (
         lambda: read_campaign(scenes / "coupon/campaign.toml", sensor),
-        lambda: read_study(tmp_path / "study.toml"),
+        lambda: open_study(tmp_path / "study.toml"),
     ):
         with pytest.raises(InputError, match="F depends on the rest of the view") as caught:
             refused()

@@ -7,7 +7,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from known_trials import CASES, KnownMaker
 
-import tests.proofs.case_trials as case_trials
+from mitsim.study import session
 
 
 @pytest.fixture
@@ -20,5 +20,5 @@ def cases(tmp_path, scenes, monkeypatch):
     file = tmp_path / "cases.toml"
     file.write_text(CASES)
     KnownMaker.made = 0
-    monkeypatch.setattr(case_trials, "measurements_of", KnownMaker)
+    monkeypatch.setattr(session, "measurements_of", KnownMaker)
     return file

@@ -8,6 +8,7 @@ from known_trials import NAMES, rows
 import tests.proofs.screening_run as screening_run
 from characterisation.scores import screening
 from characterisation.statements.selection import chance_after
+from mitsim.study import session
 from tests.proofs.part_cases import read_part_cases
 from tests.proofs.screening_page import cells_of, described_screening, write_screening_page
 from tests.proofs.screening_run import (
@@ -49,7 +50,7 @@ def screen(cases, tmp_path, monkeypatch):
     def judge(u, chance=1.0, points=None):
         size = np.ones(MORE)
         monkeypatch.setattr(
-            screening_run,
+            session,
             "screen",
             lambda study, *_: (told(u * size, chance * size, study, size if points is None else points), []),
         )

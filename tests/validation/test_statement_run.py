@@ -9,8 +9,8 @@ from known_trials import NAMES, KnownMaker, rows
 from scipy.stats import norm
 
 import tests.proofs.case_trials as case_trials
-import tests.proofs.statement_run as statement_run
 from characterisation.files.errors import InputError
+from mitsim.study import session
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
 from tests.proofs.judged_statements import choices_of
@@ -37,7 +37,7 @@ def scores(study, *_):
 
 @pytest.fixture(autouse=True)
 def _known_scores(monkeypatch):
-    monkeypatch.setattr(statement_run, "screen", lambda *given: (scores(*given), []))
+    monkeypatch.setattr(session, "screen", lambda *given: (scores(*given), []))
 
 
 def test_right_statements_cover_and_the_race_finds_the_view_that_the_map_thinks_worst(cases, tmp_path):
@@ -67,7 +67,7 @@ def test_right_statements_cover_and_the_race_finds_the_view_that_the_map_thinks_
 
 
 def test_statements_that_are_too_narrow_are_found_out(cases, tmp_path, monkeypatch):
-    monkeypatch.setattr(case_trials, "measurements_of", lambda *given: KnownMaker(*given, wider=2.0))
+    monkeypatch.setattr(session, "measurements_of", lambda *given: KnownMaker(*given, wider=2.0))
     found = run_cases(read_part_cases(cases), tmp_path / "run")
     _, table = write_statement_page(found, tmp_path / "run", "")
     shares = [float(row["share"]) for row in rows(tmp_path / "run/coverage.csv")]
@@ -149,7 +149,7 @@ def test_a_measurement_that_hardly_any_world_makes_is_in_no_mean_of_regrets(case
                 lost = {} if job.trial.day % 4 == 0 else {NAMES[0]: np.nan}
                 yield job, Outcome(dict(outcome.errors) | lost)
 
-    monkeypatch.setattr(case_trials, "measurements_of", Rarely)
+    monkeypatch.setattr(session, "measurements_of", Rarely)
     chosen = read_part_cases(cases)
     found = run_cases(chosen, tmp_path / "run")
     page, _ = write_statement_page(found, tmp_path / "run", described(cases, chosen))

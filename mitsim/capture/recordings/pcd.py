@@ -18,6 +18,7 @@ from characterisation.files.checked_files import LARGEST_FILE
 from characterisation.files.errors import InputError
 from mitsim.capture.png import LONGEST_SIDE_PX
 from mitsim.capture.recordings.lzf import decode_lzf
+from mitsim.capture.recordings.number_text import number_words
 
 _KINDS = ("ascii", "binary", "binary_compressed")
 _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
@@ -104,7 +105,7 @@ def _numbers(
     """Return the columns x, y and z, (count,) each."""
     with np.errstate(over="ignore", invalid="ignore"):
         if kind == "ascii":
-            words = body.decode("ascii").split()
+            words = number_words(body)
             each = sum(int(np.prod(dtype[name].shape)) for name in names)
             if len(words) != count * each:
                 raise ValueError(f"{len(words)} numbers, {count * each} expected")

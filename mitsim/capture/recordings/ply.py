@@ -10,13 +10,14 @@ PLY has no grid of its own. Two kinds of file state one. Range grids of Stanford
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
+from mitsim.capture.recordings.number_text import number_words
 
 _TYPES = {
     "char": "i1",
@@ -56,11 +57,30 @@ class Ply:
 
 
 @dataclass(frozen=True)
+class _Property:
+    """A number, or a list of them if ``count`` is the type of its length; types are NumPy's."""
+
+    name: str
+    kind: str
+    count: str = ""
+
+
+@dataclass(frozen=True)
 class _Element:
     name: str
     count: int
-    properties: tuple[tuple[str, str], ...]
-    lists: bool
+    properties: tuple[_Property, ...] = ()
+
+    @property
+    def lists(self) -> bool:
+        """Return whether a property is a list."""
+        return any(one.count for one in self.properties)
+
+    def with_property(self, name: str, kind: str, count: str = "") -> _Element:
+        """Return the element with another property; a name that is there gets a number."""
+        taken = {one.name for one in self.properties}
+        unique = name if name not in taken else f"{name} {len(taken)}"
+        return replace(self, properties=(*self.properties, _Property(unique, kind, count)))
 
 
 def decode_ply(data: bytes, where: str | Path) -> Ply:
@@ -105,26 +125,24 @@ def _elements(lines: tuple[str, ...], where: str | Path) -> tuple[str, list[_Ele
             case ["format", kind, _] if kind in _ORDERS:
                 order = _ORDERS[kind]
             case ["element", name, count] if count.isascii() and count.isdigit() and len(count) <= 9:
-                found.append(_Element(name, int(count), (), False))
-            case ["property", kind, name] if kind in _TYPES and found and name not in dict(found[-1].properties):
-                last = found[-1]
-                found[-1] = _Element(last.name, last.count, (*last.properties, (name, _TYPES[kind])), last.lists)
-            case ["property", "list", count, kind, _] if count in _TYPES and kind in _TYPES and found:
-                last = found[-1]
-                pair = (("count", _TYPES[count]), ("item", _TYPES[kind]))
-                if last.properties or _TYPES[count][0] == "f":
-                    raise InputError(where, f"element {last.name}", line, "one list alone, or numbers")
-                found[-1] = _Element(last.name, last.count, pair, True)
+                found.append(_Element(name, int(count)))
+            case ["property", kind, name] if kind in _TYPES and found:
+                found[-1] = found[-1].with_property(name, _TYPES[kind])
+            case ["property", "list", count, kind, name] if count in _TYPES and kind in _TYPES and found:
+                if _TYPES[count][0] == "f":
+                    raise InputError(where, f"element {found[-1].name}", line, "a whole number of items")
+                found[-1] = found[-1].with_property(name, _TYPES[kind], _TYPES[count])
             case ["comment" | "obj_info", *_] | []:
                 continue
             case _:
                 raise InputError(where, "", f"the line {line[:60]!r}", "the header of a PLY 1.0")
     if order is None:
         raise InputError(where, "format", "nothing", " | ".join(_ORDERS))
-    if any(element.lists and len(element.properties) != 2 for element in found):
-        raise InputError(where, "property list", "beside other properties", "one list alone, or numbers")
     return order, found
 
+
+#: elements that are used
+_USEFUL = ("vertex", "range_grid", "camera")
 
 #: largest text [bytes]; reading takes ten times as much memory
 _LARGEST_TEXT = 96 * 1024**2
@@ -133,61 +151,75 @@ Table = dict[str, NDArray[np.generic]] | list[list[float]]
 
 
 def _tables(body: bytes, order: str, elements: list[_Element]) -> dict[str, Table]:
-    """Read every element up to the last useful one; lists after the vertices, such as faces, are skipped."""
+    """Read every element up to the last useful one: lists after it, such as faces, are skipped.
+
+    An element with lists gives those of its first; vertices always give their numbers.
+    """
     if order == "" and len(body) > _LARGEST_TEXT:
         raise ValueError(f"{len(body):,} bytes of text, at most {_LARGEST_TEXT:,}: save it as binary PLY")
-    words = body.decode("ascii").split() if order == "" else []
+    words = number_words(body) if order == "" else []
+    last = max((number for number, one in enumerate(elements) if one.name in _USEFUL), default=-1)
     out: dict[str, Table] = {}
     at = 0
-    for element in elements:
-        if element.lists and "vertex" in out and element.name != "range_grid":
-            break
+    for element in elements[: last + 1]:
         if element.lists:
             if element.count > _MOST_LISTS:
                 raise ValueError(f"{element.count} lists")
-            rows, at = _lists(body, words, at, order, element)
-            out[element.name] = rows
+            numbers, rows, at = _rows(body, words, at, order, element)
+            out[element.name] = numbers if element.name == "vertex" else rows
         elif order == "":
             columns = len(element.properties)
             part = words[at : at + columns * element.count]
             if len(part) < columns * element.count:
                 raise ValueError(f"{len(part)} numbers of {element.name}, {columns * element.count} expected")
-            numbers = np.array(part, np.float64).reshape(element.count, columns)
-            out[element.name] = {name: numbers[:, column] for column, (name, _) in enumerate(element.properties)}
+            table = np.array(part, np.float64).reshape(element.count, columns)
+            out[element.name] = {one.name: table[:, column] for column, one in enumerate(element.properties)}
             at += columns * element.count
         else:
-            dtype = np.dtype([(name, order + kind) for name, kind in element.properties])
+            dtype = np.dtype([(one.name, order + one.kind) for one in element.properties])
             if len(body) - at < dtype.itemsize * element.count:
                 raise ValueError(f"{len(body) - at} bytes of {element.name}, {dtype.itemsize * element.count} expected")
-            table = np.frombuffer(body, dtype, element.count, at)
-            out[element.name] = {name: table[name] for name, _ in element.properties}
+            packed = np.frombuffer(body, dtype, element.count, at)
+            out[element.name] = {one.name: packed[one.name] for one in element.properties}
             at += dtype.itemsize * element.count
     return out
 
 
-def _lists(body: bytes, words: list[str], at: int, order: str, element: _Element) -> tuple[list[list[float]], int]:
+def _rows(
+    body: bytes, words: list[str], at: int, order: str, element: _Element
+) -> tuple[dict[str, NDArray[np.generic]], list[list[float]], int]:
+    """Read an element with lists: its numbers by name, the items of its first list, and the position after it."""
+    plain = [one for one in element.properties if not one.count]
+    first = next(one for one in element.properties if one.count)
+    numbers: dict[str, list[float]] = {one.name: [] for one in plain}
     rows: list[list[float]] = []
-    count_type, item_type = (np.dtype(order + kind) if order else None for _, kind in element.properties)
-    for _ in range(element.count):
-        if count_type is None or item_type is None:
-            if at >= len(words):
-                raise ValueError(f"lists of {element.name} that end too early")
-            length = int(words[at])
-            row = [float(word) for word in words[at + 1 : at + 1 + length]] if length > 0 else []
-            at += 1 + length
+
+    def items(kind: str, length: int) -> list[float]:
+        nonlocal at
+        if not order:
+            row = [float(word) for word in words[at : at + length]]
+            at += length
         else:
-            if at + count_type.itemsize > len(body):
-                raise ValueError(f"lists of {element.name} that end too early")
-            length = int(np.frombuffer(body, count_type, 1, at)[0])
-            at += count_type.itemsize
-            if not 0 <= length <= (len(body) - at) // item_type.itemsize:
-                raise ValueError(f"a list of {length} in {element.name}")
-            row = np.frombuffer(body, item_type, length, at).astype(float).tolist()
-            at += length * item_type.itemsize
+            dtype = np.dtype(order + kind)
+            whole = length * dtype.itemsize <= len(body) - at
+            row = np.frombuffer(body, dtype, length, at).astype(float).tolist() if whole else []
+            at += length * dtype.itemsize
         if len(row) != length:
-            raise ValueError(f"a list of {length} in {element.name}")
-        rows.append(row)
-    return rows, at
+            raise ValueError(f"lists of {element.name} that end too early")
+        return row
+
+    for _ in range(element.count):
+        for one in element.properties:
+            if not one.count:
+                numbers[one.name] += items(one.kind, 1)
+                continue
+            length = items(one.count, 1)[0]
+            if not (length.is_integer() and 0 <= length <= len(body)):
+                raise ValueError(f"a list of {length:g} in {element.name}")
+            row = items(one.kind, int(length))
+            if one is first:
+                rows.append(row)
+    return {name: np.array(values) for name, values in numbers.items()}, rows, at
 
 
 def _stated_size(lines: tuple[str, ...]) -> tuple[int, int] | None:

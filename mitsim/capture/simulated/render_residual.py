@@ -63,6 +63,8 @@ class RenderResidual:
         return max(self.noise, self.quadrature)
 
     def __str__(self) -> str:
+        if not self.noise >= 0:
+            return "render noise: not known, since no pixel is lit"
         return (
             f"render noise {self.noise:.3f}, quadrature error {self.quadrature:.3f} of the sensor's noise; "
             f"either exceeds it in {100 * self.outliers:.1f} % of the pixels"

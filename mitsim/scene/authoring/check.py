@@ -143,6 +143,10 @@ def _material(shape: ShapeFacts, measured: bool) -> Iterator[Finding]:
     if shape.delta:
         what = f"a {shape.bsdf} only mirrors or refracts: black under a point-like projector"
         yield Finding(severity, shape.name, what, "Use machined_metal, or a rough BSDF")
+    elif shape.kind == "instance":
+        what = "an instance has no finish of its own, so no performance map covers it"
+        advice = "Write the shape itself if it is measured; as it is, it occludes, but has no predicted points"
+        yield Finding(severity, shape.name, what, advice)
     elif shape.finish is None:
         what = f"the BSDF {shape.bsdf} has no finish, so no performance map covers it"
         advice = "Use machined_metal, gloss_paint, powder_coat or matt_white; as it is, it occludes but gives no points"

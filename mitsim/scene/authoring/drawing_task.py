@@ -64,13 +64,15 @@ class DrawnMeasurement:
 class DrawnTask:
     """Content of a drawing: measurements by name, names of the faces of each datum, and items left out.
 
-    ``middles``: the mid-planes of two sides that measurements use, by name.
+    ``middles``: the mid-planes of two sides that measurements use, by name. ``in_part``: how measurements differ from
+    the drawing.
     """
 
     measurements: dict[str, DrawnMeasurement] = field(default_factory=dict)
     datums: dict[str, tuple[str, ...]] = field(default_factory=dict)
     middles: dict[str, Side] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
+    in_part: list[str] = field(default_factory=list)
 
     def datum_of(self, name: str) -> str:
         """Return the letters of the datums on a face."""
@@ -80,6 +82,8 @@ class DrawnTask:
         """Return a summary of the drawing for the user."""
         lines = [f"The file's own dimensions and tolerances: {len(self.measurements)} measurements."]
         lines += [f"Datum {letter}: {', '.join(faces) or 'no face'}." for letter, faces in self.datums.items()]
+        if self.in_part:
+            lines += ["Converted, with a remark:", *(f"  {one}" for one in self.in_part)]
         if self.left_out:
             lines += ["Not converted:", *(f"  {one}" for one in self.left_out)]
         return lines
@@ -211,7 +215,7 @@ class _TaskBuilder:
             said = (*one.notes, *zone.remarks)
             name = f"{zone.of.name}_{zone.kind}"
             self.add(name, DrawnMeasurement(zone.kind, features, 0.0, "mm", one.zone, one.number, said))
-            self.task.left_out += [f"{described} of {zone.of.name}: {remark}" for remark in zone.remarks]
+            self.task.in_part += [f"{described} of {zone.of.name}: {remark}" for remark in zone.remarks]
         self.task.left_out += [f"{described}{f' of {name}' if name else on}: {why}" for name, why in made.left_out]
 
 

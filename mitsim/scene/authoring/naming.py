@@ -11,9 +11,11 @@ up.
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
+from decimal import ROUND_HALF_UP, Decimal
 
 import numpy as np
 
@@ -38,7 +40,12 @@ _APART = 0.02
 #: placeholders of CAD programs for faces without a name
 _NO_NAME = re.compile(r"(none|null|unnamed|advanced_?face|face|surface|shape|body|solid|\W)*[\d\W_]*", re.IGNORECASE)
 
-_LONGEST = 60
+#: longest name from a CAD file [bytes], and longest name of an assembly's part before it
+_LONGEST, _LONGEST_PART = 60, 30
+
+#: lengths and angles are rounded after noise below this many decimal places is removed: 9.525 mm is written in inches,
+#: too
+_PLACES = 4
 
 
 def with_names(faces: Sequence[Face]) -> list[Face]:
@@ -80,13 +87,26 @@ def _in_order(faces: list[Face]) -> list[Face]:
 def _given(face: Face) -> str:
     """Return the name in the CAD file if a person wrote it: it contains a word and is not the program's counter."""
     name = face.drawn_name
-    return "" if _NO_NAME.fullmatch(name) or not re.search(r"[^\W\d_]{2}", name) else identifier(name)
+    letters = "".join(one for one in name if not _is_mark(one))
+    # an ideograph or a syllable is a word; a single letter of an alphabet is not
+    word = re.search(r"[^\W\d_]{2}", letters) or any(unicodedata.category(one) == "Lo" for one in letters)
+    return identifier(name) if word and not _NO_NAME.fullmatch(letters) else ""
 
 
-def identifier(name: str) -> str:
-    """Return a name valid in files, XML and TOML: letters, digits, dash and underscore, a letter first."""
-    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_-")[:_LONGEST]
-    return plain if re.match(r"[A-Za-z]", plain) else f"face_{plain}".rstrip("_")
+def identifier(name: str, longest: int = _LONGEST) -> str:
+    """Return a name valid in files, XML and tasks: letters of any script, digits, dash and underscore, a letter first.
+
+    Letters keep their marks. ``longest`` is in bytes, since a name may become part of a file's name.
+    """
+    composed = unicodedata.normalize("NFC", name)
+    kept = "".join(one if one.isalnum() or one in "_-" or _is_mark(one) else " " for one in composed)
+    plain = re.sub(r" +", "_", kept).strip("_-").encode()[:longest].decode("utf-8", "ignore").rstrip("_-")
+    return plain if plain[:1].isalpha() else f"face_{plain}".rstrip("_")
+
+
+def _is_mark(one: str) -> bool:
+    """Return whether a character is a mark on the letter before it."""
+    return unicodedata.category(one).startswith("M")
 
 
 def _part_names(faces: Sequence[Face]) -> list[str]:
@@ -98,8 +118,8 @@ def _part_names(faces: Sequence[Face]) -> list[str]:
     order = sorted(bodies, key=lambda body: (bodies[body], middles[body].tolist()))
     names: dict[int, str] = {}
     for body in order:
-        name = identifier(bodies[body] or "part")
-        alike = [one for one in order if identifier(bodies[one] or "part") == name]
+        name = identifier(bodies[body] or "part", _LONGEST_PART)
+        alike = [one for one in order if identifier(bodies[one] or "part", _LONGEST_PART) == name]
         names[body] = name if len(alike) == 1 else f"{name}_{alike.index(body) + 1}"
     return [f"{names[face.body]}_" for face in faces]
 
@@ -116,9 +136,9 @@ def described_name(face: Face, low: Floats, high: Floats) -> str:
     if isinstance(surface, Cone):
         angle = np.rad2deg(2 * surface.half_angle)
         if not face.convex:
-            return f"countersink_{angle:.0f}deg"
+            return f"countersink_{degrees(angle)}deg"
         narrow = np.ptp((face.vertices - surface.point) @ surface.axis) < _CHAMFER_SHARE * part
-        return f"chamfer_{angle / 2:.0f}deg" if narrow else f"cone_{angle:.0f}deg"
+        return f"chamfer_{degrees(angle / 2)}deg" if narrow else f"cone_{degrees(angle)}deg"
     if isinstance(surface, Sphere):
         return f"{'ball' if face.convex else 'seat'}_{size(2 * surface.radius)}mm"
     if isinstance(surface, Torus):
@@ -139,7 +159,7 @@ def _plane_name(face: Face, surface: Plane, low: Floats, high: Floats) -> str:
     extent = np.sort(_extents(face, surface))
     narrow = extent[0] < _CHAMFER_SHARE * float(np.linalg.norm(high - low))
     upright = abs(surface.normal[2]) < np.sqrt(1 - _ALONG**2)  # like the sides of a hexagonal nut
-    return f"{'chamfer' if narrow else 'side' if upright else 'slope'}_{off:.0f}deg"
+    return f"{'chamfer' if narrow else 'side' if upright else 'slope'}_{degrees(off)}deg"
 
 
 def _extents(face: Face, surface: Plane) -> Floats:
@@ -163,8 +183,18 @@ def round_angle(face: Face, axis: Floats, point: Floats) -> float:
 
 def size(value: float) -> str:
     """Format a length for a name: to 0.01 mm, with an underscore as decimal point (``12_5``)."""
-    text = f"{value:.2f}".rstrip("0").rstrip(".")
+    text = f"{_rounded(value, 2):.2f}".rstrip("0").rstrip(".")
     return ("0" if text in ("-0", "") else text).replace(".", "_")
+
+
+def degrees(value: float) -> str:
+    """Format an angle for a name: to 1 deg."""
+    return f"{_rounded(value, 0):.0f}"
+
+
+def _rounded(value: float, places: int) -> Decimal:
+    """Round a number half away from zero, so that noise of the file does not decide."""
+    return Decimal(f"{value:.{_PLACES}f}").quantize(Decimal(1).scaleb(-places), ROUND_HALF_UP)
 
 
 def _place(face: Face) -> Floats:

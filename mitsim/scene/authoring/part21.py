@@ -113,7 +113,11 @@ def read_step_text(path: str | Path) -> StepText:
     InputError
         If it is not a Part-21 file.
     """
-    text = Path(path).read_bytes().decode("utf-8", "replace")
+    data = Path(path).read_bytes()
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError:  # older programs write the letters of their own language, mostly in this encoding
+        text = data.decode("latin-1")
     if "ISO-10303-21" not in text[:2000]:
         raise InputError(path, "", "no ISO-10303-21 in its head", "a STEP file (Part 21)")
     records = {}
@@ -200,7 +204,10 @@ def _value(tokens: list[tuple[str, str]], at: int, depth: int) -> tuple[Any, int
 
 
 def decoded(text: str) -> str:
-    r"""Resolve the escapes of a string: '' \X2\...\X0\ \X4\...\X0\ \X\hh \S\c (ISO 10303-21, 6.4.3)."""
+    r"""Resolve the escapes of a string: '' \X2\...\X0\ \X4\...\X0\ \X\hh \Pa\ \S\c (ISO 10303-21, 6.4.3).
+
+    \Pa\ selects the part of ISO 8859 for \S\, A the first.
+    """
     text = text.replace("''", "'")
     if "\\" not in text:
         return text
@@ -211,5 +218,14 @@ def decoded(text: str) -> str:
 
     text = re.sub(r"\\X([24])\\([0-9A-Fa-f]*)\\X0\\", wide, text)
     text = re.sub(r"\\X\\([0-9A-Fa-f]{2})", lambda found: chr(int(found.group(1), 16)), text)
-    text = re.sub(r"\\S\\(.)", lambda found: chr(ord(found.group(1)) | 0x80), text)
+    page = 1
+
+    def shifted(found: re.Match[str]) -> str:
+        nonlocal page
+        if found.group(1):
+            page = ord(found.group(1)) - ord("A") + 1
+            return ""
+        return bytes([ord(found.group(2)) | 0x80]).decode(f"iso8859-{page}", "replace")
+
+    text = re.sub(r"\\P([A-I])\\|\\S\\([\x20-\x7e])", shifted, text)
     return text.replace("\\\\", "\\")

@@ -25,10 +25,9 @@ from characterisation.files.errors import InputError, nearest
 from mitsim.scene.authoring.drawing_task import DrawnTask, drawn_task
 from mitsim.scene.authoring.face import Face, Torus
 from mitsim.scene.authoring.naming import with_names
-from mitsim.scene.authoring.part21 import read_step_text
 from mitsim.scene.authoring.product_information import read_product_information
 from mitsim.scene.authoring.read_mesh import STEP, check_part_file, check_size, read_mesh
-from mitsim.scene.authoring.read_step import CHORD_MM, read_step
+from mitsim.scene.authoring.read_step import Fineness, read_step
 from mitsim.scene.authoring.segment_mesh import segment_mesh
 from mitsim.scene.authoring.task_text import number, numbers, task_toml
 from mitsim.scene.surface.metals import CONSTANTS
@@ -91,8 +90,10 @@ class Part:
     drawing: DrawnTask | None = None
 
 
-def read_part(path: str | Path, units: str | None = None, angle_deg: float = 20.0, chord_mm: float = CHORD_MM) -> Part:
-    """Read a STEP file or a mesh and name its faces.
+def read_part(
+    path: str | Path, units: str | None = None, angle_deg: float = 20.0, fineness: Fineness | None = None
+) -> Part:
+    """Read a STEP file, meshed as finely as asked, or a mesh, and name its faces.
 
     Raises
     ------
@@ -105,11 +106,11 @@ def read_part(path: str | Path, units: str | None = None, angle_deg: float = 20.
     if path.suffix.lower() not in STEP:
         mesh = read_mesh(path, units)
         made = segment_mesh(mesh.vertices, mesh.triangles, angle_deg, None, str(path))
-        return Part(with_names(made.faces), made.remarks)
-    drawn = read_step(path, chord_mm)
+        return Part(with_names(made.faces), [*mesh.remarks, *made.remarks])
+    drawn = read_step(path, fineness or Fineness(), units)
     check_size(path, np.concatenate([face.vertices for face in drawn.faces]))
     faces = with_names(drawn.faces)
-    information = read_product_information(read_step_text(path))
+    information = read_product_information(drawn.text)
     return Part(faces, drawn.remarks, drawn_task(information, faces) if information.found else None)
 
 
@@ -119,7 +120,7 @@ def write_part(
     units: str | None = None,
     finishing: Finishing | None = None,
     angle_deg: float = 20.0,
-    chord_mm: float = CHORD_MM,
+    fineness: Fineness | None = None,
 ) -> Part:
     """Read a part, write its scene folder atomically, and return the part.
 
@@ -134,13 +135,13 @@ def write_part(
     finishing = finishing or Finishing()
     if not 0 < angle_deg < 90:
         raise InputError("--angle", "", f"{angle_deg:g} deg", "over 0 to 90 deg")
-    if not 0 < chord_mm <= 10:
-        raise InputError("--chord", "", f"{chord_mm:g} mm", "over 0 to 10 mm")
+    if fineness is not None and not 0 < fineness.chord_mm <= 10:
+        raise InputError("--chord", "", f"{fineness.chord_mm:g} mm", "over 0 to 10 mm")
     if folder.exists():
         raise InputError(folder, "", "a folder that exists", "a new one", "existing files are not overwritten")
     if not re.fullmatch(r"[\w][\w .-]{0,99}", folder.name):
         raise InputError("--output", "", repr(folder.name), "a folder name of letters, digits, dot, dash, underscore")
-    part = read_part(path, units, angle_deg, chord_mm)
+    part = read_part(path, units, angle_deg, fineness)
     files = {f"{face.name}.ply": ply(face) for face in part.faces}
     files[f"{folder.name}.xml"] = scene_xml(part.faces, finishing, path.name).encode()
     files["task.toml"] = task_toml(part.faces, folder.name, part.drawing).encode()

@@ -9,12 +9,12 @@ Follows the CAx-IF "Recommended Practices for the Representation and Presentatio
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from typing import Any
 
 from mitsim.scene.authoring.drawn_characteristics import Dimension, GeometricTolerance, ProductInformation, Target
 from mitsim.scene.authoring.part21 import Entity, Enumeration, Reference, StepText, Typed
+from mitsim.scene.authoring.units import unit_size
 
 #: geometric tolerances by the type of their entity
 TOLERANCES = {
@@ -60,21 +60,6 @@ _RESTRICTIONS = {
     "GEOMETRIC_TOLERANCE_WITH_DEFINED_UNIT": "it holds for each length of the feature",
     "GEOMETRIC_TOLERANCE_WITH_DEFINED_AREA_UNIT": "it holds for each area of the feature",
     "GEOMETRIC_TOLERANCE_WITH_MAXIMUM_TOLERANCE": "its zone has a maximum",
-}
-_PREFIX = {
-    "EXA": 1e18,
-    "PETA": 1e15,
-    "TERA": 1e12,
-    "GIGA": 1e9,
-    "MEGA": 1e6,
-    "KILO": 1e3,
-    "HECTO": 1e2,
-    "DECA": 10.0,
-    "DECI": 0.1,
-    "CENTI": 0.01,
-    "MILLI": 1e-3,
-    "MICRO": 1e-6,
-    "NANO": 1e-9,
 }
 _DEEPEST = 20
 
@@ -224,27 +209,8 @@ class _Reader:
         if number is None:
             return None
         unit = next((v for v in values if isinstance(v, Reference)), None)
-        scale = self.unit(unit, 0)
+        scale = unit_size(self.text, unit)
         return None if scale is None else float(number.values[0]) * scale
-
-    def unit(self, reference: Any, depth: int) -> float | None:
-        """Return a unit in mm or deg; None for other units or none."""
-        entity = self.text.follow(reference)
-        if entity is None or depth > _DEEPEST:
-            return None
-        converted = entity.of("CONVERSION_BASED_UNIT")
-        if converted is not None:
-            base = self.text.follow(converted[1]) if len(converted) > 1 else None
-            values = [value for part in base.parts for value in part.values] if base else []
-            factor = next((v for v in values if isinstance(v, Typed) and v.values), None)
-            inner = self.unit(next((v for v in values if isinstance(v, Reference)), None), depth + 1)
-            return None if factor is None or inner is None else float(factor.values[0]) * inner
-        si = entity.of("SI_UNIT")
-        if si is None:
-            return None
-        prefix, name = ([one.name if isinstance(one, Enumeration) else "" for one in si[-2:]] + ["", ""])[:2]
-        base_unit = {"METRE": 1e3, "RADIAN": math.degrees(1.0)}.get(name)
-        return None if base_unit is None else base_unit * _PREFIX.get(prefix, 1.0)
 
     def tolerance(self, entity: Entity) -> GeometricTolerance:
         """Read one geometric tolerance."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,14 +13,8 @@ import trimesh
 
 from characterisation.files.errors import InputError, nearest
 from mitsim.scene.authoring.face import Floats, Ints
+from mitsim.scene.authoring.units import UNITS, WORDS, commented_unit, unit_words
 
-#: units of length [mm]
-UNITS = {"mm": 1.0, "m": 1000.0, "inch": 25.4}
-
-#: formats with a fixed unit: glTF is in metres
-_IN_METRES = (".glb", ".gltf")
-
-#: STEP files state their unit
 STEP = (".step", ".stp", ".p21")
 _MESHES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".3mf")
 
@@ -28,16 +23,18 @@ _LARGEST_FILE = 1024**3
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles of a file: ``vertices`` (n, 3) [mm], ``triangles`` (m, 3)."""
+    """Triangles of a file: ``vertices`` (n, 3) [mm], ``triangles`` (m, 3), and ``remarks`` about their unit."""
 
     vertices: Floats
     triangles: Ints
+    remarks: tuple[str, ...] = ()
 
 
 def read_mesh(path: str | Path, units: str | None = None) -> Mesh:
     """Read any mesh that trimesh supports, in mm.
 
-    ``units`` (``mm``, ``m``, ``inch``) for formats that do not state theirs; mm if None.
+    ``units`` (``mm``, ``m``, ``inch``) of a file that does not state its own, mm if None. It takes precedence over a
+    stated unit that differs, with a remark.
 
     Raises
     ------
@@ -47,8 +44,9 @@ def read_mesh(path: str | Path, units: str | None = None) -> Mesh:
     path = Path(path)
     check_part_file(path, units)
     scene = _load(path)
-    scale = UNITS[units] if units else 1000.0 if path.suffix.lower() in _IN_METRES else 1.0
-    return _gathered(path, scene, scale)
+    scale, remarks = _scale(path, scene, units)
+    mesh = _gathered(path, scene, scale)
+    return Mesh(mesh.vertices, mesh.triangles, remarks)
 
 
 def check_part_file(path: Path, units: str | None) -> None:
@@ -67,8 +65,6 @@ def check_part_file(path: Path, units: str | None) -> None:
         raise InputError(path, "", "no such file", "a STEP file or a mesh", nearest(path.name, there))
     if kind not in (*STEP, *_MESHES):
         raise InputError(path, "", f"the ending {kind!r}", ", ".join((*STEP, *_MESHES)))
-    if units is not None and kind in STEP:
-        raise InputError("--units", "", repr(units), "nothing: a STEP file states its own unit")
     if path.stat().st_size > _LARGEST_FILE:
         raise InputError(path, "", "a file over 1 GiB", "a smaller one", "mesh the part more coarsely")
 
@@ -87,6 +83,32 @@ def _load(path: Path) -> Any:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         allowed = f"a {path.suffix.lower().lstrip('.').upper()} file"
         raise InputError(path, "", f"an unreadable file ({reason})", allowed) from None
+
+
+def _scale(path: Path, scene: Any, units: str | None) -> tuple[float, tuple[str, ...]]:
+    """Return the size of a file's unit [mm], and a remark unless the file states it and nothing contradicts it."""
+    stated = _stated_unit(path, scene)
+    if stated is None:
+        if units is None:
+            return 1.0, (f"{path.name} states no unit of length: mm assumed; --units m or --units inch changes it",)
+        return UNITS[units], ()
+    if units is None or math.isclose(stated, UNITS[units]):
+        return stated, ()
+    return UNITS[units], (f"{path.name} states {unit_words(stated)} as its unit: --units {units} is used instead",)
+
+
+def _stated_unit(path: Path, scene: Any) -> float | None:
+    """Return the unit of length [mm] that a mesh file states, None without one."""
+    kind = path.suffix.lower()
+    if kind in (".glb", ".gltf"):
+        return UNITS["m"]
+    if kind == ".3mf":
+        word = str(scene.metadata.get("units", "millimeter")).strip().lower()
+        if word not in WORDS:
+            raise InputError(path, "unit", repr(word[:40]), "micron, millimeter, centimeter, inch, foot or meter")
+        return WORDS[word]
+    with path.open("rb") as file:
+        return commented_unit(kind, file.read(4096))
 
 
 def _gathered(path: Path, scene: Any, scale: float) -> Mesh:

@@ -9,10 +9,14 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 from collections import defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +25,7 @@ import numpy as np
 
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
 from characterisation.files.errors import InputError
+from mitsim.running.progress import say_progress
 from mitsim.scene.authoring import step_worker
 from mitsim.scene.authoring.face import (
     Face,
@@ -32,11 +37,15 @@ from mitsim.scene.authoring.face import (
     same_surface,
     surface_distance,
 )
-from mitsim.scene.authoring.part21 import read_step_text
+from mitsim.scene.authoring.part21 import StepText, read_step_text
+from mitsim.scene.authoring.units import UNITS, step_units, unit_words
 
 #: default mesh of STEP without a sensor: distance from the true surface [mm], and angle between facets [rad]. The angle
 #: only keeps small round faces round, since the normals are exact
 CHORD_MM, BEND = 0.01, 0.2
+
+#: seconds between lines of progress
+_LINE_EVERY_S = 5.0
 
 #: halves of one surface agree within this [mm]; a CAD program's own tolerance is 1e-3 to 1e-5
 ONE_SURFACE_MM = 1e-3
@@ -49,12 +58,27 @@ _INSTALL = 'pip install "cadquery-ocp-novtk<8" (or "mitsim[step]"), or save the 
 
 
 @dataclass(frozen=True)
+class Fineness:
+    """How fine a mesh is: the chord error [mm] of its faces.
+
+    - ``chord_mm`` of faces that a task can measure.
+    - ``others_mm`` of tori and free forms; None for the same.
+    - ``most`` triangles of a file, beyond which the largest faces become coarser, measured ones first; None: no limit.
+    """
+
+    chord_mm: float = CHORD_MM
+    others_mm: float | None = None
+    most: int | None = None
+
+
+@dataclass(frozen=True)
 class Drawn:
-    """Faces of a STEP file, remarks about their processing, and whether they bound closed bodies."""
+    """Faces of a STEP file, remarks about their processing, whether they bound closed bodies, and the file's text."""
 
     faces: list[Face]
     remarks: list[str]
     closed: bool
+    text: StepText
 
 
 def step_installed() -> bool:
@@ -62,17 +86,25 @@ def step_installed() -> bool:
     return importlib.util.find_spec("OCP") is not None
 
 
-def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
-    """Read the faces of a STEP file, in mm, meshed to ``chord_mm``.
+_DEFAULT = Fineness()
+
+
+def read_step(path: str | Path, fineness: Fineness = _DEFAULT, units: str | None = None) -> Drawn:
+    """Read the faces of a STEP file, in mm, meshed as finely as asked, and report the progress.
+
+    ``units`` (``mm``, ``m``, ``inch``) of a file that does not state its own; mm if None.
 
     Raises
     ------
     InputError
-        If the file cannot be read, contains no faces, or the required library is not installed.
+        If the file cannot be read, contains no faces, states another unit than ``units``, or the required library is
+        not installed.
     """
     path = Path(path)
     if not step_installed():
         raise InputError(path, "", "a STEP file, which needs OpenCASCADE", "an STL, PLY or OBJ file", _INSTALL)
+    text = read_step_text(path)
+    scale, unit_remarks = _scale(path, text, units)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "faces.npz"
         command = [
@@ -80,48 +112,123 @@ def read_step(path: str | Path, chord_mm: float = CHORD_MM) -> Drawn:
             step_worker.__file__,
             str(path),
             str(out),
-            repr(max(chord_mm / 2, FINEST_MM)),  # OpenCASCADE exceeds the requested value by a factor of up to 2
+            repr(_requested(fineness.chord_mm)),
             repr(BEND),
+            repr(scale),
+            repr(_requested(fineness.others_mm or fineness.chord_mm)),
+            repr(fineness.most or 0),
         ]
-        try:
-            done = subprocess.run(command, capture_output=True, timeout=_SECONDS, check=False)
-        except subprocess.TimeoutExpired:
-            raise InputError(path, "", "a part that cannot be meshed within an hour", "a simpler one") from None
-        if b"ImportError" in done.stderr or b"ModuleNotFoundError" in done.stderr:
+        done = run_worker(command, path)
+        if "ImportError" in done.stderr or "ModuleNotFoundError" in done.stderr:
             found = "a STEP file, and an unsupported version of OpenCASCADE"
             raise InputError(path, "", found, "an STL, PLY or OBJ file", _INSTALL)
         if done.returncode != 0 or not out.exists():
             raise InputError(path, "", "a file that OpenCASCADE cannot read", "a STEP file (AP203, AP214 or AP242)")
         with np.load(out) as data:
-            text = json.loads(data["text"].tobytes())
+            read = json.loads(data["text"].tobytes())
             arrays = {key: data[key] for key in ("vertices", "normals", "triangles")}
-    names = _names(path)
+    names = _names(text)
     faces, vertex, triangle = [], 0, 0
-    for record in text["faces"]:
+    for record in read["faces"]:
         points, corners = record["counts"]
         here, there = slice(vertex, vertex + points), slice(triangle, triangle + corners)
         vertex, triangle = vertex + points, triangle + corners
         face = _face(record, arrays["vertices"][here], arrays["normals"][here], arrays["triangles"][there])
         faces.append(replace(face, drawn_name=names.get(record["entity"], "")))
     joined = _joined(faces)
-    remarks = []
+    remarks = unit_remarks
     if len(joined) < len(faces):
         remarks.append(f"{len(faces)} faces in the file, {len(joined)} after those of one surface were joined")
-    if text["lost"]:
-        remarks.append(f"{text['lost']} faces could not be meshed and are left out")
+    if read["lost"]:
+        remarks.append(f"{read['lost']} faces could not be meshed and are left out")
     bodies = len({face.body for face in faces})
     if bodies > 1:
         remarks.append(f"{bodies} bodies, each with its own faces")
-    closed = all(record["closed"] for record in text["faces"])
+    if read["chord_mm"] > 1.01 * _requested(fineness.chord_mm):
+        coarse = 2 * read["chord_mm"]
+        remarks.append(
+            f"the largest curved faces are meshed to {coarse:.2g} mm instead of {fineness.chord_mm:.2g} mm, which would"
+            f" take over {fineness.most:,} triangles; --chord has no such limit"
+        )
+    closed = all(record["closed"] for record in read["faces"])
     if not closed:
         remarks.append("the file has surfaces that bound no solid: mitsim check reports visible backs")
-    return Drawn(joined, remarks, closed)
+    return Drawn(joined, remarks, closed, text)
 
 
-def _names(path: Path) -> dict[int, str]:
+def _requested(chord_mm: float) -> float:
+    """Return the chord to request [mm]: OpenCASCADE exceeds it by a factor of up to 2."""
+    return max(chord_mm / 2, FINEST_MM)
+
+
+def run_worker(command: list[str], path: Path) -> subprocess.CompletedProcess[str]:
+    """Run the process that reads ``path``, and report its progress.
+
+    Raises
+    ------
+    InputError
+        If it takes more than an hour.
+    """
+    with (
+        tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, errors="replace") as process,
+    ):
+        over = threading.Event()
+
+        def stop() -> None:
+            over.set()
+            process.kill()
+
+        limit = threading.Timer(_SECONDS, stop)
+        limit.start()
+        try:
+            assert process.stdout is not None
+            _report(process.stdout, path)
+            code = process.wait()
+        finally:
+            limit.cancel()
+            process.kill()
+        if over.is_set():
+            raise InputError(path, "", "a part that cannot be meshed within an hour", "a simpler one")
+        errors.seek(0)
+        return subprocess.CompletedProcess(command, code, "", errors.read())
+
+
+def _report(lines: Iterable[str], path: Path) -> None:
+    """Report how many triangles are made, and the time that the others will take."""
+    start = last = time.monotonic()
+    say_progress(f"{path.name}: reading and meshing its faces")
+    for line in lines:
+        if not line.startswith(step_worker.TOLD):
+            continue
+        made, total = map(float, line.removeprefix(step_worker.TOLD).split())
+        now = time.monotonic()
+        if now - last >= _LINE_EVERY_S and made < total:
+            left = (now - start) / made * (total - made)
+            say_progress(f"{path.name}: {made:,.0f} of about {total:,.0f} triangles, {left:.0f} s left")
+            last = now
+
+
+def _scale(path: Path, text: StepText, units: str | None) -> tuple[float, list[str]]:
+    """Return the size [mm] of the unit that OpenCASCADE takes for mm, 1 for a file with its own, and a remark.
+
+    OpenCASCADE converts the lengths of each context that states a unit, and takes all others as mm.
+    """
+    stated = step_units(text)
+    if not stated:
+        if units is None:
+            return 1.0, [f"{path.name} states no unit of length: mm assumed; --units m or --units inch changes it"]
+        return UNITS[units], []
+    if units is not None and not all(math.isclose(one, UNITS[units]) for one in stated):
+        words = " and ".join(map(unit_words, stated))
+        hint = "leave out --units: the file's dimensions and tolerances have units of their own, too"
+        raise InputError("--units", "", repr(units), f"{words}, the unit that {path.name} states", hint)
+    return 1.0, []
+
+
+def _names(text: StepText) -> dict[int, str]:
     """Return the names of the faces by the number of their entity."""
     found = {}
-    text = read_step_text(path)
     for entity in text.all("ADVANCED_FACE", "FACE_SURFACE"):
         values = entity.of("ADVANCED_FACE", "FACE_SURFACE")
         if values and isinstance(values[0], str):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -77,19 +78,28 @@ def task_toml(faces: Sequence[Face], name: str, drawing: DrawnTask | None = None
         lines += ["# No plane, cylinder, cone or sphere was recognised.", "[features]", ""]
     for face in known:
         datum = drawing.datum_of(face.name) if drawing else ""
-        lines += [f"[features.{face.name}]{f'  # datum {datum}' if datum else ''}", *toml_lines(feature_keys(face)), ""]
+        lines += [
+            f"[features.{_key(face.name)}]{f'  # datum {datum}' if datum else ''}",
+            *toml_lines(feature_keys(face)),
+            "",
+        ]
     for title, side in (drawing.middles if drawing else {}).items():
         spread = middle_outline(side, outline(side.of[0]))
         keys = {"kind": "mid_plane", "of": [face.name for face in side.of], "outline_mm": [numbers(p) for p in spread]}
-        lines += [f"[features.{title}]", *toml_lines(keys), ""]
+        lines += [f"[features.{_key(title)}]", *toml_lines(keys), ""]
     for title, one in measured.items():
-        lines += [f"[measurements.{title}]", *(f"# {line}" for line in one.remarks), *toml_lines(one.keys()), ""]
+        lines += [f"[measurements.{_key(title)}]", *(f"# {line}" for line in one.remarks), *toml_lines(one.keys()), ""]
     return "\n".join(lines)
 
 
 def toml_lines(keys: dict[str, Any]) -> list[str]:
     """Return keys as TOML."""
     return [f"{key} = {_toml(value)}" for key, value in keys.items()]
+
+
+def _key(name: str) -> str:
+    """Return a name as a key; TOML wants quotes around letters beyond ASCII."""
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _toml(name)
 
 
 def _toml(value: Any) -> str:
@@ -105,7 +115,7 @@ def _example(faces: Sequence[Face]) -> list[str]:
     if first is None or not isinstance(first.surface, Cylinder | Sphere):
         return ["# Measurements between planes: see docs/reference/formats/task.md.", ""]
     return [
-        f"# [measurements.{first.name}_radius]",
+        f"# [measurements.{_key(f'{first.name}_radius')}]",
         '# kind = "radius"',
         f'# features = ["{first.name}"]',
         f"# nominal = {number(first.surface.radius)}",

@@ -125,7 +125,7 @@ def _open_or_error(
     path: Path, file: StudyFile, map_name: str, ask: Ask | None
 ) -> tuple[Study | None, InputError | None]:
     try:
-        return open_study(path, file, map_name or None, ask), None
+        return open_study(path, file, performance_map=map_name or None, ask=ask), None
     except InputError as error:
         if Path(str(error.where)).name == Path(file.task).name:
             raise  # an error in the task concerns every sensor

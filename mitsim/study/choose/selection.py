@@ -21,7 +21,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -37,20 +36,12 @@ from characterisation.tasks.task_file import Task
 from mitsim.maps.campaign.run import write_netcdf
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say
-from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable
 from mitsim.study.choose.candidates import CandidateSensor
-from mitsim.study.exposures.planned import exposed_for
-from mitsim.study.virtual.mapped import MappedMeasurements
-from mitsim.study.virtual.plan import map_digest, measurements_of, trial_digest
-from mitsim.study.virtual.race import ALL, Raced, RaceRules, TrialRunner, run_race
-from mitsim.study.virtual.rendered import RenderedMeasurements
-from mitsim.study.virtual.screening import screen
-from mitsim.study.virtual.spread_out import spread_over
-from mitsim.study.virtual.stated import state_view, statement_document, write_statement
-from mitsim.study.virtual.study_unknowns import study_unknowns
-from mitsim.study.virtual.trials import TrialFolder
-from mitsim.study.virtual.world import Unknowns
+from mitsim.study.session import Session, StatedView
+from mitsim.study.virtual.plan import map_digest, trial_digest
+from mitsim.study.virtual.race import ALL, Raced, RaceRules
+from mitsim.study.virtual.stated import write_statement
 from mitsim.views.view_scores import screening_risk
 
 Floats = NDArray[np.float64]
@@ -80,20 +71,18 @@ class SensorResult:
 
     ``screened`` (measurement,) is the demand of the best view by screening, ``screened_u`` its uncertainty,
     ``screened_view`` its number. ``unpromising`` excludes the sensor from measurement. ``stated`` holds statements
-    by view number; the view that is best for all measurements comes first. ``planned`` holds the exposures of these
-    views, if the study asks for them.
+    by view number; the view that is best for all measurements comes first.
     """
 
     candidate: CandidateSensor
-    unknowns: Unknowns
+    session: Session
     scores: xr.Dataset
     screened: Floats
     screened_u: Floats
     screened_view: NDArray[np.int64]
     unpromising: bool = False
-    stated: dict[int, list[Statement]] = field(default_factory=dict)
+    stated: dict[int, StatedView] = field(default_factory=dict)
     raced: Raced | None = None
-    planned: dict[int, PlannedExposure] = field(default_factory=dict)
 
     @property
     def ratio(self) -> float:
@@ -105,7 +94,8 @@ class SensorResult:
         """Return view, demand and statement of least demand for each measurement; None without a value."""
         out = list[tuple[int, float, Statement] | None]()
         for m in range(len(self.screened)):
-            rows = [(view, _demand(some[m]), some[m]) for view, some in self.stated.items()]
+            statements = {view: one.statements[m] for view, one in self.stated.items()}
+            rows = [(view, _demand(one), one) for view, one in statements.items()]
             rows = [row for row in rows if math.isfinite(row[1])]
             out.append(min(rows, key=lambda row: row[1]) if rows else None)
         return out
@@ -131,7 +121,7 @@ def choose_sensor(
     end = time.monotonic() + 60 * minutes
     found = list[SensorResult]()
     for number, candidate in enumerate(candidates, 1):
-        found.append(_screened(candidate, folder / candidate.name))
+        found.append(_screened(candidate, Session(candidate.study, folder / candidate.name, workers)))
         _say(found, f"{number} of {len(candidates)} screened", end)
     promising = _promising(found)
     report_results(_ordered(found), False)
@@ -140,12 +130,12 @@ def choose_sensor(
         if left <= 0 and place:
             say(f"choose: time is over; {len(promising) - place} sensors are judged by screening alone")
             break
-        _measure_sensor(one, folder / one.candidate.name, max(left, 1.0) / (len(promising) - place), workers)
+        _measure_sensor(one, max(left, 1.0) / (len(promising) - place))
         _say(found, f"{place + 1} of {len(promising)} sensors measured", end)
         report_results(_ordered(found), False)
     leader = _ordered(found)[0]
     if leader.stated and time.monotonic() < end:
-        _refine_leader(leader, folder / leader.candidate.name, end, workers)
+        _refine_leader(leader, end)
     report_results(_ordered(found), True)
     return _ordered(found)
 
@@ -183,23 +173,19 @@ def sort_key(one: SensorResult) -> tuple[bool, float]:
     return not one.stated, float(np.mean(np.log(rows)))
 
 
-def _screened(candidate: CandidateSensor, folder: Path) -> SensorResult:
+def _screened(candidate: CandidateSensor, session: Session) -> SensorResult:
     """Return the scores of all views, from the folder if they are there."""
-    study, path = candidate.study, folder / "scores.nc"
-    folder.mkdir(parents=True, exist_ok=True)
-    unknowns = study_unknowns(study)
-    digest = trial_digest(study, unknowns, f"screening {study.file.score.light_path_depth} {map_digest(study)}")
+    study, path = session.study, session.folder / "scores.nc"
+    session.folder.mkdir(parents=True, exist_ok=True)
+    screening = f"screening {study.file.score.light_path_depth} {map_digest(study)}"
+    digest = trial_digest(study, session.unknowns, screening)
     scores = _kept(path, digest)
     if scores is None:
-        from mitsim.decode.cloud import sensor_geometry
-        from mitsim.maps.prediction import Predictor
-
-        assert study.performance_map is not None
-        predictor = Predictor.of_sensor(study.sensor, sensor_geometry(study.sensor))
         say(f"choose: {candidate.name}, {len(study.views)} views")
-        scores, _ = screen(study, predictor, study.performance_map, unknowns)
+        scores, _ = session.screen()
         scores.attrs["digest"] = digest
         write_netcdf(scores, path)
+        session.release()
         gc.collect()
     u = scores["predicted_uncertainty"].transpose("measurement", "view").values
     able = scores["uncertainty_possible"].transpose("measurement", "view").values.astype(bool) & (u > 0)
@@ -211,7 +197,7 @@ def _screened(candidate: CandidateSensor, folder: Path) -> SensorResult:
         for name, size in zip(study.task.measurements, least, strict=True)
     ]
     screened_view = scores["view"].values[best].astype(np.int64)
-    return SensorResult(candidate, unknowns, scores, np.array(demands), least, screened_view)
+    return SensorResult(candidate, session, scores, np.array(demands), least, screened_view)
 
 
 _OF_A_VIEW = ("measurement", "view")
@@ -258,62 +244,41 @@ def _screened_demand(task: Task, name: str, u: float) -> float:
     return u if tolerance is None else demand(screened_errors(u), tolerance)
 
 
-@dataclass
-class _Workspace:
-    """Everything that virtual measurements of a sensor need."""
-
-    candidate: CandidateSensor
-    unknowns: Unknowns
-    virtual_measurements: RenderedMeasurements | MappedMeasurements
-    runner: TrialRunner
-    trials: TrialFolder
-    digest: str
-    folder: Path
-    planned: dict[int, PlannedExposure] = field(default_factory=dict)
-
-    def state(self, view: int, count: int) -> list[Statement]:
-        study = self.candidate.study
-        chosen = next(one for one in study.views if one.number == view)
-        exposed = exposed_for(study, chosen, self.virtual_measurements, self.runner, self.digest, self.folder)
-        if exposed.planned is not None:
-            self.planned[view] = exposed.planned
-        trials = exposed.trials(study, self.folder, self.trials)
-        return state_view(study, chosen, exposed.runner, trials, self.unknowns, StatementTable(trials=count, pairs=0))
-
-
-def _prepared(one: SensorResult, folder: Path, workers: Executor | None) -> _Workspace:
-    candidate, study, unknowns = one.candidate, one.candidate.study, one.unknowns
-    virtual_measurements = measurements_of(study, unknowns)
-    runner = spread_over(workers, study, unknowns, virtual_measurements)
-    digest = trial_digest(study, unknowns, runner.source)
-    trials = TrialFolder.of(folder / "trials", digest, study.task)
-    return _Workspace(candidate, unknowns, virtual_measurements, runner, trials, digest, folder)
-
-
-def _measure_sensor(one: SensorResult, folder: Path, seconds: float, workers: Executor | None) -> None:
+def _measure_sensor(one: SensorResult, seconds: float) -> None:
     """Race and state one sensor in approximately ``seconds``."""
     began = time.monotonic()
-    study, workspace = one.candidate.study, _prepared(one, folder, workers)
+    session, study = one.session, one.session.study
     table = study.file.race
     rules = RaceRules(
         min(SHORTLIST, table.shortlist), min(RACE_TRIALS, table.trials), table.margin, 0.9, _RACE_SHARE * seconds
     )
-    one.raced = run_race(study.views, one.scores, workspace.runner, workspace.trials, rules)
+    one.raced = session.race(one.scores, rules)
     if not len(one.raced.views):
         return
     view, most = one.raced.leader(ALL), study.file.statement.trials
     count = min(FIRST_TRIALS, most)
     while True:
-        one.stated[view] = workspace.state(view, count)
+        _state(one, view, count)
         for number in _own_views(one, list(study.task.measurements), view):
             if time.monotonic() - began > seconds:
                 break
-            one.stated[number] = workspace.state(number, count)
+            _state(one, number, count)
         if time.monotonic() - began > seconds or count >= most or not _is_undecided(one):
             break
         count = min(2 * count, most)
-    _write(one, workspace, folder, view)
-    del workspace
+    _finish(one, view)
+
+
+def _state(one: SensorResult, view: int, count: int) -> None:
+    """State a view from ``count`` trials, without a budget."""
+    table = StatementTable(trials=count, pairs=0)
+    one.stated[view] = one.session.state(one.session.study.view(view), table)
+
+
+def _finish(one: SensorResult, view: int) -> None:
+    """Write the statement of a view, and free the memory of the sensor."""
+    write_statement(one.session.folder / "statement.json", one.stated[view].document)
+    one.session.release()
     gc.collect()
 
 
@@ -343,7 +308,7 @@ def _own_views(one: SensorResult, names: list[str], view: int) -> list[int]:
     assert one.raced is not None
     out = list[int]()
     place = int(np.flatnonzero(one.raced.views == view)[0])
-    for name, known in zip(names, one.stated[view], strict=True):
+    for name, known in zip(names, one.stated[view].statements, strict=True):
         standing = one.raced.standings[name]
         better = standing.risk[standing.leader] < _WORTH_STATING * standing.risk[place]
         if known.verdict not in ("fits", "no tolerance") and better:
@@ -351,25 +316,18 @@ def _own_views(one: SensorResult, names: list[str], view: int) -> list[int]:
     return list(dict.fromkeys(out))
 
 
-def _refine_leader(leader: SensorResult, folder: Path, end: float, workers: Executor | None) -> None:
+def _refine_leader(leader: SensorResult, end: float) -> None:
     """Add trials of the leader up to the number in the study, as long as there is time."""
-    workspace = _prepared(leader, folder, workers)
-    most = leader.candidate.study.file.statement.trials
+    most = leader.session.study.file.statement.trials
     used = {row[0] for row in leader.best() if row is not None}
+
+    def trials(view: int) -> int:
+        return leader.stated[view].statements[0].trials
+
     while time.monotonic() < end:
-        behind = [view for view in used if leader.stated[view] and leader.stated[view][0].trials < most]
+        behind = [view for view in used if leader.stated[view].statements and trials(view) < most]
         if not behind:
             break
-        view = min(behind, key=lambda number: leader.stated[number][0].trials)
-        leader.stated[view] = workspace.state(view, min(leader.stated[view][0].trials + 40, most))
-    _write(leader, workspace, folder, next(iter(leader.stated)))
-
-
-def _write(one: SensorResult, workspace: _Workspace, folder: Path, view: int) -> None:
-    study = one.candidate.study
-    one.planned.update(workspace.planned)
-    chosen = next(known for known in study.views if known.number == view)
-    document: dict[str, Any] = statement_document(
-        study, chosen, one.stated[view], workspace.unknowns, workspace.runner.source, one.planned.get(view)
-    )
-    write_statement(folder / "statement.json", document)
+        view = min(behind, key=trials)
+        _state(leader, view, min(trials(view) + 40, most))
+    _finish(leader, next(iter(leader.stated)))

@@ -158,7 +158,7 @@ def _sensor(one: SensorResult) -> SensorEntry:
         words="",
         fits=sum(cell.verdict == "fits" and cell.by == "statement" for cell in cells.values()),
         poses=[_pose(study, number) for number in views if number in used or number == next(iter(one.stated), None)],
-        capture=capture_entry(study.sensor, one.planned.get(next(iter(one.stated), -1))),
+        capture=capture_entry(study.sensor, next(iter(stated.planned for stated in one.stated.values()), None)),
         measurements=cells,
         map_digest=map_digest(study),
     )
@@ -255,7 +255,7 @@ def _relative(sensors: Sequence[SensorEntry]) -> list[SensorEntry]:
 
 
 def _pose(study: Study, number: int) -> PoseEntry:
-    view = next(one for one in study.views if one.number == number)
+    view = study.view(number)
     return PoseEntry(
         view=number,
         azimuth_deg=view.azimuth_deg,

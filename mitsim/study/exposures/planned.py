@@ -1,16 +1,16 @@
-"""Plan the exposures of a study's views, store the plans, and make virtual measurements with them.
+"""Plan the exposures of a study's views, store the plans, and print them.
 
 Signal chain: study and view -> plan (:mod:`mitsim.study.exposures.exposure_plan`), or the exposures that the study
-gives -> ``exposures/view_0012.json`` -> the same virtual measurements with these exposures, and separate trials.
+gives -> ``exposures/view_0012.json`` -> exposures for virtual measurements, table, CSV file.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from pydantic import ConfigDict, Field
 
@@ -25,9 +25,7 @@ from mitsim.study import ExposureTable, Study
 from mitsim.study.exposures.exposure_plan import ExposurePlan, PlanRules, plan_exposures
 from mitsim.study.exposures.exposure_sweep import ExposureResult, ExposureSweep
 from mitsim.study.virtual.mapped import MappedMeasurements
-from mitsim.study.virtual.race import TrialRunner
 from mitsim.study.virtual.rendered import RenderedMeasurements
-from mitsim.study.virtual.trials import TrialFolder
 from mitsim.views import View
 
 #: default exposure limits of a sensor file [s], which are not those of a device
@@ -35,62 +33,6 @@ _NO_LIMITS = (1e-9, 1e3)
 
 #: version of the planning rules; a stored plan of another version is not used
 PLAN_VERSION = 1
-
-
-@runtime_checkable
-class Exposable(Protocol):
-    """Virtual measurements whose exposure can be set."""
-
-    def exposed_as(self, planned: PlannedExposure | None) -> TrialRunner:
-        """Return the same measurements with other exposures; None is the sensor's own rule."""
-
-
-@dataclass(frozen=True)
-class Exposed:
-    """Virtual measurements of one view with their exposures.
-
-    - ``runner``: makes the trials.
-    - ``digest``: identifies everything that determines them.
-    - ``planned``: exposures, None for the sensor's own rule.
-    """
-
-    runner: TrialRunner
-    digest: str
-    planned: PlannedExposure | None
-
-    def trials(self, study: Study, folder: Path, own: TrialFolder) -> TrialFolder:
-        """Return the folder of the trials: ``own`` for the sensor's own exposure, otherwise one inside ``folder``."""
-        if self.planned is None:
-            return own
-        return TrialFolder.of(folder / "planned_trials", self.digest, study.task)
-
-
-def exposed_for(
-    study: Study,
-    view: View,
-    measurements: RenderedMeasurements | MappedMeasurements,
-    runner: TrialRunner,
-    digest: str,
-    folder: Path,
-) -> Exposed:
-    """Return the virtual measurements of a view with the exposures of the study: see :func:`planned_for`.
-
-    Parameters
-    ----------
-    measurements
-        The measurements of this process, with which exposures are planned.
-    runner
-        The same measurements, in this process or spread over several; it makes the trials.
-    digest
-        Identifies everything but the exposures that determines a trial.
-    folder
-        Keeps the plans.
-    """
-    planned = planned_for(study, view, measurements, digest, folder)
-    if planned is None:
-        return Exposed(runner, digest, None)
-    assert isinstance(runner, Exposable)  # planned_for rejects a map
-    return Exposed(runner.exposed_as(planned), with_exposure(digest, planned), planned)
 
 
 class _StoredPlan(Document):
@@ -103,23 +45,20 @@ class _StoredPlan(Document):
     power: float = Field(gt=0, le=1)
 
 
-def planned_for(
-    study: Study, view: View, measurements: RenderedMeasurements | MappedMeasurements, digest: str, folder: Path
-) -> PlannedExposure | None:
-    """Return the exposures of a view's captures: those of the study, or planned ones; None for the sensor's own rule.
+def planned_for(renderer: RenderedMeasurements, view: View, digest: str, folder: Path) -> PlannedExposure:
+    """Return the exposures of a view's captures: those that the study gives in [exposure], or planned ones.
 
-    A plan in ``folder`` with the same ``digest`` is used again.
+    A plan in ``folder`` with the same ``digest`` is used again. ``digest`` identifies everything but the exposures that
+    determines a trial.
 
     Raises
     ------
     InputError
-        If the measurements are drawn from a map, which holds only for the exposure that it was made with. Also if the
-        sensor cannot take or merge the exposures of the study.
+        If the sensor cannot take or merge the exposures of the study.
     """
+    study = renderer.study
     table = study.file.exposure
-    if table is None:
-        return None
-    renderer = rendered(study, measurements)
+    assert table is not None
     if table.exposures_s is not None:
         given = PlannedExposure(tuple(sorted(table.exposures_s)), table.power)
         _check_given(study, given, table)
@@ -134,27 +73,28 @@ def planned_for(
             stored = None
         if stored is not None and stored.digest == digest_of_plan:
             return PlannedExposure(tuple(stored.exposures_s), stored.power)
-    plan = plan_view(study, renderer, view, rules)
+    plan = plan_view(renderer, view, rules)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, plan_document(study, plan) | {"digest": digest_of_plan})
     say(f"view {view.number}: {plan_in_words(plan)}")
     return plan.exposure
 
 
-def plan_view(study: Study, renderer: RenderedMeasurements, view: View, rules: PlanRules) -> ExposurePlan:
+def plan_view(renderer: RenderedMeasurements, view: View, rules: PlanRules) -> ExposurePlan:
     """Plan the exposures of one view; its light is traced once."""
-    policy = study.sensor.exposure
+    sensor = renderer.study.sensor
+    policy = sensor.exposure
     if policy.limits_s == _NO_LIMITS:
-        say(f"{study.sensor.name} states no exposure limits: any exposure is allowed")
-    own = PlannedExposure(policy.exposures(None, float(study.sensor.imager.full_well)))
+        say(f"{sensor.name} states no exposure limits: any exposure is allowed")
+    own = PlannedExposure(policy.exposures(None, float(sensor.imager.full_well)))
     sweep = ExposureSweep(renderer, view)
-    if not study.sensor.merges_exposures:
-        say(f"{study.sensor.name} cannot merge exposures: the plan has one exposure")
+    if not sensor.merges_exposures:
+        say(f"{sensor.name} cannot merge exposures: the plan has one exposure")
         rules = PlanRules(1, rules.within)
     return plan_exposures(sweep.evaluate, own, policy.limits_s, rules, sweep.dimmable, view.number)
 
 
-def rendered(study: Study, measurements: RenderedMeasurements | MappedMeasurements) -> RenderedMeasurements:
+def rendered(measurements: RenderedMeasurements | MappedMeasurements) -> RenderedMeasurements:
     """Return the virtual measurements, if they are rendered.
 
     Raises
@@ -164,7 +104,7 @@ def rendered(study: Study, measurements: RenderedMeasurements | MappedMeasuremen
     """
     if not isinstance(measurements, RenderedMeasurements):
         raise InputError(
-            study.path,
+            measurements.study.path,
             "exposure",
             "exposures, and measurements that are drawn from a map",
             "rendered measurements",

@@ -14,12 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from characterisation.files.checked_files import dataset_digest
 from characterisation.files.errors import InputError
 from characterisation.tasks.folded import folded_values
 from mitsim.capture.simulated.indirect_light import IndirectLight
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.maps.campaign.plan import sensor_checksum
 from mitsim.running.version import __version__
+from mitsim.scene.xml_check import named_digests
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.study import RaceTable, Study
 from mitsim.study.virtual.mapped import MappedMeasurements
@@ -82,19 +84,16 @@ def race_rules(table: RaceTable, minutes: float | None = None) -> RaceRules:
 
 
 def map_digest(study: Study) -> str:
-    """Return sixteen hexadecimal digits of the performance map's values, or an empty string without a map."""
-    if study.performance_map is None:
-        return ""
-    digest = hashlib.sha256(repr(study.performance_map.data.attrs).encode())
-    for name in sorted(map(str, study.performance_map.data.variables)):
-        values = study.performance_map.data[name].values
-        text = values.dtype.kind in "OU"
-        digest.update(name.encode() + (repr(values.tolist()).encode() if text else values.tobytes()))
-    return digest.hexdigest()[:16]
+    """Return sixteen hexadecimal digits of the content of the performance map, or an empty string without a map."""
+    return "" if study.performance_map is None else dataset_digest(study.performance_map.data)[:16]
 
 
 def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: bool = False) -> str:
-    """Return sixteen hexadecimal digits of everything that determines a trial."""
+    """Return sixteen hexadecimal digits of everything that determines a trial.
+
+    These are sensor, calibration, unknowns, task, views, the scene with its meshes and textures, and, for clouds drawn
+    from the map, the map.
+    """
     file = study.file
     content = {
         "version": TRIAL_VERSION,
@@ -117,11 +116,13 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: 
     folded = folded_values(study.task)
     if folded:
         content["deviations"] = {name: one.shape for name, one in folded.items()}
+    if named := named_digests(Path(study.scene.where), {name: str(value) for name, value in file.parameters.items()}):
+        content["files"] = named
     if separate_light or not unknowns.pooled:
         content["apart"] = [separate_light, unknowns.pooled]
     if source == "map":
-        assert study.performance_map is not None
-        content["map"] = hashlib.sha256(repr(study.performance_map.data.attrs).encode()).hexdigest()
+        content["map"] = map_digest(study)
+        content["score"] = file.score.model_dump(mode="json")  # effects outside the map are multiples of a screened u
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 

@@ -21,7 +21,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.statements.selection import Standing, judge, posterior, sampled
-from mitsim.running.progress import say, say_progress
+from mitsim.running.progress import say, say_progress, track
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
 from mitsim.views import View
@@ -64,6 +64,13 @@ class TrialRunner(Protocol):
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
         """Yield the outcome of every virtual measurement, job by job."""
+
+
+def complete(trials: TrialFolder, runner: TrialRunner, jobs: Iterable[Job], label: str) -> None:
+    """Make the jobs whose trials are not finished yet, and keep each in the folder as soon as it is."""
+    missing = [job for job in jobs if job.trial not in trials.known(job.view.number)]
+    for job, outcome in track(runner.run(runner.in_order(missing)), label, len(missing)):
+        trials.add(job.view.number, job.trial, outcome)
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,10 @@ from pathlib import Path
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.study import Study, StudyFile, open_study
-from mitsim.study.virtual.plan import rendering_of, trial_digest
-from mitsim.study.virtual.race import Job, TrialRunner
+from mitsim.study import StudyFile, open_study
+from mitsim.study.virtual.mapped import MappedMeasurements
+from mitsim.study.virtual.plan import rendering_of
+from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.trials import Outcome
 from mitsim.study.virtual.world import Unknowns
@@ -48,12 +49,10 @@ class SpreadMeasurements:
 
     source = "render"
 
-    def __init__(self, workers: Executor, study: Study, unknowns: Unknowns, renderer: RenderedMeasurements) -> None:
+    def __init__(self, workers: Executor, renderer: RenderedMeasurements, digest: str) -> None:
         self.workers, self.renderer = workers, renderer
-        digest = trial_digest(study, unknowns, self.source, renderer.separate_light)
-        self._order = TrialOrder(
-            str(Path(study.path).absolute()), study.file, unknowns, renderer.separate_light, digest, ()
-        )
+        path = str(Path(renderer.study.path).absolute())
+        self._order = TrialOrder(path, renderer.study.file, renderer.unknowns, renderer.separate_light, digest, ())
 
     def exposed_as(self, planned: PlannedExposure | None) -> SpreadMeasurements:
         """Return the same measurements with other exposures than the sensor's own."""
@@ -80,17 +79,20 @@ class SpreadMeasurements:
                 yield row[first : first + _IN_A_ROW]
 
 
-def spread_over(workers: Executor | None, study: Study, unknowns: Unknowns, runner: TrialRunner) -> TrialRunner:
-    """Return the given runner, or one that distributes its trials to workers.
+def spread_over(
+    workers: Executor | None, measurements: RenderedMeasurements | MappedMeasurements, digest: str
+) -> RenderedMeasurements | MappedMeasurements | SpreadMeasurements:
+    """Return the given measurements, or workers that make them.
 
-    Clouds from a map are always drawn in this process.
+    Workers prepare the study again for another ``digest``, which identifies everything that determines a trial. Clouds
+    from a map are always drawn in this process.
     """
     if workers is None:
-        return runner
-    if not isinstance(runner, RenderedMeasurements):
+        return measurements
+    if not isinstance(measurements, RenderedMeasurements):
         say("clouds are drawn from a map in this process, not by workers")
-        return runner
-    return SpreadMeasurements(workers, study, unknowns, runner)
+        return measurements
+    return SpreadMeasurements(workers, measurements, digest)
 
 
 _prepared: dict[str, RenderedMeasurements] = {}

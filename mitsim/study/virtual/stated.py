@@ -19,13 +19,12 @@ from characterisation.statements.losses import common_losses, losses
 from characterisation.statements.one_sided import stated_errors
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
-from mitsim.running.progress import track
 from mitsim.running.text_table import aligned
 from mitsim.running.version import __version__
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable, Study
 from mitsim.study.virtual.influences import influences
-from mitsim.study.virtual.race import Job, TrialRunner
+from mitsim.study.virtual.race import Job, TrialRunner, complete
 from mitsim.study.virtual.trial_errors import errors_of_trials, stated_errors_of_trials
 from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, STATEMENT_DAYS, Trial, Unknowns
@@ -45,9 +44,7 @@ def state_view(
     swapped = {group: [Trial(one.day, one.capture, group) for one in pairs] for group in groups}
     repeats = [Trial(one.day, one.capture + 1) for one in pairs]
     wanted = [*base, *repeats, *(trial for some in swapped.values() for trial in some)]
-    missing = [Job(view, trial) for trial in wanted if trial not in trials.known(view.number)]
-    for job, outcome in track(runner.run(runner.in_order(missing)), f"state view {view.number}", len(missing)):
-        trials.add(view.number, job.trial, outcome)
+    complete(trials, runner, [Job(view, trial) for trial in wanted], f"state view {view.number}")
     by_trial = errors_of_trials(study.task, trials, view.number, base)
     second = stated_errors_of_trials(study.task, trials, view.number, repeats)
     again = {group: stated_errors_of_trials(study.task, trials, view.number, some) for group, some in swapped.items()}

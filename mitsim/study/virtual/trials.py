@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
-from characterisation.tasks.evaluation import Measured
 from characterisation.tasks.folded import folded_values
+from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from mitsim.study.virtual.world import GROUPS, Trial
 
@@ -41,7 +41,7 @@ class Outcome:
     deviations: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, measured: Mapping[str, Measured]) -> Outcome:
+    def of(cls, measured: Mapping[str, Result]) -> Outcome:
         """Return the errors of a cloud's measurements, and the reasons of those without a value."""
         return cls(
             {name: float(one.error) for name, one in measured.items()},

@@ -1,0 +1,149 @@
+"""Read clouds without a grid, and clouds in arrays and text files, to measure them or to compare with them.
+
+Signal chain: .npy, .mat, text of three columns, PLY or PCD -> x, y, z of every point, on a grid if the array has rows
+and columns -> unit -> cloud.
+
+The points are used as they are: mitsim assumes that their frame is that of the sensor or, for a reference, that of the
+cloud. A cloud without a grid is one row of pixels, and each pixel's ray passes through its point. So it has no windows
+and no picture.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.io import loadmat
+
+from characterisation.files.checked_files import read_bounded
+from characterisation.files.errors import InputError
+from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from mitsim.capture.recordings.number_text import number_words
+from mitsim.capture.recordings.organised_cloud import FARTHEST_MM, METRES_UNDER
+from mitsim.capture.recordings.pcd import decode_pcd
+from mitsim.capture.recordings.ply import decode_ply
+
+#: suffixes of clouds in arrays and text
+ARRAYS, TEXTS = (".npy", ".mat"), (".xyz", ".txt", ".asc", ".pts", ".csv")
+
+#: largest text [bytes]; reading takes ten times as much memory
+_LARGEST_TEXT = 256 * 1024**2
+
+
+def is_plain(path: Path) -> bool:
+    """Return whether a file is a cloud that no recording's reader takes: an array, a text, or points without a grid."""
+    suffix = path.suffix.lower()
+    if suffix in (*ARRAYS, *TEXTS):
+        return path.is_file()
+    if suffix not in (".ply", ".pcd") or not path.is_file():
+        return False
+    data = read_bounded(path)
+    if data.startswith(b"ply"):
+        return decode_ply(data, path).size is None
+    return bool(decode_pcd(data, path)[0].shape[0] == 1)
+
+
+def read_plain_cloud(path: Path) -> tuple[PointCloud, str]:
+    """Return a cloud [mm], and a sentence about its unit and its grid.
+
+    Raises
+    ------
+    InputError
+        If the file holds no points with x, y and z.
+    """
+    points = np.array(_points(path), np.float64)
+    points[~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)] = np.nan
+    valid = np.isfinite(points[..., 0])
+    if not valid.any():
+        raise InputError(path, "", "no points", "a cloud with x, y and z")
+    distance = float(np.median(np.linalg.norm(points[valid], axis=-1)))
+    metres = distance < METRES_UNDER
+    points *= 1000.0 if metres else 1.0
+    if np.nanmax(np.abs(points)) > FARTHEST_MM:
+        raise InputError(path, "x, y, z", f"{np.nanmax(np.abs(points)):.3g} mm", f"up to {FARTHEST_MM:g} mm")
+    organised = points.ndim == 3 and min(points.shape[:2]) > 1
+    grid = points if organised else points.reshape(1, -1, 3)
+    status = np.where(np.isfinite(grid[..., 0]), Status.VALID, Status.NO_SURFACE).astype(np.uint8)
+    cloud = PointCloud(grid.astype(np.float32), status, _through(grid), "point-cloud", "device")
+    shape = f"{grid.shape[1]} x {grid.shape[0]} points" if organised else f"{grid.shape[1]} points without a grid"
+    unit = f"in {'m' if metres else 'mm'}, which their median distance of {distance:.4g} suggests"
+    return cloud, f"{path.name}: {shape}, {unit}"
+
+
+def _through(points: NDArray[np.float64]) -> ViewGrid:
+    """Return a grid whose rays pass through the points (H, W, 3); along the axis where there is none ahead."""
+    height, width = points.shape[:2]
+    ahead = points[..., 2] > 0
+    depth = np.where(ahead, points[..., 2], 1.0)[..., None]
+    rays = np.where(ahead[..., None], points[..., :2] / depth, np.nan)
+    steps = np.linalg.norm(np.diff(rays, axis=1), axis=-1)
+    steps = steps[steps > 0]
+    focal = 1.0 / float(np.median(steps)) if steps.size else 1.0
+    rays = np.nan_to_num(rays).astype(np.float32)
+    return ViewGrid(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, normalised=rays)
+
+
+def _points(path: Path) -> NDArray[np.floating]:
+    """Return the points (n, 3) or (H, W, 3) of a file, in its unit."""
+    suffix, data = path.suffix.lower(), read_bounded(path, "a cloud")
+    if suffix in TEXTS:
+        return _of_text(path, data)
+    if suffix not in ARRAYS:
+        return decode_ply(data, path).points if data.startswith(b"ply") else decode_pcd(data, path)[0]
+    try:
+        if suffix == ".npy":
+            arrays = {path.name: np.load(io.BytesIO(data), allow_pickle=False)}
+        else:
+            arrays = {k: v for k, v in loadmat(io.BytesIO(data)).items() if isinstance(v, np.ndarray)}
+    except Exception as error:  # SciPy raises many types of errors for damaged files, and its own for version 7.3
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        hint = "save(..., '-v7')" if suffix == ".mat" else ""
+        raise InputError(path, "", f"an unreadable file ({reason})", f"a {suffix} file with numbers", hint) from None
+    found = _with_three(arrays)
+    if found is None:
+        shapes = ", ".join(f"{name} {' x '.join(map(str, one.shape))}" for name, one in arrays.items())[:200]
+        raise InputError(path, "", shapes or "no array", "an array of n x 3 or rows x columns x 3, or x, y and z alike")
+    return found
+
+
+def _with_three(arrays: dict[str, NDArray[np.generic]]) -> NDArray[np.floating] | None:
+    """Return the largest array of points among arrays, or x, y and z joined; None without either."""
+    real = {name: one for name, one in arrays.items() if one.dtype.kind in "fiu"}
+    points = [one for one in real.values() if one.ndim in (2, 3) and one.shape[-1] >= 3 and one.size]
+    named = [next((one for name, one in real.items() if name.lower() == axis), None) for axis in "xyz"]
+    if all(one is not None and one.shape == (named[0].shape if named[0] is not None else ()) for one in named):
+        joined = np.stack([np.asarray(one, np.float64) for one in named], axis=-1)
+        return joined.reshape(-1, 3) if 1 in joined.shape[:-1] else joined
+    best = max((one for one in points if one.shape[-1] <= 9), key=lambda one: one.size, default=None)
+    return None if best is None else np.asarray(best[..., :3], np.float64)
+
+
+def _of_text(path: Path, data: bytes) -> NDArray[np.float64]:
+    """Return the first three columns of a text; lines that begin with a letter, # or / are comments."""
+    if len(data) > _LARGEST_TEXT:
+        raise InputError(path, "", f"{len(data):,} bytes of text", f"at most {_LARGEST_TEXT:,}", "save it as PLY")
+    lines = [line.strip() for line in data.removeprefix(b"\xef\xbb\xbf").splitlines()]
+    rows = [line for line in lines if line and not _comment(line)]
+    try:
+        columns = len(number_words(rows[0].translate(_SPACES))) if rows else 0
+        if columns == 1:  # the number of points
+            rows, columns = rows[1:], len(number_words(rows[1].translate(_SPACES))) if len(rows) > 1 else 0
+        words = number_words(b"\n".join(rows).translate(_SPACES))
+        if columns < 3 or len(words) != columns * len(rows):
+            raise ValueError(f"{len(words)} numbers in {len(rows)} lines")
+        return np.array(words, np.float64).reshape(len(rows), columns)[:, :3]
+    except ValueError as error:
+        reason = " ".join(str(error).split())[:120]
+        raise InputError(
+            path, "", f"text that is no cloud ({reason})", "lines of x, y and z, and equal columns"
+        ) from None
+
+
+_SPACES = bytes.maketrans(b",;\t", b"   ")
+
+
+def _comment(line: bytes) -> bool:
+    """Return whether a line is a comment or the names of the columns; NaN is a number."""
+    return line.startswith((b"#", b"/")) or (line[:1].isalpha() and not line[:3].lower().startswith((b"nan", b"inf")))

@@ -1,0 +1,122 @@
+"""Read the unit of length that a part's file states.
+
+- 3MF: the attribute ``unit`` of its model, millimetres without one (3MF Core Specification 1.3, section 3.4).
+- glTF: metres by definition (glTF 2.0, section 3.4).
+- STEP: the units that its contexts assign (ISO 10303-41, ``global_unit_assigned_context``).
+- STL, OBJ, PLY, OFF: their formats have no unit; some programs write one in a comment, as in ``# File units = inches``.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+from mitsim.scene.authoring.part21 import Entity, Enumeration, Reference, StepText, Typed
+
+#: units of length that an option may name [mm]
+UNITS = {"mm": 1.0, "m": 1000.0, "inch": 25.4}
+
+#: units of length by the words of files [mm]
+WORDS = {
+    word: size
+    for size, words in {
+        1e-3: "um micron microns micrometer micrometers micrometre micrometres",
+        1.0: "mm millimeter millimeters millimetre millimetres",
+        10.0: "cm centimeter centimeters centimetre centimetres",
+        1000.0: "m meter meters metre metres",
+        25.4: "in inch inches",
+        304.8: "ft foot feet",
+    }.items()
+    for word in words.split()
+}
+
+#: head of a file in which a comment may state the unit [bytes]
+_HEAD = 4096
+
+_COMMENT = {".obj": rb"#", ".off": rb"#", ".ply": rb"comment|obj_info", ".stl": rb"solid"}
+_STATEMENT = re.compile(r"\bunits?\b(?:\s*[=:]|\s+(?:in|is|are)\b)?\s*[\"']?([a-z]+)|\b([a-z]+) as units?\b")
+
+_PREFIX = {
+    "EXA": 1e18,
+    "PETA": 1e15,
+    "TERA": 1e12,
+    "GIGA": 1e9,
+    "MEGA": 1e6,
+    "KILO": 1e3,
+    "HECTO": 1e2,
+    "DECA": 10.0,
+    "DECI": 0.1,
+    "CENTI": 0.01,
+    "MILLI": 1e-3,
+    "MICRO": 1e-6,
+    "NANO": 1e-9,
+}
+_DEEPEST = 20
+
+
+def unit_words(size_mm: float) -> str:
+    """Return the name of a unit of ``size_mm``: ``mm``, ``m``, ``inch``, ``foot``; else its size in mm."""
+    names = {1e-3: "um", 1.0: "mm", 10.0: "cm", 1000.0: "m", 25.4: "inch", 304.8: "foot"}
+    return next((name for size, name in names.items() if math.isclose(size, size_mm)), f"{size_mm:g} mm")
+
+
+def commented_unit(suffix: str, data: bytes) -> float | None:
+    """Return the unit [mm] in a comment at the head of an STL, OBJ, PLY or OFF file; None without one."""
+    mark, head = _COMMENT.get(suffix), data[:_HEAD]
+    if mark is None:
+        return None
+    if suffix == ".ply":
+        head = head.partition(b"end_header")[0]
+    lines = head.splitlines()
+    if suffix == ".stl":  # the name of the solid, or the free text at the head of a binary file
+        lines = [b"solid " + b" ".join(head[:80].split())]
+    for line in lines:
+        if re.match(mark, line.strip()):
+            for found in _STATEMENT.finditer(line.decode("ascii", "replace").lower()):
+                size = WORDS.get(found.group(1) or found.group(2))
+                if size is not None:
+                    return size
+    return None
+
+
+def step_units(text: StepText) -> list[float]:
+    """Return the units of length [mm] that the contexts of a STEP file assign, each once."""
+    sizes: dict[float, None] = {}
+    for context in text.all("GLOBAL_UNIT_ASSIGNED_CONTEXT"):
+        for values in context.of("GLOBAL_UNIT_ASSIGNED_CONTEXT") or ():
+            for one in values if isinstance(values, tuple) else ():
+                unit = text.follow(one)
+                size = unit_size(text, one) if unit is not None and _is_length(text, unit) else None
+                if size is not None:
+                    sizes[round(size, 9)] = None
+    return list(sizes)
+
+
+def _is_length(text: StepText, unit: Entity) -> bool:
+    si = unit.of("SI_UNIT")
+    metre = si is not None and any(isinstance(one, Enumeration) and one.name == "METRE" for one in si)
+    return unit.has("LENGTH_UNIT") or metre
+
+
+def unit_size(text: StepText, reference: Any, depth: int = 0) -> float | None:
+    """Return the size of a STEP file's unit in mm or deg; None for other units or none."""
+    entity = text.follow(reference)
+    if entity is None or depth > _DEEPEST:
+        return None
+    converted = entity.of("CONVERSION_BASED_UNIT")
+    if converted is not None:
+        base = text.follow(converted[1]) if len(converted) > 1 else None
+        values = [value for part in base.parts for value in part.values] if base else []
+        plain = [
+            v.values[0] if isinstance(v, Typed) and v.values else v for v in values
+        ]  # some programs leave the type
+        factor = next((v for v in plain if isinstance(v, float)), None)
+        inner = unit_size(text, next((v for v in values if isinstance(v, Reference)), None), depth + 1)
+        return None if factor is None or inner is None else factor * inner
+    si = entity.of("SI_UNIT")
+    if si is None:
+        return None
+    prefix, name = ([one.name if isinstance(one, Enumeration) else "" for one in si[-2:]] + ["", ""])[:2]
+    base_unit = {"METRE": 1e3, "RADIAN": math.degrees(1.0)}.get(name)
+    return None if base_unit is None else base_unit * _PREFIX.get(prefix, 1.0)
