@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from characterisation.files.errors import InputError, nearest
 
 
-def only_known(props: Any, where: str, known: tuple[str, ...]) -> None:
+def only_known(props: Any, where: str, known: Sequence[str]) -> None:
     """Raise :class:`InputError` if a BSDF has a property that is not ``known``."""
     for key in props.keys():  # noqa: SIM118 - not a dict
         if key not in known:

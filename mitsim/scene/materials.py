@@ -127,31 +127,14 @@ def loading(
 
 
 _METAL_KEYS = (
-    "metal",
-    "process",
-    "Ra",
-    "Rq",
-    "Rdq",
-    "RSm",
-    "profile",
-    "profile_along",
-    "height_map",
-    "spacing_um",
-    "gloss",
-    "alpha",
-    "alpha_u",
-    "alpha_v",
-    "lay",
-    "nose_radius_mm",
-    "feed_marks",
-    "alpha_factor",
-    "wide_angle_share",
+    "metal process Ra Rq Rdq RSm profile profile_along height_map spacing_um gloss alpha alpha_u alpha_v lay "
+    "nose_radius_mm feed_marks alpha_factor wide_angle_share"
 )
 
 
 def _machined_metal(props: Any) -> Any:
     where = _where(props)
-    only_known(props, where, _METAL_KEYS)
+    only_known(props, where, _METAL_KEYS.split())
 
     def number(key: str, low: float, high: float, unit: str) -> float | None:
         return number_within(props, where, key, None, low, high, unit) if key in props else None
