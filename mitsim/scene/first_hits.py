@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import vectors_to_device, vectors_to_host
 from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.raycast import PixelRays, cast, shapes_met
+from mitsim.scene.ray_casting.raycast import PixelRays, cast, shape_indices, shapes_met
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import Transform
 
@@ -25,18 +25,10 @@ Floats = NDArray[np.float64]
 class VisibleSurfaces:
     """Surfaces that the pixels of the reference camera see.
 
-    Attributes
-    ----------
-    shape
-        (H, W) index of the first shape on the ray, whichever side it shows; -1 for none.
-    front
-        (H, W) whether the reflecting side of the shape is seen.
-    normal
-        (H, W, 3) unit normal toward the camera, sensor frame; NaN without a shape.
-    point
-        (H, W, 3) [mm], sensor frame; NaN without a shape.
-    seen_by_all
-        (H, W) whether the front is seen and every other camera and the projector has a free line to the point.
+    - ``shape`` (H, W): index of the first shape on the ray, whichever side it shows; -1 for none.
+    - ``front`` (H, W): whether the reflecting side of the shape is seen.
+    - ``normal`` (H, W, 3) toward the camera and ``point`` (H, W, 3) [mm], sensor frame; NaN without a shape.
+    - ``seen_by_all`` (H, W): whether the front is seen and every other camera and the projector has a free line to it.
     """
 
     shape: NDArray[np.int16]
@@ -50,16 +42,9 @@ class VisibleSurfaces:
 class Hits:
     """First surfaces on n rays.
 
-    Attributes
-    ----------
-    shape
-        (n,) index of the shape, of the instance for a shape in a group; -1 for none.
-    front
-        (n,) whether the ray meets the reflecting side.
-    normal
-        (n, 3) unit normal on the side of the ray's origin, world frame; NaN without a surface.
-    distance
-        (n,) [mm]; NaN without a surface.
+    - ``shape`` (n,): index of the shape, of the instance for a shape in a group; -1 for none.
+    - ``front`` (n,): whether the ray meets the reflecting side.
+    - ``normal`` (n, 3) on the side of the ray's origin, world frame, and ``distance`` (n,) [mm]; NaN without a surface.
     """
 
     shape: NDArray[np.int16]
@@ -84,14 +69,7 @@ def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.fl
     shape_id_of_ray = dr.select(surface.is_valid(), dr.select(instance != 0, instance, inside), 0)
     distance = dr.select(surface.is_valid(), surface.t, dr.nan)
     dr.eval(front, normal, shape_id_of_ray, distance)
-    ids = np.array(shape_id_of_ray)
-    lookup = np.full(int(ids.max(initial=0)) + 1, -1, np.int16)
-    for index, mitsuba_shape in enumerate(scene.shapes):
-        shape_id = int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(mitsuba_shape))))[0])
-        if shape_id < len(lookup):
-            lookup[shape_id] = index
-    lookup[0] = -1
-    shape = lookup[ids]
+    shape = shape_indices(scene, shape_id_of_ray)
     vectors = np.where((shape >= 0)[:, None], vectors_to_host(normal, float), np.nan)
     return Hits(shape, np.array(front, bool) & (shape >= 0), vectors, np.array(distance, float))
 

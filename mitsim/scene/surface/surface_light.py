@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from characterisation.files.errors import InputError
 from characterisation.maps.light import Light, same_light
-from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.scene.surface.metals import CONSTANTS, normal_reflectance
 from mitsim.scene.surface.paint import matt_white, paint
 from mitsim.scene.surface.processes import PROCESSES
@@ -50,7 +50,7 @@ def nominal_light(finish: str, roughness_um: float, wavelength_nm: float) -> Lig
     if metal not in CONSTANTS or process not in PROCESSES or not roughness_um > 0:
         return None
     try:
-        scatter = machined(Face(metal, process, roughness_um), wavelength_nm)
+        scatter = machined(MachinedFace(metal, process, roughness_um), wavelength_nm)
         reflectance = normal_reflectance(metal, wavelength_nm)
     except (InputError, ValueError):
         return None
