@@ -79,6 +79,17 @@ def read_toml(path: str | Path, model: type[Model]) -> Model:
     InputError
         If the file is missing, is not TOML, or violates the model.
     """
+    return validate(path, read_toml_table(path), model)
+
+
+def read_toml_table(path: str | Path) -> dict[str, Any]:
+    """Read one TOML file as a table, of which only nesting and numbers are checked.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or is not TOML.
+    """
     path = Path(path)
     text = read_text_bounded(path, "a TOML file", _neighbours(path), LARGEST_TOML).replace("\r\n", "\n")
     _check_nesting(path, text)
@@ -88,7 +99,7 @@ def read_toml(path: str | Path, model: type[Model]) -> Model:
         cause = " ".join(str(error).split())[:200]
         raise InputError(path, "", f"text that is not TOML ({cause})", "TOML, see https://toml.io") from None
     _check_numbers(path, table)
-    return validate(path, table, model)
+    return table
 
 
 def _check_nesting(path: Path, text: str) -> None:

@@ -57,9 +57,16 @@ class Directions:
     """Unit directions from points of a coupon, in its frame (z is the normal).
 
     ``view`` (N, 3) toward the camera and ``light`` (N, 3) toward the projector.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ or are not (N, 3).
     """
 
     def __init__(self, view: NDArray[np.floating], light: NDArray[np.floating]) -> None:
+        if view.shape != light.shape or view.ndim != 2 or view.shape[1] != 3:
+            raise ValueError(f"directions {view.shape} and {light.shape}: both must be (N, 3)")
         self.count = len(view)
         self.view, self.light = (mi.Vector3f(np.ascontiguousarray(d.T, np.float32)) for d in (view, light))
         #: whether the lobe's factor h is 1 for all pairs, with a margin for single precision

@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict
 
-from characterisation.files.documents import Document, Name, missing_error, missing_keys, read_toml, validate
+from characterisation.files.documents import Document, Name, missing_error, missing_keys, read_toml_table, validate
 from characterisation.files.errors import InputError, nearest
 from mitsim.running.progress import say
 from mitsim.sensor.camera import Camera, Rig
@@ -264,7 +263,7 @@ def load_sensor(name: str | Path, purpose: Purpose = "simulation", size: tuple[i
     """
     path, written = _written_table(name)
     table, notes = with_calibration(path, with_lenses(path, written), size)
-    sensor = _sensor_of(path, _sized(table, size), purpose, tuple(notes))
+    sensor = _sensor_of(path, table, purpose, tuple(notes))
     if purpose == "simulation":
         for note in notes:
             say(f"warning: {note}")
@@ -297,20 +296,7 @@ def _written_table(name: str | Path) -> tuple[Path, dict[str, Any]]:
             allowed = f"{', '.join(presets())}, or the path of a .toml file"
             raise InputError("--sensor", "", repr(str(name)), allowed, nearest(str(name), presets()))
         path = Path(str(files("mitsim.sensor") / "presets" / f"{name}.toml"))
-    return path, read_toml(path, _Written).model_extra or {}
-
-
-def _sized(table: dict[str, Any], size: tuple[int, int] | None) -> dict[str, Any]:
-    """Return the table with the image size given to cameras that have none."""
-    cameras = table.get("cameras")
-    if size is None or not isinstance(cameras, dict):
-        return table
-    width_height = {"width": size[0], "height": size[1]}
-    sized = {
-        name: width_height | each if isinstance(each, dict) and not {"width", "height"} & set(each) else each
-        for name, each in cameras.items()
-    }
-    return table | {"cameras": sized}
+    return path, read_toml_table(path)
 
 
 def _lacking(table: dict[str, Any], purpose: Purpose) -> list[str]:
@@ -339,12 +325,6 @@ def _sensor_of(path: Path, written: dict[str, Any], purpose: Purpose, notes: tup
 class _Named(Document):
     name: Name
     technology: str
-
-
-class _Written(Document):
-    """A sensor file as written, before its calibration is read."""
-
-    model_config = ConfigDict(extra="allow")
 
 
 def _assemble(path: Path, table: SensorFile, missing: frozenset[str], notes: tuple[str, ...]) -> Sensor:

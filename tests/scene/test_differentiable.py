@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lobe_formulas import lobe_factor
 
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
-from mitsim.scene.surface.coherence import lobe_factor
 from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.scene.surface.metals import refractive_index
 from mitsim.scene.surface.microfacet import fresnel, shadowing, slope_density

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from lobe_formulas import lobe_factor
 
-from mitsim.scene.surface.coherence import coherent_weight, lobe_factor
+from mitsim.scene.surface.coherence import coherent_weight
 from mitsim.scene.surface.energy import facets
 from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.scene.surface.processes import PROCESSES

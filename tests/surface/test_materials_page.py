@@ -6,18 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lobe_formulas import alpha_of_half_width, short_wave_height
 from scipy.optimize import brentq
 
 from mitsim.scene.surface.diffraction import coherent_share, lobe_alpha
 from mitsim.scene.surface.energy import directional_albedo, energy_factors
 from mitsim.scene.surface.machined import MachinedFace, machined
-from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, alpha_of_half_width, half_width
+from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, half_width
 from mitsim.scene.surface.processes import PROCESSES
 from mitsim.scene.surface.roughness import (
     ALPHA_LARGEST,
     correlation_length,
     rms_height,
-    short_wave_height,
     stylus_slope,
 )
 from mitsim.scene.surface.scatter import ALPHA_FORM

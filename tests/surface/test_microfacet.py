@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lobe_formulas import alpha_of_half_width
 from scipy.integrate import quad
 
 from mitsim.scene.surface.microfacet import (
     GGX_PER_BECKMANN,
-    alpha_of_half_width,
     half_width,
     shadowing,
     slope_density,

@@ -115,9 +115,16 @@ class _Lobe:
 def machined(
     face: MachinedFace, wavelength_nm: float, where: str = "a machined face", deviation: Deviation = NOMINAL
 ) -> Scatter:
-    """Return how a face scatters at one wavelength [nm]; ``where`` names it in messages.
+    """Return how a face scatters.
 
-    ``deviation`` moves the result away from the best estimate.
+    Parameters
+    ----------
+    face, wavelength_nm
+        Its properties, and the wavelength of the light [nm].
+    where
+        Name of the face in messages.
+    deviation
+        From the best estimate.
 
     Raises
     ------

@@ -194,6 +194,17 @@ def height_map(heights_um: ArrayLike, spacing_um: float, name: str = "height map
 def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "", key: str = "height_map") -> HeightMap:
     """Read an areal map [um]: a two-dimensional .npy, or a CSV of numbers without a header, row by row.
 
+    Parameters
+    ----------
+    path, spacing_um
+        The file, and the spacing of its heights [um].
+    where, key
+        Place that refers to the file, for messages.
+
+    See Also
+    --------
+    read_profile : a trace
+
     Raises
     ------
     InputError

@@ -60,6 +60,14 @@ def nominal_light(finish: str, roughness_um: float, wavelength_nm: float) -> Lig
 def surface_light(
     kind: str, reflectance: float, scatter: Scatter, finish: str, roughness_um: float, wavelength_nm: float
 ) -> Light:
-    """Return the light of a surface, and whether its finish and Ra alone would give the same."""
+    """Return the light of a surface, and whether its finish and Ra alone would give the same.
+
+    Parameters
+    ----------
+    kind, reflectance, scatter
+        As for :func:`light_of_scatter`.
+    finish, roughness_um, wavelength_nm
+        As for :func:`nominal_light`.
+    """
     light, usual = light_of_scatter(kind, reflectance, scatter), nominal_light(finish, roughness_um, wavelength_nm)
     return replace(light, as_made=usual is not None and same_light(light, usual))
