@@ -15,7 +15,8 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import vectors_to_device, vectors_to_host
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import PixelRays, cast, shape_indices, shapes_met
-from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.camera import Rig
+from mitsim.sensor.rig_parameters import eyes
 from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
@@ -76,22 +77,20 @@ def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.fl
 
 def sees_nothing(scene: Scene, rig: Rig, world_from_sensor: Transform) -> list[str]:
     """Return the names of the cameras, and ``projector``, in whose images no pixel shows the scene."""
-    eyes: dict[str, Camera] = rig.cameras | ({"projector": rig.projector} if rig.projector else {})
-    seen = {name: shapes_met(scene, PixelRays.of_camera(eye), world_from_sensor) for name, eye in eyes.items()}
+    seen = {name: shapes_met(scene, PixelRays.of_camera(eye), world_from_sensor) for name, eye in eyes(rig).items()}
     return [name for name, shape in seen.items() if not (shape >= 0).any()]
 
 
 def visible_surfaces(scene: Scene, rig: Rig, world_from_sensor: Transform) -> VisibleSurfaces:
     """Return the surfaces that the pixels of a rig's reference camera see from one pose."""
     camera = rig.reference
-    eyes = [*list(rig.cameras.values())[1:], *([rig.projector] if rig.projector else [])]
     directions = camera.pixel_directions()
     shape = directions.shape[:2]
     origin = world_from_sensor.points(camera.centre)
     world = world_from_sensor.directions(directions.reshape(-1, 3))
     hits = trace(scene, np.broadcast_to(origin, world.shape), world)
     rays = PixelRays(camera.centre, directions)  # PixelRays.of_camera would undistort all pixels again
-    seen = cast(scene, rays, world_from_sensor, np.array([eye.centre for eye in eyes])).seen
+    seen = cast(scene, rays, world_from_sensor, np.array([eye.centre for eye in list(eyes(rig).values())[1:]])).seen
     normal = world_from_sensor.inverse().directions(hits.normal).reshape(*shape, 3)
     point = camera.centre + directions * hits.distance.reshape(*shape, 1)
     seen_by_all = np.asarray(hits.front.reshape(shape) & seen.all(axis=0))

@@ -83,7 +83,12 @@ class ReadOut:
 
 
 def check_intrinsics(focal: tuple[float, float], principal: tuple[float, float], width: int, height: int) -> None:
-    """Check that a focal length and a principal point [px] belong to images of a size.
+    """Check that a focal length and a principal point belong to images of a size.
+
+    Parameters
+    ----------
+    focal, principal, width, height
+        All [px].
 
     Raises
     ------

@@ -71,6 +71,15 @@ def bracket(base_s: float, count: int, factor: float, limits_s: tuple[float, flo
     either side. Exposures beyond the limits are clipped to them and equal exposures are merged, so fewer than
     ``count`` may be returned.
 
+    Parameters
+    ----------
+    base_s
+        Exposure in the middle [s].
+    count, factor
+        Number n of exposures, and ratio of each to the one before.
+    limits_s
+        Shortest and longest exposure of the device [s].
+
     Raises
     ------
     InputError

@@ -32,8 +32,9 @@ from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.mesh_facts import MeshFacts
 from mitsim.scene.surface.processes import PROCESSES
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.rig_parameters import eyes
 from mitsim.sensor.transforms import Transform
-from mitsim.sensor.working_volume import depth, eyes_of, field_of_view, in_image, in_working_volume
+from mitsim.sensor.working_volume import depth, field_of_view, in_image, in_working_volume
 
 Severity = Literal["error", "warning", "note"]
 
@@ -107,7 +108,16 @@ def findings(
 ) -> list[SceneFinding]:
     """Return all findings, the most severe first.
 
-    ``posed``: whether the author chose the pose; then shapes outside the working volume are reported.
+    Parameters
+    ----------
+    facts
+        About the scene.
+    sensor, pose, visible
+        The sensor, its pose, and what it sees from there.
+    posed
+        Whether the author chose the pose; then shapes outside the working volume are reported.
+    task
+        The features to measure, if any.
     """
     measured = set(task.features) if task else set()
     found: list[SceneFinding] = []
@@ -286,7 +296,7 @@ def _why_outside(sensor: Sensor, points: np.ndarray) -> str:
         reasons.append(f"{along.min():.0f} to {along.max():.0f} mm deep, the sensor works from {near:g} to {far:g} mm")
     reasons += [
         f"not {'wholly ' if in_image(eye, points).any() else ''}in the image of the {name}"
-        for name, eye in eyes_of(sensor).items()
+        for name, eye in eyes(sensor.rig).items()
         if not in_image(eye, points).all()
     ]
     return "; ".join(reasons)
