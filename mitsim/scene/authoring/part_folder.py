@@ -114,7 +114,7 @@ def read_part(
     check_part_file(path, units)
     if path.suffix.lower() not in STEP:
         mesh = read_mesh(path, units)
-        made = segment_mesh(mesh.vertices, mesh.triangles, angle_deg, None, str(path))
+        made = segment_mesh(mesh.vertices, mesh.triangles, angle_deg, str(path))
         return Part(with_names(made.faces), [*mesh.remarks, *made.remarks])
     drawn = read_step(path, fineness or Fineness(), units)
     check_size(path, np.concatenate([face.vertices for face in drawn.faces]))
