@@ -78,7 +78,7 @@ def structured_light() -> None:
 def campaign_and_map() -> None:
     """netCDF, xarray, scipy, matplotlib."""
     Path("campaign.toml").write_text(CAMPAIGN.format(scenes=SCENES.as_posix()))
-    mitsim("characterise", "campaign.toml", "-o", "map")
+    mitsim("map", "make", "campaign.toml", "-o", "map")
     mitsim("compare", "map/map.nc", "ensenso-n10", "-o", "compared")
 
 
@@ -110,7 +110,7 @@ def step_part() -> None:
 def scores_and_report() -> None:
     """pydantic, jinja2, the prediction."""
     Path("study.toml").write_text(STUDY.format(scenes=SCENES.as_posix()))
-    assert "view" in mitsim("score", "study.toml", "-o", "scores")
+    assert "view" in mitsim("study", "score", "study.toml", "-o", "scores")
 
 
 def exports() -> None:
@@ -127,7 +127,7 @@ def cluster() -> None:
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as made:
-        mitsim("characterise", "campaign.toml", "-o", "map_there", "--scheduler", made.scheduler_address)
+        mitsim("map", "make", "campaign.toml", "-o", "map_there", "--scheduler", made.scheduler_address)
     assert Path("map/map.nc").read_bytes() == Path("map_there/map.nc").read_bytes()
 
 

@@ -7,7 +7,9 @@ change between versions.
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from mitsim.running.version import __version__ as __version__
@@ -27,6 +29,7 @@ _NAMES = {
     "Study": "mitsim.study",
     "Task": "characterisation.tasks.task_file",
     "Transform": "mitsim.sensor.transforms",
+    "decode": "mitsim.decode.captures",
     "label": "mitsim.study.measurements",
     "load_scene": "mitsim.decode.captures",
     "load_sensor": "mitsim.decode.captures",
@@ -55,6 +58,7 @@ if TYPE_CHECKING:
     from characterisation.tasks.task_file import Task
     from mitsim.capture.capture import Capture
     from mitsim.decode.captures import (
+        decode,
         load_scene,
         load_sensor,
         read_capture,
@@ -87,6 +91,7 @@ __all__ = [
     "Study",
     "Task",
     "Transform",
+    "decode",
     "label",
     "load_scene",
     "load_sensor",
@@ -104,6 +109,17 @@ __all__ = [
     "write_capture",
     "write_cloud",
 ]
+
+
+class _Interface(ModuleType):
+    """A module whose public names stay: importing the package ``mitsim.decode`` does not replace ``ms.decode``."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _NAMES and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Interface
 
 
 def __getattr__(name: str) -> Any:

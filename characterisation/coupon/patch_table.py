@@ -94,7 +94,7 @@ _PATCH = ("patch",)
 
 #: schema of a stored table of patches from which a map can be made
 PATCHES = Schema(
-    "a table of patches from mitsim characterise",
+    "a table of patches from mitsim map make",
     {
         **{name: Variable(_PATCH, "number", 0, 1) for name in ("recovered_fraction", "false_fraction")},
         **{name: Variable(_PATCH, "number", 0, 1e9) for name in ("points", "points_possible")},

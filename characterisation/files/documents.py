@@ -125,12 +125,15 @@ def _check_numbers(path: Path, table: Any, field: str = "") -> None:
             _check_numbers(path, value, place)
 
 
-def validate(where: str | Path, table: dict[str, Any], model: type[Model]) -> Model:
-    """Check a table against a model; raise an :class:`InputError` with the first fault and all missing keys."""
+def validate(where: str | Path, table: dict[str, Any], model: type[Model], context: Any = None) -> Model:
+    """Check a table against a model; raise an :class:`InputError` with the first fault and all missing keys.
+
+    ``context`` is passed to the validators of the model.
+    """
     try:
-        return model.model_validate(table)
+        return model.model_validate(table, context=context)
     except ValidationError as error:
-        raise _explain(where, table, model, error, missing_keys(table, model)) from None
+        raise _explain(where, table, model, error, missing_keys(table, model, context)) from None
 
 
 def missing_error(where: str | Path, keys: Iterable[str]) -> InputError:
@@ -140,7 +143,7 @@ def missing_error(where: str | Path, keys: Iterable[str]) -> InputError:
     return InputError(where, ", ".join(names), "nothing", allowed)
 
 
-def missing_keys(table: dict[str, Any], model: type[Document]) -> list[str]:
+def missing_keys(table: dict[str, Any], model: type[Document], context: Any = None) -> list[str]:
     """Return the dotted names of all required keys that a table lacks, including those of missing tables.
 
     An empty table is inserted for each missing key. If validation then finds keys missing in it, it is a table;
@@ -149,7 +152,7 @@ def missing_keys(table: dict[str, Any], model: type[Document]) -> list[str]:
     filled = copy.deepcopy(table)
     lacking: dict[tuple[Any, ...], None] = {}
     while True:
-        new = [loc for loc in _missing_in(filled, model) if loc not in lacking]
+        new = [loc for loc in _missing_in(filled, model, context) if loc not in lacking]
         if not new:
             break
         for loc in new:
@@ -159,9 +162,9 @@ def missing_keys(table: dict[str, Any], model: type[Document]) -> list[str]:
     return [".".join(map(str, loc)) for loc in lacking if loc not in tables]
 
 
-def _missing_in(table: dict[str, Any], model: type[Document]) -> list[tuple[Any, ...]]:
+def _missing_in(table: dict[str, Any], model: type[Document], context: Any) -> list[tuple[Any, ...]]:
     try:
-        model.model_validate(table)
+        model.model_validate(table, context=context)
     except ValidationError as error:
         out = []
         for fault in error.errors():

@@ -54,7 +54,7 @@ _NODES = ("sample", "distance", "b", "a")
 _ROUNDED_FINELY = (*FIELDS[:2], *(LAY_FIELDS[name] for name in FIELDS[:2]))
 
 _SCHEMA = Schema(
-    "a performance map (map.nc) made by mitsim characterise",
+    "a performance map (map.nc) made by mitsim map make",
     {
         **{
             name: Variable(_NODES, low=0.0, high=1e9, gaps=True, needed=name in FIELDS[:4])

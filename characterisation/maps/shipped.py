@@ -32,5 +32,5 @@ def map_path(name: str | Path, folder: str | Path = ".") -> Path:
     known = shipped_maps()
     if str(name) in known:
         return known[str(name)]
-    allowed = f"a performance map (map.nc) made by mitsim characterise, or one of {', '.join(known) or 'none'}"
+    allowed = f"a performance map (map.nc) made by mitsim map make, or one of {', '.join(known) or 'none'}"
     raise InputError(path, "", "no such file", allowed, nearest(str(name), list(known)))

@@ -7,18 +7,15 @@ map and report. Maps of depth, disparity or points that a device computes itself
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.errors import InputError
+from mitsim.capture.decoding import Decoding
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.transforms import Transform
-
-if TYPE_CHECKING:
-    from characterisation.point_cloud import PointCloud
-    from mitsim.sensor.preset import Sensor
 
 Source = Literal["simulated", "device", "replay", "emulator"]
 SOURCES: tuple[Source, ...] = ("simulated", "device", "replay", "emulator")
@@ -47,8 +44,11 @@ class Capture:
         none.
     bits
         Bits per pixel of the cameras; full scale is 2**bits - 1 DN.
+    decoding
+        What decoding needs besides images and calibration: settings of the decoder, imager, pattern, exposure.
     settings
-        Exposure, gain and others, as JSON values with units in their names (``exposure_s``).
+        Records of the device, the simulation or the import, as JSON values with units in their names. No decoder reads
+        them.
     world_from_sensor
         Pose of the sensor in the world frame [mm], None if unknown.
     serial
@@ -60,14 +60,12 @@ class Capture:
     pose_covariance
         (6, 6) covariance of the pose, None if unknown: rotation vector about the world's axes [rad], and position of
         the sensor's origin in the world [mm].
-    taken_by
-        The sensor that this process simulated, None otherwise. :meth:`cloud` decodes with its settings. It is not
-        written to a folder.
 
     Raises
     ------
     ValueError
-        If the source is unknown, an image or map has the wrong shape or type, or a covariance has no pose.
+        If the source is unknown, an image or map has the wrong shape or type, or a covariance has no pose. An
+        InputError if a region was read out of a camera that the capture does not have, or is not inside its image.
     """
 
     sensor: str
@@ -76,12 +74,12 @@ class Capture:
     rig: Rig
     images: dict[str, NDArray[np.unsignedinteger[Any]]]
     bits: int = 8
+    decoding: Decoding = field(default_factory=Decoding)
     settings: dict[str, Any] = field(default_factory=dict)
     world_from_sensor: Transform | None = None
     serial: str = ""
     derived: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     pose_covariance: NDArray[np.float64] | None = None
-    taken_by: Sensor | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES:
@@ -97,49 +95,14 @@ class Capture:
                 raise ValueError(f"map {name!r}: allowed are {', '.join(DERIVED_UNITS)}")
             if values.dtype != np.float32 or values.shape[2:] != ((3,) if name == "points" else ()) or values.ndim < 2:
                 raise ValueError(f"map of {name}: {values.dtype} of shape {values.shape}")
+        for name, region in self.decoding.read_out.items():
+            where = f"capture of {self.sensor}: settings.json"
+            if name not in self.rig.cameras:
+                raise InputError(where, "read_out", repr(name), ", ".join(self.rig.cameras))
+            camera = self.rig.cameras[name]
+            if not region.fits(camera.width, camera.height):
+                found = [region.left, region.top, region.width, region.height]
+                allowed = f"[left, top, width, height] within {camera.width} x {camera.height} pixels"
+                raise InputError(where, f"read_out.{name}", found, allowed)
         if self.pose_covariance is not None and self.world_from_sensor is None:
             raise ValueError("a pose covariance without a pose")
-
-    def cloud(
-        self, sensor: Sensor | str | Path | None = None, *, range_mm: tuple[float, float] | None = None
-    ) -> PointCloud:
-        """Decode the images into a point cloud.
-
-        Parameters
-        ----------
-        sensor
-            Sensor whose settings are used: loaded, the name of a preset, or the path of a sensor TOML file. By default
-            they are those of the simulated sensor, those of the capture, or those of the preset that it names.
-        range_mm
-            Nearest and farthest depth to decode [mm], instead of the sensor's.
-
-        Returns
-        -------
-        PointCloud
-            Points (H, W, 3) float32 [mm] in the sensor frame, NaN where missing; ``status`` (H, W) is the reason.
-
-        Raises
-        ------
-        InputError
-            If the sensor is unknown or of another technology, or the range is invalid.
-
-        Examples
-        --------
-        >>> import mitsim as ms
-        >>> cloud = ms.read_capture("capture").cloud("small.toml")
-        >>> cloud.points.shape
-        (240, 320, 3)
-        >>> round(float(cloud.valid.mean()), 1) > 0
-        True
-        """
-        # imported here because a capture alone does not need the decoders
-        from mitsim.decode.cloud import capture_cloud, decoder_settings, in_range
-        from mitsim.decode.noise import known_noise
-
-        chosen = self.taken_by if sensor is None else sensor
-        if chosen is None or isinstance(chosen, str | Path):
-            settings, imager = decoder_settings(self, None if chosen is None else str(chosen), range_mm)
-        else:
-            settings = in_range(chosen.settings, range_mm, f"capture of {self.sensor}")
-            imager = chosen.imager if chosen.imager.bits == self.bits else None
-        return capture_cloud(self, settings, imager=known_noise(self, imager))

@@ -33,6 +33,7 @@ from characterisation.files.errors import InputError
 from mitsim.capture.calibration import CalibrationDocument, PoseDocument, rig_of
 from mitsim.capture.capture import DERIVED_UNITS, SOURCES, Capture
 from mitsim.capture.capture_document import SCHEMA_VERSION, CaptureDocument, FileEntry
+from mitsim.capture.decoding import read_settings
 from mitsim.capture.npy import decode_npy
 from mitsim.capture.packed_files import SAFE_NAME, check_image, files_of, packed
 from mitsim.capture.png import decode_png
@@ -158,6 +159,7 @@ def read_capture(folder: str | Path) -> Capture:
     calibration = validate(*only("calibration"), CalibrationDocument)
     pose = validate(*only("pose"), PoseDocument)
     rig = rig_of(calibration)
+    decoding, records = read_settings(*only("settings"), document.technology)
     images: dict[str, list[NDArray[np.unsignedinteger[Any]]]] = {name: [] for name in rig.cameras}
     derived: dict[str, NDArray[np.float32]] = {}
     for number, entry in enumerate(document.files):
@@ -189,7 +191,8 @@ def read_capture(folder: str | Path) -> Capture:
         rig=rig,
         images={name: np.stack(stack) for name, stack in images.items() if stack},
         bits=document.bits,
-        settings=only("settings")[1],
+        decoding=decoding,
+        settings=records,
         world_from_sensor=pose.transform(),
         serial=document.serial,
         derived=derived,

@@ -24,6 +24,7 @@ from characterisation.files.errors import InputError
 from mitsim.capture.calibration import CalibrationDocument, PoseDocument, calibration_table, pose_table
 from mitsim.capture.capture import DERIVED_UNITS, Capture
 from mitsim.capture.capture_document import FRAME, SCHEMA_VERSION, UNITS, CaptureDocument
+from mitsim.capture.decoding import settings_table
 from mitsim.capture.npy import encode_npy
 from mitsim.capture.png import LONGEST_SIDE_PX, encode_png
 from mitsim.running.version import __version__
@@ -69,7 +70,7 @@ def files_of(capture: Capture, extra: Mapping[tuple[str, str], bytes], folder: P
     validate(folder / "pose.json", pose, PoseDocument)
     files = {
         "calibration.json": _json(calibration, folder, "calibration"),
-        "settings.json": _json(capture.settings, folder, "settings"),
+        "settings.json": _json(settings_table(capture.decoding, capture.settings), folder, "settings"),
         "pose.json": _json(pose, folder, "pose"),
     }
     entries: list[dict[str, Any]] = [{"path": path, "role": path.removesuffix(".json")} for path in files]

@@ -1,7 +1,7 @@
 """Read and write grey PNG images of 8 or 16 bits, and check all that is read.
 
-Signal chain: bytes -> chunks, their lengths and checksums compared -> size and type of the image -> number of bytes of
-its pixels -> image, decoded by OpenCV.
+Signal chain: bytes -> chunks, their lengths and checksums compared -> size and type of the image -> its pixels
+expanded, and their number compared -> image; with filters that mitsim does not write, decoded by OpenCV.
 
 OpenCV decodes the undamaged part of a damaged PNG, and reports the damage only on stderr. The half-black image would
 then be measured. So the file is checked before OpenCV decodes it.
@@ -68,7 +68,11 @@ def decode_png(data: bytes, where: str | Path, size: tuple[int, int] | None = No
             "grey (type 0) of 8 or 16 bits, not interlaced",
             "colour images are not read",
         )
-    _check_pixels(b"".join(body for kind, body in chunks if kind == b"IDAT"), height * (1 + width * depth // 8), where)
+    compressed = b"".join(body for kind, body in chunks if kind == b"IDAT")
+    pixels = _inflated(compressed, height * (1 + width * depth // 8), where)
+    rows = np.frombuffer(pixels, np.uint8).reshape(height, -1)
+    if (rows[:, 0] == 1).all():
+        return _unfiltered(rows[:, 1:], depth // 8)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -110,12 +114,26 @@ def png_chunks(data: bytes, where: str | Path) -> list[tuple[bytes, bytes]]:
     return chunks
 
 
-def _check_pixels(compressed: bytes, expected: int, where: str | Path) -> None:
-    """Check that the compressed pixels expand to ``expected`` bytes. At most one byte more is expanded."""
+def _inflated(compressed: bytes, expected: int, where: str | Path) -> bytes:
+    """Return the ``expected`` bytes of compressed pixels. At most one byte more is expanded."""
     inflate = zlib.decompressobj()
     try:
-        found = len(inflate.decompress(compressed, expected + 1))
+        found = inflate.decompress(compressed, expected + 1)
     except zlib.error as error:
         raise InputError(where, "", f"a damaged PNG ({error})", "a complete PNG: copy the file again") from None
-    if found != expected:
-        raise InputError(where, "", f"a PNG with {found} bytes of pixels", f"{expected} bytes, as stated in its header")
+    if len(found) != expected:
+        allowed = f"{expected} bytes, as stated in its header"
+        raise InputError(where, "", f"a PNG with {len(found)} bytes of pixels", allowed)
+    return found
+
+
+def _unfiltered(rows: NDArray[np.uint8], size: int) -> Image:
+    """Return the image (H, W) whose rows (H, W * size) are filtered by differences, as OpenCV writes them.
+
+    Filter type 1 of the PNG specification: each byte less the same byte of the pixel to its left, modulo 256. ``size``
+    is the bytes of a pixel; two are big-endian.
+    """
+    levels = np.cumsum(rows.reshape(len(rows), -1, size), axis=1, dtype=np.uint8)
+    if size == 1:
+        return levels[..., 0]
+    return levels.view(">u2")[..., 0].astype(np.uint16)

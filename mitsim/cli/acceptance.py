@@ -43,7 +43,7 @@ def acceptance(
     Several clouds of one pose add the figures that need repeats: temporal noise, global planarity trueness, mean depth
     error. Exit code 1 if a figure could not be computed.
 
-    Example: mitsim acceptance captures/plate --plane plate=200,150,300,200,600
+    Example: mitsim measure acceptance captures/plate --plane plate=200,150,300,200,600
     """
     from characterisation.tasks.result import repeatability
     from mitsim.cli.acceptance_request import cloud_figures, joint_figures, read_artefacts
@@ -53,7 +53,8 @@ def acceptance(
 
     artefacts = read_artefacts(plane or [], sphere or [], spacing or [])
     if not (artefacts.planes or artefacts.spheres):
-        raise InputError("mitsim acceptance", "", "no artefact", "--plane or --sphere", "see mitsim acceptance --help")
+        command = "mitsim measure acceptance"
+        raise InputError(command, "", "no artefact", "--plane or --sphere", f"see {command} --help")
     given = [read_cloud(path, sensor) for path in cloud_paths(clouds)]
     results = [cloud_figures(one.cloud, artefacts, baseline) for one in given]
     several = len(given) > 1

@@ -45,41 +45,20 @@ def decode(
     from characterisation.cloud_files import write_ply
     from mitsim.capture.folder import read_capture
     from mitsim.capture.workspace import written_frame
-    from mitsim.decode.checks.sanity import capture_findings, cloud_warnings, pair_row_error, row_error_in_words
-    from mitsim.decode.cloud import capture_cloud, decoder_settings, range_is_known, settings_are_known, with_options
-    from mitsim.decode.depth_range import range_warning, surface_beyond
-    from mitsim.decode.noise import known_noise, sigma_source
+    from mitsim.decode.checks.checked_cloud import checked_cloud
+    from mitsim.decode.cloud import decoder_settings, settings_in_words, with_options
     from mitsim.running.progress import say
-    from mitsim.sensor.preset import presets
 
     read = read_capture(capture)
     written = written_frame(read, points_in, capture)
     settings, imager = decoder_settings(read, sensor, depth_range)
     settings = with_options(settings, block, contrast)
-    assumed = "" if range_is_known(read, sensor, depth_range) else " (assumed: the capture has no range; set --range)"
-    by = f"settings of {sensor or read.sensor}"
-    if read.source == "simulated" and not settings_are_known(read, sensor):
-        by = "default settings, since settings.json has none (add --sensor FILE for those of its sensor)"
-    say(f"decoding: {settings.near_mm:g} to {settings.far_mm:g} mm{assumed}; {by}")
-    found = capture_findings(read, settings)
-    for warning in dict.fromkeys([*read.settings.get("warnings", []), *found.warnings]):
+    say(f"decoding: {settings_in_words(read, settings, sensor, depth_range)}")
+    decoded = checked_cloud(read, settings, imager, where=str(capture), sensor=sensor)
+    for warning in decoded.warnings:
         say(f"warning: {warning}")
-    noise = known_noise(read, imager)
-    cloud = capture_cloud(read, settings, imager=noise)
-    matched = pair_row_error(read, cloud)
-    rows = row_error_in_words(read, settings, found, matched)
-    if rows:
-        say(rows)
-    for warning in cloud_warnings(matched):
-        say(f"warning: {warning}")
-    source = sigma_source(read, cloud, noise)
-    if source:
-        say(source)
-    beyond = surface_beyond(read, cloud, settings)
-    if beyond is not None:
-        known = f"a coarse search over a wider range finds it in {100 * beyond.share:.0f} % of the pixels"
-        whose = sensor or (read.sensor if read.sensor in presets() else None)
-        say(range_warning(f"{capture}: a surface", beyond.depths, settings, whose, known))
+    for note in decoded.notes:
+        say(note)
     check_file(output)
-    write_ply(cloud, output, written)
-    print_reasons(cloud)
+    write_ply(decoded.cloud, output, written)
+    print_reasons(decoded.cloud)

@@ -155,7 +155,7 @@ def results(
 
 @app.command()
 def targets(
-    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim score.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim study score.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
     robot: Annotated[str, typer.Option(help="Make of the robot: abb, kuka, ur or moveit.")],
     views: Annotated[

@@ -6,29 +6,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from mitsim.cli.options import Defines, Group, Seed, Variant, check_file, definitions, start
-
-
-class _FinishByDefault(Group):
-    """A group that runs its first command if the arguments name none."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Insert ``finish`` before arguments that name no command and do not ask for help."""
-        if args and args[0] not in self.commands and args[0] != "--help":
-            args = ["finish", *args]
-        return list(super().parse_args(ctx, args))
-
-
-app = typer.Typer(
-    cls=_FinishByDefault,
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    help="Fit a finish (mitsim fit finish) or a sensor file (mitsim fit sensor) to captures.",
-)
+from mitsim.cli.options import Defines, Seed, Variant, check_file, definitions, start
 
 
 def finish(
@@ -138,7 +120,3 @@ def sensor_(
     write_sensor(found, sensor, output)
     print(fit_table(found), end="")
     say(f"sensor: {output}, {len(found.estimates)} fitted parameters, {len(found.undetermined)} not determined")
-
-
-app.command(name="finish")(finish)
-app.command(name="sensor")(sensor_)

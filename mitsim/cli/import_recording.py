@@ -108,6 +108,7 @@ def import_(
     from mitsim.capture.folder import is_written, write_capture
     from mitsim.capture.recordings.recognise import KINDS, ReadOptions, read_recording
     from mitsim.capture.recordings.recording_files import plain_name
+    from mitsim.decode.checks.sanity import with_warnings
     from mitsim.running.progress import say
 
     options = ReadOptions(
@@ -130,7 +131,7 @@ def import_(
         projector=projector,
     )
     imported = read_recording(path, options, kind)
-    capture = imported.capture
+    capture = with_warnings(imported.capture)
     folder = output or Path(plain_name(path.resolve().stem) + "_capture")
     say(f"{path}: {KINDS[imported.kind].name}, of {capture.sensor}, {capture.technology}, {capture.source}")
     for name in SETTINGS_TO_CHECK:

@@ -42,7 +42,7 @@ class Noise(StrEnum):
     CORRELATED = "correlated"
 
 
-def characterise(
+def make(
     campaign: Annotated[Path, typer.Argument(help="Campaign TOML file.")],
     output: Out,
     sensor: SensorOption = "ensenso-n10",
@@ -65,7 +65,7 @@ def characterise(
     Captures are simulated, or taken with the [device] and [stage] of the campaign. Run the same command again to
     continue an interrupted campaign.
 
-    Example: mitsim characterise scenes/coupon/campaign.toml -o runs/n10
+    Example: mitsim map make scenes/coupon/campaign.toml -o runs/n10
     """
     start(variant)
     from characterisation.files.documents import read_toml
@@ -142,7 +142,7 @@ def compare(
 ) -> None:
     """Draw performance maps of several sensors side by side on one scale, and over distance.
 
-    Example: mitsim compare ensenso-n10 david-sls-3 kinect-v2 --distance 600 -o runs/compare
+    Example: mitsim map compare ensenso-n10 david-sls-3 kinect-v2 --distance 600 -o runs/compare
     """
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.maps.shipped import map_path, shipped_maps
@@ -181,7 +181,7 @@ def predict(
 ) -> None:
     """Predict the point cloud of a view from a performance map, without rendering.
 
-    Example: mitsim predict scenes/two_pillars/two_pillars.xml --map runs/n10/map.nc --position 0 -400 300 -o cloud.ply
+    Example: mitsim map predict scenes/two_pillars/two_pillars.xml --map ensenso-n10 --position 0 -400 300 -o cloud.ply
     """
     start(variant)
     from mitsim.decode.captures import load_scene, load_sensor, write_cloud
@@ -197,3 +197,125 @@ def predict(
     check_file(output)
     write_cloud(cloud, output)
     print_reasons(cloud)
+
+
+def validate(
+    map_file: Annotated[
+        Path, typer.Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")
+    ],
+    campaign: Annotated[Path, typer.Argument(help="Campaign TOML file with the coupons to capture.")],
+    output: Out,
+    sensor: SensorOption = "ensenso-n10",
+    poses: Annotated[int, typer.Option(min=1, max=10000, help="Poses of each sample at each distance.")] = 24,
+    repeats: Annotated[
+        int,
+        typer.Option(
+            min=1, max=1000, help="Captures of each pose; up to four times as many where few points are recovered."
+        ),
+    ] = 1,
+    seed: Seed = 1,
+    scheduler: Scheduler = None,
+    processes: Processes = 1,
+    variant: Variant = None,
+) -> None:
+    """Compare a map with captures at new poses; exit code 1 if the map predicts them wrongly.
+
+    The poses have random surface normals, at the distances of the map and half-way between them. Prints one row per
+    sample and distance. A [device] and a [stage] in the campaign take the captures, at the distance of the stage;
+    without them, the captures are simulated.
+
+    Example: mitsim map validate runs/n10/map.nc scenes/coupon/campaign.toml -o runs/n10_held_out
+    """
+    start(variant)
+    from contextlib import AbstractContextManager, nullcontext
+
+    from characterisation.files.documents import read_toml
+    from characterisation.maps.performance_map import PerformanceMap
+    from characterisation.maps.shipped import map_path
+    from characterisation.maps.validation import residual_table, within_limits
+    from mitsim.capture.simulated.simulate import SimulatedSensor
+    from mitsim.maps.campaign.acquire import CaptureSource, simulated_source
+    from mitsim.maps.campaign.hold_out import (
+        compare,
+        held_out_campaign,
+        held_out_live,
+        held_out_orders,
+        held_out_shots,
+        hold_out_order,
+    )
+    from mitsim.maps.campaign.live import live_source
+    from mitsim.maps.campaign.plan import CampaignFile
+    from mitsim.maps.campaign.run import write_netcdf
+    from mitsim.report.style import write_png
+    from mitsim.report.validation_figures import agreement_figure, validation_table
+    from mitsim.running.executor import results_of
+    from mitsim.running.progress import say, track
+    from mitsim.sensor.preset import load_sensor
+
+    path = map_path(map_file)
+    performance_map = PerformanceMap.load(path)
+    file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
+    if file.device is not None and (scheduler is not None or processes != 1):
+        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
+        raise InputError(option, "", given, "not with a [device]", "a device takes one capture at a time")
+    live = None if file.device is None else held_out_live(campaign, file, chosen, performance_map)
+    plan = held_out_campaign(campaign, chosen, performance_map) if live is None else live.campaign
+    shots = held_out_shots(plan, poses, seed)
+    check_folder(output)
+    workers = requested_workers(scheduler, processes)
+    if workers is not None:
+        pairs = results_of(held_out_orders(plan, shots, path, repeats), hold_out_order, workers, "hold out")
+    else:
+        source: AbstractContextManager[CaptureSource]
+        if live is None:
+            source = nullcontext(simulated_source(SimulatedSensor(plan.sensor), plan.file.samples_per_pixel))
+        else:
+            source = live_source(live, mount)
+        with source as take:
+            pairs = list(track(compare(plan, performance_map, shots, take, repeats), "hold out", len(shots)))
+    table = residual_table(pairs)
+    write_netcdf(table, output / "validation.nc")
+    for sample in plan.samples:
+        mine = [p for p in pairs if (p.finish, str(p.roughness)) == (sample.finish, str(sample.roughness))]
+        name = sample.label().replace("/", "-").replace(" ", "_")
+        write_png(agreement_figure(mine), output / f"held_out_{name}.png")
+    print(validation_table(table), end="")
+    say(f"figures: {output}")
+    if not within_limits(table).all():
+        raise typer.Exit(1)
+
+
+def sheet(
+    sensors: Annotated[list[str], typer.Argument(help="Presets or sensor TOML files; default: all presets.")] = [],  # noqa: B006
+    output: Out = Path("datasheet"),
+    seed: Seed = 1,
+    scheduler: Scheduler = None,
+    processes: Processes = 1,
+    variant: Variant = None,
+) -> None:
+    """Make data sheets: noise floor, noise over distance, and recovery on metal, from simulated plates and balls.
+
+    Example: mitsim map sheet ensenso-n10 kinect-v2 -o runs/sheets
+    """
+    start(variant)
+    from characterisation.files.atomic_io import write_json
+    from mitsim.maps.data_sheet import gallery, measure_sensor
+    from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_leaves_out, sheet_table
+    from mitsim.report.style import write_png
+    from mitsim.running.progress import say
+    from mitsim.sensor.preset import load_sensor, presets
+
+    chosen = [load_sensor(name) for name in (sensors or presets())]
+    check_folder(output)
+    workers = requested_workers(scheduler, processes)
+    sheets = []
+    for sensor in chosen:
+        sheets.append(measure_sensor(sensor, seed, workers))
+        pictures = gallery_figure(sensor.name, gallery(sensor, seed))
+        write_png(pictures, output / f"gallery_{sensor.name}.png", dpi=72)
+        write_json(output / f"{sensor.name}.json", sheets[-1].numbers())
+    write_png(noise_figure(sheets), output / "noise.png", dpi=90)
+    write_png(residual_figure(sheets), output / "residuals.png", dpi=90)
+    print(sheet_table(sheets), end="")
+    print("\nNot included in these values:\n\n" + sheet_leaves_out(sheets), end="")
+    say(f"figures: {output}")

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 _WINDOW = "NAME=COLUMN,ROW,WIDTH,HEIGHT"
 
 
-def measure(
-    clouds: Clouds,
+def clouds(
+    inputs: Clouds,
     plane: Annotated[
         list[str] | None,
         typer.Option(
@@ -132,7 +132,7 @@ def measure(
         start(variant)
         of_task = _task(task, scene, pose, view, correct, definitions(define))
     reference = None if against is None else read_cloud(against, sensor, reference=True)
-    paths = cloud_paths(clouds)
+    paths = cloud_paths(inputs)
     whose: list[tuple[Path, str, str]] = []
     results: list[list[Result]] = []
     for number, path in enumerate(paths):

@@ -97,6 +97,35 @@ class Group(TyperGroup):
             formatter.write_dl(rows)
 
 
+class DefaultCommandGroup(Group):
+    """A group that runs its first command if the arguments name none: ``mitsim fit X`` is ``mitsim fit finish X``.
+
+    ``--help`` describes that command, and then lists the others.
+    """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert the first command before arguments that name no command and do not ask for help."""
+        if args and args[0] not in self.commands and args[0] != "--help":
+            args = [next(iter(self.commands)), *args]
+        return list(super().parse_args(ctx, args))
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help of the first command, and the list of all."""
+        first = next(iter(self.commands.values()))
+        first.format_help(typer.Context(first, parent=ctx.parent, info_name=ctx.info_name), formatter)
+        self.format_commands(ctx, formatter)
+
+
+def command_group(words: str, *commands: Callable[..., None], default: bool = False) -> typer.Typer:
+    """Return a group of commands with its help; with ``default``, the first one runs if none is named."""
+    group = typer.Typer(
+        cls=DefaultCommandGroup if default else Group, no_args_is_help=True, rich_markup_mode=None, help=words
+    )
+    for command in commands:
+        group.command(name=command.__name__.rstrip("_"))(command)
+    return group
+
+
 def start(variant: str | None) -> None:
     """Select the Mitsuba variant; call this before any other import of Mitsuba."""
     from mitsim.scene import backend

@@ -142,7 +142,7 @@ def part(
 ) -> None:
     """Convert a STEP file or a mesh to a scene with one named shape per face, and a task with the drawing's dimensions.
 
-    Any finish is possible. If a sensor's map lacks it, `mitsim run` and `mitsim score` can characterise it.
+    Any finish is possible. If a sensor's map lacks it, `mitsim run` and `mitsim study score` can characterise it.
 
     Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 1.6 --sensor ensenso-n10 --edit
     """

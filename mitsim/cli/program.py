@@ -24,6 +24,7 @@ from characterisation.files.errors import InputError, MissingEnvironmentError
 from mitsim.cli import (
     acceptance,
     calibrations,
+    compare,
     decode,
     devices,
     export,
@@ -34,11 +35,9 @@ from mitsim.cli import (
     measure,
     parts,
     render,
-    sheets,
     studies,
-    validations,
 )
-from mitsim.cli.options import Group, release_folders
+from mitsim.cli.options import Group, command_group, release_folders
 from mitsim.running.progress import be_quiet
 from mitsim.running.version import __version__
 
@@ -82,29 +81,43 @@ def _common(
 for command in (
     machine.doctor,
     studies.run,
-    studies.choose,
-    render.render,
-    parts.check,
+    studies.report,
     parts.part,
+    parts.check,
+    render.render,
     devices.capture,
     import_recording.import_,
     decode.decode,
-    measure.measure,
-    acceptance.acceptance,
-    maps.characterise,
-    maps.compare,
-    maps.predict,
-    studies.score,
-    studies.budget,
-    studies.exposures,
-    sheets.datasheet,
     calibrations.calibrate,
-    studies.report,
+    compare.compare,
 ):
     app.command(name=command.__name__.rstrip("_"))(command)
+for name, group in {
+    "study": command_group(
+        "Take single steps of a study: predict, compare sensors, state one view, plan its exposures.",
+        studies.score,
+        studies.choose,
+        studies.state,
+        studies.exposures,
+    ),
+    "measure": command_group(
+        "Measure planes, spheres, cylinders, dots or a task in clouds, or compute figures of acceptance tests.",
+        measure.clouds,
+        acceptance.acceptance,
+        default=True,
+    ),
+    "map": command_group(
+        "Make performance maps, compare and validate them, predict clouds from them, make data sheets of sensors.",
+        maps.make,
+        maps.compare,
+        maps.validate,
+        maps.predict,
+        maps.sheet,
+    ),
+    "fit": command_group("Fit a finish or a sensor file to captures.", fit.finish, fit.sensor_, default=True),
+}.items():
+    app.add_typer(group, name=name)
 app.add_typer(export.app, name="export")
-app.add_typer(fit.app, name="fit")
-app.add_typer(validations.app, name="validate")
 
 
 #: errors of the system for a path that does not exist or may not be read or written

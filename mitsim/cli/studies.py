@@ -33,8 +33,8 @@ PlanExposures = Annotated[
     bool,
     typer.Option(
         "--plan-exposures",
-        help="Plan the exposures of the stated view (see `mitsim exposures`), with the limits in [exposure] of the "
-        "study. Views are screened and compared with the sensor's own exposure.",
+        help="Plan the exposures of the stated view (see `mitsim study exposures`), with the limits in [exposure] "
+        "of the study. Views are screened and compared with the sensor's own exposure.",
     ),
 ]
 ViewNumber = Annotated[int, typer.Option(min=0, help="Number of the view in scores.csv and poses/.")]
@@ -105,7 +105,7 @@ def choose(
 
     Finished work is kept: run the same command again to continue. Exit code 1 if no sensor fits every tolerance.
 
-    Example: mitsim choose scenes/two_pillars/tolerances.toml --sensors all -o runs/choice
+    Example: mitsim study choose scenes/two_pillars/tolerances.toml --sensors all -o runs/choice
     """
     start(variant)
     import json
@@ -152,7 +152,7 @@ def choose(
         raise typer.Exit(1)
 
 
-def budget(
+def state(
     study: StudyFile,
     output: Out,
     view: ViewNumber,
@@ -166,7 +166,7 @@ def budget(
 
     Exit code 1 if a measurement with a tolerance does not fit it.
 
-    Example: mitsim budget scenes/two_pillars/study.toml --view 12 -o runs/view_12
+    Example: mitsim study state scenes/two_pillars/study.toml --view 12 -o runs/view_12
     """
     start(variant)
     from mitsim.study import open_study, with_plan
@@ -208,7 +208,7 @@ def exposures(
     simulates the light once and decodes sets of exposures. Exit code 1 if a feature that the task needs has too few
     points at every exposure, or if a limit is not met.
 
-    Example: mitsim exposures scenes/two_pillars/study.toml --view 40 -o runs/exposures
+    Example: mitsim study exposures scenes/two_pillars/study.toml --view 40 -o runs/exposures
     """
     start(variant)
     import json
@@ -279,7 +279,7 @@ def score(
 ) -> None:
     """Predict the uncertainty of every measurement from each candidate view, without rendering; print the best.
 
-    Example: mitsim score scenes/two_pillars/study.toml -o runs/scores
+    Example: mitsim study score scenes/two_pillars/study.toml -o runs/scores
     """
     start(variant)
     from mitsim.report.best_views import best_views
@@ -303,7 +303,7 @@ def score(
 
 
 def report(
-    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim choose.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim study choose.")],
     pdf: Annotated[
         bool, typer.Option("--pdf", help="Write one A4 sheet for a quotation or an inspection plan.")
     ] = False,

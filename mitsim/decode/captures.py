@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 from numpy.typing import ArrayLike
@@ -16,6 +16,8 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decode import input_clouds as clouds
+from mitsim.decode.checks.checked_cloud import checked_cloud
+from mitsim.decode.cloud import decoder_settings
 from mitsim.scene import load
 from mitsim.scene.load import Scene
 from mitsim.scene.surface.scatter import NOMINAL, Deviation
@@ -140,7 +142,7 @@ def render(
     Returns
     -------
     Capture
-        ``images`` by camera, (frames, H, W) [DN]. :meth:`Capture.cloud` decodes it.
+        ``images`` by camera, (frames, H, W) [DN]. :func:`decode` decodes it.
 
     Raises
     ------
@@ -161,10 +163,55 @@ def render(
             raise InputError("render", name, value, f"{low} to {high}")
     world_from_sensor = as_pose(pose, "render")
     chosen = Noise.parse(noise, "render: noise")
-    rendered = prepared_sensor(sensor).capture(
+    return prepared_sensor(sensor).capture(
         scene, world_from_sensor, seed=seed, rendering=Rendering(samples, depth), noise=chosen
     )
-    return replace(rendered, taken_by=sensor)
+
+
+def decode(
+    capture: Capture, sensor: Sensor | str | Path | None = None, *, range_mm: tuple[float, float] | None = None
+) -> PointCloud:
+    """Decode the images of a capture to a point cloud, and issue the warnings that ``mitsim decode`` prints.
+
+    Parameters
+    ----------
+    capture
+        From :func:`render` or :func:`read_capture`.
+    sensor
+        Sensor whose settings are used: loaded, the name of a preset, or the path of a sensor TOML file. By default
+        those of the capture, or those of the preset that it names.
+    range_mm
+        Nearest and farthest depth to decode [mm], instead of the sensor's.
+
+    Returns
+    -------
+    PointCloud
+        Points (H, W, 3) float32 [mm] in the sensor frame, NaN where missing; ``status`` (H, W) is the reason.
+
+    Raises
+    ------
+    InputError
+        If the sensor is unknown or of another technology, the range is invalid, or the capture is inconsistent.
+
+    Warns
+    -----
+    UserWarning
+        If images, calibration or range are doubtful: one warning for each sentence.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> cloud = ms.decode(ms.read_capture("capture"), "small.toml")
+    >>> cloud.points.shape
+    (240, 320, 3)
+    >>> round(float(cloud.valid.mean()), 1) > 0
+    True
+    """
+    settings, imager = decoder_settings(capture, sensor, range_mm)
+    decoded = checked_cloud(capture, settings, imager, sensor=sensor)
+    for text in decoded.warnings:
+        warnings.warn(text, stacklevel=2)
+    return decoded.cloud
 
 
 def read_capture(path: str | Path) -> Capture:

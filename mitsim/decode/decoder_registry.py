@@ -1,28 +1,26 @@
 """Register how the captures of each technology become clouds: one entry of :data:`TECHNOLOGIES` for each.
 
-An entry has the types of the decoder's settings and two functions. One prepares the geometry of a rig once, the other
+An entry has two functions. One prepares the geometry of a rig once, the other
 decodes images to a cloud. The first four technologies decode raw images. For the last three the device has measured a
 map, which is converted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
-from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import SETTINGS_OF, Settings
 from mitsim.decode.device_maps import (
     DeviceMapGeometry,
-    DeviceMapSettings,
     camera_map_geometry,
     decode_depth_map,
     decode_disparity_map,
@@ -36,10 +34,12 @@ from mitsim.decode.matching.reference_matching import ReferenceGeometry, decode_
 from mitsim.decode.matching.stereo import StereoGeometry, decode_stereo, stereo_geometry
 from mitsim.decode.structured_light.decoder import decode_structured_light
 from mitsim.decode.structured_light.geometry import StructuredLightGeometry, structured_light_geometry
-from mitsim.decode.structured_light.two_cameras import decode_structured_light_stereo
+from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
+from mitsim.decode.structured_light.two_cameras import cloud_of_pair, decode_structured_light_stereo
 from mitsim.decode.time_of_flight import TimeOfFlightGeometry, decode_time_of_flight, time_of_flight_geometry
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.image_role import Axis
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, LightCode, PhaseShift, roles
@@ -53,9 +53,11 @@ DEFAULT_RANGE_MM = (300.0, 2000.0)
 #: range of depths to accept from a device's own map if none is given: everything [mm]
 DEVICE_RANGE_MM = (1e-3, 1e6)
 
-Settings = MatcherSettings | DecoderSettings | TimeOfFlightSettings | DeviceMapSettings
 Geometry = StereoGeometry | ReferenceGeometry | StructuredLightGeometry | TimeOfFlightGeometry | DeviceMapGeometry
 Pattern = DotPattern | LightCode | AmplitudeModulation
+
+#: projector coordinates of structured light, of whole images, by camera and axis
+Coordinates = Mapping[str, Mapping[Axis, ProjectorCoordinate]]
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,8 @@ class Images:
         Region of the cloud's grid to decode; None for all.
     read_out
         Region that was read out of each camera, without cameras that were read out completely.
+    coordinates
+        Projector coordinates that structured light was decoded to before; None if it is not decoded yet.
     """
 
     capture: Capture
@@ -84,6 +88,7 @@ class Images:
     imager: Imager | MeasuredNoise | None
     roi: Roi | None
     read_out: dict[str, Roi]
+    coordinates: Coordinates | None = None
 
     @property
     def reference(self) -> tuple[str, NDArray[np.unsignedinteger[Any]]]:
@@ -126,8 +131,6 @@ class Technology:
 
     Attributes
     ----------
-    settings
-        Types of settings that the decoder accepts, its own first.
     patterns
         Kinds of pattern that a capture must name; empty if the decoder does not need one.
     geometry
@@ -140,7 +143,6 @@ class Technology:
         Whether the device has measured the points. Of a sensor's settings only the range is then used.
     """
 
-    settings: tuple[type[Settings], ...]
     patterns: tuple[type[Pattern], ...]
     geometry: Callable[[Rig, Any, Any], Geometry]
     decode: Callable[[Images, Any, Any, Any], PointCloud]
@@ -154,7 +156,7 @@ def _stereo_geometry(rig: Rig, settings: MatcherSettings, pattern: None) -> Ster
 
 def _stereo(images: Images, geometry: StereoGeometry, settings: MatcherSettings, pattern: None) -> PointCloud:
     # the ambient image is the last one; SGBM uses one frame
-    ambient = bool(images.capture.settings.get("ambient_image", False))
+    ambient = images.capture.decoding.ambient_image
     left, right = (stack[: len(stack) - ambient] for stack in list(images.stacks.values())[:2])
     if settings.method == "sgbm":
         left, right = left[:1], right[:1]
@@ -179,12 +181,6 @@ def _reference(
     return decode_reference(images.first_images(1), geometry, settings, images.context(images.roi))
 
 
-class _ProjectorSize(Document):
-    """The part of a capture's settings with the size of its pattern, if the projector's pose is unknown."""
-
-    projector_size_px: tuple[Annotated[int, Field(ge=16, le=20000)], Annotated[int, Field(ge=16, le=20000)]]
-
-
 def projector_size(capture: Capture) -> tuple[int, int]:
     """Return the width and height of the pattern of a structured-light capture [px].
 
@@ -196,11 +192,10 @@ def projector_size(capture: Capture) -> tuple[int, int]:
     projector = capture.rig.projector
     if projector is not None:
         return projector.width, projector.height
-    size = capture.settings.get("projector_size_px")
+    size = capture.decoding.projector_size_px
     if size is None:
         raise InputError("rig", "projector", "none", "a projector, or at least the size of its pattern")
-    where = f"capture of {capture.sensor}: settings.json"
-    return validate(where, {"projector_size_px": size}, _ProjectorSize).projector_size_px
+    return size
 
 
 def _structured_light_geometry(rig: Rig, settings: DecoderSettings, code: LightCode) -> Geometry:
@@ -212,17 +207,26 @@ def _structured_light_geometry(rig: Rig, settings: DecoderSettings, code: LightC
 def _structured_light(
     images: Images, geometry: StereoGeometry | StructuredLightGeometry, settings: DecoderSettings, code: LightCode
 ) -> PointCloud:
-    size = projector_size(images.capture)
+    size, coordinates = projector_size(images.capture), images.coordinates or {}
     count = len(roles(code, *size))
     if isinstance(geometry, StereoGeometry):
-        left, right = (images.first_images(count, name) for name in list(images.stacks)[:2])
-        context = images.context(images.roi)
+        names, context = list(images.stacks)[:2], images.context(images.roi)
+        if coordinates:
+            return cloud_of_pair(
+                lambda camera, region: coordinates[names[camera]]["columns"].part(region.slices),
+                geometry,
+                code,
+                settings,
+                context,
+            )
+        left, right = (images.first_images(count, name) for name in names)
         return decode_structured_light_stereo(left, right, geometry, code, settings, size, context)
     stack = images.first_images(count)
     roi, any_read_out = images.raw_region()
     if not any_read_out:
         return empty_cloud(geometry, images.capture.sensor, images.capture.source)
-    return decode_structured_light(stack, geometry, images.reference[0], code, settings, images.context(roi))
+    name = images.reference[0]
+    return decode_structured_light(stack, geometry, name, code, settings, images.context(roi), coordinates.get(name))
 
 
 def _time_of_flight_geometry(
@@ -270,24 +274,20 @@ def _map_decoder(name: str, decode: MapDecoder) -> Callable[[Images, DeviceMapGe
 
 
 def _device_technology(name: str, prepare: Callable[[Rig], DeviceMapGeometry], decode: MapDecoder) -> Technology:
-    settings = (DeviceMapSettings, MatcherSettings, DecoderSettings, TimeOfFlightSettings)
     return Technology(
-        settings, (), lambda rig, settings, pattern: prepare(rig), _map_decoder(name, decode), DEVICE_RANGE_MM, True
+        (), lambda rig, settings, pattern: prepare(rig), _map_decoder(name, decode), DEVICE_RANGE_MM, True
     )
 
 
 TECHNOLOGIES: dict[str, Technology] = {
-    "active_stereo": Technology((MatcherSettings,), (), _stereo_geometry, _stereo),
-    "reference_stereo": Technology((MatcherSettings,), (RandomDots, DiffractionSpots), _reference_geometry, _reference),
+    "active_stereo": Technology((), _stereo_geometry, _stereo),
+    "reference_stereo": Technology((RandomDots, DiffractionSpots), _reference_geometry, _reference),
     "structured_light": Technology(
-        (DecoderSettings,),
         (PhaseShift, GrayCode, GrayCodePhaseShift, ImageSequence),
         _structured_light_geometry,
         _structured_light,
     ),
-    "time_of_flight": Technology(
-        (TimeOfFlightSettings,), (AmplitudeModulation,), _time_of_flight_geometry, _time_of_flight
-    ),
+    "time_of_flight": Technology((AmplitudeModulation,), _time_of_flight_geometry, _time_of_flight),
     "depth_map": _device_technology("depth", camera_map_geometry, decode_depth_map),
     "disparity_map": _device_technology("disparity", disparity_map_geometry, decode_disparity_map),
     "point_map": _device_technology("points", camera_map_geometry, decode_point_map),
@@ -305,3 +305,8 @@ def technology_of(name: str) -> Technology:
     if name not in TECHNOLOGIES:
         raise InputError("capture", "technology", repr(name), ", ".join(TECHNOLOGIES))
     return TECHNOLOGIES[name]
+
+
+def accepted_settings(name: str) -> tuple[type[Settings], ...]:
+    """Return the types of settings that a technology decodes with; a device's map uses only the range of any."""
+    return get_args(Settings) if technology_of(name).from_device else (SETTINGS_OF[name],)

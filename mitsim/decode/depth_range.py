@@ -29,6 +29,7 @@ from scipy.ndimage import median_filter
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
+from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.decode.cloud import Settings, capture_cloud
 from mitsim.decode.decoder_registry import technology_of
@@ -93,7 +94,7 @@ def depths_of(points: NDArray[np.floating], rig: Rig, settings: Settings) -> NDA
 def range_warning(
     surface: str, depths: tuple[float, float], settings: Settings, sensor: str | None, reason: str
 ) -> str:
-    """Return the warning that a surface is outside the depths that its decoder searches.
+    """Word the warning that a surface is outside the depths that its decoder searches.
 
     Parameters
     ----------
@@ -114,7 +115,7 @@ def range_warning(
     if sensor is None:
         place = "settings.json of the capture (mitsim import --range), or decode with --sensor"
     return (
-        f"warning: {surface} is at a depth of {extent} ({reason}), but the decoder searches {settings.near_mm:g} to "
+        f"{surface} is at a depth of {extent} ({reason}), but the decoder searches {settings.near_mm:g} to "
         f"{settings.far_mm:g} mm: change near_mm and far_mm in {place}"
     )
 
@@ -208,17 +209,16 @@ def _coarse_capture(capture: Capture, step: int, *, binned: bool) -> Capture:
     if pair is not None:
         left, right = (_coarse_matrix(matrix, step, (step - 1) / 2) for matrix in (pair.matrix_left, pair.matrix_right))
         pair = replace(pair, matrix_left=left, matrix_right=right, width=pair.width // step, height=pair.height // step)
-    settings: dict[str, Any] = dict(capture.settings)
-    if "read_out" in settings:  # whole coarse pixels within the region
-        settings["read_out"] = {
-            name: [-(-column // step), -(-row // step), max(width // step - 1, 1), max(height // step - 1, 1)]
-            for name, (column, row, width, height) in settings["read_out"].items()
-        }
+    read_out = {  # whole coarse pixels within the region
+        name: Roi(-(-left // step), -(-top // step), max(width // step - 1, 1), max(height // step - 1, 1))
+        for name, roi in capture.decoding.read_out.items()
+        for left, top, width, height in [(roi.left, roi.top, roi.width, roi.height)]
+    }
     return replace(
         capture,
         images=images,
         rig=replace(capture.rig, cameras=cameras, rectification=pair),
-        settings=settings,
+        decoding=capture.decoding.model_copy(update={"read_out": read_out}),
         derived={},
     )
 

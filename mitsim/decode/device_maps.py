@@ -19,28 +19,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
 
-from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.region_of_interest import Roi, checked_roi
 from mitsim.decode.grid_cloud import cloud_on_grid
 from mitsim.decode.structured_light.geometry import camera_grid
 from mitsim.sensor.camera import Rectification, Rig
-
-
-class DeviceMapSettings(Document):
-    """Range of depths along the camera's axis in which points are accepted: ``near_mm`` to ``far_mm``."""
-
-    near_mm: float = Field(gt=0)
-    far_mm: float = Field(gt=0)
-
-    @model_validator(mode="after")
-    def _ordered(self) -> DeviceMapSettings:
-        if self.near_mm >= self.far_mm:
-            raise ValueError("near_mm under far_mm")
-        return self
 
 
 @dataclass(frozen=True)

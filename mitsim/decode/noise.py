@@ -6,17 +6,19 @@ themselves (:mod:`mitsim.decode.structured_light.measured_noise`). A Gray code h
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
-from mitsim.decode.cloud import bracket_exposures, capture_pattern
 from mitsim.decode.decoder_registry import projector_size
 from mitsim.decode.grey_levels import MeasuredNoise
 from mitsim.decode.structured_light.measured_noise import measured_noise
-from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import GrayCodePhaseShift, LightCode, PhaseShift, axes, has_fringes, roles
+from mitsim.sensor.light_code import GrayCode, LightCode, axes, has_fringes, roles
 
 
 def known_noise(capture: Capture, imager: Imager | None) -> Imager | MeasuredNoise | None:
@@ -25,26 +27,38 @@ def known_noise(capture: Capture, imager: Imager | None) -> Imager | MeasuredNoi
     The result is None if neither is available: for a Gray code alone, three steps of one period, or a bracket of
     exposures.
     """
-    if imager is not None or capture.technology != "structured_light" or bracket_exposures(capture) is not None:
+    code = capture.decoding.pattern
+    if imager is not None or capture.technology != "structured_light" or not isinstance(code, LightCode):
         return imager
-    code, size = capture_pattern(capture), projector_size(capture)
-    if not isinstance(code, PhaseShift | GrayCodePhaseShift | ImageSequence):
+    if capture.decoding.bracket_s is not None:
+        return None
+    return fringe_noise(capture.images, code, projector_size(capture), 2.0**capture.bits - 1)
+
+
+def fringe_noise(
+    images: Mapping[str, NDArray[np.unsignedinteger[Any]]], code: LightCode, size: tuple[int, int], full_scale: float
+) -> MeasuredNoise | None:
+    """Return the noise that the images (P, H, W) [DN] of each camera show, None if it cannot be measured.
+
+    ``size``: width and height of the projector [px]; ``full_scale``: value of a saturated pixel [DN].
+    """
+    if isinstance(code, GrayCode):
         return None
     image_roles = roles(code, *size)
-    stacks = [stack[: len(image_roles)] for stack in capture.images.values() if len(stack) >= len(image_roles)]
-    return measured_noise(stacks, image_roles, 2.0**capture.bits - 1) if stacks else None
+    stacks = [stack[: len(image_roles)] for stack in images.values() if len(stack) >= len(image_roles)]
+    return measured_noise(stacks, image_roles, full_scale) if stacks else None
 
 
 def sigma_source(capture: Capture, cloud: PointCloud, noise: Imager | MeasuredNoise | None) -> str:
     """Return a sentence on the source of a structured-light cloud's sigma, or why it has none; "" for others."""
     if capture.technology != "structured_light" or not cloud.valid.any():
         return ""
-    code = capture_pattern(capture)
+    code = capture.decoding.pattern
     fringes = isinstance(code, LightCode) and any(has_fringes(code, axis) for axis in axes(code))
     if cloud.sigma is None or not np.isfinite(cloud.sigma[cloud.valid]).any():
         if not fringes:
             reason = "the errors of a Gray code between two cameras are not independent between pixels"
-        elif bracket_exposures(capture) is not None:
+        elif capture.decoding.bracket_s is not None:
             reason = "it is not propagated through merged exposures"
         else:
             reason = (

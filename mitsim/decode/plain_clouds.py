@@ -24,6 +24,10 @@ from mitsim.capture.recordings.number_text import number_words
 from mitsim.capture.recordings.organised_cloud import FARTHEST_MM, METRES_UNDER
 from mitsim.capture.recordings.pcd import decode_pcd
 from mitsim.capture.recordings.ply import decode_ply
+from mitsim.sensor.mat_structure import check_mat
+
+#: most numbers of a MATLAB file: x, y, z and more of 100 million points
+_MOST_NUMBERS = 1_000_000_000
 
 #: suffixes of clouds in arrays and text
 ARRAYS, TEXTS = (".npy", ".mat"), (".xyz", ".txt", ".asc", ".pts", ".csv")
@@ -96,7 +100,10 @@ def _points(path: Path) -> NDArray[np.floating]:
         if suffix == ".npy":
             arrays = {path.name: np.load(io.BytesIO(data), allow_pickle=False)}
         else:
+            check_mat(path, data, _MOST_NUMBERS)
             arrays = {k: v for k, v in loadmat(io.BytesIO(data)).items() if isinstance(v, np.ndarray)}
+    except InputError:
+        raise
     except Exception as error:  # SciPy raises many types of errors for damaged files, and its own for version 7.3
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         hint = "save(..., '-v7')" if suffix == ".mat" else ""

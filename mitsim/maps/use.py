@@ -27,7 +27,7 @@ def performance_map(sensor_name_or_path: str | Path) -> PerformanceMap:
     Parameters
     ----------
     sensor_name_or_path
-        The name of a preset whose map is shipped with mitsim, or a ``map.nc`` of ``mitsim characterise``.
+        The name of a preset whose map is shipped with mitsim, or a ``map.nc`` of ``mitsim map make``.
 
     Returns
     -------

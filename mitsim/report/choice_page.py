@@ -32,7 +32,7 @@ def write_choice_page(folder: Path) -> Path:
     """
     choice = read_choice(folder)
     if choice is None:
-        raise InputError(folder / CHOICE, "", "no such file", "a folder made by mitsim choose")
+        raise InputError(folder / CHOICE, "", "no such file", "a folder made by mitsim study choose")
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,

@@ -1,4 +1,4 @@
-"""Limits of a structured-light decoder; :mod:`mitsim.decode` does the decoding."""
+"""Limits of a structured-light decoder, and of a device's own maps; :mod:`mitsim.decode` does the decoding."""
 
 from __future__ import annotations
 
@@ -46,3 +46,16 @@ class DecoderSettings(Document):
     def at_exposure(self, share: float) -> DecoderSettings:
         """Return the settings for an exposure shorter by ``share`` than the one to which the limits refer."""
         return self.model_copy(update={"minimum_modulation_dn": self.minimum_modulation_dn * share})
+
+
+class DeviceMapSettings(Document):
+    """Range of depths along the camera's axis in which points are accepted: ``near_mm`` to ``far_mm``."""
+
+    near_mm: float = Field(gt=0)
+    far_mm: float = Field(gt=0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> DeviceMapSettings:
+        if self.near_mm >= self.far_mm:
+            raise ValueError("near_mm under far_mm")
+        return self

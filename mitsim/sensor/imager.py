@@ -12,13 +12,13 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, model_validator
+from pydantic import ConfigDict, Field, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
 _PLANCK_J_S = 6.62607015e-34
 _LIGHT_M_S = 299792458.0
 
-#: numbers without a default
-_DESCRIPTION = ("pixel_um", "quantum_efficiency", "full_well", "read_noise", "f_number")
+#: keys of the numbers without a default
+DESCRIPTION = ("pixel_um", "quantum_efficiency", "full_well_e", "read_noise_e", "f_number")
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -107,20 +107,18 @@ class Imager:
         return float(np.interp(self.black_level, levels_out, levels_in)) if self.companding else self.black_level
 
 
-def _described(imager: Imager) -> Imager:
-    if any(math.isnan(getattr(imager, name)) for name in _DESCRIPTION):
-        raise ValueError(f"an imager with a value of each of {', '.join(_DESCRIPTION)}")
+def _read(value: Any, read: ValidatorFunctionWrapHandler) -> Imager:
+    if isinstance(value, Imager):
+        return value
+    imager: Imager = read(value)
+    missing = [f"imager.{key}" for key in DESCRIPTION if math.isnan(getattr(imager, key.removesuffix("_e")))]
+    if missing:
+        raise ValueError(f"a value of each of {', '.join(missing)}")
     return imager
 
 
-#: type of an imager in a document, of which every number is stated
-DescribedImager = Annotated[Imager, AfterValidator(_described)]
-
-
-def imager_table(imager: Imager) -> dict[str, Any]:
-    """Return an imager as the JSON values of a capture's settings, from which pydantic makes the imager again."""
-    table: dict[str, Any] = TypeAdapter(Imager).dump_python(imager, mode="json", by_alias=True)
-    return table
+#: type of an imager in a document, which states all its numbers
+WrittenImager = Annotated[Imager, WrapValidator(_read)]
 
 
 def electrons_per_radiance(imager: Imager, wavelength_nm: float, exposure_s: float) -> float:

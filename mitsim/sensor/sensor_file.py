@@ -23,7 +23,7 @@ from mitsim.sensor.calibration_qualifiers import check_intrinsics
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
-from mitsim.sensor.imager import Imager
+from mitsim.sensor.imager import DESCRIPTION, Imager
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
@@ -290,7 +290,7 @@ DECODERS = {"structured_light": ("decoder", (50.0, 20000.0)), "active_stereo": (
 
 _OPTICS = ("projector.focal_px", "projector.principal_px")
 _SHOWN = ("pattern.kind", "projector.width", "projector.height")
-_NOISE = tuple(f"imager.{key}" for key in ("pixel_um", "quantum_efficiency", "full_well_e", "read_noise_e", "f_number"))
+_NOISE = tuple(f"imager.{key}" for key in DESCRIPTION)
 _LIGHT = ("wavelength_nm", "working_range_mm", "projector.flux_w", "exposure.rule")
 
 

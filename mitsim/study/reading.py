@@ -161,7 +161,7 @@ def open_study(
                 "characterisation.map",
                 f"none, and no map of {sensor.name} comes with mitsim",
                 'map = "map.nc" or campaign = "campaign.toml" in [characterisation]',
-                f"mitsim characterise CAMPAIGN --sensor {own_sensor} -o FOLDER writes FOLDER/map.nc",
+                f"mitsim map make CAMPAIGN --sensor {own_sensor} -o FOLDER writes FOLDER/map.nc",
             )
         chosen_map = read_map(performance_map or own, sensor, "." if performance_map else folder)
         distances = chosen_map.data["distance"].values.tolist()

@@ -41,7 +41,7 @@ def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
     folder
         Folder of the run.
     command
-        Command that writes: ``run``, ``score``, ``budget``.
+        Command that writes: ``run``, ``score``, ``state``.
     digest
         Digest of everything that decides the results.
 

@@ -73,7 +73,7 @@ class ViewStatement:
                 "world_from_sensor",
                 f"a view {distance_mm:.1f} mm and {rotation_deg:.1f} deg from that of the cloud",
                 f"up to {SAME_PLACE_MM:g} mm and {SAME_ANGLE_DEG:g} deg: a bias holds only for its view",
-                "make a statement for this view: mitsim budget STUDY --view N",
+                "make a statement for this view: mitsim study state STUDY --view N",
             )
 
 
@@ -166,7 +166,7 @@ def read_view_statement(path: Path) -> ViewStatement:
     InputError
         If the file cannot be read, or is not a statement.
     """
-    table = _json(path, "a statement.json of mitsim run or mitsim budget")
+    table = _json(path, "a statement.json of mitsim run or mitsim study state")
     try:
         corrections = {
             str(name): Correction(

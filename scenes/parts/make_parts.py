@@ -7,7 +7,7 @@ disks, which are exact; flat faces with holes, cones, bends and the casting are 
 from the surface. Lengths are mm, and the part stands on the plane z = 0.
 
 `OPEN` parts may be looked at while something is developed, and numbers may be read off them. `SEALED` parts are for
-the pages of `mitsim validate` alone: see scenes/parts/README.md.
+the pages of `python -m tests.proofs` alone: see scenes/parts/README.md.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
 
 Each command runs alone, in a process of its own, and its largest resident size is told, as the system counts it
 (Linux; children included). The capture is of the two pillars in ground aluminium, the whole image, light of three
-surfaces, 16 samples per pixel, from the middle of the working range. The validation is ``mitsim validate map`` of matt
+surfaces, 16 samples per pixel, from the middle of the working range. The validation is ``mitsim map validate`` of matt
 white with so many poses at each distance. How large a worker must be is the largest number of its row.
 """
 
@@ -57,7 +57,7 @@ def main() -> None:
             found = [
                 peak("render", SCENE, *place, "-o", f"{folder}/c"),
                 peak("decode", f"{folder}/c", "-o", f"{folder}/c.ply"),
-                peak("validate", "map", name, campaign, "--sensor", name, "--poses", given.poses, "-o", f"{folder}/v"),
+                peak("map", "validate", name, campaign, "--sensor", name, "--poses", given.poses, "-o", f"{folder}/v"),
             ]
         sizes = " | ".join(f"{size:.2f} GiB" for size, _ in found)
         print(f"| `{name}` | {sizes} | {', '.join(f'{seconds:.0f}' for _, seconds in found)} s |", flush=True)

@@ -2,9 +2,9 @@
 
 python tests/benchmarks/plate_dots.py CAPTURE SIMULATED [left or right]
 
-CAPTURE is the imported recording, SIMULATED its twin as `mitsim validate captures` writes it. The plate is the right
+CAPTURE is the imported recording, SIMULATED its twin as `mitsim compare` writes it. The plate is the right
 one of the two unless said. Of every dot: disparities
-of its pixels about their own plane [px]. `mitsim validate captures` takes patches of 40 px instead, of which few have
+of its pixels about their own plane [px]. `mitsim compare` takes patches of 40 px instead, of which few have
 points enough on such a plate. Then the twin's right image is changed, in one thing at a time.
 """
 

@@ -4,7 +4,7 @@
 
 All 642 directions of an icosahedron subdivided three times, also those below the part, and the seven measurements of
 scenes/two_pillars/task.toml, with the map that comes with mitsim: first for direct light without the calibration, then
-as `mitsim score` and `mitsim run` do it. The first views, which compile, are counted in both.
+as `mitsim study score` and `mitsim run` do it. The first views, which compile, are counted in both.
 """
 
 from __future__ import annotations

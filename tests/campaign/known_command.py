@@ -1,4 +1,4 @@
-"""``mitsim characterise`` of a sensor that is known: the command as it is, with clouds in place of light.
+"""``mitsim map make`` of a sensor that is known: the command as it is, with clouds in place of light.
 
 ``python tests/campaign/known_command.py characterise CAMPAIGN.toml -o FOLDER``
 """

@@ -268,7 +268,7 @@ def test_yes_needs_no_question_and_scripts_have_nobody_to_ask():
     assert asking(False) is None  # pytest has no terminal
 
 
-@pytest.mark.parametrize("command", ["score", "run", "budget", "choose", "predict"])
+@pytest.mark.parametrize("command", ["study score", "run", "study state", "study choose", "map predict"])
 def test_scripts_without_yes_end_with_a_message(command, scenes, tmp_path, monkeypatch):
     study = (scenes / "two_pillars/study.toml").read_text()
     scene = scenes / "two_pillars/two_pillars.xml"
@@ -281,12 +281,12 @@ def test_scripts_without_yes_end_with_a_message(command, scenes, tmp_path, monke
     ]
     (tmp_path / "study.toml").write_text("\n".join(lines))
     arguments = {
-        "predict": [str(scene), "--map", "ensenso-n10", "--position", "0", "-300", "400", "-D", "plane_Ra=3.2"],
-        "budget": [str(tmp_path / "study.toml"), "--view", "1"],
-        "choose": [str(tmp_path / "study.toml"), "--sensors", "ensenso-n10"],
+        "map predict": [str(scene), "--map", "ensenso-n10", "--position", "0", "-300", "400", "-D", "plane_Ra=3.2"],
+        "study state": [str(tmp_path / "study.toml"), "--view", "1"],
+        "study choose": [str(tmp_path / "study.toml"), "--sensors", "ensenso-n10"],
     }.get(command, [str(tmp_path / "study.toml")])
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    done = mitsim_here(command, *arguments, "-o", tmp_path / "out", code=2)
+    done = mitsim_here(*command.split(), *arguments, "-o", tmp_path / "out", code=2)
     assert "--yes" in done.stderr
     assert "Ra 3.2" in done.stderr
 

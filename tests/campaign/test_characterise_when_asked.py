@@ -1,4 +1,4 @@
-"""A finish that a map does not know: `run`, `budget` and `choose` ask alike, and characterise it when they may.
+"""A finish that a map does not know: `run`, `study state` and `study choose` ask alike, and characterise it.
 
 Clouds of a known F and sigma stand in for the campaign's light, and virtual measurements are drawn from the map
 that it ends in.
@@ -29,12 +29,12 @@ from tests.smaller_sensors import coarse_sensor
 #: milled steel of Ra 3.2 on the plane: the map of the N10 knows ground aluminium from 0.09 to 0.74, and matt white
 STUDY = small_study("{ plane_Ra = 3.2 }", "ensenso-n10.toml")
 DRAWN = STUDY.replace("[measure]\n", '[measure]\nby = "map"\n')
-COMMANDS = {"run": [], "budget": ["--view", "1"], "choose": ["--sensors", "ensenso-n10.toml"]}
+COMMANDS = {"run": [], "study state": ["--view", "1"], "study choose": ["--sensors", "ensenso-n10.toml"]}
 #: what each command does with the map, once it has it; and an exit code that says that it came so far
 WORK = {
     "run": "mitsim.study.run.run_study",
-    "budget": "mitsim.study.session.Session",
-    "choose": "mitsim.study.choose.choose_sensor",
+    "study state": "mitsim.study.session.Session",
+    "study choose": "mitsim.study.choose.choose_sensor",
 }
 REACHED = 7
 QUESTION = r"ensenso-n10: its map lacks .*Ra 3\.2.*; characterise now \(about \d+ (s|min)\)\?"
@@ -59,15 +59,15 @@ def invoked(*arguments):
 def test_with_yes_the_finish_is_characterised_and_the_command_goes_on(command, study, quick, tmp_path):
     out = tmp_path / "out"
     study.write_text(DRAWN)
-    done = invoked(command, study, *COMMANDS[command], "--yes", "-o", out)
+    done = invoked(*command.split(), study, *COMMANDS[command], "--yes", "-o", out)
     assert len(quick) >= 1
     assert re.search(r"ensenso-n10: characterising .*Ra 3\.2.* in about \d+ (s|min); kept in ", done.stderr)
-    where = out / "ensenso-n10" if command == "choose" else out
+    where = out / "ensenso-n10" if command == "study choose" else out
     stated = json.loads((where / "statement.json").read_text())
     assert set(stated["measurements"]) and stated["sensor"] == "ensenso-n10"
     count = len(quick)
     with mock.patch(WORK[command], side_effect=typer.Exit(REACHED)):  # it is kept: the work begins, and nobody is asked
-        mitsim_here(command, study, *COMMANDS[command], "-o", tmp_path / "again", code=REACHED)
+        mitsim_here(*command.split(), study, *COMMANDS[command], "-o", tmp_path / "again", code=REACHED)
     assert len(quick) == count
 
 
@@ -77,7 +77,7 @@ def test_at_a_terminal_the_user_is_asked_and_may_refuse(command, study, tmp_path
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("COLUMNS", "500")
     started = at_a_terminal if command == "run" else here_at_a_terminal
-    told, code = started([command, str(study), *COMMANDS[command], "-o", str(tmp_path / "out")], "n\n")
+    told, code = started([*command.split(), str(study), *COMMANDS[command], "-o", str(tmp_path / "out")], "n\n")
     assert re.search(QUESTION, " ".join(told.split())), told
     assert "[y/N]" in told
     assert code == 2
@@ -89,7 +89,7 @@ def test_exposures_of_a_view_need_no_map(study, tmp_path, monkeypatch):
     monkeypatch.setattr(exposure_plan, "DRAWS", dict.fromkeys(exposure_plan.DRAWS, 1))
     monkeypatch.setattr(exposure_plan, "STEP", 100.0)
     study.write_text(STUDY.replace("[measure]\n", "[measure]\nsamples_per_pixel = 1\n"))
-    done = mitsim_here("exposures", study, "--view", "1", "--most", "1", "-o", tmp_path / "out", code=(0, 1))
+    done = mitsim_here("study", "exposures", study, "--view", "1", "--most", "1", "-o", tmp_path / "out", code=(0, 1))
     assert "characterise" not in done.stderr
     assert json.loads((tmp_path / "out/exposures.json").read_text())["view"] == 1
 

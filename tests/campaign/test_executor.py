@@ -133,7 +133,7 @@ def test_commands_give_the_same_bytes_in_two_processes(tmp_path, pool, monkeypat
         "--depth",
         1,
     ]
-    for command, call in (("many", many), ("map", ["characterise", tmp_path / "campaign.toml"])):
+    for command, call in (("many", many), ("map", ["map", "make", tmp_path / "campaign.toml"])):
         for processes in (1, 2):
             place = tmp_path / f"{command}_{processes}"
             asked = [*map(str, [*call, "--sensor", sensor, "-o", place, "--processes", processes])]

@@ -8,6 +8,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -16,9 +17,11 @@ from hypothesis import strategies as st
 from characterisation.files import atomic_io, checked_files
 from characterisation.files.checked_files import content_checksum
 from characterisation.files.errors import InputError
+from characterisation.region_of_interest import Roi
 from mitsim.capture import folder
 from mitsim.capture.capture import Capture
 from mitsim.capture.capture_document import capture_schema, schema_text
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.npy import decode_npy, encode_npy
 from mitsim.capture.png import decode_png, encode_png
@@ -45,7 +48,8 @@ def example(dtype=np.uint8, bits: int = 8) -> Capture:
         Rig(cameras, projector, rectification),
         images,
         bits,
-        {"exposure_s": 0.1 + 0.2, "projector_on": True, "note": "µm", "list": [1, None]},
+        Decoding(exposure_s=0.1 + 0.2, pattern=None, read_out={"left": Roi(1, 2, 16, 8)}, near_mm=250.0),
+        {"projector_on": True, "note": "µm", "list": [1, None]},
         Transform.from_degrees([10, 20, 30], [1, 2, 1e-3]),
         "42",
         maps(),
@@ -64,7 +68,7 @@ def maps() -> dict[str, np.ndarray]:
 
 
 def assert_same(a: Capture, b: Capture) -> None:
-    for name in ("sensor", "technology", "source", "bits", "settings", "serial"):
+    for name in ("sensor", "technology", "source", "bits", "decoding", "settings", "serial"):
         assert getattr(a, name) == getattr(b, name)
     assert (a.world_from_sensor is None) == (b.world_from_sensor is None)
     if a.world_from_sensor and b.world_from_sensor:
@@ -423,6 +427,28 @@ def test_any_bytes_are_refused_in_words(data):
     for text in (data, PNG[:8] + data):
         with pytest.raises(InputError):
             decode_png(text, "x.png")
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_an_image_as_mitsim_writes_it_is_inflated_once(monkeypatch, dtype):
+    """Differences along rows are summed here; OpenCV, which would inflate them again, has no part in it."""
+    image = np.random.default_rng(3).integers(0, np.iinfo(dtype).max, (7, 13), dtype, endpoint=True)
+    data = encode_png(image)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("inflated twice"))
+    found = decode_png(data, "x.png")
+    assert found.dtype == dtype
+    np.testing.assert_array_equal(found, image)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize(
+    "chosen", [cv2.IMWRITE_PNG_FILTER_NONE, cv2.IMWRITE_PNG_FILTER_UP, cv2.IMWRITE_PNG_ALL_FILTERS]
+)
+def test_images_with_any_filter_are_read(dtype, chosen):
+    image = np.cumsum(np.random.default_rng(3).integers(0, 9, (20, 30)), axis=0).astype(dtype)
+    done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_FILTER, chosen])
+    assert done
+    np.testing.assert_array_equal(decode_png(data.tobytes(), "x.png"), image)
 
 
 def test_colour_and_huge_pngs_are_refused():

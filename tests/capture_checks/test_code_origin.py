@@ -10,6 +10,7 @@ import pytest
 from test_sanity import PAIRED, SETTINGS, gray, pair, said, sequence, taken
 
 from characterisation.point_cloud import Status
+from mitsim.capture.decoding import Decoding
 from mitsim.decode.checks.fringe_wave import has_jump
 from mitsim.decode.cloud import capture_cloud
 from mitsim.sensor.camera import Camera
@@ -37,7 +38,7 @@ def coded(*groups, stripe=8, **more):
 
 
 def stated(capture, code):
-    return replace(capture, settings={"pattern": code.model_dump(mode="json")})
+    return replace(capture, decoding=Decoding(pattern=code))
 
 
 def off_surface(capture):

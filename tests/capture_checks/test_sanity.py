@@ -12,10 +12,16 @@ from simulated_rigs import images_seen, surface_seen
 
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
+from mitsim.decode import coded_images
+from mitsim.decode.checks import image_sanity
+from mitsim.decode.checks.checked_cloud import checked_cloud
 from mitsim.decode.checks.rig_sanity import measured_row_error
 from mitsim.decode.checks.sanity import capture_findings, capture_warnings, cloud_warnings, row_error_in_words
 from mitsim.decode.cloud import capture_cloud
 from mitsim.decode.matching.stereo import stereo_geometry
+from mitsim.decode.structured_light import decoder, two_cameras
+from mitsim.decode.structured_light.decoder import decode_coordinates
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
@@ -88,7 +94,7 @@ def taken(code, cameras=None, beamer=None, **other):
         "device",
         Rig(cameras, beamer),
         images,
-        settings={"pattern": code.model_dump(mode="json")},
+        decoding=Decoding(pattern=code),
     )
 
 
@@ -184,7 +190,7 @@ def test_bits_exchanged_with_their_complements_whatever_their_number(bits):
 
 def test_columns_and_rows_exchanged():
     code = sequence(gray("rows"), gray(), "white", "black")
-    spoiled = replace(taken(BOTH), settings={"pattern": code.model_dump(mode="json")})
+    spoiled = replace(taken(BOTH), decoding=Decoding(pattern=code))
     assert "they fit if columns and rows are exchanged in [pattern]" in said(spoiled)
 
 
@@ -329,3 +335,23 @@ def test_rows_of_two_cameras_by_the_texture(off):
     found = measured_row_error((look(cameras["left"]), look(turned)), geometry, cloud)
     assert abs(found - off) < 0.1
     assert bool(cloud_warnings(found)) == (abs(off) > 0.3)
+
+
+@pytest.mark.parametrize("paired", [False, True])
+def test_cloud_and_checks_decode_the_images_once(monkeypatch, paired):
+    """The cloud is that of the images alone, and no stack is decoded a second time."""
+    capture = taken(BOTH, pair() if paired else None)
+    settings = PAIRED if paired else SETTINGS
+    alone, stacks = capture_cloud(capture, settings), []
+
+    def counted(stack, *rest, **options):
+        stacks.append(stack.shape)
+        return decode_coordinates(stack, *rest, **options)
+
+    for module in (coded_images, decoder, two_cameras, image_sanity):
+        monkeypatch.setattr(module, "decode_coordinates", counted)
+    decoded = checked_cloud(capture, settings, None)
+    assert stacks == [stack.shape for stack in capture.images.values()]
+    assert decoded.warnings == ()
+    np.testing.assert_array_equal(decoded.cloud.points, alone.points)
+    np.testing.assert_array_equal(decoded.cloud.status, alone.status)

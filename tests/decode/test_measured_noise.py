@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.decode.cloud import capture_cloud
 from mitsim.decode.noise import known_noise, sigma_source
 from mitsim.decode.structured_light.measured_noise import measured_noise
@@ -116,7 +117,7 @@ def test_points_scatter_as_their_sigma_says(pair, rng):
         "device",
         Rig(cameras, beamer),
         images,
-        settings={"pattern": code.model_dump(mode="json")},
+        decoding=Decoding(pattern=code),
     )
     settings = DecoderSettings(near_mm=50, far_mm=20000, triangulate="cameras" if pair else "projector")
     noise = known_noise(capture, None)

@@ -1,4 +1,4 @@
-"""The kernel that goes with an exported map against the map's own queries, and against ``mitsim predict``."""
+"""The kernel that goes with an exported map against the map's own queries, and against ``mitsim map predict``."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""`--plan-exposures` of `run`, `budget` and `choose`: the same option, the same plan, and the same words."""
+"""`--plan-exposures` of `run`, `study state` and `study choose`: the same option, the same plan, and the same words."""
 
 from __future__ import annotations
 
@@ -94,16 +94,16 @@ def test_run_states_its_view_with_the_planned_exposure(chosen):
     assert stated["exposure"]["exposures_s"][0] > 1.3 * OWN_S
 
 
-@pytest.mark.parametrize("command", ["budget", "choose"])
-def test_budget_and_choose_plan_as_run_does(chosen, plans, command):
+@pytest.mark.parametrize("command", ["state", "choose"])
+def test_state_and_choose_plan_as_run_does(chosen, plans, command):
     """Of the same view the plan, and what is said of it, are the same; the statement holds for it.
 
-    `budget` makes its plan anew. `choose` has to ask for the very plan that `run` made, and gets that.
+    `study state` makes its plan anew. `choose` has to ask for the very plan that `run` made, and gets that.
     """
     folder, done, view = chosen
-    more = ["--view", view] if command == "budget" else ["--sensors", folder / "ensenso-n10.toml"]
-    with mock.patch.object(planned, "plan_view", plans.anew if command == "budget" else plans.kept):
-        other = invoked(command, folder / "study.toml", *more, "--plan-exposures", "-o", folder / command)
+    more = ["--view", view] if command == "state" else ["--sensors", folder / "ensenso-n10.toml"]
+    with mock.patch.object(planned, "plan_view", plans.anew if command == "state" else plans.kept):
+        other = invoked("study", command, folder / "study.toml", *more, "--plan-exposures", "-o", folder / command)
     assert plans.taken_again == (command == "choose")
     where = folder / command / ("ensenso-n10" if command == "choose" else "")
     stated = statement_in(where)
@@ -118,7 +118,7 @@ def test_budget_and_choose_plan_as_run_does(chosen, plans, command):
 
 def test_without_the_option_the_sensors_own_exposure_holds(chosen):
     folder, _, view = chosen
-    done = invoked("budget", folder / "study.toml", "--view", view, "-o", folder / "own")
+    done = invoked("study", "state", folder / "study.toml", "--view", view, "-o", folder / "own")
     assert "expose" not in done.stderr
     assert "exposure" not in statement_in(folder / "own")
     assert not (folder / "own/exposures").exists()
@@ -127,7 +127,7 @@ def test_without_the_option_the_sensors_own_exposure_holds(chosen):
 def test_exposures_that_the_study_gives_are_not_planned_again(chosen):
     folder, _, view = chosen
     (folder / "given.toml").write_text((folder / "study.toml").read_text() + "[exposure]\nexposures_s = [0.003]\n")
-    done = invoked("budget", folder / "given.toml", "--view", view, "--plan-exposures", "-o", folder / "given")
+    done = invoked("study", "state", folder / "given.toml", "--view", view, "--plan-exposures", "-o", folder / "given")
     assert "expose" not in done.stderr
     assert statement_in(folder / "given")["exposure"] == {"exposures_s": [0.003], "power": 1.0}
 

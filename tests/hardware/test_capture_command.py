@@ -48,7 +48,7 @@ def test_captures_are_folders_and_a_second_run_goes_on(camera, mitsim, tmp_path)
     for folder in folders:
         capture = read_capture(folder)
         assert capture.source == "emulator"
-        assert capture.settings["exposure_s"] == 0.002
+        assert capture.decoding.exposure_s == 0.002
         assert capture.images["left"].shape == (3, 120, 160)
         assert (tmp_path / "out/0000/vendor/150358_calib.json").is_file()
 

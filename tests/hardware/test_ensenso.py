@@ -258,7 +258,7 @@ def test_a_capture_comes_back_from_its_folder_with_points_in_the_left_cameras_fr
     assert taken.originals.keys() == {"150358_calib.json"}
     capture = read_capture(write_capture(taken.capture, tmp_path / "one", vendor=taken.originals))
     assert (capture.sensor, capture.serial, capture.source) == ("StandIn-N10", "150358", "emulator")
-    assert (capture.settings["exposure_s"], capture.settings["flex_view"]) == (0.002, 3)
+    assert (capture.decoding.exposure_s, capture.settings["flex_view"]) == (0.002, 3)
     assert capture.settings["projector_on"] is True
     assert np.array_equal(capture.images["right"], shot.images["right"])
     pair = capture.rig.rectification

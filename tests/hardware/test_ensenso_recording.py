@@ -48,7 +48,7 @@ def test_the_live_camera_gives_what_its_file_camera_holds(recorded):
     assert np.array_equal(capture.images["left"], images[0])
     assert np.array_equal(capture.images["right"], told.images["right"])
     assert (capture.sensor, capture.serial, capture.source) == ("N10-304-18", "150358", "emulator")
-    assert capture.settings["exposure_s"] == 0.004
+    assert capture.decoding.exposure_s == 0.004
     assert camera.node["Parameters"]["Capture"]["Exposure"] == 3.0
 
 

@@ -16,7 +16,6 @@ def public() -> dict[str, object]:
         for name in package.__all__:
             if inspect.isfunction(one := getattr(package, name)):
                 out[f"{package.__name__}.{name}"] = one
-    out["mitsim.Capture.cloud"] = mitsim.Capture.cloud
     out["characterisation.PointCloud.to_open3d"] = characterisation.PointCloud.to_open3d
     return out
 

@@ -78,7 +78,7 @@ def test_predict_gives_the_cloud_of_the_command(workplace):
 
 
 def test_score_has_the_figures_of_the_command(workplace):
-    run("score", "study.toml", "-o", "scores")
+    run("study", "score", "study.toml", "-o", "scores")
     scores = ms.score(ms.open_study("study.toml"))
     with xr.open_dataset("scores/scores.nc") as theirs:
         for name in ("predicted_uncertainty", "uncertainty_rank", "V_m"):
@@ -88,28 +88,38 @@ def test_score_has_the_figures_of_the_command(workplace):
 def test_statement_has_the_figures_of_the_command(workplace):
     text = (workplace / "study.toml").read_text() + "\n[statement]\ntrials = 3\npairs = 0\n"
     (workplace / "short.toml").write_text(text)
-    CliRunner().invoke(app, ["budget", "short.toml", "--view", "4", "-o", "budget"], catch_exceptions=False)
+    CliRunner().invoke(app, ["study", "state", "short.toml", "--view", "4", "-o", "budget"], catch_exceptions=False)
     theirs = json.loads((workplace / "budget/statement.json").read_text())["measurements"]
     for one in ms.statement(ms.open_study("study.toml"), 4, trials=3, pairs=0, folder="mine"):
         assert one.trials == 3
         assert one.standard_uncertainty == pytest.approx(theirs[one.measurement]["standard_uncertainty"], nan_ok=True)
-    kept, mine = (workplace / one / "trials/view_0004.jsonl" for one in ("budget", "mine"))
+    kept, mine = (workplace / one / "trials/view_0004.jsonl" for one in ("study", "state", "mine"))
     assert kept.read_bytes() == mine.read_bytes()
 
 
 def test_a_rendered_capture_is_decoded_by_the_sensor_that_took_it(workplace):
     sensor = ms.load_sensor("small.toml")
     capture = ms.render(ms.load_scene("matt_white.xml", sensor), sensor, POSE, samples=8, depth=1)
-    cloud = capture.cloud()
-    for same in (capture.cloud(sensor), capture.cloud("small.toml")):
+    cloud = ms.decode(capture)
+    for same in (ms.decode(capture, sensor), ms.decode(capture, "small.toml")):
         assert np.array_equal(same.points, cloud.points, equal_nan=True)
     # the capture keeps the sensor's settings; without them the usual ones are taken, and they are others
-    kept = replace(capture, taken_by=None)
-    assert np.array_equal(kept.cloud().points, cloud.points, equal_nan=True)
-    usual = replace(kept, settings={key: value for key, value in kept.settings.items() if key != "decoder"}).cloud()
+    usual = ms.decode(replace(capture, decoding=capture.decoding.model_copy(update={"decoder": None})))
     assert not np.array_equal(usual.points, cloud.points, equal_nan=True)
-    near = capture.cloud(range_mm=(330, 480))
+    near = ms.decode(capture, range_mm=(330, 480))
     assert 0 < np.nanmax(near.points[..., 2]) < 500 < np.nanmax(cloud.points[..., 2])
+
+
+def test_decode_issues_the_warnings_that_the_command_prints(workplace):
+    capture = ms.read_capture("capture")
+    told = "the rig has moved since its calibration"
+    ms.write_capture(replace(capture, settings=capture.settings | {"warnings": [told]}), "moved")
+    with pytest.warns(UserWarning) as warned:
+        cloud = ms.decode(ms.read_capture("moved"))
+    done = CliRunner().invoke(app, ["decode", "moved", "-o", "moved.ply"], catch_exceptions=False)
+    assert [str(one.message) for one in warned] == [told]
+    assert f"warning: {told}" in done.stderr
+    assert np.array_equal(ms.read_cloud("moved.ply").points, cloud.points, equal_nan=True)
 
 
 def test_labels_are_those_of_the_part(workplace):

@@ -54,6 +54,12 @@ def test_dir_and_all_name_what_can_be_had(package):
         assert getattr(package, name).__name__ == name
 
 
+def test_a_function_is_not_replaced_by_the_package_of_its_name():
+    """Importing ``mitsim.decode.x`` sets the package as an attribute of its parent; ``ms.decode`` stays a function."""
+    code = "import mitsim as ms, mitsim.decode.blocks; print(ms.decode.__module__, callable(ms.decode))"
+    assert run(code).split() == ["mitsim.decode.captures", "True"]
+
+
 @PACKAGES
 def test_type_checkers_see_the_same_names(package):
     tree = ast.parse(Path(package.__file__).read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""``mitsim acceptance``: figures of planes and spheres whose errors are known."""
+"""``mitsim measure acceptance``: figures of planes and spheres whose errors are known."""
 
 import json
 
@@ -16,7 +16,7 @@ SIGMA = 0.05
 
 
 def of(folder, *arguments, code=0):
-    done = mitsim_here("acceptance", *arguments, "--json", code=code, cwd=folder)
+    done = mitsim_here("measure", "acceptance", *arguments, "--json", code=code, cwd=folder)
     document = json.loads(done.stdout)
     lists = [one["measurements"] for one in document["clouds"]] + [document["all_clouds"]]
     return [{one["name"]: one for one in measured} for measured in lists]
@@ -89,12 +89,12 @@ def test_spheres_have_the_errors_of_diameter_and_spacing_that_they_were_made_wit
 
 
 def test_the_table_names_figures_and_a_figure_that_cannot_be_is_told(walls, tmp_path):
-    done = mitsim_here("acceptance", "walls", "--plane", "wall=600", cwd=walls)
+    done = mitsim_here("measure", "acceptance", "walls", "--plane", "wall=600", cwd=walls)
     assert "all clouds" in done.stdout and "wall temporal noise" in done.stdout
     assert done.stderr.splitlines()[-1].startswith("27 of 27 measurements")
-    done = mitsim_here("acceptance", "walls/0.ply", "--plane", "wall=0,0,50,5", code=1, cwd=walls)
+    done = mitsim_here("measure", "acceptance", "walls/0.ply", "--plane", "wall=0,0,50,5", code=1, cwd=walls)
     assert "not possible: 0 points in the window" in done.stdout
-    done = mitsim_here("acceptance", "walls/0.ply", "--sphere", "ball=40", code=1, cwd=walls)
+    done = mitsim_here("measure", "acceptance", "walls/0.ply", "--sphere", "ball=40", code=1, cwd=walls)
     assert "not possible: probing_error" in done.stdout
 
 
@@ -117,4 +117,4 @@ def test_options_that_make_no_sense_are_refused_with_what_can_be_asked(options, 
 
 
 def test_nothing_asked_is_refused(walls):
-    assert "--plane or --sphere" in mitsim_here("acceptance", "walls", code=2, cwd=walls).stderr
+    assert "--plane or --sphere" in mitsim_here("measure", "acceptance", "walls", code=2, cwd=walls).stderr

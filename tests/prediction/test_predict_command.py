@@ -1,4 +1,4 @@
-"""``mitsim predict`` as a user runs it: with independent and with correlated noise."""
+"""``mitsim map predict`` as a user runs it: with independent and with correlated noise."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_noise_is_independent_unless_it_is_asked_to_be_correlated(scenes: Path, 
 def test_a_noise_that_there_is_not_is_told(scenes: Path, tmp_path: Path) -> None:
     scene, cloud = scenes / "two_pillars/two_pillars.xml", tmp_path / "cloud.ply"
     pose = ("--position", "0", "-400", "300")
-    arguments = ["predict", str(scene), "--map", "ensenso-n10", *pose, "--noise", "pink", "-o", str(cloud)]
+    arguments = ["map", "predict", str(scene), "--map", "ensenso-n10", *pose, "--noise", "pink", "-o", str(cloud)]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 2
     assert "'pink' is not one of 'independent', 'correlated'" in " ".join(done.output.split())
@@ -79,4 +79,4 @@ def test_a_noise_that_there_is_not_is_told(scenes: Path, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("option", ["--noise", "--seed"])
 def test_the_help_names_what_a_draw_depends_on(option: str) -> None:
-    assert option in CliRunner().invoke(app, ["predict", "--help"]).output
+    assert option in CliRunner().invoke(app, ["map", "predict", "--help"]).output

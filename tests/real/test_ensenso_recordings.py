@@ -37,8 +37,8 @@ def sheet(real_data, tmp_path_factory):
     capture = read_capture(write_capture(read_ensenso(path), folder, vendor=ensenso_originals(path)))
     assert (capture.sensor, capture.serial, capture.source) == ("N35-604-16-BL", "160606", "device")
     assert capture.settings["projector_on"] is True
-    assert capture.settings["exposure_s"] == pytest.approx(0.153e-3, rel=0.01)
-    settings = MatcherSettings(near_mm=capture.settings["near_mm"], far_mm=capture.settings["far_mm"])
+    assert capture.decoding.exposure_s == pytest.approx(0.153e-3, rel=0.01)
+    settings = MatcherSettings(near_mm=capture.decoding.near_mm, far_mm=capture.decoding.far_mm)
     left, right = capture.images["left"][0], capture.images["right"][0]
     roi = Roi.between(COLUMNS[0], ROWS[0], COLUMNS[1], ROWS[1])
     return decode_stereo(

@@ -191,7 +191,7 @@ def test_bits_in_the_wrong_order_are_said_although_most_pixels_decode(procam, re
     sensor, _ = procam
     table = sensor.pattern.model_dump()
     table["images"][0]["first"] = "least_significant"
-    spoiled = replace(recorded, settings=recorded.settings | {"pattern": table})
+    spoiled = replace(recorded, decoding=recorded.decoding.model_copy(update={"pattern": ImageSequence(**table)}))
     said = " ".join(capture_warnings(spoiled, sensor.settings))
     assert "the columns that camera decodes do not vary smoothly" in said or "contradict one another" in said
     assert "they fit if the bits are in the reverse order" in said

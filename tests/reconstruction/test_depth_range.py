@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.folder import write_capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
@@ -109,7 +111,7 @@ def test_fewer_pixels_look_along_the_same_rays(n10, binned):
         "simulated",
         replace(n10.rig, rectification=pair),
         dict.fromkeys(n10.rig.cameras, stack),
-        settings={"read_out": {"left": [10, 20, 300, 200]}},
+        decoding=Decoding(read_out={"left": Roi(10, 20, 300, 200)}),
     )
     few = _coarse_capture(capture, 3, binned=binned)
     eye = few.rig.reference
@@ -117,8 +119,8 @@ def test_fewer_pixels_look_along_the_same_rays(n10, binned):
     mine = eye.rays(np.array([[40.0, 50.0]]))
     whole = camera.rays(np.array([[3 * 40.0 + 1, 3 * 50.0 + 1]]))  # of 120, 121, 122 the middle one
     np.testing.assert_allclose(mine, whole, atol=1e-9)
-    column, row, width, height = few.settings["read_out"]["left"]
-    assert 3 * column >= 10 and 3 * row >= 20 and 3 * (column + width) <= 310 and 3 * (row + height) <= 220
+    region = few.decoding.read_out["left"]
+    assert 3 * region.left >= 10 and 3 * region.top >= 20 and 3 * region.right <= 310 and 3 * region.bottom <= 220
     fewer = few.rig.rectification
     depth = fewer.depth(pair.disparity(500.0) / 3)  # a disparity in coarse pixels is a third as large
     np.testing.assert_allclose(depth, 500.0, rtol=1e-9)
@@ -140,8 +142,8 @@ def test_decode_warns_in_one_line(strip, tmp_path):
     capture = SimulatedSensor(strip).capture(
         plate(0.6 * distance, "matt white", strip.wavelength_nm), pose.inverse(), rendering=Rendering(samples=4), seed=3
     )
-    settings = {"near_mm": 1000.0, "far_mm": 2000.0}
-    far = write_capture(replace(capture, sensor="MINE", settings=settings), tmp_path / "far")
+    decoding = Decoding(near_mm=1000.0, far_mm=2000.0)
+    far = write_capture(replace(capture, sensor="MINE", decoding=decoding), tmp_path / "far")
     near = write_capture(capture, tmp_path / "near")
     told = {}
     for folder in (far, near):

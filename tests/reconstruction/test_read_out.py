@@ -16,7 +16,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud, read_out_of, sensor_geometry
+from mitsim.decode.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.load import load_scene
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
@@ -116,7 +116,7 @@ def phase(tmp_path_factory):
 
 def test_a_window_has_the_bytes_of_the_whole_image(shown):
     capture = shown.capture()
-    assert "read_out" not in capture.settings
+    assert not capture.decoding.read_out
     whole = shown.cloud(capture)
     rows, columns = (np.flatnonzero(whole.valid.any(axis=axis)) for axis in (1, 0))
     rng = np.random.default_rng(3)
@@ -142,7 +142,7 @@ def test_a_window_has_the_bytes_of_the_whole_image(shown):
 
 def test_a_capture_around_the_coupon_is_read_out_and_decoded_there_only(shown, tmp_path):
     capture, none = shown.capture(True), Noise.none()
-    parts = read_out_of(capture)
+    parts = capture.decoding.read_out
     assert set(parts) == set(shown.sensor.rig.cameras)
     sharp, whole = shown.capture(True, none), shown.capture(False, none)
     for name, roi in parts.items():
@@ -189,7 +189,7 @@ def test_noise_within_the_part_is_that_of_the_imager(phase):
     imager = phase.sensor.imager
     noise = Noise.only("read", "quantisation")
     images = phase.capture(True, noise).images["camera"].astype(float)
-    roi = read_out_of(phase.capture(True))["camera"]
+    roi = phase.capture(True).decoding.read_out["camera"]
     corner = images[:, roi.top : roi.top + 8, roi.left : roi.left + 40]  # beside the coupon, which stands askew
     most = imager.black_level + 12 * imager.gain * imager.read_noise
     dark = corner[:, corner.max(axis=0) < most]
@@ -212,7 +212,7 @@ def test_an_automatic_exposure_is_that_of_the_whole_image(tmp_path):
         simulated.capture(scene, pose, rendering=Rendering(samples=1), seed=1, noise=none, **given)
         for given in ({}, {"around": corners})
     )
-    assert part.settings["exposure_s"] == pytest.approx(whole.settings["exposure_s"], rel=1e-6)
+    assert part.decoding.exposure_s == pytest.approx(whole.decoding.exposure_s, rel=1e-6)
 
 
 def test_a_window_beside_what_was_read_out_shows_nothing(shown):
@@ -225,19 +225,16 @@ def test_a_window_beside_what_was_read_out_shows_nothing(shown):
 @pytest.mark.parametrize(
     ("read_out", "named"),
     [
-        ({"eye": [0, 0, 10, 10]}, "eye"),
-        ({"camera": [400, 0, 100, 10]}, "440 x 320"),
-        ({"camera": [0, -1, 10, 10]}, "440 x 320"),
-        ({"camera": [0, 0, 0, 10]}, "440 x 320"),
-        ({"camera": [0, 0, 10]}, "read_out"),
-        ({"camera": "all"}, "read_out"),
+        ({"eye": Roi(0, 0, 10, 10)}, "eye"),
+        ({"camera": Roi(400, 0, 100, 10)}, "440 x 320"),
+        ({"camera": Roi(0, -1, 10, 10)}, "440 x 320"),
+        ({"camera": Roi(0, 0, 0, 10)}, "440 x 320"),
     ],
 )
 def test_a_region_that_cannot_be_is_refused(phase, read_out, named):
     capture = phase.capture(True)
-    wrong = replace(capture, settings=capture.settings | {"read_out": read_out})
     with pytest.raises(InputError, match=re.escape(named)):
-        phase.cloud(wrong)
+        replace(capture, decoding=capture.decoding.model_copy(update={"read_out": read_out}))
 
 
 @pytest.mark.parametrize("roi", [Roi(0, 0, 441, 10), Roi(10, 0, 0, 10), Roi(-1, 0, 11, 10)])

@@ -143,10 +143,11 @@ def test_the_factory_calibration_on_request(tmp_path):
 
 
 def test_settings_carry_units_and_the_link_is_only_recorded(tmp_path):
-    found = read_ensenso(pack(tmp_path / "r.zip", files(node()))).settings
-    assert found["exposure_s"] == pytest.approx(1.5e-3)
+    capture = read_ensenso(pack(tmp_path / "r.zip", files(node())))
+    found, stated = capture.settings, capture.decoding
+    assert stated.exposure_s == pytest.approx(1.5e-3)
     assert (found["gain"], found["projector_on"], found["hardware_gamma"]) == (2, True, True)
-    assert (found["near_mm"], found["far_mm"]) == (300, 600)
+    assert (stated.near_mm, stated.far_mm) == (300, 600)
     assert found["link_translation_mm"] == [1, 2, 3]
     assert found["link_angle_rad"] == 0.1
 

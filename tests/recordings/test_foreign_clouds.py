@@ -21,6 +21,7 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.recordings.depth_image import read_depth_image
 from mitsim.capture.recordings.organised_cloud import read_organised_cloud
@@ -28,9 +29,9 @@ from mitsim.capture.recordings.pinhole_fit import fit_pinhole
 from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
 from mitsim.decode.cloud import capture_cloud, capture_geometry, decoder_settings, sensor_geometry
-from mitsim.decode.device_maps import DeviceMapSettings
 from mitsim.maps.campaign.acquire import coupon_cloud
 from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.decoder_settings import DeviceMapSettings
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
 
@@ -262,7 +263,7 @@ def test_a_devices_map_is_decoded_with_the_range_of_its_sensor(tmp_path, n10):
     np.testing.assert_array_equal(cloud.valid, (z >= 690) & (z <= 720))
     assert (cloud.status[z > 721] == Status.OUT_OF_RANGE).all()
     assert decoder_settings(replace(capture, sensor="other"))[0] == DeviceMapSettings(near_mm=1e-3, far_mm=1e6)
-    told = replace(capture, sensor="other", settings={"near_mm": 5, "far_mm": 4})
+    told = replace(capture, sensor="other", decoding=Decoding(near_mm=5, far_mm=4))
     with pytest.raises(InputError, match=r"settings\.json.*near_mm under far_mm"):
         decoder_settings(told)
     with pytest.raises(InputError, match="map of depth, since its technology is depth_map"):

@@ -90,7 +90,7 @@ def test_a_pair_by_patterns_with_all_that_is_known_of_it(pairs):
     np.testing.assert_array_equal(capture.images["right"][0], texture(RIGHT, 3.0))
     np.testing.assert_allclose(capture.world_from_sensor.matrix(), POSE.matrix(), atol=1e-12)
     settings = capture.settings
-    assert (settings["exposure_s"], settings["coupon"], settings["projector_on"]) == (
+    assert (capture.decoding.exposure_s, settings["coupon"], settings["projector_on"]) == (
         0.02,
         {"sample": "steel/ground"},
         False,
@@ -217,8 +217,8 @@ exposure_s = 0.04
     given = ReadOptions(sensor=str(tmp_path / "rig.toml"), images={"left": "a*.png", "right": "b*.png"})
     capture = read_recording(tmp_path / "images", given).capture
     assert set(capture.images) == {"left", "right"}
-    assert capture.settings["exposure_s"] == 0.04
-    assert capture.settings["projector_size_px"] == [64, 48]
+    assert capture.decoding.exposure_s == 0.04
+    assert capture.decoding.projector_size_px == (64, 48)
     assert "warnings" not in capture.settings
 
 

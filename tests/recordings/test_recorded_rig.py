@@ -200,7 +200,7 @@ def test_fringes_without_an_imager_have_the_sigma_of_their_own_noise_and_decode_
     save_images(tmp_path / "images", stack)
     done = run("import", tmp_path / "images", "--sensor", file, "-o", tmp_path / "capture")
     capture = read_capture(tmp_path / "capture")
-    assert (capture.bits, capture.settings["exposure_s"]) == (12, 0.02)
+    assert (capture.bits, capture.decoding.exposure_s) == (12, 0.02)
     assert "bits_from" in done.output
     done = run("decode", tmp_path / "capture", "--range", 300, 800, "-o", tmp_path / "cloud.ply")
     assert "sigma of the points: from the contrast of the fringes and the residuals of their fit, 16 DN" in done.output

@@ -100,7 +100,7 @@ def test_a_view_is_recognised_and_decodes_to_the_depth_beside_it(scene):
     imported = read_recording(scene, ReadOptions(frame=0))
     capture = imported.capture
     assert {"LEFT_view_0.bmp", f"{scene.name}_LEFT.yml", "DEPTH_view_0.json"} <= set(imported.originals)
-    assert capture.settings["near_mm"] == pytest.approx(0.85 * DISTANCE, rel=1e-3)
+    assert capture.decoding.near_mm == pytest.approx(0.85 * DISTANCE, rel=1e-3)
     depth = capture.derived["depth"]
     assert np.isnan(depth[:40]).all() and depth[60, 60] == pytest.approx(DISTANCE, abs=UNIT)
     settings, imager = decoder_settings(capture)

@@ -1,4 +1,4 @@
-"""A folder as mitsim choose leaves it: a sensor that fits, one that does not, one screened, one excluded."""
+"""A folder as mitsim study choose leaves it: a sensor that fits, one that does not, one screened, one excluded."""
 
 import json
 from pathlib import Path

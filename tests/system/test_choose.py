@@ -1,4 +1,4 @@
-"""`mitsim choose` as its user runs it, with clouds drawn from the maps: table, page, sheet, and a second start."""
+"""`mitsim study choose` as users run it, with clouds drawn from the maps: table, page, sheet, and a second start."""
 
 import json
 import re
@@ -50,7 +50,7 @@ def chosen(tmp_path_factory):
     task = re.sub(r"(nominal = 70.0)", rf"\1\ntolerance = {DISTANCE}", task)
     (folder / "task.toml").write_text(task)
     david = coarse_sensor("david-sls-3", 4, folder)
-    arguments = ("choose", folder / "study.toml", "--sensors", f"kinect-v2,{david}", "-o")
+    arguments = ("study", "choose", folder / "study.toml", "--sensors", f"kinect-v2,{david}", "-o")
     return folder, arguments, mitsim_here(*arguments, folder / "out")
 
 
@@ -110,7 +110,7 @@ def test_page_and_sheet(chosen):
 )
 def test_sensors_that_are_none_are_one_message(chosen, sensors, told):
     folder, _, _ = chosen
-    done = mitsim_here("choose", folder / "study.toml", "--sensors", sensors, "-o", folder / "other")
+    done = mitsim_here("study", "choose", folder / "study.toml", "--sensors", sensors, "-o", folder / "other")
     assert done.returncode == 2 and told in done.stderr and "Traceback" not in done.stderr
 
 

@@ -30,12 +30,24 @@ def test_importing_is_quick_and_light(module):
 
 def test_help_names_every_command_and_each_has_an_example():
     text = mitsim_here("--help").stdout
-    for command in ("doctor", "run", "render", "import", "decode", "characterise", "predict", "calibrate", "report"):
-        assert command in text
-        assert f"Example: mitsim {command}" in " ".join(mitsim_here(command, "--help").stdout.split())
+    for command in (
+        "doctor",
+        "run",
+        "render",
+        "import",
+        "decode",
+        "calibrate",
+        "report",
+        "map make",
+        "study score",
+        "measure",
+    ):
+        assert command.split()[0] in text
+        helped = mitsim_here(*command.split(), "--help").stdout
+        assert f"Example: mitsim {command}" in " ".join(helped.split())
 
 
-@pytest.mark.parametrize("group", [(), ("validate",), ("export",), ("fit",)])
+@pytest.mark.parametrize("group", [(), ("study",), ("map",), ("export",), ("fit",)])
 def test_the_list_of_commands_tells_whole_sentences(group):
     assert "..." not in mitsim_here(*group, "--help").stdout.partition("Commands:")[2]
 
@@ -135,7 +147,7 @@ def test_characterise_says_what_is_not_known_of_a_finish(tmp_path):
         spread = true
     """)
     sensor = coarse_sensor("ensenso-n10", 2, tmp_path)
-    done = mitsim_here("characterise", tmp_path / "campaign.toml", "--sensor", sensor, "-o", tmp_path / "out")
+    done = mitsim_here("map", "make", tmp_path / "campaign.toml", "--sensor", sensor, "-o", tmp_path / "out")
     assert "aluminium/ground, Ra 0.4 µm: unknown properties of the finish change F by up to 0." in done.stderr
 
 
@@ -183,8 +195,9 @@ def test_a_bad_study_is_one_message_and_code_2(tmp_path, old, new, says):
         ("decode", "missing", "-o", "{tmp}/cloud.ply"),
         ("import", "missing.zip", "-o", "{tmp}/out"),
         ("report", "{tmp}"),
-        ("characterise", "missing.toml", "-o", "{tmp}/out"),
+        ("map", "make", "missing.toml", "-o", "{tmp}/out"),
         (
+            "map",
             "predict",
             "scenes/coupon/coupon.xml",
             "--map",

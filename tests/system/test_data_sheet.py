@@ -113,7 +113,7 @@ def test_an_unknown_sensor_is_refused_before_anything_is_measured(tmp_path, monk
     from typer.testing import CliRunner
 
     monkeypatch.setattr(data_sheet, "measure_sensor", None)
-    done = CliRunner().invoke(app, ["datasheet", "ensenso-n11", "-o", str(tmp_path / "out")])
+    done = CliRunner().invoke(app, ["map", "sheet", "ensenso-n11", "-o", str(tmp_path / "out")])
     assert done.exit_code != 0
     assert "ensenso-n1" in str(done.exception)
     assert not (tmp_path / "out").exists()

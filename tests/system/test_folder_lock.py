@@ -121,7 +121,8 @@ def test_commands_hold_their_folders_and_let_them_go(tmp_path, tmp_path_factory,
     study, into = str(tmp_path_factory.mktemp("study") / "study.toml"), ("-o", str(tmp_path))
     sensor = coarse_sensor("ensenso-n10", 2, Path(study).parent)
     Path(study).write_text(small_study("{ plane_Ra = 0.37, pillar_Ra = 0.37 }", sensor), encoding="utf-8")
-    for call in (("score", study, *into), ("run", study, *into), ("budget", study, "--view", "1", *into)):
+    into_view = ("--view", "1", *into)
+    for call in (("study", "score", study, *into), ("run", study, *into), ("study", "state", study, *into_view)):
         assert f"process {holder.pid}" in mitsim_here(*call, code=2).stderr
     assert {path.name for path in tmp_path.iterdir()} == {LOCK, f".scores.csv.{holder.pid}.partial"}
     os.kill(holder.pid, signal.SIGKILL)
@@ -133,6 +134,6 @@ def test_commands_hold_their_folders_and_let_them_go(tmp_path, tmp_path_factory,
         return score_study(*given)
 
     with mock.patch("mitsim.study.scoring.score_study", scored):
-        mitsim_here("score", study, *into)
+        mitsim_here("study", "score", study, *into)
     assert seen == [os.getpid()]
     assert (tmp_path / "scores.csv").exists() and not (tmp_path / LOCK).exists()

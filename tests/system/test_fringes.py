@@ -110,7 +110,7 @@ def test_a_capture_on_disk_knows_its_code(sensor, simulated, geometry, tmp_path)
     assert np.isfinite(told.sigma[told.valid]).all()
     size = np.percentile(np.abs(world[:, 2] - np.median(world[:, 2])) / told.sigma[told.valid], 68.3)
     assert 0.9 < size < 1.2, size  # the plate faces the sensor: along the ray and along z are nearly one
-    del again.settings["pattern"]
+    again = replace(again, decoding=again.decoding.model_copy(update={"pattern": None}))
     with pytest.raises(InputError, match="pattern"):
         capture_cloud(again, sensor.settings)
 
@@ -134,7 +134,7 @@ def test_metal_blinds_a_single_exposure_and_not_a_bracket(sensor, geometry, tmp_
     _, single = reasons(sensor)
     capture, merged = reasons(bracketed)
     assert len(capture.images["camera"]) == 3 * 16
-    assert np.allclose(np.array(capture.settings["exposure_s"]) / sensor.exposure.base_s, [1 / 8, 1, 8])
+    assert np.allclose(np.array(capture.decoding.exposures_s) / sensor.exposure.base_s, [1 / 8, 1, 8])
     blinded = single.status == Status.SATURATED
     assert blinded.sum() > 500
     assert merged.valid[blinded].mean() > 0.9
@@ -144,7 +144,7 @@ def test_metal_blinds_a_single_exposure_and_not_a_bracket(sensor, geometry, tmp_
     longest = replace(
         capture,
         images={"camera": capture.images["camera"][-16:]},
-        settings=capture.settings | {"exposure_s": capture.settings["exposure_s"][-1:]},
+        decoding=capture.decoding.model_copy(update={"exposure_s": capture.decoding.exposures_s[-1:]}),
     )
     faint = [(c.status == Status.LOW_MODULATION) & ~blinded for c in (merged, capture_cloud(longest, sensor.settings))]
     assert (faint[0] ^ faint[1]).mean() < 0.01
@@ -177,11 +177,11 @@ def test_an_ambient_image_holds_the_scene_s_own_light(sensor):
     pose = look_at([0, 0, 600], [0, 0, 0], [0, 1, 0])
     simulated = SimulatedSensor(own)
     capture = simulated.capture(scene, pose, seed=1, noise=Noise.none())
-    images = capture.images["camera"].astype(float) - capture.settings["black_level_dn"]
+    images = capture.images["camera"].astype(float) - capture.decoding.black_level_dn
     assert len(images) == 17
     dark = replace(own, projector=replace(own.projector, flux=1e-12))
     alone = SimulatedSensor(dark).capture(scene, pose, seed=1, noise=Noise.none()).images["camera"]
-    assert np.abs(images[-1] + capture.settings["black_level_dn"] - alone[0]).max() <= 1
+    assert np.abs(images[-1] + capture.decoding.black_level_dn - alone[0]).max() <= 1
     assert 0 < np.median(images[-1]) < np.median(images[0])
     cloud = capture_cloud(capture, own.settings)
     assert cloud.valid.sum() > 100000

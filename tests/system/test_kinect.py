@@ -322,7 +322,7 @@ def test_a_capture_on_disk_knows_its_modulation(kinect, simulated, geometry, tmp
     np.testing.assert_array_equal(one.status, other.status)
     assert np.isfinite(one.sigma[one.valid]).all()
     assert capture_cloud(again, settings).sigma is None
-    del again.settings["pattern"]
+    again = replace(again, decoding=again.decoding.model_copy(update={"pattern": None}))
     with pytest.raises(InputError, match="pattern"):
         capture_cloud(again, settings)
 

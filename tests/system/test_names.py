@@ -81,15 +81,16 @@ def commands_with(folder, sensor):
         f'scene = "{part}"\ntask = "{task}"\nsensor = "{sensor}"\n[views]\nsubdivisions = 0\n', encoding="utf-8"
     )
     campaign = SCENES / "coupon" / "quick.toml"
-    yield ["datasheet", sensor, "-o", out]
+    at = ("--sensor", sensor, "--position", 0, -300, 400)
+    yield ["map", "sheet", sensor, "-o", out]
     yield ["run", study, "-o", out]
-    yield ["score", study, "-o", out]
-    yield ["budget", study, "--view", 1, "-o", out]
-    yield ["characterise", campaign, "--sensor", sensor, "-o", out]
-    yield ["render", part, "--sensor", sensor, "--position", 0, -300, 400, "-o", out / "capture"]
-    yield ["predict", part, "--map", "ensenso-n10", "--sensor", sensor, "--position", 0, -300, 400, "-o", out / "a.ply"]
+    yield ["study", "score", study, "-o", out]
+    yield ["study", "state", study, "--view", 1, "-o", out]
+    yield ["map", "make", campaign, "--sensor", sensor, "-o", out]
+    yield ["render", part, *at, "-o", out / "capture"]
+    yield ["map", "predict", part, "--map", "ensenso-n10", *at, "-o", out / "a.ply"]
     yield ["calibrate", sensor, "-o", out / "covariance.json"]
-    yield ["validate", "map", "ensenso-n10", campaign, "--sensor", sensor, "-o", out]
+    yield ["map", "validate", "ensenso-n10", campaign, "--sensor", sensor, "-o", out]
 
 
 @pytest.mark.parametrize("name", HOSTILE)

@@ -15,6 +15,7 @@ from characterisation.cloud_files import read_ply
 from characterisation.files.documents import fields_of
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import SETTINGS_OF, read_settings
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
@@ -22,7 +23,7 @@ from mitsim.cli.decode import decode
 from mitsim.decode.cloud import decoder_settings
 from mitsim.decode.decoder_registry import technology_of
 from mitsim.scene.load import load_scene
-from mitsim.sensor.imager import DescribedImager, imager_table
+from mitsim.sensor.imager import WrittenImager
 from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.sensor_file import ImagerTable
 from mitsim.sensor.transforms import look_at
@@ -86,8 +87,7 @@ def taken(request, tmp_path_factory):
 
 def with_settings(capture: Capture, **changed) -> Capture:
     """The capture with other settings; None leaves one out."""
-    settings = {key: value for key, value in (capture.settings | changed).items() if value is not None}
-    return replace(capture, settings=settings)
+    return replace(capture, decoding=capture.decoding.model_copy(update=changed))
 
 
 def test_the_cloud_is_the_same_with_and_without_the_sensor_file(taken, capsys):
@@ -127,7 +127,7 @@ def test_an_old_folder_still_loads(taken):
     old = with_settings(read_capture(taken.folder), decoder=None, imager=None)
     kind = technology_of(old.technology)
     settings, imager = decoder_settings(old)
-    assert isinstance(settings, kind.settings[0])
+    assert isinstance(settings, SETTINGS_OF[old.technology])
     assert (settings.near_mm, settings.far_mm, imager) == (*kind.range_mm, None)
     # a folder of an import has decoder settings and no imager
     assert decoder_settings(with_settings(read_capture(taken.folder), imager=None)) == (taken.sensor.settings, None)
@@ -145,13 +145,10 @@ def test_an_old_folder_still_loads(taken):
     ],
 )
 def test_a_bad_value_is_an_error_that_names_file_and_field(taken, key, value, told):
-    capture = read_capture(taken.folder)
-    bad = with_settings(capture, **{key: capture.settings[key] | value})
-    with pytest.raises(InputError, match=rf"settings\.json: {told}"):
-        decoder_settings(bad)
-    with pytest.raises(InputError, match=rf"settings\.json: {key}"):
-        decoder_settings(with_settings(capture, **{key: 5}))
-    assert decoder_settings(bad, str(taken.file))[0] == taken.sensor.settings
+    written = json.loads((taken.folder / "settings.json").read_text())
+    for bad, words in ((written[key] | value, told), (5, key)):
+        with pytest.raises(InputError, match=rf"settings\.json: {words}"):
+            read_settings("settings.json", written | {key: bad}, taken.sensor.technology)
 
 
 def test_settings_of_another_technology_are_an_error(taken):
@@ -164,9 +161,9 @@ def test_settings_of_another_technology_are_an_error(taken):
 @pytest.mark.parametrize("name", presets())
 def test_an_imager_comes_back_from_its_table(name):
     imager = load_sensor(name).imager
-    table = json.loads(json.dumps(imager_table(imager)))
-    assert TypeAdapter(DescribedImager).validate_python(table) == imager
+    table = json.loads(json.dumps(TypeAdapter(WrittenImager).dump_python(imager, mode="json", by_alias=True)))
+    assert TypeAdapter(WrittenImager).validate_python(table) == imager
     assert set(table) == set(fields_of(ImagerTable)) - {"focus_mm"}
     for key in ("pixel_um", "full_well_e"):
-        with pytest.raises(ValidationError, match="a value of each"):
-            TypeAdapter(DescribedImager).validate_python({name: table[name] for name in table if name != key})
+        with pytest.raises(ValidationError, match=f"a value of each of imager.{key}"):
+            TypeAdapter(WrittenImager).validate_python({name: table[name] for name in table if name != key})

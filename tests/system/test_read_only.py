@@ -20,7 +20,7 @@ COMMANDS = {
     "report": (["report", "{}/run"], "report.html: found Read-only file system"),
     "report --pdf": (["report", "--pdf", "{}/run"], "sheet.pdf: found Read-only file system"),
     "check": (["check", "scenes/coupon/matt_white.xml", "--html", "{}/a.html"], "which is not writable"),
-    "score": (["score", "scenes/two_pillars/study.toml", "-o", "{}/run"], "which is not writable"),
+    "score": (["study", "score", "scenes/two_pillars/study.toml", "-o", "{}/run"], "which is not writable"),
     "import": (["import", "{}/a.pcd", "-o", "{}/c"], "a.pcd"),
 }
 

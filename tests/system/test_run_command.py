@@ -83,7 +83,7 @@ def test_run_leaves_everything(study_folder):
     assert not list(out.rglob("*.partial"))
     assert len(list((out / "clouds").glob("predicted_*.ply"))) >= 2
     assert {"poses.csv", "poses.json"} <= {path.name for path in (out / "poses").iterdir()}
-    for step in ("characterise", "score views", "race", "state view", "predict clouds", "render pictures"):
+    for step in ("map", "make", "score views", "race", "state view", "predict clouds", "render pictures"):
         assert step in done.stderr
     run = json.loads((out / "run.json").read_text())
     assert run["source"] == "simulated"
@@ -200,13 +200,13 @@ def test_a_set_of_views_is_chosen_and_told(study_folder, tmp_path):
     text = (folder / "study.toml").read_text().replace('campaign = "campaign.toml"', 'map = "out/map.nc"')
     table = "[set]\nlimits = {{ pillar1_radius = {0}, pillar2_radius = {0} }}\n"
     (folder / "set.toml").write_text(text + table.format(100.0))
-    done = mitsim_here("score", folder / "set.toml", "--measurement", "pillar1_radius", "-o", tmp_path / "one")
+    done = mitsim_here("study", "score", folder / "set.toml", "--measurement", "pillar1_radius", "-o", tmp_path / "one")
     assert "views that measure together: " in done.stderr and "(the fewest)" in done.stderr
     (folder / "wrong.toml").write_text(text + "[set]\nlimits = { pilar1_radius = 1.0 }\n")
-    done = mitsim_here("score", folder / "wrong.toml", "-o", tmp_path / "no", code=2)
+    done = mitsim_here("study", "score", folder / "wrong.toml", "-o", tmp_path / "no", code=2)
     assert "set.limits.pilar1_radius" in done.stderr
     (folder / "small.toml").write_text(text + table.format(1e-5))
-    done = mitsim_here("score", folder / "small.toml", "-o", tmp_path / "small")
+    done = mitsim_here("study", "score", folder / "small.toml", "-o", tmp_path / "small")
     assert "is unreachable" in done.stderr
 
 

@@ -1,4 +1,4 @@
-"""`mitsim budget` as its user runs it: the statement of one view, stopped and started again."""
+"""`mitsim study state` as its user runs it: the statement of one view, stopped and started again."""
 
 import json
 from functools import partial
@@ -40,7 +40,7 @@ def stated(tmp_path_factory):
     (folder / "task.toml").write_text(
         task[:place] + task[place:].replace("nominal = 20.0", "nominal = 20.0\ntolerance = 1e-6", 1)
     )
-    done = mitsim_here("budget", folder / "study.toml", "--view", 1, "-o", folder / "out")
+    done = mitsim_here("study", "state", folder / "study.toml", "--view", 1, "-o", folder / "out")
     return folder, done
 
 
@@ -70,7 +70,7 @@ def test_a_second_start_goes_on_and_ends_in_the_same_bytes(stated):
     whole = trials.read_bytes()
     trials.write_bytes(b"".join(whole.splitlines(keepends=True)[:3]) + b'{"day": 10485')  # as a kill leaves it
     statement.unlink()
-    again = mitsim_here("budget", folder / "study.toml", "--view", 1, "-o", folder / "out")
+    again = mitsim_here("study", "state", folder / "study.toml", "--view", 1, "-o", folder / "out")
     assert again.returncode == 1
     assert statement.read_bytes() == before
     assert sorted(trials.read_bytes().splitlines()) == sorted(whole.splitlines())
@@ -78,5 +78,5 @@ def test_a_second_start_goes_on_and_ends_in_the_same_bytes(stated):
 
 def test_a_view_that_is_none_is_one_message(stated):
     folder, _ = stated
-    done = mitsim_here("budget", folder / "study.toml", "--view", 999, "-o", folder / "other")
+    done = mitsim_here("study", "state", folder / "study.toml", "--view", 999, "-o", folder / "other")
     assert done.returncode == 2 and "--view" in done.stderr and "Traceback" not in done.stderr

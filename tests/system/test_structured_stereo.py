@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +77,7 @@ def test_a_plane_comes_back_between_two_cameras(sensor, simulated, tilt, tmp_pat
     if tilt == 0:
         write_capture(capture, tmp_path / "capture")
         again = read_capture(tmp_path / "capture")
-        again.settings["decoder"] = sensor.decoder.model_dump()
+        again = replace(again, decoding=again.decoding.model_copy(update={"decoder": sensor.decoder}))
         np.testing.assert_array_equal(capture_cloud(again, decoder_settings(again)[0]).points, cloud.points)
 
 

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
@@ -55,8 +56,9 @@ def taken(sensor, seed):
 
 def as_recorded(capture):
     """The same as if a device had taken it: no pose, nothing of how it was rendered."""
-    kept = {key: capture.settings[key] for key in ("exposure_s", "read_out")} | {"projector_on": True}
-    return replace(capture, source="device", settings=kept, world_from_sensor=None)
+    kept = Decoding(exposure_s=capture.decoding.exposure_s, read_out=capture.decoding.read_out)
+    records = {"projector_on": True}
+    return replace(capture, source="device", decoding=kept, settings=records, world_from_sensor=None)
 
 
 @pytest.fixture(scope="module")
@@ -185,9 +187,7 @@ def test_a_change_shows_in_the_right_quantity(n10_module, real, place, changed, 
         # level between the dark and the bright of the dots
         imager, inside = n10_module.imager, image_mask(place, real.rig.reference, 15)
         levels = np.percentile(real.images["left"][0][inside], [10, 90])
-        variance = pixel_noise(imager, imager, 1, real.settings["exposure_s"], False).variance(
-            linearised(levels, imager)
-        )
+        variance = pixel_noise(imager, imager, 1, real.decoding.exposure_s, False).variance(linearised(levels, imager))
         added = np.sqrt((found["finest detail"].simulated ** 2 - found["finest detail"].real ** 2) / 3)
         assert imager.gain * np.sqrt(variance[0]) < added < imager.gain * np.sqrt(variance[1])
         assert "median grey level" in others - differing
@@ -227,9 +227,7 @@ def test_a_rebuilt_capture_is_as_bright_and_agrees(n10_module, changed, tmp_path
     dim = replace(n10_module, projector=replace(n10_module.projector, flux=0.7 * n10_module.projector.flux))
     recorded = as_recorded(taken(dim, 3))
     write_capture(recorded, tmp_path / "real")
-    found = CliRunner().invoke(
-        app, ["validate", "captures", str(tmp_path / "real"), "-o", str(tmp_path / "out"), "--seed", "5"]
-    )
+    found = CliRunner().invoke(app, ["compare", str(tmp_path / "real"), "-o", str(tmp_path / "out"), "--seed", "5"])
     assert found.exit_code == 0, found.output
     twin = read_capture(tmp_path / "out" / "simulated")
     assert twin.source == "simulated"
@@ -348,6 +346,6 @@ def test_a_specimen_of_few_patches_is_refused(n10_module, real, place, again):
 
 
 def test_a_projector_is_on_or_off(folder, tmp_path):
-    found = CliRunner().invoke(app, ["validate", "captures", str(folder), "-o", str(tmp_path), "--projector", "dim"])
+    found = CliRunner().invoke(app, ["compare", str(folder), "-o", str(tmp_path), "--projector", "dim"])
     assert found.exit_code != 0
     assert isinstance(found.exception, InputError)

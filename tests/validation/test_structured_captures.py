@@ -11,6 +11,7 @@ import pytest
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.region_of_interest import Roi
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
@@ -57,8 +58,9 @@ def recorded(sensor, pattern, flux=1.0):
     corners = SIZE / 2 * np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)])
     around = pose.inverse().points(corners)
     capture = taker.capture(plate(SIZE, "matt white", 550), pose, rendering=Rendering(samples=4), seed=1, around=around)
-    kept = {key: capture.settings[key] for key in ("exposure_s", "read_out", "pattern")}
-    return replace(capture, source="device", settings=kept, world_from_sensor=None)
+    made = capture.decoding
+    kept = Decoding(exposure_s=made.exposure_s, read_out=made.read_out, pattern=made.pattern)
+    return replace(capture, source="device", decoding=kept, settings={}, world_from_sensor=None)
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +107,7 @@ def test_the_power_is_that_of_the_device_and_rows_that_do_not_apply_say_so(david
 )
 def test_the_plain_image_of_a_gray_code_is_lit_all_over(david, gray, code):
     """A bit and its inverse light every pixel once, and white lights all: their brightest is 1 everywhere."""
-    capture = replace(gray, settings={"pattern": code.model_dump(mode="json")})
+    capture = replace(gray, decoding=Decoding(pattern=code))
     shown = patterns(code, david.projector.optics.width, david.projector.optics.height)
     plain = plain_image(capture)
     np.testing.assert_array_equal(plain.of(shown), 1.0)
@@ -114,7 +116,7 @@ def test_the_plain_image_of_a_gray_code_is_lit_all_over(david, gray, code):
 
 def test_the_plain_image_of_fringes_is_near_their_crest(david, gray):
     """Of N shifts one lies within pi / N of the crest: at least mean + contrast cos(pi / N)."""
-    capture = replace(gray, settings={"pattern": FRINGES.model_dump(mode="json")})
+    capture = replace(gray, decoding=Decoding(pattern=FRINGES))
     shown = patterns(FRINGES, david.projector.optics.width, david.projector.optics.height)
     level = plain_image(capture).of(shown)
     assert level.min() >= FRINGES.mean + FRINGES.contrast * np.cos(np.pi / 4) - 1e-6

@@ -112,7 +112,7 @@ def test_light_of_the_room_reaches_the_images_by_photon_transfer(fringes):
     dark = maker._captured(view, replace(world, room=0.0)).capture
     lit = maker._captured(view, replace(world, room=irradiance)).capture
     imager, sensor = study.sensor.imager, study.sensor
-    scale = electrons_per_radiance(imager, sensor.wavelength_nm, dark.settings["exposure_s"])
+    scale = electrons_per_radiance(imager, sensor.wavelength_nm, dark.decoding.exposure_s)
     seen = maker.predictor.surfaces(study.scene, view.world_from_sensor).shape == study.scene.names.index("plane")
     black = np.argmin([image[seen].mean() for image in dark.images["camera"]])
     before, after = (capture.images["camera"][black].astype(float) for capture in (dark, lit))

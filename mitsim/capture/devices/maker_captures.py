@@ -28,6 +28,7 @@ from pydantic import Field
 from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import read_settings
 from mitsim.capture.devices.depthai_camera import DepthaiCamera, DepthaiShot, open_depthai
 from mitsim.capture.devices.depthai_settings import DepthaiSettings
 from mitsim.capture.devices.device_error import DeviceError
@@ -143,6 +144,7 @@ def depthai_capture(shot: DepthaiShot) -> DeviceCapture:
     """Return the capture of a DepthAI camera's shot: raw images, and the disparity of its own matcher."""
     size = shot.images["left"].shape[::-1]
     derived = {} if shot.disparity is None else {"disparity": shot.disparity}
+    decoding, records = read_settings(f"camera {shot.model}", shot.settings, "active_stereo")
     capture = Capture(
         sensor=shot.model,
         technology="active_stereo",
@@ -150,7 +152,8 @@ def depthai_capture(shot: DepthaiShot) -> DeviceCapture:
         rig=depthai_rig(shot.calibration, (int(size[0]), int(size[1]))),
         images={name: image[None] for name, image in shot.images.items()},
         bits=8 * shot.images["left"].dtype.itemsize,
-        settings=shot.settings,
+        decoding=decoding,
+        settings=records,
         serial=shot.serial,
         derived=derived,
     )

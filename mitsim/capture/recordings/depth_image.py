@@ -15,6 +15,7 @@ import numpy as np
 
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import read_grey
 from mitsim.capture.recordings.calibration_file import camera_of, read_calibration
 from mitsim.sensor.camera import Rig
@@ -65,8 +66,7 @@ def read_depth_image(
     settings["imported_from"] = path.name
     if read.notes:
         settings["warnings"] = list(read.notes)
-    if read.range_mm is not None:
-        settings |= {"near_mm": read.range_mm[0], "far_mm": read.range_mm[1]}
+    near, far = read.range_mm or (None, None)
     return Capture(
         sensor=sensor or read.sensor or "depth-camera",
         technology="depth_map",
@@ -74,6 +74,7 @@ def read_depth_image(
         rig=Rig({camera or next(iter(read.rig.cameras)): eye}, read.rig.projector),
         images={},
         bits=16,
+        decoding=Decoding(near_mm=near, far_mm=far),
         settings=settings,
         derived={"depth": depth},
     )

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from characterisation.files.checked_files import is_inside
 from characterisation.files.errors import InputError, MissingEnvironmentError
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.recordings.depthai_calibration import DepthaiCalibration, read_depthai_calibration
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
 
@@ -127,7 +128,7 @@ def read_depthai_recording(
         "spec_baseline_mm": known.spec_baseline_mm,
     }
     if first.exposure_s > 0:
-        settings |= {"exposure_s": first.exposure_s, "sensitivity_iso": first.sensitivity_iso}
+        settings["sensitivity_iso"] = first.sensitivity_iso
     derived = _derived(frames, known, subpixel_bits, settings)
     images: dict[str, NDArray[Any]] = {}
     if {"left", "right"} <= set(frames):
@@ -149,6 +150,7 @@ def read_depthai_recording(
         rig=rig,
         images=images,
         bits=8 * max((stack.dtype.itemsize for stack in images.values()), default=2),
+        decoding=Decoding(exposure_s=first.exposure_s if first.exposure_s > 0 else None),
         settings=settings,
         derived=derived,
     )

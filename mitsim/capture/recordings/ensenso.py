@@ -26,6 +26,7 @@ import numpy as np
 
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import Image, decode_grey
 from mitsim.capture.recordings.nxlib_calibration import nxlib_rig, sensor_from_workspace
 from mitsim.capture.recordings.nxlib_tree import NxLibTree
@@ -86,7 +87,7 @@ def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = 
             raise InputError(f"{path}/{name}", "size", found, f"{width} x {height} px, as the left image")
     if tree.has("Sensor/Size") and tree.numbers("Sensor/Size", (2,)).tolist() != [width, height]:
         raise tree.fault("Sensor/Size", f"{width} x {height} px, as the images are; binned ones are not read")
-    settings = _settings(tree, dynamic)
+    decoding, settings = _decoding(tree), _settings(tree, dynamic)
     _check_series(tree, len(left))
     return Capture(
         sensor=tree.text("ModelName"),
@@ -95,6 +96,7 @@ def read_ensenso(path: str | Path, *, dynamic: bool = True, frame: int | None = 
         rig=nxlib_rig(tree, (width, height), dynamic=dynamic),
         images={"left": _stacked(left), "right": _stacked(right)},
         bits=8 * max(image.dtype.itemsize for image in (*left, *right)),
+        decoding=decoding,
         settings=settings | {"image_set": PurePosixPath(chosen.base).name},
         serial=tree.text("SerialNumber"),
     )
@@ -193,11 +195,21 @@ def _stacked(images: list[Image]) -> Image:
     return np.stack(images) if len({image.dtype for image in images}) == 1 else np.stack(images).astype(np.uint16)
 
 
+def _decoding(tree: NxLibTree) -> Decoding:
+    """Return exposure and range of the camera; a value missing in the file is None."""
+    exposure, volume = "Parameters/Capture/Exposure", "Parameters/DisparityMap/MeasurementVolume"
+    near, far = (
+        # z of a corner of the volume that NxLib searches, in the rectified left frame
+        float(tree.numbers(corner, (3,))[2]) if tree.has(corner) else None
+        for corner in (f"{volume}/Near/LeftTop", f"{volume}/Far/LeftTop")
+    )
+    seconds = float(tree.numbers(exposure, ())) / 1000 if tree.has(exposure) else None  # NxLib: ms
+    return Decoding(exposure_s=seconds, near_mm=near, far_mm=far)
+
+
 def _settings(tree: NxLibTree, dynamic: bool) -> dict[str, Any]:
-    """Return the camera's settings under mitsim's names; settings missing in the file are left out."""
+    """Return the camera's other settings under mitsim's names; settings missing in the file are left out."""
     capture = "Parameters/Capture"
-    volume = "Parameters/DisparityMap/MeasurementVolume"
-    corners = {"near_mm": f"{volume}/Near/LeftTop", "far_mm": f"{volume}/Far/LeftTop"}
     read = {
         "auto_exposure": tree.get(f"{capture}/AutoExposure"),
         "gain": tree.get(f"{capture}/Gain"),
@@ -216,11 +228,7 @@ def _settings(tree: NxLibTree, dynamic: bool) -> dict[str, Any]:
         "link_angle_rad": tree.get("Link/Rotation/Angle"),
         "link_translation_mm": tree.get("Link/Translation"),
     }
-    for depth in corners:  # z of a corner of the volume that NxLib searches, in the rectified left frame
-        read[depth] = float(tree.numbers(corners[depth], (3,))[2]) if tree.has(corners[depth]) else None
     settings = {name: value for name, value in read.items() if value is not None}
-    if tree.has(f"{capture}/Exposure"):
-        settings["exposure_s"] = float(tree.numbers(f"{capture}/Exposure", ())) / 1000  # NxLib: ms
     workspace = sensor_from_workspace(tree, dynamic=dynamic)
     if workspace is not None:
         settings["sensor_from_workspace"] = workspace.matrix().tolist()

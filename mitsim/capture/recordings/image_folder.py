@@ -18,6 +18,7 @@ import numpy as np
 
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import CHANNELS, SUFFIXES, Image, channel_name, is_colour, read_grey
 from mitsim.capture.recordings.image_count import advice
 from mitsim.sensor.camera import Camera
@@ -64,23 +65,20 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
         images[name] = _stack(found, rig.cameras[name], sensor.bits, channel)
         colour |= is_colour(found[0])
         names[name] = [path.relative_to(folder).as_posix() for path in found]
-    settings: dict[str, Any] = {
-        "pattern": code.model_dump(),
-        "decoder": decoder.model_dump(),
-        "near_mm": decoder.near_mm,
-        "far_mm": decoder.far_mm,
-        "ambient_image": sensor.ambient_image,
-        "imported_from": folder.resolve().name,
-        "files": names,
-        "black_level_dn": sensor.imager.black_level,
-        "gamma": sensor.imager.gamma,
-    }
+    decoding = Decoding(
+        decoder=decoder,
+        pattern=code,
+        projector_size_px=projector_size if rig.projector is None else None,
+        exposure_s=None if sensor.exposure.bracket else sensor.exposure.base_s,
+        black_level_dn=sensor.imager.black_level,
+        gamma=sensor.imager.gamma,
+        ambient_image=sensor.ambient_image,
+        near_mm=decoder.near_mm,
+        far_mm=decoder.far_mm,
+    )
+    settings: dict[str, Any] = {"imported_from": folder.resolve().name, "files": names}
     if colour:
         settings["channel"] = channel_name(channel)
-    if sensor.exposure.base_s is not None and sensor.exposure.bracket is None:
-        settings["exposure_s"] = sensor.exposure.base_s
-    if rig.projector is None:
-        settings["projector_size_px"] = list(projector_size)
     bits = sensor.bits
     if bits is None:
         bits = max(bits_of(stack) for stack in images.values())
@@ -93,6 +91,7 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
         rig=rig,
         images=images,
         bits=bits,
+        decoding=decoding,
         settings=settings,
     )
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.nxlib_calibration import sensor_from_rectified
 from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of
@@ -111,8 +112,7 @@ def read_organised_cloud(
     points = rig.reference.sensor_from_camera.points(points).astype(np.float32)
     if given is not None and given.notes:
         settings["warnings"] = list(given.notes)
-    if given is not None and given.range_mm is not None:
-        settings |= {"near_mm": given.range_mm[0], "far_mm": given.range_mm[1]}
+    near, far = (given.range_mm if given else None) or (None, None)
     return Capture(
         sensor=sensor or (given.sensor if given else "") or "point-cloud",
         technology="point_map",
@@ -120,6 +120,7 @@ def read_organised_cloud(
         rig=rig,
         images={},
         bits=16,
+        decoding=Decoding(near_mm=near, far_mm=far),
         settings=settings,
         derived={"points": points},
     )

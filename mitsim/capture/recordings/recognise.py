@@ -25,7 +25,6 @@ from mitsim.capture.recordings.pose_file import read_pose
 from mitsim.capture.recordings.recording_files import MCAP_MAGIC, frame_of, plain_name
 from mitsim.capture.recordings.robi import is_robi, read_robi
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
-from mitsim.decode.checks.sanity import capture_warnings
 from mitsim.sensor.preset import load_sensor, named_sensor
 
 AXES: tuple[Axes, ...] = ("opencv", "opengl")
@@ -119,8 +118,7 @@ def _read_images(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, b
     if options.images:
         rig = replace(rig, images={**(rig.images or {}), **options.images})
     capture = read_image_folder(path, rig, channel_of(options.channel))
-    warnings = [*rig.notes, *capture_warnings(capture, rig.settings)]
-    return replace(capture, settings=capture.settings | ({"warnings": warnings} if warnings else {})), {}
+    return replace(capture, settings=capture.settings | ({"warnings": list(rig.notes)} if rig.notes else {})), {}
 
 
 def _read_pair(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
@@ -256,7 +254,7 @@ def read_recording(path: str | Path, options: ReadOptions, kind: str | None = No
         if getattr(options, name) is not None and name not in FOR_ALL and name not in KINDS[kind].options:
             used = ", ".join(_option(each) for each in (*sorted(KINDS[kind].options), *FOR_ALL))
             raise InputError(path, "", f"{_option(name)} for {KINDS[kind].name}", used)
-    settings_given = _settings_given(options)
+    decoding, records = _options_for_all(options)
     capture, originals = KINDS[kind].read(path, options)
     for name in (options.images or {}) if kind in ("images", "stereo-pair") else ():
         if name not in capture.rig.cameras:
@@ -264,7 +262,8 @@ def read_recording(path: str | Path, options: ReadOptions, kind: str | None = No
     pose, covariance = (None, None) if options.pose is None else read_pose(options.pose)
     capture = replace(
         capture,
-        settings=capture.settings | settings_given,
+        decoding=capture.decoding.model_copy(update=decoding),
+        settings=capture.settings | records,
         world_from_sensor=pose or capture.world_from_sensor,
         pose_covariance=covariance if pose is not None else capture.pose_covariance,
     )
@@ -275,25 +274,26 @@ def _option(name: str) -> str:
     return "--" + name.removesuffix("_mm").removesuffix("_s").replace("_", "-")
 
 
-def _settings_given(options: ReadOptions) -> dict[str, Any]:
-    """Return the settings from options that apply to every kind."""
-    settings_given: dict[str, Any] = {}
+def _options_for_all(options: ReadOptions) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what the options for every kind change in :class:`Decoding`, and the records that they add."""
+    decoding: dict[str, Any] = {}
+    records: dict[str, Any] = {}
     if options.range_mm is not None:
         near, far = options.range_mm
         if not 0 < near < far <= 1e6:
             raise InputError("--range", "", f"{near:g} {far:g}", "near before far, over 0, in mm")
-        settings_given |= {"near_mm": near, "far_mm": far, "range_mm": [near, far]}
+        decoding |= {"near_mm": near, "far_mm": far, "range_mm": (near, far)}
     if options.exposure_s is not None:
         if not 0 < options.exposure_s <= 1e3:
             raise InputError("--exposure", "", f"{options.exposure_s:g}", "seconds, over 0 to 1000")
-        settings_given["exposure_s"] = options.exposure_s
+        decoding["exposure_s"] = options.exposure_s
     if options.sample is not None:
-        settings_given["coupon"] = {"sample": options.sample}
+        records["coupon"] = {"sample": options.sample}
     if options.projector is not None:
         if options.projector not in ("on", "off"):
             raise InputError("--projector", "", repr(options.projector), "on | off")
-        settings_given["projector_on"] = options.projector == "on"
-    return settings_given
+        records["projector_on"] = options.projector == "on"
+    return decoding, records
 
 
 def _kind_of_folder(path: Path, options: ReadOptions) -> str:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import read_grey
 from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rectification, Rig
@@ -100,10 +101,10 @@ def read_robi(
         "projector_on": True,
         "disparity_shift_px": numbers["depth"].get("disparity_shift", 0.0),
     }
-    known = depth[np.isfinite(depth)]
+    known, decoding = depth[np.isfinite(depth)], Decoding()
     if len(known):
         near, far = np.percentile(known, _PERCENTILES)
-        settings |= {"near_mm": float(near) * (1 - _WIDER), "far_mm": float(far) * (1 + _WIDER)}
+        decoding = Decoding(near_mm=float(near) * (1 - _WIDER), far_mm=float(far) * (1 + _WIDER))
     pose_file = folder / "Depth" / f"DEPTH_{view}.json"
     capture = Capture(
         sensor=sensor or folder.name,
@@ -111,6 +112,7 @@ def read_robi(
         source="device",
         rig=rig,
         images=images,
+        decoding=decoding,
         settings=settings,
         world_from_sensor=_pose(pose_file) if pose_file.is_file() else None,
         derived={"depth": depth},

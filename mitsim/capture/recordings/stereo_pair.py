@@ -13,6 +13,7 @@ import numpy as np
 
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import CHANNELS, SUFFIXES, channel_name, is_colour, read_grey
 from mitsim.capture.recordings.calibration_file import camera_of, read_calibration
 from mitsim.capture.recordings.image_folder import counted, size_of_images
@@ -86,8 +87,7 @@ def read_stereo_pair(
         settings["channel"] = channel_name(channel)
     if read.notes:
         settings["warnings"] = list(read.notes)
-    if read.range_mm is not None:
-        settings |= {"near_mm": read.range_mm[0], "far_mm": read.range_mm[1]}
+    near, far = read.range_mm or (None, None)
     return Capture(
         sensor=sensor or read.sensor or "stereo-pair",
         technology="active_stereo",
@@ -95,6 +95,7 @@ def read_stereo_pair(
         rig=Rig({name: read.rig.cameras[name] for name in names}, read.rig.projector, read.rig.rectification),
         images={name: np.asarray(image)[None] for name, image in levels.items()},
         bits=8 * first.itemsize,
+        decoding=Decoding(near_mm=near, far_mm=far),
         settings=settings,
     )
 

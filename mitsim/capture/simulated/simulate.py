@@ -26,6 +26,7 @@ from characterisation.files.errors import InputError
 from characterisation.files.threads import in_threads
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
 from mitsim.capture.simulated.exposing import LightOnImagers, UnitPatterns, brightest_images, expose_camera
 from mitsim.capture.simulated.indirect_light import IndirectLight, smoothed
 from mitsim.capture.simulated.lens_blur import blur_by_lens
@@ -42,7 +43,6 @@ from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.raycast import PixelRays, shapes_met
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.image_formation import converter
-from mitsim.sensor.imager import imager_table
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import Sensor
@@ -239,8 +239,7 @@ class SimulatedSensor:
             Seed of the rendering, and of the speckle, which belongs to the surface and the pose.
         around
             (n, 3) points in the *sensor* frame [mm]: of each image, only their bounding box and 12 px more are read
-            out. The rest has grey level 0. ``settings["read_out"]`` states the region of each camera that has one as
-            [left, top, width, height].
+            out. The rest has grey level 0. ``decoding.read_out`` states the region of each camera that has one.
         noise
             The sources of noise that are on; all by default.
 
@@ -294,30 +293,23 @@ class SimulatedSensor:
         Each seed gives another capture from the same pose, with the same speckle.
         """
         noise, sensor, exposures = light.noise, self.sensor, light.exposures
-        assert sensor.pattern is not None  # simulation needs it
         images = {}
         for index, name in enumerate(light.rois):
             _, noise_stream, _ = np.random.SeedSequence([seed, index]).spawn(3)
             images[name] = expose_camera(sensor, light, name, self.units[name], noise_stream)
-        settings: dict[str, Any] = {
-            "exposure_s": exposures[0] if len(exposures) == 1 else list(exposures),
-            "exposure_rule": sensor.exposure.rule,
-            "pattern": sensor.pattern.model_dump(mode="json"),
-            **light.rendered,
-            "ambient_image": sensor.ambient_image,
-            "seed": seed,
-            "noise": asdict(noise),
-        }
         adc = converter(sensor.imager, noise)
-        settings |= {"black_level_dn": adc.black_level, "gamma": adc.gamma}
-        settings |= {"decoder": sensor.settings.model_dump(mode="json"), "imager": imager_table(sensor.imager)}
-        read_out = {
-            name: [roi.left, roi.top, roi.width, roi.height]
-            for name, roi in light.rois.items()
-            if roi != self.rays[name].whole
-        }
-        if read_out:
-            settings["read_out"] = read_out
+        whole = {name: rays.whole for name, rays in self.rays.items()}
+        decoding = Decoding(
+            decoder=sensor.settings,
+            imager=sensor.imager,
+            pattern=sensor.pattern,
+            exposure_s=exposures[0] if len(exposures) == 1 else tuple(exposures),
+            black_level_dn=adc.black_level,
+            gamma=adc.gamma,
+            ambient_image=sensor.ambient_image,
+            read_out={name: roi for name, roi in light.rois.items() if roi != whole[name]},
+        )
+        records = {"exposure_rule": sensor.exposure.rule, **light.rendered, "seed": seed, "noise": asdict(noise)}
         return Capture(
             sensor=sensor.name,
             technology=sensor.technology,
@@ -325,7 +317,8 @@ class SimulatedSensor:
             rig=sensor.rig,
             images=images,
             bits=adc.bits,
-            settings=settings,
+            decoding=decoding,
+            settings=records,
             world_from_sensor=light.world_from_sensor,
         )
 

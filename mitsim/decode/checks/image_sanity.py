@@ -10,7 +10,7 @@ changes is nearly the sum of their absolute values. If bits are exchanged, the c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -24,6 +24,7 @@ from mitsim.decode.checks.fringe_origin import origin_in_words, stripe_edges
 from mitsim.decode.checks.fringe_wave import wave_in_words
 from mitsim.decode.checks.gray_origin import beyond_in_words
 from mitsim.decode.structured_light.decoder import decode_coordinates
+from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis, Kind, Role
 from mitsim.sensor.light_code import LightCode, axes, roles
@@ -79,15 +80,28 @@ class Smoothness:
 
 
 def image_warnings(
-    stack: Levels, code: LightCode, size: tuple[int, int], settings: DecoderSettings, full_scale: float, camera: str
+    stack: Levels,
+    code: LightCode,
+    size: tuple[int, int],
+    settings: DecoderSettings,
+    full_scale: float,
+    camera: str,
+    decoded: Mapping[Axis, ProjectorCoordinate] | None = None,
 ) -> list[str]:
-    """Return warnings about the images (P, H, W) of one camera; ``size`` (width, height) of the pattern [px]."""
+    """Return warnings about the images (P, H, W) of one camera; ``size`` (width, height) of the pattern [px].
+
+    ``decoded``: coordinates (H, W) of the images; without them, some rows and columns of the images are decoded.
+    """
     image_roles = roles(code, *size)
     lines = _lines(stack[: len(image_roles)])
     out = _plain_images(lines[0], image_roles, settings, full_scale, camera)
     if out:
         return out
-    found = smoothness(lines, code, size, settings, full_scale)
+    if decoded is None:
+        found = smoothness(lines, code, size, settings, full_scale)
+    else:
+        shape = stack.shape[1:]
+        found = _smoothness([{axis: each.part(way) for axis, each in decoded.items()} for way in _line_slices(shape)])
     for axis in [axis for axis in axes(code) if axis in found]:
         warning = _unresolved(lines[0], image_roles, axis, settings, camera)
         own, order = found[axis], ""
@@ -165,13 +179,22 @@ def smoothness(
     only: Axis | None = None,
 ) -> dict[Axis, Smoothness]:
     """Return the smoothness of coordinates along ``lines``: images (P, n, W) of rows, and (P, H, m) of columns."""
+    decoded: list[Mapping[Axis, ProjectorCoordinate]] = []
+    for part in lines:
+        try:
+            decoded.append(decode_coordinates(part, code, size, settings, full_scale=full_scale))
+        except InputError:
+            decoded.append({})
+    return _smoothness(decoded, only)
+
+
+def _smoothness(
+    lines: Sequence[Mapping[Axis, ProjectorCoordinate]], only: Axis | None = None
+) -> dict[Axis, Smoothness]:
+    """Return the smoothness of coordinates along decoded rows (n, W), and along decoded columns (H, m)."""
     evenness: dict[Axis, list[float]] = {}
     statuses: dict[Axis, list[NDArray[np.uint8]]] = {}
-    for way, part in enumerate(lines):
-        try:
-            found = decode_coordinates(part, code, size, settings, full_scale=full_scale)
-        except InputError:
-            continue
+    for way, found in enumerate(lines):
         for axis, coordinate in found.items():
             if only in (None, axis):
                 values = coordinate.value if way == 0 else coordinate.value.T
@@ -188,9 +211,14 @@ def smoothness(
 
 
 def _lines(stack: Levels) -> list[Levels]:
-    height, width = stack.shape[1:]
+    return [np.ascontiguousarray(stack[:, *way]) for way in _line_slices(stack.shape[1:])]
+
+
+def _line_slices(shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
+    """Return the rows, and the columns, of an image (H, W) that are evaluated."""
+    height, width = shape
     down, along = max(1, height // _LINES), max(1, width // _LINES)
-    return [np.ascontiguousarray(stack[:, down // 2 :: down]), np.ascontiguousarray(stack[:, :, along // 2 :: along])]
+    return [np.s_[down // 2 :: down, :], np.s_[:, along // 2 :: along]]
 
 
 def _evenness(values: NDArray[np.float64]) -> float:

@@ -7,6 +7,7 @@ rectified rows -> disparity, and row error by the other coordinate or by the tex
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,12 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.decode.checks.row_texture import textured_row_error, uniform_light_mean
 from mitsim.decode.matching.row_error import row_error
 from mitsim.decode.matching.stereo import StereoGeometry, stereo_geometry
-from mitsim.decode.structured_light.decoder import decode_coordinates
 from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.decode.structured_light.two_cameras import find_coordinates
 from mitsim.sensor.camera import Camera, Rig
@@ -71,25 +70,17 @@ def baseline_warning(rig: Rig, code: LightCode) -> str:
     )
 
 
-def camera_warnings(
-    stack: Levels, rig: Rig, code: LightCode, settings: DecoderSettings, full_scale: float
-) -> list[str]:
-    """Return warnings about one camera and a projector: rays that miss their light, or meet it behind the camera."""
+def camera_warnings(decoded: Mapping[Axis, ProjectorCoordinate], rig: Rig, settings: DecoderSettings) -> list[str]:
+    """Return warnings about one camera and a projector: rays that miss their light, or meet it behind the camera.
+
+    ``decoded``: coordinates (H, W) that the camera sees.
+    """
     eye, projector = rig.reference, rig.projector
-    if projector is None:
+    if projector is None or not decoded:
         return []
-    step = max(1, min(stack.shape[1:]) // _COARSE)
+    step = max(1, min(eye.width, eye.height) // _COARSE)
     places = np.s_[step // 2 :: step, step // 2 :: step]
-    try:
-        found = decode_coordinates(
-            np.ascontiguousarray(stack[:, *places]),
-            code,
-            (projector.width, projector.height),
-            settings,
-            full_scale=full_scale,
-        )
-    except InputError:
-        return []
+    found = {axis: each.part(places) for axis, each in decoded.items()}
     rays = eye.sensor_from_camera.directions(eye.rays(eye.pixel_grid()[places]))
     known = np.all([each.status == Status.VALID for each in found.values()], axis=0)
     if known.mean() < 0.005:
@@ -176,24 +167,22 @@ def _meeting(eye: Camera, projector: Camera, rays: Floats, coordinates: dict[Axi
 
 
 def pair_warnings(
-    left: Levels,
-    right: Levels,
+    stacks: Sequence[Levels],
+    decoded: Sequence[Mapping[Axis, ProjectorCoordinate]],
     rig: Rig,
     code: LightCode,
     size: tuple[int, int],
-    settings: DecoderSettings,
     full_scale: float,
 ) -> tuple[list[str], float, str]:
     """Return warnings about two cameras that see one code: exchanged, another calibration, or a row error.
+
+    ``stacks`` and ``decoded``: images (P, H, W) of the left and the right camera, and their coordinates (H, W).
 
     Also return the row error [px] of the right image and its source: the code of the rows if present, else the texture
     of the surface. NaN and "" if neither gives it, or the calibration is doubtful.
     """
     geometry = stereo_geometry(rig)
-    found = [
-        decode_coordinates(stack, code, size, settings, full_scale=full_scale, interpolate=True)
-        for stack in (left, right)
-    ]
+    found = list(decoded)
     matches = _Matches.of(found, geometry)
     if matches.decoded < 0.005:
         return [], float("nan"), ""
@@ -207,7 +196,7 @@ def pair_warnings(
     if "rows" not in found[0]:
         image_roles = roles(code, *size)
         source = "by the texture of the surface"
-        one, other = (uniform_light_mean(stack, image_roles, full_scale) for stack in (left, right))
+        one, other = (uniform_light_mean(stack, image_roles, full_scale) for stack in stacks)
         offset = textured_row_error((one, other), (found[0]["columns"].value, found[1]["columns"].value), geometry)
     if not np.isfinite(offset):
         return [], offset, ""
@@ -234,7 +223,7 @@ class _Matches:
     spread: float
 
     @classmethod
-    def of(cls, found: list[dict[Axis, ProjectorCoordinate]], geometry: StereoGeometry) -> _Matches:
+    def of(cls, found: Sequence[Mapping[Axis, ProjectorCoordinate]], geometry: StereoGeometry) -> _Matches:
         maps, seen = (geometry.map_left, geometry.map_right), (geometry.seen_left, geometry.seen_right)
         height = geometry.map_left.shape[1]
         lines = np.arange(2, height - 2, max(1, height // _COARSE))
@@ -293,7 +282,10 @@ def _core(values: Floats, least: float) -> Floats:
 
 
 def _row_by_code(
-    found: list[dict[Axis, ProjectorCoordinate]], geometry: StereoGeometry, lines: NDArray[np.intp], place: Floats
+    found: Sequence[Mapping[Axis, ProjectorCoordinate]],
+    geometry: StereoGeometry,
+    lines: NDArray[np.intp],
+    place: Floats,
 ) -> tuple[Floats, float]:
     """Return the row error [px] of the right image at each match, and projector rows per pixel.
 

@@ -5,13 +5,14 @@ A warning is not an error: the capture is still written and decoded according to
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Settings
 from mitsim.decode.checks.gray_origin import gray_origin_warning
 from mitsim.decode.checks.image_sanity import image_warnings
 from mitsim.decode.checks.rig_sanity import (
@@ -22,12 +23,11 @@ from mitsim.decode.checks.rig_sanity import (
     pair_warnings,
     row_error_warning,
 )
-from mitsim.decode.cloud import Settings, capture_pattern
-from mitsim.decode.decoder_registry import projector_size
+from mitsim.decode.cloud import decoder_settings
+from mitsim.decode.coded_images import CodedImages
 from mitsim.decode.matching.stereo import stereo_geometry
+from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.image_sequence import ImageSequence
-from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
 
 
 @dataclass(frozen=True)
@@ -47,40 +47,51 @@ def capture_warnings(capture: Capture, settings: Settings) -> list[str]:
     return capture_findings(capture, settings).warnings
 
 
+def with_warnings(capture: Capture) -> Capture:
+    """Return the capture with the warnings about it added to those that its settings already have."""
+    if capture.technology != "structured_light":
+        return capture
+    settings, _ = decoder_settings(capture)
+    stored = capture.settings.get("warnings", [])
+    warnings = list(dict.fromkeys([*stored, *capture_warnings(capture, settings)]))
+    return replace(capture, settings=capture.settings | ({"warnings": warnings} if warnings else {}))
+
+
 def capture_findings(capture: Capture, settings: Settings) -> Findings:
     """Check the images and calibration of a structured-light capture; other captures have no findings.
 
-    A bracket of exposures is not checked. If images do not match their pattern, the calibration is not checked.
+    A bracket of exposures is not checked, and images that are missing are reported by decoding.
     """
-    exposures = capture.settings.get("exposure_s")
-    if not isinstance(settings, DecoderSettings) or capture.technology != "structured_light":
-        return Findings()
-    if isinstance(exposures, list) and len(exposures) > 1:
-        return Findings()
-    code = capture_pattern(capture)
-    if not isinstance(code, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence):
-        return Findings()
-    size, full_scale = projector_size(capture), 2.0**capture.bits - 1
-    count, matched = len(roles(code, *size)), settings.triangulate == "cameras"
-    stacks = [stack[:count] for stack in capture.images.values()][: 2 if matched else 1]
-    if any(len(stack) < count for stack in stacks):
-        return Findings()  # decoding reports the error
+    images = CodedImages.of(capture, settings)
+    return Findings() if images is None else code_findings(images, capture.rig, capture.source == "device")
+
+
+def code_findings(images: CodedImages, rig: Rig, recorded: bool) -> Findings:
+    """Check coded images and the calibration of their rig; the calibration only if the images match their code.
+
+    The origin of the code is checked in ``recorded`` images: a simulation has the pattern that its file states.
+    """
+    code, size, settings, full_scale = images.code, images.size, images.settings, images.full_scale
+    try:
+        coordinates = images.coordinates
+    except InputError:
+        coordinates = {}  # decoding reports the error
     out = []
-    for name, stack in zip(capture.images, stacks, strict=False):
-        out += image_warnings(stack, code, size, settings, full_scale, name)
-    if out:
+    for name, stack in images.stacks.items():
+        out += image_warnings(stack, code, size, settings, full_scale, name, coordinates.get(name, {}))
+    if out or not coordinates:
         return Findings(out)
-    if matched:
+    decoded = [coordinates[name] for name in images.stacks]
+    if settings.triangulate == "cameras":
         try:
-            return Findings(*pair_warnings(stacks[0], stacks[1], capture.rig, code, size, settings, full_scale))
+            return Findings(*pair_warnings(list(images.stacks.values()), decoded, rig, code, size, full_scale))
         except InputError as error:
             return Findings([str(error)])
-    recorded = capture.source == "device"  # mitsim's own simulations have the pattern that their file states
-    origin = gray_origin_warning(stacks[0], capture.rig, code, settings, full_scale, recorded)
-    if origin:
-        return Findings([f"{next(iter(capture.images))}: {origin}"])
-    along = baseline_warning(capture.rig, code)
-    return Findings(([along] if along else []) + camera_warnings(stacks[0], capture.rig, code, settings, full_scale))
+    name, stack = next(iter(images.stacks.items()))
+    if origin := gray_origin_warning(stack, rig, code, settings, full_scale, recorded):
+        return Findings([f"{name}: {origin}"])
+    along = baseline_warning(rig, code)
+    return Findings(([along] if along else []) + camera_warnings(decoded[0], rig, settings))
 
 
 def pair_row_error(capture: Capture, cloud: PointCloud) -> float:

@@ -13,6 +13,8 @@ image, up to its edge. Only a gamma that is estimated from the images (``correct
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -91,6 +93,7 @@ def decode_structured_light(
     code: LightCode,
     settings: DecoderSettings,
     context: ImageContext,
+    decoded_before: Mapping[Axis, ProjectorCoordinate] | None = None,
 ) -> PointCloud:
     """Decode the images of one camera.
 
@@ -109,6 +112,9 @@ def decode_structured_light(
         Range and limits.
     context
         Of the images. Its ``roi`` is a region of the image; ``read_out`` is not used.
+    decoded_before
+        Coordinates (H, W) of the whole images, from :func:`decode_coordinates` with the same settings. None if the
+        images are not decoded yet.
 
     Returns
     -------
@@ -142,14 +148,17 @@ def decode_structured_light(
         raise InputError(f"images of {camera_name}", "shape", stack.shape, f"(images, {camera.height}, {camera.width})")
     roi = checked_roi(context.roi, camera.width, camera.height, "decode_structured_light")
     region = roi.slices
-    coordinates = decode_coordinates(
-        np.ascontiguousarray(stack[:, *region]),
-        code,
-        (projector.width, projector.height),
-        settings,
-        full_scale=context.full_scale,
-        imager=context.imager,
-    )
+    if decoded_before is not None:
+        coordinates = {axis: each.part(region) for axis, each in decoded_before.items()}
+    else:
+        coordinates = decode_coordinates(
+            np.ascontiguousarray(stack[:, *region]),
+            code,
+            (projector.width, projector.height),
+            settings,
+            full_scale=context.full_scale,
+            imager=context.imager,
+        )
     coordinate = coordinates[geometry.axis]
     points, sigma, in_range = _points(coordinate, geometry, settings, region)
     status = coordinate.status.copy()

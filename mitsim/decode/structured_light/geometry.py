@@ -22,7 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError, nearest
+from characterisation.files.threads import in_threads
 from characterisation.point_cloud import ViewGrid
+from mitsim.decode.blocks import BLOCK
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.light_code import LightCode, axes
@@ -257,13 +259,20 @@ def _polynomial(
     """Return Newton's polynomial w(u) through ``count`` exact points of each ray: its nodes and divided differences."""
     # Chebyshev-Lobatto points, which include both ends
     fraction = (1 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2
-    differences = low + (high - low) * fraction[:, None, None]
-    nodes = np.stack([coordinate(inverse_depth, ray) for inverse_depth in differences])
-    with np.errstate(invalid="ignore", divide="ignore"):
+    nodes, differences = np.empty((count, *low.shape)), np.empty((count, *low.shape))
+
+    @np.errstate(invalid="ignore", divide="ignore")
+    def solve(rows: slice) -> None:
+        u, w = nodes[:, rows], differences[:, rows]
+        w[:] = low[rows] + (high[rows] - low[rows]) * fraction[:, None, None]
+        for node, inverse_depth in zip(u, w, strict=True):
+            node[:] = coordinate(inverse_depth, ray[rows])
         for order in range(1, count):
-            differences[order:] = (differences[order:] - differences[order - 1 : -1]) / (
-                nodes[order:] - nodes[: count - order]
-            )
+            w[order:] = (w[order:] - w[order - 1 : -1]) / (u[order:] - u[: count - order])
+
+    # bands of rows that stay in the processor's cache
+    band = max(1, BLOCK // low.shape[1])
+    in_threads(solve, [slice(top, top + band) for top in range(0, len(low), band)])
     return nodes, differences
 
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.point_cloud import Status
+
 
 @dataclass(frozen=True)
 class ProjectorCoordinate:
@@ -29,3 +31,16 @@ class ProjectorCoordinate:
     sigma: NDArray[np.float32]
     modulation: NDArray[np.float32]
     status: NDArray[np.uint8]
+
+    def part(self, region: tuple[slice, slice]) -> ProjectorCoordinate:
+        """Return the coordinate of a region (rows, columns), without copying it."""
+        value, sigma = self.value[region], self.sigma[region]
+        return ProjectorCoordinate(value, sigma, self.modulation[region], self.status[region])
+
+    def placed(self, shape: tuple[int, int], region: tuple[slice, slice]) -> ProjectorCoordinate:
+        """Return the coordinate of a region (rows, columns) as that of its image (H, W), which is dark elsewhere."""
+        value, sigma = np.full(shape, np.nan), np.full(shape, np.nan, np.float32)
+        modulation, status = np.zeros(shape, np.float32), np.full(shape, Status.LOW_MODULATION, np.uint8)
+        value[region], sigma[region] = self.value, self.sigma
+        modulation[region], status[region] = self.modulation, self.status
+        return ProjectorCoordinate(value, sigma, modulation, status)

@@ -24,6 +24,7 @@ since a coordinate that occurs twice in a row is ambiguous.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,46 +92,72 @@ def decode_structured_light_stereo(
         If the code has no columns, the images do not fit code and calibration, or the region of interest does not lie
         in the grid.
     """
-    if "columns" not in axes(code):
-        raise InputError(
-            "pattern", "axis", ", ".join(axes(code)), "'columns' or 'both', for cameras that are side by side"
-        )
     geometry = rig if isinstance(rig, StereoGeometry) else stereo_geometry(rig)
-    roi, read_out = context.roi, context.read_out
     for name, stack, size in zip(("left", "right"), (left, right), geometry.raw_size, strict=True):
         if stack.shape[1:] != size:
             raise InputError(f"{name} images", "shape", stack.shape, f"(images, {size[0]}, {size[1]})")
-    grid, rectification = geometry.grid, geometry.rectification
-    if roi is None and read_out[0] is not None:
-        roi = rectified_roi(geometry, read_out[0])
-    roi = checked_roi(roi, grid.width, grid.height, "decode_structured_light_stereo")
-    region = rows, columns = roi.slices
 
-    def coordinates_of(
-        stack: NDArray[np.generic], positions: NDArray[np.float32], read_region: Roi | None
-    ) -> _CameraCoordinates:
-        size = stack.shape[2], stack.shape[1]
-        read_region = read_region or Roi.whole(*size)
-        used_region = needed_region(positions, *size).overlap(read_region)
-        if used_region is None:
-            return _CameraCoordinates.without_pixels(positions)
-        images = np.ascontiguousarray(stack[:, *used_region.slices])
-        decoded = decode_coordinates(
-            images,
+    def decoded(camera: int, region: Roi) -> ProjectorCoordinate:
+        stack = (left, right)[camera]
+        shown = context.read_out[camera] or Roi.whole(stack.shape[2], stack.shape[1])
+        # the stripes at the edge of a region are cut: without a region of interest, no stripe of the image is
+        used = shown if context.roi is None else region
+        columns = decode_coordinates(
+            np.ascontiguousarray(stack[:, *used.slices]),
             code,
             projector_size,
             settings,
             full_scale=context.full_scale,
             imager=context.imager,
             interpolate=True,
+        )["columns"]
+        top, left_edge = region.top - used.top, region.left - used.left
+        return columns.part((slice(top, top + region.height), slice(left_edge, left_edge + region.width)))
+
+    return cloud_of_pair(decoded, geometry, code, settings, context)
+
+
+def cloud_of_pair(
+    decoded: Callable[[int, Roi], ProjectorCoordinate],
+    geometry: StereoGeometry,
+    code: LightCode,
+    settings: DecoderSettings,
+    context: ImageContext,
+) -> PointCloud:
+    """Return the cloud of two cameras whose images are decoded: see :func:`decode_structured_light_stereo`.
+
+    ``decoded`` is a function from the camera, 0 or 1, and a region of its raw image to the columns in this region, with
+    ``interpolate`` of :func:`~mitsim.decode.structured_light.decoder.decode_coordinates`.
+
+    Raises
+    ------
+    InputError
+        If the code has no columns, or the region of interest does not lie in the grid.
+    """
+    if "columns" not in axes(code):
+        raise InputError(
+            "pattern", "axis", ", ".join(axes(code)), "'columns' or 'both', for cameras that are side by side"
         )
+    roi, read_out = context.roi, context.read_out
+    grid, rectification = geometry.grid, geometry.rectification
+    if roi is None and read_out[0] is not None:
+        roi = rectified_roi(geometry, read_out[0])
+    roi = checked_roi(roi, grid.width, grid.height, "decode_structured_light_stereo")
+    region = rows, columns = roi.slices
+
+    def coordinates_of(camera: int, positions: NDArray[np.float32], read_region: Roi | None) -> _CameraCoordinates:
+        size = geometry.raw_size[camera][::-1]
+        read_region = read_region or Roi.whole(*size)
+        used_region = needed_region(positions, *size).overlap(read_region)
+        if used_region is None:
+            return _CameraCoordinates.without_pixels(positions)
         seen = was_read_out(positions, read_region, *size)
         origin = np.array([used_region.left, used_region.top], np.float32)[:, None, None]
-        return _CameraCoordinates.of(decoded["columns"], positions - origin, seen)
+        return _CameraCoordinates.of(decoded(camera, used_region), positions - origin, seen)
 
     # whole rows on the right, since a coordinate may lie anywhere in them
-    left_decoded = coordinates_of(left, geometry.map_left[:, *region], read_out[0])
-    right_decoded = coordinates_of(right, geometry.map_right[:, rows], read_out[1])
+    left_decoded = coordinates_of(0, geometry.map_left[:, *region], read_out[0])
+    right_decoded = coordinates_of(1, geometry.map_right[:, rows], read_out[1])
     u_left = np.where(geometry.seen_left[region], left_decoded.coordinate, np.nan)
     u_right = np.where(geometry.seen_right[rows], right_decoded.coordinate, np.nan)
 

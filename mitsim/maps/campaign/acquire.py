@@ -211,7 +211,8 @@ def out_of_range(campaign: Campaign, found: dict[Path, Shot] | None = None) -> l
         middle, *depths = depths_of(places, sensor.rig, sensor.settings)
         if not sensor.settings.near_mm <= middle <= sensor.settings.far_mm:
             reach = (float(min(depths)), float(max(depths)))
-            lines.append(range_warning(f"{name}: the coupon", reach, sensor.settings, sensor.name, known))
+            warned = range_warning(f"{name}: the coupon", reach, sensor.settings, sensor.name, known)
+            lines.append(f"warning: {warned}")
     if len(lines) > NAMED:
         lines[NAMED:] = [f"warning: and {len(lines) - NAMED} of {len(shown)} more are outside the range"]
     return lines

@@ -123,7 +123,7 @@ def read_shot(captures: Path, shot: Shot) -> Finished | None:
     document = _document(folder)
     data = {path: _checked(folder, path, entry) for path, entry in document.files.items()}
     if "patches.npy" not in data:
-        raise InputError(folder / "shot.json", "files", "no patches.npy", "a shot of mitsim characterise", _AGAIN)
+        raise InputError(folder / "shot.json", "files", "no patches.npy", "a shot of mitsim map make", _AGAIN)
     patches = _table(data["patches.npy"], folder / "patches.npy")
     return Finished(patches.assign_attrs(source=document.source), document.source)
 

@@ -233,7 +233,7 @@ def _grey(capture: Capture, grid: ViewGrid) -> NDArray[np.uint8] | None:
     if name not in capture.images or not len(capture.images[name]):
         return None
     lit = capture.images[name]
-    if capture.settings.get("ambient_image") and len(lit) > 1:
+    if capture.decoding.ambient_image and len(lit) > 1:
         lit = lit[:-1]
     place = camera.project((camera.centre + 1000.0 * grid.rays()).reshape(-1, 3)).reshape(grid.height, grid.width, 2)
     mean = lit.mean(axis=0, dtype=np.float64) * 255 / (2**capture.bits - 1)

@@ -59,7 +59,7 @@ class RobotFormat:
 
 
 def read_targets(folder: str | Path, views: str = "best") -> tuple[list[Target], str]:
-    """Return the targets of a run's views, or of a folder of ``mitsim score``; and the name of their tool.
+    """Return the targets of a run's views, or of a folder of ``mitsim study score``; and the name of their tool.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[Target],
     """
     path = Path(folder) / "poses" / "poses.json"
     try:
-        document = read_json_object(path, "a folder made by mitsim run or mitsim score")
+        document = read_json_object(path, "a folder made by mitsim run or mitsim study score")
         known = {int(one["view"]): one for one in document["views"]}
         tool = "flange" if "flange_from_sensor" in document else "sensor"
         poses = {number: Transform.from_matrix(one[f"part_from_{tool}"]) for number, one in known.items()}

@@ -1,4 +1,4 @@
-"""Validate a simulated capture against a real one (``mitsim validate captures``).
+"""Validate a simulated capture against a real one (``mitsim compare``).
 
 Signal chain: capture folder -> settings of the decoder -> plane of the specimen -> twin, unless a simulated capture is
 given (:mod:`mitsim.twin.compare.rebuild`) -> rows with verdicts (:mod:`mitsim.twin.compare.compare_captures`) ->

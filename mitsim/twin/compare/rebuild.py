@@ -125,7 +125,7 @@ def rebuild(
     if with_print:
         taken["grey levels, distance"] = "the print was taken from the recording"
     if not projector_on:
-        capture.settings["pattern"] = None
+        capture = replace(capture, decoding=capture.decoding.model_copy(update={"pattern": None}))
         for quantity in ("contrast", "run length", "grey levels, distance"):
             taken[quantity] = "the texture was taken from the recording"
     capture.settings["projector_on"] = projector_on
@@ -152,15 +152,13 @@ def like(real: Capture, sensor: Sensor, where: str) -> Sensor:
             raise InputError("--sensor", "pattern.shifts_px", f"{pattern.frames} frames", f"{count}, as {where} holds")
         shifts = pattern.shifts_px[:count] if count > 1 else []
         pattern = pattern.model_copy(update={"shifts_px": shifts})
-    exposure, seconds = sensor.exposure, real.settings.get("exposure_s")
-    if isinstance(seconds, list):
+    exposure, seconds = sensor.exposure, real.decoding.exposure_s
+    if isinstance(seconds, tuple):
         raise InputError(
             where, "settings.exposure_s", f"{len(seconds)} exposures", "one exposure: mitsim does not rebuild a bracket"
         )
-    if isinstance(seconds, int | float) and seconds > 0:
-        exposure = replace(
-            exposure, rule=f"as recorded, {seconds:.3g} s", base_s=float(seconds), control=None, bracket=None
-        )
+    if seconds is not None and seconds > 0:
+        exposure = replace(exposure, rule=f"as recorded, {seconds:.3g} s", base_s=seconds, control=None, bracket=None)
     rig = replace(real.rig, projector=projector.optics)
     return replace(
         sensor,

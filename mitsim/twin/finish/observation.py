@@ -152,11 +152,10 @@ def observe(
         raise InputError(where, "technology", capture.technology, "images of light, not of its correlation")
     if not capture.images:
         raise InputError(where, "images", "none", "images of the coupon")
-    exposures = capture.settings.get("exposure_s")
-    exposures = exposures if isinstance(exposures, list) else [exposures]
-    if not exposures or not all(isinstance(e, int | float) and e > 0 for e in exposures):
-        raise InputError(where, "settings.exposure_s", repr(exposures), "the exposure [s] of every image")
-    ambient = bool(capture.settings.get("ambient_image", False))
+    exposures, ambient = capture.decoding.exposures_s, capture.decoding.ambient_image
+    if not exposures or min(exposures) <= 0:
+        found = repr(capture.decoding.exposure_s)
+        raise InputError(where, "settings.exposure_s", found, "the exposure [s] of every image")
     views = []
     for name, stack in capture.images.items():
         if len(stack) % len(exposures) or len(stack) // len(exposures) <= ambient:
@@ -167,7 +166,7 @@ def observe(
         roi = coupon_roi(camera, place)
         white = renderer.white(place, name, roi, pattern)
         loss = renderer.corner_loss(name)
-        region = _CouponRegion.of(camera, place, sensor, roi, _read_out(capture, name), white, loss)
+        region = _CouponRegion.of(camera, place, sensor, roi, capture.decoding.read_out.get(name), white, loss)
         each = len(stack) // len(exposures)
         shown = stack[:, *roi.slices]
         for number, seconds in enumerate(exposures):
@@ -335,9 +334,3 @@ def _why_no_block(region: _CouponRegion, place: Place, width: int) -> str:
         return f"within {2 * _EDGE_PX:g} px the coupon has two edges: it is too small, or was not read out"
     inside = int(region.inside.sum())
     return f"its {inside} pixels, {_EDGE_PX:g} px inside the edge, fill half of no block of {width} x {width} px"
-
-
-def _read_out(capture: Capture, camera: str) -> Roi | None:
-    """Return the region of a camera's image that was read out, None for the whole image."""
-    region = capture.settings.get("read_out", {}).get(camera)
-    return None if region is None else Roi(*region)

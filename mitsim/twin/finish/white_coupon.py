@@ -82,8 +82,7 @@ def _mean_sent(frames: NDArray[np.float32], projector: Projector) -> NDArray[np.
 
 def pattern_is_known(capture: Capture, sensor: Sensor) -> bool:
     """Return whether the settings of a capture state the same pattern as the sensor file."""
-    assert sensor.pattern is not None  # simulation needs it
-    return capture.settings.get("pattern") == sensor.pattern.model_dump(mode="json")
+    return capture.decoding.pattern == sensor.pattern
 
 
 def with_rig(sensor: Sensor, rig: Rig) -> Sensor:

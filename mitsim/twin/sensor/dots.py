@@ -38,7 +38,7 @@ Floats = NDArray[np.float64]
 #: side of a patch [px], and the least number of patches of a capture
 PATCH_PX, FEWEST_PATCHES = 40, 8
 
-#: limits of the window of local means [px], and its width in run lengths of the pattern: as `mitsim validate captures`
+#: limits of the window of local means [px], and its width in run lengths of the pattern: as `mitsim compare`
 _WINDOWS, _RUNS = (7, 31), 2.5
 
 _ALONE = ("crossings", "sharpness", "noise in the dark half", "noise in the bright half", "grain")

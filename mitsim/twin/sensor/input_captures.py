@@ -89,7 +89,7 @@ def same_light(one: Capture, other: Capture) -> bool:
     first, second = (next(iter(capture.images.values()))[0].astype(float) for capture in (one, other))
     if first.shape != second.shape or one.bits != other.bits:
         return False
-    if one.settings.get("exposure_s") != other.settings.get("exposure_s"):
+    if one.decoding.exposure_s != other.decoding.exposure_s:
         return False
     off = first - second
     noise = float(np.abs(finest_detail(off)).mean()) * np.sqrt(np.pi / 2)

@@ -152,7 +152,7 @@ def _check_exposure(sensor: Sensor, source: InputCapture) -> Sensor:
         raise InputError(
             source.folder / "settings.json",
             "exposure_s",
-            repr(source.capture.settings.get("exposure_s")),
+            repr(source.capture.decoding.exposure_s),
             "the exposure [s], since the sensor file has automatic exposure",
         )
     return sensor

@@ -1,0 +1,82 @@
+"""Decode a capture and check it: its cloud, warnings about images, rig and range, and notes on the cloud.
+
+Signal chain: capture and settings -> its images, decoded once -> checks of images and calibration -> cloud -> checks of
+rows and range. ``mitsim decode`` prints the sentences; :func:`mitsim.decode` issues the warnings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from characterisation.point_cloud import PointCloud
+from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Settings
+from mitsim.decode.checks.sanity import Findings, cloud_warnings, code_findings, pair_row_error, row_error_in_words
+from mitsim.decode.cloud import capture_cloud
+from mitsim.decode.coded_images import CodedImages
+from mitsim.decode.depth_range import range_warning, surface_beyond
+from mitsim.decode.grey_levels import MeasuredNoise
+from mitsim.decode.noise import sigma_source
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.preset import Sensor, presets
+
+
+@dataclass(frozen=True)
+class CheckedCloud:
+    """A decoded ``cloud``; ``warnings`` about its capture, and ``notes`` on its rows and its sigma: one sentence each.
+
+    The warnings that the capture's settings already have come first.
+    """
+
+    cloud: PointCloud
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def checked_cloud(
+    capture: Capture,
+    settings: Settings,
+    imager: Imager | None,
+    *,
+    where: str = "the capture",
+    sensor: Sensor | str | Path | None = None,
+) -> CheckedCloud:
+    """Decode a capture, and check its images, its calibration and its range.
+
+    Parameters
+    ----------
+    capture
+        The capture.
+    settings, imager
+        From :func:`mitsim.decode.cloud.decoder_settings`.
+    where
+        Name of the capture in warnings.
+    sensor
+        The sensor that the settings belong to; None if they are those of the capture.
+
+    Raises
+    ------
+    InputError
+        If the settings belong to another technology, or the capture is inconsistent.
+    """
+    images = CodedImages.of(capture, settings, imager)
+    if images is None:
+        noise: Imager | MeasuredNoise | None = imager
+        found = Findings()
+        cloud = capture_cloud(capture, settings, imager=imager)
+    else:
+        noise = images.noise
+        cloud = capture_cloud(capture, settings, imager=noise, coordinates=images.coordinates)
+        found = code_findings(images, capture.rig, capture.source == "device")
+    matched = pair_row_error(capture, cloud)
+    warnings = [*capture.settings.get("warnings", []), *found.warnings, *cloud_warnings(matched)]
+    beyond = surface_beyond(capture, cloud, settings)
+    if beyond is not None:
+        known = f"a coarse search over a wider range finds it in {100 * beyond.share:.0f} % of the pixels"
+        whose = capture.sensor if capture.sensor in presets() else None
+        if sensor is not None:
+            whose = sensor.name if isinstance(sensor, Sensor) else str(sensor)
+        warnings.append(range_warning(f"{where}: a surface", beyond.depths, settings, whose, known))
+    notes = row_error_in_words(capture, settings, found, matched), sigma_source(capture, cloud, noise)
+    return CheckedCloud(cloud, tuple(dict.fromkeys(warnings)), tuple(note for note in notes if note))
