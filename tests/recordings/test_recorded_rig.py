@@ -10,15 +10,18 @@ import pytest
 from simulated_rigs import images_seen, save_calibration, save_images, surface_seen
 from typer.testing import CliRunner
 
+import mitsim as ms
 from characterisation.cloud_files import read_ply
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture
+from mitsim.capture.recordings.image_folder import read_image_folder
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.program import app
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import load_sensor, named_sensor, presets
 from mitsim.sensor.transforms import Transform
 
+SCENES = Path(__file__).parents[2] / "scenes"
 HOW_TO = Path(__file__).parents[2] / "docs/how-to/import-a-rig.md"
 
 TURN = Transform.from_degrees([0.5, -12.0, 0.3], [100.0, 3.0, 5.0])
@@ -205,3 +208,13 @@ def test_fringes_without_an_imager_have_the_sigma_of_their_own_noise_and_decode_
     done = run("decode", tmp_path / "capture", "--range", 300, 800, "-o", tmp_path / "cloud.ply")
     assert "sigma of the points: from the contrast of the fringes and the residuals of their fit, 16 DN" in done.output
     assert np.isfinite(read_ply(tmp_path / "cloud.ply").sigma).sum() > 5000
+
+
+def test_a_program_decodes_with_a_rig_and_cannot_simulate_it(tmp_path):
+    file = written(tmp_path, smallest())
+    rig, truth = ms.load_sensor(file, "decoding"), surface_seen(CAMERA)
+    save_images(tmp_path / "images", images_seen(rig.pattern, CAMERA, PROJECTOR, truth))
+    cloud = ms.decode(read_image_folder(tmp_path / "images", rig), rig)
+    assert cloud.valid.mean() > 0.8
+    with pytest.raises(InputError, match=r"sensor my-rig: wavelength_nm, .*simulation needs them"):
+        ms.render(ms.load_scene(SCENES / "coupon/coupon.xml", ms.load_sensor("ensenso-n10")), rig, np.eye(4))
