@@ -11,12 +11,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import MissingEnvironmentError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Floats = NDArray[np.floating]
 
@@ -152,6 +155,18 @@ class ViewGrid:
         return np.asarray(directions @ axis / np.linalg.norm(directions, axis=-1))
 
 
+class HasPlane(Protocol):
+    """A plane through ``point`` (3,) [mm] with the unit ``normal`` (3,)."""
+
+    @property
+    def point(self) -> NDArray[np.float64]:
+        """Return a point of the plane (3,) [mm]."""
+
+    @property
+    def normal(self) -> NDArray[np.float64]:
+        """Return its unit normal (3,)."""
+
+
 @dataclass(frozen=True)
 class PointCloud:
     """Organised cloud of one capture.
@@ -234,6 +249,54 @@ class PointCloud:
         out = open3d.geometry.PointCloud()
         out.points = open3d.utility.Vector3dVector(self.points[self.valid].astype(np.float64))
         return out
+
+    def plot(self, ax: Axes | None = None, *, plane: HasPlane | None = None) -> Axes:
+        """Draw the depth of every point, and why the other pixels have none.
+
+        Parameters
+        ----------
+        ax
+            Axes to draw into; by default those of a new figure.
+        plane
+            A plane with ``point`` (3,) [mm] and unit ``normal`` (3,) in the sensor frame, as
+            :func:`characterisation.fit_plane` returns. The distance of the points from it, positive on the side of the
+            normal, is then drawn instead of their depth.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+            x is the column and y the row of a pixel. Colours are the depth z in the sensor frame [mm], or the distance
+            from the plane [mm].
+
+        Raises
+        ------
+        InputError
+            If ``ax`` is something else.
+
+        Examples
+        --------
+        >>> import characterisation
+        >>> cloud = characterisation.read_cloud("coupon.ply")
+        >>> cloud.plot().get_xlabel()
+        'column [px]'
+        >>> plane = characterisation.fit_plane(cloud.points[cloud.valid], viewpoint=(0, 0, 0))
+        >>> axes = cloud.plot(plane=plane)
+        >>> axes.figure.savefig("residuals.png")
+        """
+        # imported here because a cloud alone does not need matplotlib
+        from characterisation.plots.clouds import draw_cloud
+        from characterisation.plots.style import axes_for
+
+        values, label = self.points[..., 2], "depth z, sensor frame [mm]"
+        if plane is not None:
+            values = (self.points - np.asarray(plane.point)) @ np.asarray(plane.normal)
+            label = "distance from the plane [mm]"
+        wide = 6.4
+        with axes_for(ax, (1, 1), (wide, min(0.72 * wide * self.grid.height / self.grid.width, 8.0) + 1.7)) as grid:
+            axes: Axes = grid[0, 0]
+            draw_cloud(axes, values, self.status, {s.value: s.name for s in Status}, label, plane is not None)
+            axes.set_title(f"{self.sensor}, {self.source}: {self.valid.sum()} points of {self.status.size} pixels")
+        return axes
 
     def reasons(self) -> Mapping[str, int]:
         """Count the pixels of each status, by name, most frequent first."""

@@ -29,6 +29,7 @@ _NAMES = {
     "Study": "mitsim.study",
     "Task": "characterisation.tasks.task_file",
     "Transform": "mitsim.sensor.transforms",
+    "Truth": "mitsim.capture.simulated.truth",
     "decode": "mitsim.decode.captures",
     "label": "mitsim.study.measurements",
     "load_scene": "mitsim.decode.captures",
@@ -44,6 +45,7 @@ _NAMES = {
     "render": "mitsim.decode.captures",
     "score": "mitsim.study.programs",
     "statement": "mitsim.study.programs",
+    "triangulate": "mitsim.decode.own_code",
     "write_capture": "mitsim.decode.captures",
     "write_cloud": "mitsim.decode.captures",
 }
@@ -57,6 +59,7 @@ if TYPE_CHECKING:
     from characterisation.tasks.result import Result
     from characterisation.tasks.task_file import Task
     from mitsim.capture.capture import Capture
+    from mitsim.capture.simulated.truth import Truth
     from mitsim.decode.captures import (
         decode,
         load_scene,
@@ -67,6 +70,7 @@ if TYPE_CHECKING:
         write_capture,
         write_cloud,
     )
+    from mitsim.decode.own_code import triangulate
     from mitsim.maps.use import performance_map, predict
     from mitsim.scene.load import Scene
     from mitsim.sensor.poses import look_at
@@ -91,6 +95,7 @@ __all__ = [
     "Study",
     "Task",
     "Transform",
+    "Truth",
     "decode",
     "label",
     "load_scene",
@@ -106,6 +111,7 @@ __all__ = [
     "render",
     "score",
     "statement",
+    "triangulate",
     "write_capture",
     "write_cloud",
 ]

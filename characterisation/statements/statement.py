@@ -20,17 +20,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import t
 
+from characterisation.files.errors import InputError
 from characterisation.statements.budget import BudgetLine
 from characterisation.statements.coverage import BLOCKS, coverage_interval, standard_errors
 from characterisation.statements.decision import Decided, Tolerance, Verdict, decide
 from characterisation.statements.losses import Loss
 from characterisation.statements.one_sided import OneSidedErrors
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Floats = NDArray[np.float64]
 
@@ -121,6 +125,28 @@ class Statement:
         """Return the root mean square error without correction."""
         return math.hypot(self.bias, self.standard_uncertainty)
 
+    def plot(self, ax: Axes | None = None) -> NDArray[np.object_]:
+        """Draw the error and the budget of this measurement, as :meth:`Statements.plot` does for several.
+
+        Parameters
+        ----------
+        ax
+            Axes to draw the error alone into; by default those of a new figure.
+
+        Returns
+        -------
+        numpy.ndarray of matplotlib.axes.Axes
+            (1, 2) of error and budget; (1, 1) without a budget, or with ``ax``.
+
+        Examples
+        --------
+        >>> from characterisation.statements.statement import statement
+        >>> stated = statement("radius", "mm", errors=[0.02, 0.05, -0.01, 0.03])
+        >>> stated.plot()[0, 0].get_xlabel()
+        'measured − true [mm]'
+        """
+        return Statements([self]).plot(ax)
+
     def after_repeats(self, captures: int) -> float:
         """Return the standard uncertainty of the mean of several captures of one day.
 
@@ -128,6 +154,66 @@ class Statement:
         """
         within = min(self.repeatability**2, self.standard_uncertainty**2)
         return math.sqrt(self.standard_uncertainty**2 - within * (1 - 1 / captures))
+
+
+class Statements(list[Statement]):
+    """Statements of several measurements from one view: a list that can draw itself."""
+
+    def plot(self, ax: Any = None) -> NDArray[np.object_]:
+        """Draw the error of each measurement with its 95 % interval, its bias and u, and its budget beside it.
+
+        Parameters
+        ----------
+        ax
+            Axes to draw the errors alone into, one for each unit; by default those of a new figure.
+
+        Returns
+        -------
+        numpy.ndarray of matplotlib.axes.Axes
+            (units, 2): a row for each unit, errors on the left and budgets on the right. (units, 1) if no statement has
+            a budget, or with ``ax``.
+
+        Raises
+        ------
+        InputError
+            If there is no statement, or ``ax`` is not one axes for each unit.
+
+        Examples
+        --------
+        >>> from characterisation.statements.statement import Statements, statement
+        >>> errors = {"radius": [0.02, 0.05, -0.01], "height": [0.1, 0.2, 0.1]}
+        >>> Statements(statement(name, "mm", values) for name, values in errors.items()).plot().shape
+        (1, 1)
+        """
+        # imported here because a statement alone does not need matplotlib
+        from characterisation.plots.statements import (
+            MARGIN_IN,
+            ROW_IN,
+            ErrorRow,
+            budget_legend,
+            draw_budget,
+            draw_errors,
+        )
+        from characterisation.plots.style import axes_for
+
+        if not self:
+            raise InputError("plot", "statements", "none", "at least one")
+        rows: dict[str, list[ErrorRow]] = {}
+        for one in self:
+            shares = {line.group: line.share for line in one.budget}
+            row = ErrorRow(one.measurement, one.bias, one.standard_uncertainty, one.interval, shares, one.verdict)
+            rows.setdefault(one.unit, []).append(row)
+        columns = 2 if ax is None and any(one.budget for one in self) else 1
+        heights = [ROW_IN * len(of_unit) + MARGIN_IN for of_unit in rows.values()]
+        size = (10.0 if columns == 2 else 6.4, sum(heights) + 0.5 * (columns - 1))
+        with axes_for(ax, (len(rows), columns), size, height_ratios=heights) as grid:
+            for panels, (unit, of_unit) in zip(grid, rows.items(), strict=True):
+                draw_errors(panels[0], of_unit, unit)
+                if columns == 2:
+                    draw_budget(panels[1], of_unit)
+            if columns == 2:
+                budget_legend(grid[0, 1], [row for of_unit in rows.values() for row in of_unit])
+        return grid
 
 
 def statement(

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from characterisation.files.documents import Document
-from mitsim.capture.png import LONGEST_SIDE_PX
 from mitsim.sensor.camera import Camera, Rectification, Rig
+from mitsim.sensor.png import LONGEST_SIDE_PX
 from mitsim.sensor.transforms import Transform
 
 Number = Annotated[float, Field(ge=-1e9, le=1e9)]

@@ -106,3 +106,41 @@ class Capture:
                 raise InputError(where, f"read_out.{name}", found, allowed)
         if self.pose_covariance is not None and self.world_from_sensor is None:
             raise ValueError("a pose covariance without a pose")
+
+    def plot(self, ax: Any = None, *, camera: str | None = None, image: int = 0) -> NDArray[np.object_]:
+        """Draw an image of every camera in grey, with saturated pixels marked.
+
+        All cameras share one scale. It is stretched to the grey levels that occur, since metal is dark but for its
+        highlights. Of a capture without images, the maps that the device computed are drawn.
+
+        Parameters
+        ----------
+        ax
+            Axes to draw into, one for each camera; by default those of a new figure.
+        camera
+            Draw this camera alone.
+        image
+            Number of the image, from 0; negative numbers count from the last.
+
+        Returns
+        -------
+        numpy.ndarray of matplotlib.axes.Axes
+            (cameras,), in the order of ``images``.
+
+        Raises
+        ------
+        InputError
+            If there is no such camera or image, or another number of axes.
+
+        Examples
+        --------
+        >>> import mitsim as ms
+        >>> left, right = ms.read_capture("capture").plot()
+        >>> left.get_title()
+        'left: small, simulated'
+        >>> left.figure.savefig("images.png")
+        """
+        # imported here because a capture alone does not need matplotlib
+        from mitsim.capture.picture import draw_capture
+
+        return draw_capture(self, ax, camera, image)

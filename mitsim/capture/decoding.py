@@ -29,6 +29,7 @@ from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.pattern import DotPattern
+from mitsim.sensor.projector_images import ImagesDescription
 
 Settings = MatcherSettings | DecoderSettings | TimeOfFlightSettings | DeviceMapSettings
 
@@ -83,7 +84,13 @@ class Decoding(Document):
     imager: WrittenImager | None = None
     pattern: (
         Annotated[
-            DotPattern | PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence | AmplitudeModulation,
+            DotPattern
+            | PhaseShift
+            | GrayCode
+            | GrayCodePhaseShift
+            | ImageSequence
+            | ImagesDescription
+            | AmplitudeModulation,
             Field(discriminator="kind"),
         ]
         | None

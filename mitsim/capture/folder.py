@@ -36,7 +36,7 @@ from mitsim.capture.capture_document import SCHEMA_VERSION, CaptureDocument, Fil
 from mitsim.capture.decoding import read_settings
 from mitsim.capture.npy import decode_npy
 from mitsim.capture.packed_files import SAFE_NAME, check_image, files_of, packed
-from mitsim.capture.png import decode_png
+from mitsim.sensor.png import decode_png
 from mitsim.sensor.transforms import Transform
 
 #: largest allowed size of all files of a capture [bytes]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.checked_files import LARGEST_FILE, read_bounded
 from characterisation.files.errors import InputError
-from mitsim.capture.png import LONGEST_SIDE_PX, PNG_SIGNATURE, decode_png, png_chunks
+from mitsim.sensor.png import LONGEST_SIDE_PX, PNG_SIGNATURE, decode_png, png_chunks
 
 #: suffixes of the image files that are read
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")

@@ -15,7 +15,7 @@ from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
-from mitsim.capture.png import LONGEST_SIDE_PX
+from mitsim.sensor.png import LONGEST_SIDE_PX
 
 #: allowed types of the values of a map
 DTYPES = ("uint8", "uint16", "int16", "float32")
@@ -37,7 +37,7 @@ def decode_npy(data: bytes, where: str | Path) -> NDArray[Any]:
     ------
     InputError
         If the bytes are not a complete file of version 1.0, or the values are not of :data:`DTYPES`, little-endian and
-        by rows. Also if a side is longer than :data:`~mitsim.capture.png.LONGEST_SIDE_PX`.
+        by rows. Also if a side is longer than :data:`~mitsim.sensor.png.LONGEST_SIDE_PX`.
     """
     stream = io.BytesIO(data)
     try:

@@ -26,8 +26,8 @@ from mitsim.capture.capture import DERIVED_UNITS, Capture
 from mitsim.capture.capture_document import FRAME, SCHEMA_VERSION, UNITS, CaptureDocument
 from mitsim.capture.decoding import settings_table
 from mitsim.capture.npy import encode_npy
-from mitsim.capture.png import LONGEST_SIDE_PX, encode_png
 from mitsim.running.version import __version__
+from mitsim.sensor.png import LONGEST_SIDE_PX, encode_png
 
 #: allowed names of cameras and files
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")

@@ -104,7 +104,7 @@ def render(
     from mitsim.capture.folder import check_free, read_capture, write_capture
     from mitsim.capture.simulated.render_residual import LIMIT, render_residual
     from mitsim.capture.simulated.rendering import Rendering
-    from mitsim.capture.simulated.truth import encode_exr, true_image
+    from mitsim.capture.simulated.truth import encode_exr, true_images
     from mitsim.decode import captures as interface
     from mitsim.running.progress import say
     from mitsim.scene.first_hits import sees_nothing
@@ -152,10 +152,8 @@ def render(
     capture.settings["render"] = {"digest": digest}
     known = {}
     if truth:
-        known = {
-            name: encode_exr(true_image(simulated, loaded, pose, name, samples=samples, depth=max(depth, 3), seed=seed))
-            for name in chosen.rig.cameras
-        }
+        every = true_images(simulated, loaded, pose, samples=samples, depth=depth, seed=seed)
+        known = {name: encode_exr(one) for name, one in every.items()}
     write_capture(capture, output, truth=known)
     if deviation:
         finishes = [one for one in loaded.finishes if one and one.scatter]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal, overload
 
 from numpy.typing import ArrayLike
 
@@ -15,6 +16,7 @@ from mitsim.capture import folder
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.capture.simulated.truth import Truth, true_images
 from mitsim.decode import input_clouds as clouds
 from mitsim.decode.checks.checked_cloud import checked_cloud
 from mitsim.decode.cloud import decoder_settings
@@ -115,6 +117,7 @@ def prepared_sensor(sensor: Sensor) -> SimulatedSensor:
     return _prepared[0][1]
 
 
+@overload
 def render(
     scene: Scene,
     sensor: Sensor,
@@ -124,7 +127,35 @@ def render(
     samples: int = 16,
     depth: int = 3,
     noise: str = "all",
-) -> Capture:
+    truth: Literal[False] = False,
+) -> Capture: ...
+
+
+@overload
+def render(
+    scene: Scene,
+    sensor: Sensor,
+    pose: Transform | ArrayLike,
+    *,
+    seed: int = 1,
+    samples: int = 16,
+    depth: int = 3,
+    noise: str = "all",
+    truth: Literal[True],
+) -> tuple[Capture, dict[str, Truth]]: ...
+
+
+def render(  # noqa: PLR0913 - options of programs, all by name
+    scene: Scene,
+    sensor: Sensor,
+    pose: Transform | ArrayLike,
+    *,
+    seed: int = 1,
+    samples: int = 16,
+    depth: int = 3,
+    noise: str = "all",
+    truth: bool = False,
+) -> Capture | tuple[Capture, dict[str, Truth]]:
     """Render one capture of a scene: all images that the sensor takes, with noise.
 
     Parameters
@@ -143,11 +174,16 @@ def render(
         Number of surfaces on a light path, 1 to 16; 1 is direct light.
     noise
         ``"all"``, ``"none"``, some sources by name (``"shot,read"``), or all but some (``"no-speckle"``).
+    truth
+        Return what every pixel truly sees, too.
 
     Returns
     -------
     Capture
         ``images`` by camera, (frames, H, W) [DN]. :func:`decode` decodes it.
+    dict of Truth
+        With ``truth``: by camera, depth, normal, shape, projector coordinate, shadow and share of indirect light of the
+        pixels of its images. A cloud of two cameras has other pixels, those of rectified images.
 
     Raises
     ------
@@ -162,15 +198,21 @@ def render(
     >>> capture = ms.render(scene, sensor, ms.look_at((0, -300, 400)), samples=2, depth=1)
     >>> capture.images["left"].shape, capture.source
     ((1, 240, 320), 'simulated')
+    >>> capture, truth = ms.render(scene, sensor, ms.look_at((0, -300, 400)), samples=2, depth=1, truth=True)
+    >>> left = truth["left"]
+    >>> left.depth.shape, left.feature_names[left.feature[120, 160]]
+    ((240, 320), 'plane')
     """
     for name, value, low, high in (("samples", samples, 1, 65536), ("depth", depth, 1, 16), ("seed", seed, 0, 2**63)):
         if not low <= value <= high:
             raise InputError("render", name, value, f"{low} to {high}")
     world_from_sensor = as_pose(pose, "render")
     chosen = Noise.parse(noise, "render: noise")
-    return prepared_sensor(sensor).capture(
-        scene, world_from_sensor, seed=seed, rendering=Rendering(samples, depth), noise=chosen
-    )
+    simulated = prepared_sensor(sensor)
+    capture = simulated.capture(scene, world_from_sensor, seed=seed, rendering=Rendering(samples, depth), noise=chosen)
+    if not truth:
+        return capture
+    return capture, true_images(simulated, scene, world_from_sensor, samples=samples, depth=depth, seed=seed)
 
 
 def decode(

@@ -38,6 +38,7 @@ from mitsim.sensor.decoder_settings import DecoderSettings, DeviceMapSettings
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.preset import Sensor, load_sensor, presets
+from mitsim.sensor.projector_images import ImagesDescription, ProjectorImages
 
 __all__ = [
     "Geometry",
@@ -173,6 +174,8 @@ def with_options(settings: Settings, block: int | None, contrast: float | None) 
 def sensor_geometry(sensor: Sensor) -> Geometry:
     """Return the geometry that is prepared once for all captures of a sensor."""
     technology = technology_of(sensor.technology)
+    if technology.patterns and isinstance(sensor.pattern, ProjectorImages):
+        raise unknown_code(f"sensor {sensor.name}", sensor.pattern.count)
     pattern = sensor.pattern if isinstance(sensor.pattern, technology.patterns) else None
     return technology.geometry(sensor.rig, sensor.settings, pattern)
 
@@ -189,19 +192,33 @@ def capture_geometry(capture: Capture, settings: Settings) -> Geometry:
     return technology.geometry(capture.rig, settings, capture_pattern(capture))
 
 
+def unknown_code(where: str, count: int) -> InputError:
+    """Return the error that mitsim cannot decode images of the user's own, and what to do."""
+    return InputError(
+        where,
+        "pattern",
+        f"{count} images of your own, whose code mitsim does not know",
+        "a code of mitsim, to decode",
+        "decode capture.images[camera], one image (H, W) for each of yours, to the projector column that each pixel "
+        "sees; ms.triangulate(capture, columns) makes the cloud. render(..., truth=True) gives the true columns",
+    )
+
+
 def capture_pattern(capture: Capture) -> Pattern | None:
     """Return the pattern of a capture, or None if its technology does not need one.
 
     Raises
     ------
     InputError
-        If it has no pattern, or one of another technology.
+        If it has no pattern, one of another technology, or images of the user's own.
     """
     technology, pattern = technology_of(capture.technology), capture.decoding.pattern
     if not technology.patterns:
         return None
     if pattern is None:
         raise InputError(_where(capture), "pattern", "nothing", "a value: this key is required")
+    if isinstance(pattern, ImagesDescription):
+        raise unknown_code(f"capture of {capture.sensor}", pattern.count)
     if not isinstance(pattern, technology.patterns):
         raise InputError("capture", "settings.pattern.kind", pattern.kind, f"a kind that {capture.technology} has")
     return pattern

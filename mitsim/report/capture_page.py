@@ -13,9 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from characterisation.files.atomic_io import atomic_write
+from characterisation.plots.style import BLUE, FIELD, VERMILION, drawing
 from characterisation.point_cloud import Status
 from mitsim.report.cloud_figures import REASONS
-from mitsim.report.style import BLUE, FIELD, VERMILION, drawing, write_png
+from mitsim.report.style import write_png
 from mitsim.running.numbers import percent
 from mitsim.twin.compare.captures_run import Shown
 

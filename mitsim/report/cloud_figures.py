@@ -11,35 +11,21 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from characterisation.plots.clouds import REASONS as STATUS_WORDS
+from characterisation.plots.clouds import depth_limits
+from characterisation.plots.style import FIELD, SEQUENTIAL, drawing
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
-from mitsim.capture.png import encode_png
+from mitsim.capture.picture import STRETCH_EXPONENT, grey_limits
 from mitsim.report.findings import reason_shares
-from mitsim.report.style import FIELD, SEQUENTIAL, drawing
 from mitsim.running.numbers import percent
 from mitsim.sensor.camera import Camera
-
-#: percentiles of the grey values shown as black and white, and the display exponent, since metal is dark but for its
-#: highlights
-STRETCH_PERCENTILES, STRETCH_EXPONENT = (5, 99.9), 0.7
+from mitsim.sensor.png import encode_png
 
 LARGEST_WIDTH_PX = 800
 
-#: meaning and colour of each status: Okabe and Ito's palette, and greys of different lightness
-REASONS: dict[Status, tuple[str, str]] = {
-    Status.VALID: ("a point", "#009e73"),
-    Status.NO_SURFACE: ("no surface visible", FIELD),
-    Status.OUT_OF_RANGE: ("out of range, or outside the map", "#56b4e9"),
-    Status.SATURATED: ("saturated", "#f0e442"),
-    Status.LOW_MODULATION: ("low modulation", "#5b6b8c"),
-    Status.SHADOWED: ("in the projector's shadow", "#2b2b2b"),
-    Status.HIDDEN: ("hidden from the second camera, or rejected by it", "#d55e00"),
-    Status.AMBIGUOUS: ("ambiguous match", "#cc79a7"),
-    Status.PHASE_INCONSISTENT: ("phase inconsistent", "#9467bd"),
-    Status.INTERREFLECTION: ("interreflection", "#8c564b"),
-    Status.DROPPED: ("lost at random, 1 − F", "#e69f00"),
-}
-
+#: meaning and colour of each status
+REASONS = {status: STATUS_WORDS[status.name] for status in Status}
 
 #: margin around the part in a camera image, relative to the part's size there, and its minimum in pixels
 _CROP_MARGIN, _CROP_LEAST_PX = 0.08, 12
@@ -74,8 +60,7 @@ def camera_images(capture: Capture, part: NDArray[np.floating] | None = None) ->
         known = part is not None and camera is not None and stack.shape[1:] == (camera.height, camera.width)
         cut = part_window(camera, part) if known and camera is not None and part is not None else (slice(None),) * 2
         frames[name] = shrink(stack[0][cut])
-    ends = np.array([np.percentile(frame, STRETCH_PERCENTILES) for frame in frames.values()])
-    black, white = float(ends[:, 0].min()), float(max(ends[:, 1].max(), ends[:, 0].min() + 1))
+    black, white = grey_limits(list(frames.values()))
     uris = {}
     for name, frame in frames.items():
         shown = np.rint(255 * np.clip((frame - black) / (white - black), 0, 1) ** STRETCH_EXPONENT).astype(np.uint8)
@@ -110,7 +95,7 @@ def cloud_figure(predicted: PointCloud, decoded: PointCloud) -> Figure:
     distances = [np.linalg.norm(cloud.points[cut] - cloud.grid.origin, axis=-1) for cloud in clouds.values()]
     present = sorted({Status(int(s)) for cloud in clouds.values() for s in np.unique(cloud.status[cut])})
     # the part's own depth sets the colours, since a false match can lie at any distance
-    near, far = _limits(distances[0])
+    near, far = depth_limits(distances[0])
     colours = ListedColormap([REASONS[status][1] for status in Status])
     steps = BoundaryNorm(np.arange(len(Status) + 1) - 0.5, len(Status))
     height, width = predicted.status[cut].shape
@@ -162,11 +147,3 @@ def cloud_figure(predicted: PointCloud, decoded: PointCloud) -> Figure:
             title_fontsize=8.0,
         )
     return figure
-
-
-def _limits(distance: NDArray[np.floating]) -> tuple[float, float]:
-    known = distance[np.isfinite(distance)]
-    if not len(known):
-        return 0.0, 1.0
-    near, far = float(np.percentile(known, 0.5)), float(np.percentile(known, 99.5))
-    return (near, far) if far > near else (near - 0.5, far + 0.5)

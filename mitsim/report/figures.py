@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LogNorm, Normalize
 from matplotlib.figure import Figure
@@ -23,16 +22,13 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from characterisation.maps.performance_map import PerformanceMap, lambert_projection
+from characterisation.plots.discs import disc, disc_image, disc_view, noise_limits, plain_log_ticks
+from characterisation.plots.style import FIELD, NOISE, SEQUENTIAL, drawing
 from mitsim.report.findings import incidence_of_nodes
-from mitsim.report.style import FIELD, INK, NOISE, SEQUENTIAL, disc, drawing, write_png
+from mitsim.report.style import write_png
 from mitsim.running.numbers import count, finish_name
 
 Floats = NDArray[np.float64]
-
-RINGS_DEG = (15, 30, 45, 60, 75)
-
-#: percentiles of sigma at the ends of the colour scale
-NOISE_PERCENTILES = (2, 95)
 
 
 def write_map_figures(performance_map: PerformanceMap, folder: Path) -> list[Path]:
@@ -49,16 +45,6 @@ def matt_to_shiny(samples: list[tuple[str, float]]) -> list[int]:
     return sorted(range(len(samples)), key=lambda i: (not math.isnan(samples[i][1]), samples[i][0], -samples[i][1]))
 
 
-def noise_limits(performance_map: PerformanceMap) -> tuple[float, float]:
-    """Return the ends of the colour scale of sigma [mm], at :data:`NOISE_PERCENTILES` of all nodes."""
-    sigma = performance_map.data["ray_noise_std"].values
-    sigma = sigma[np.isfinite(sigma) & (sigma > 0)]
-    if not len(sigma):
-        return 0.1, 1.0
-    low, high = (float(np.percentile(sigma, p)) for p in NOISE_PERCENTILES)
-    return (low, high) if high > 1.05 * low else (low / 1.05, high * 1.05)
-
-
 def fraction_figure(performance_map: PerformanceMap) -> Figure:
     """Draw F over the orientation, a disc for each sample (across) and distance (down); all colours run from 0 to 1."""
     fraction = performance_map.data["recovered_fraction"].values
@@ -67,9 +53,9 @@ def fraction_figure(performance_map: PerformanceMap) -> Figure:
 
 def noise_figure(performance_map: PerformanceMap) -> Figure:
     """Draw sigma [mm] over the orientation as in :func:`fraction_figure`, on one logarithmic scale."""
-    low, high = noise_limits(performance_map)
+    sigma = performance_map.data["ray_noise_std"].values
     label = "standard deviation along the view ray σ [mm], without outliers"
-    return _map_figure(performance_map, performance_map.data["ray_noise_std"].values, LogNorm(low, high), NOISE, label)
+    return _map_figure(performance_map, sigma, LogNorm(*noise_limits(sigma)), NOISE, label)
 
 
 def _map_figure(
@@ -80,8 +66,7 @@ def _map_figure(
     known = np.isfinite(data["recovered_fraction"].values).any(axis=(0, 1))
     incidence = incidence_of_nodes(performance_map)
     largest = float(incidence[known].max()) if known.any() else math.radians(75)
-    half_cell = float(data["a"][1] - data["a"][0]) / 2
-    reach = float(data["a"][-1]) + half_cell
+    axis = data["a"].values.astype(float)
     with drawing():
         width = max(2.35 * len(order) + 0.7, 5.5)
         figure = Figure((width, 2.25 * len(distances) + 1.45), layout="constrained")
@@ -89,17 +74,7 @@ def _map_figure(
         for row, distance in enumerate(distances):
             for column, sample in enumerate(order):
                 axes = grid[row, column]
-                rim = disc(axes, 2 * math.sin(largest / 2))
-                shown = axes.imshow(
-                    np.ma.masked_invalid(values[sample, row]),
-                    norm=norm,
-                    cmap=colours,
-                    origin="lower",
-                    extent=(-reach, reach, -reach, reach),
-                    interpolation="none",
-                    zorder=1,
-                )
-                shown.set_clip_path(rim)
+                disc_image(axes, values[sample, row], axis, largest).set(norm=norm, cmap=colours)
                 disc_view(axes, largest)
                 if row == 0:
                     axes.set_title(finish_name(*performance_map.samples[sample]).replace(", ", "\n"))
@@ -110,33 +85,6 @@ def _map_figure(
         legend = [Patch(facecolor=FIELD, label="no value (not measured, or no point returned)")]
         figure.legend(handles=legend, loc="outside lower right")
     return figure
-
-
-def disc_view(axes: Axes, largest: float, labelled: bool = True) -> None:
-    """Draw rings of incidence angle and the direction of the baseline on a disc of normals up to ``largest`` [rad]."""
-    angle = np.linspace(0, 2 * math.pi, 181)
-    for ring in RINGS_DEG:
-        if math.radians(ring) > largest + 0.03:
-            continue
-        radius = 2 * math.sin(math.radians(ring) / 2)
-        axes.plot(radius * np.cos(angle), radius * np.sin(angle), color=INK, lw=0.4, alpha=0.45, zorder=2)
-        if not labelled:
-            continue
-        place = radius * np.array([math.cos(math.radians(62)), math.sin(math.radians(62))])
-        text = axes.text(float(place[0]), float(place[1]), f"{ring}°", fontsize=6, ha="center", va="center", zorder=4)
-        text.set_bbox({"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6})
-        text.set_color("#1c1c1c")  # the label's box is white in every page theme
-    if not labelled:
-        return
-    rim = 2 * math.sin(largest / 2)
-    axes.annotate(
-        "",
-        xy=(1.0 * rim, -1.06 * rim),
-        xytext=(0.35 * rim, -1.06 * rim),
-        annotation_clip=False,
-        arrowprops={"arrowstyle": "->", "color": INK, "lw": 0.8, "shrinkA": 0, "shrinkB": 0},
-    )
-    axes.text(0.32 * rim, -1.06 * rim, "baseline", fontsize=6.5, ha="right", va="center")
 
 
 def colour_bar(
@@ -155,11 +103,7 @@ def colour_bar(
         pad=0.03,
     )
     if isinstance(norm, LogNorm):
-        low, high = float(norm.vmin or 0), float(norm.vmax or 1)
-        steps = np.array([m * 10.0**e for e in range(-6, 7) for m in (1, 1.5, 2, 3, 5, 7)])
-        ticks = steps[(steps >= low) & (steps <= high)]
-        bar.set_ticks(ticks.tolist(), labels=[f"{tick:g}" for tick in ticks])
-        bar.minorticks_off()
+        plain_log_ticks(bar, float(norm.vmin or 0), float(norm.vmax or 1))
     bar.outline.set_visible(False)  # type: ignore[operator]
 
 

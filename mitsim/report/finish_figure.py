@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mitsim.report.style import FIELD, drawing
+from characterisation.plots.style import FIELD, drawing
 from mitsim.running.numbers import two_digits
 from mitsim.twin.finish.run import CouponFit
 

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
-from mitsim.report.figures import colour_bar, disc_view, matt_to_shiny, noise_limits
-from mitsim.report.style import NOISE, SEQUENTIAL, disc, drawing
+from characterisation.plots.discs import disc, disc_view, noise_limits
+from characterisation.plots.style import NOISE, SEQUENTIAL, drawing
+from mitsim.report.figures import colour_bar, matt_to_shiny
 from mitsim.running.numbers import finish_name
 
 Sample = tuple[str, float]
@@ -48,7 +49,7 @@ def comparison_figure(
 ) -> Figure:
     """Draw discs over the orientation, a row for each map and a column for each sample, on one colour scale."""
     samples = common_samples(maps)
-    limits = np.array([noise_limits(one) for one in maps])
+    limits = np.array([noise_limits(one.data["ray_noise_std"].values) for one in maps])
     norm = Normalize(0, 1) if what == "fraction" else LogNorm(float(limits[:, 0].min()), float(limits[:, 1].max()))
     colours = SEQUENTIAL if what == "fraction" else NOISE
     variable = "recovered_fraction" if what == "fraction" else "ray_noise_std"
@@ -109,7 +110,8 @@ def strip_figure(maps: Sequence[PerformanceMap]) -> Figure:
             bottom.set_xscale("log")
             bottom.set_yscale("log")
             if not any(np.isfinite(line.get_ydata()).any() for each in lower for line in each.lines):
-                bottom.set_ylim(*noise_limits(maps[0]))  # matplotlib finds no limits if no map has a noise
+                # matplotlib finds no limits if no map has a noise
+                bottom.set_ylim(*noise_limits(maps[0].data["ray_noise_std"].values))
             bottom.set_xlabel("|V| [mm]")
             ticks = [300, 500, 1000, 2000, 4000]
             bottom.set_xticks(ticks, labels=[str(tick) for tick in ticks], fontsize=6.5)

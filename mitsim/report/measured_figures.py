@@ -11,9 +11,9 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from characterisation.acceptance.cloud_difference import Difference
+from characterisation.plots.style import BLUE, FIELD, INK, SEQUENTIAL, VERMILION, drawing
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
-from mitsim.report.style import BLUE, FIELD, INK, SEQUENTIAL, VERMILION, drawing
 
 #: ends of the colours: this percentile of |difference|, or this many robust deviations from the median if that is less
 _PERCENTILE, _DEVIATIONS = 98.0, 6.0

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from characterisation.plots.discs import NOISE_PERCENTILES, noise_limits
 from characterisation.point_cloud import Status
 from mitsim.report import figures, findings
 from mitsim.report.agreement import CHANCE, CONFIRMED, TOO_FEW, Agreement, chance_level
@@ -58,13 +59,13 @@ def map_pictures(run: Run) -> Iterator[tuple[str, Picture]]:
     alt = f"Discs of recovered fraction over surface orientation for {listed(names)} at several distances"
     yield "Fraction of points recovered", _picture(figures.fraction_figure(performance_map), alt, caption)
 
-    low, high = figures.noise_limits(performance_map)
+    low, high = noise_limits(performance_map.data["ray_noise_std"].values)
     medians = [findings.median_noise(performance_map, i, middle, math.radians(45)) for i in order]
     noises = [f"{two_digits(s)} mm on {name}" for s, name in zip(medians, names, strict=True) if math.isfinite(s)]
     caption = (
         f"Dark means little noise. At {distances[middle]:g} mm and up to 45° of incidence the median of σ is "
-        f"{listed(noises) or 'not known'} (logarithmic colours from the {figures.NOISE_PERCENTILES[0]}nd to the "
-        f"{figures.NOISE_PERCENTILES[1]}th percentile, {two_digits(low)} to {two_digits(high)} mm)."
+        f"{listed(noises) or 'not known'} (logarithmic colours from the {NOISE_PERCENTILES[0]}nd to the "
+        f"{NOISE_PERCENTILES[1]}th percentile, {two_digits(low)} to {two_digits(high)} mm)."
     )
     alt = f"Discs of noise along the view ray over surface orientation for {listed(names)} at several distances"
     yield "Noise along the view ray", _picture(figures.noise_figure(performance_map), alt, caption)

@@ -24,7 +24,8 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
-from mitsim.report.style import INK, MUTED, PAPER, drawing
+from characterisation.plots.labels import label_columns
+from characterisation.plots.style import INK, MUTED, PAPER, drawing
 from mitsim.study.scene_geometry import SceneGeometry
 
 Floats = NDArray[np.float64]
@@ -48,9 +49,6 @@ _PIXELS = 900
 
 #: azimuth of the picture's viewpoint relative to the sensor, and its minimum elevation [deg]
 _ASIDE_DEG, _LOWEST_DEG = 62.0, 18.0
-
-#: largest number of labels on each side of the part, and of characters in one
-_MOST_LABELS, _LONGEST = 9, 16
 
 #: largest number of times that a picture is widened for its texts: it shrinks, and they do not
 _WIDENINGS = 12
@@ -253,39 +251,8 @@ def _labels(axes: Axes, geometry: SceneGeometry, flat: Floats, depth: Floats, ve
                 int(inside.argmax()), inside.shape
             )  # the point farthest from the edges of the feature
             places[name] = low + np.array([column, row]) / scale
-    left = sorted(places, key=lambda name: places[name][0])
-    half = len(left) // 2
-    span = high - low
-    step = float(max(span[1], 0.62 * span[0])) / 7
-    aside = 0.09 * float(span.max())
-    columns_of = ((left[:half], low[0] - aside, "right", -1), (left[half:], high[0] + aside, "left", 1))
-    every = [low[1], high[1]]
-    for names, x, side, way in columns_of:
-        worst = sorted(names, key=lambda name: -list(VERDICTS).index(verdicts[name]))[:_MOST_LABELS]
-        chosen = sorted(worst, key=lambda name: places[name][1])
-        heights = spread([float(places[name][1]) for name in chosen], step)
-        every += heights
-        for name, y in zip(chosen, heights, strict=True):
-            place = places[name]
-            axes.plot([x, place[0]], [y, place[1]], color=MUTED, lw=0.7, zorder=4)
-            axes.plot(*place, "o", ms=2.5, color=INK, zorder=5)
-            short = name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…"
-            axes.text(x + way * 0.01 * float(span.max()), y, short, ha=side, va="center", fontsize=8, zorder=8)
-    room = aside + 0.34 * float(span.max())  # space for the names
-    axes.set_xlim(low[0] - room, high[0] + room)
-    axes.set_ylim(min(every) - step / 2, max(every) + step / 2)
-
-
-def spread(heights: Sequence[float], step: float) -> list[float]:
-    """Return ascending heights, moved as little as possible to be at least ``step`` apart (pooled neighbours)."""
-    groups = list[list[float]]()  # first height and number of labels of each group of touching labels
-    for height in heights:
-        groups.append([height, 1.0])
-        while len(groups) > 1 and groups[-1][0] < groups[-2][0] + groups[-2][1] * step:
-            (first, one), (second, two) = groups[-2], groups[-1]
-            # least squares: the mean of the shifts of its labels is 0
-            groups[-2:] = [[(first * one + (second - one * step) * two) / (one + two), one + two]]
-    return [first + k * step for first, number in groups for k in range(int(number))]
+    order = sorted(places, key=lambda name: (-list(VERDICTS).index(verdicts[name]), places[name][0]))  # worst first
+    label_columns(axes, {name: places[name] for name in order}, low, high)
 
 
 def _axes_of_part(axes: Axes, turn: Floats) -> None:

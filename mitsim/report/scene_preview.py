@@ -6,7 +6,6 @@ looks along -z of the part, to scale. Shading depends on the normal alone to sho
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,7 +17,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
-from mitsim.report.style import FIELD, INK, MUTED, drawing
+from characterisation.plots.labels import round_length, scale_bar
+from characterisation.plots.style import FIELD, INK, MUTED, OTHER_SHAPE, SHAPES, bare, drawing
 from mitsim.running.numbers import finish_name
 from mitsim.scene.first_hits import VisibleSurfaces, trace
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
@@ -29,9 +29,7 @@ from mitsim.sensor.working_volume import common_view, depth, in_working_volume
 
 Floats = NDArray[np.float64]
 
-#: Okabe and Ito's palette, safe for colour-blind readers; shapes without a colour of their own are grey
-COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7")
-_OTHER, _BACK = "#9a9fa8", "#2b2d33"
+_BACK = "#2b2d33"
 
 #: share of the colour that remains where the sensor cannot measure
 _PALE = 0.35
@@ -88,9 +86,9 @@ def _colours(facts: SceneFacts, first: Sequence[str]) -> list[str]:
         range(len(shapes)),
         key=lambda i: (shapes[i].emitter, shapes[i].name not in first, -np.nan_to_num(shapes[i].area), i),
     )
-    coloured = order if len(order) <= len(COLOURS) else order[: len(COLOURS)]
-    own = dict(zip(coloured, COLOURS, strict=False))
-    return [own.get(i, _OTHER) for i in range(len(shapes))]
+    coloured = order if len(order) <= len(SHAPES) else order[: len(SHAPES)]
+    own = dict(zip(coloured, SHAPES, strict=False))
+    return [own.get(i, OTHER_SHAPE) for i in range(len(shapes))]
 
 
 def _painted(
@@ -125,13 +123,13 @@ def _from_sensor(axes: Axes, colours: list[str], sensor: Sensor, visible: Visibl
     height, width = visible.shape.shape
     axes.set_xlim(-0.5, width - 0.5)
     axes.set_ylim(height - 0.5, -0.5)
-    _frame(axes)
+    bare(axes)
     seen = visible.shape >= 0
     if seen.any():
         at = float(np.median(depth(sensor, visible.point[seen])))
         pixels = float(sensor.rig.reference.matrix[0, 0]) / at
-        length = _round_length(0.2 * width / pixels)
-        _scale_bar(
+        length = round_length(0.2 * width / pixels)
+        scale_bar(
             axes, (0.03 * width, 0.955 * height), length * pixels, f"{length:g} mm at {at:.0f} mm", -0.02 * height
         )
     else:
@@ -165,10 +163,10 @@ def _from_above(
     _outline(axes, facts, sensor, pose, window)
     axes.set_xlim(left, right)
     axes.set_ylim(bottom, top)
-    _frame(axes)
-    length = _round_length(0.3 * (right - left))
+    bare(axes)
+    length = round_length(0.3 * (right - left))
     place = (left + 0.04 * (right - left), bottom + 0.045 * (top - bottom))
-    _scale_bar(axes, place, length, f"{length:g} mm", 0.02 * (top - bottom))
+    scale_bar(axes, place, length, f"{length:g} mm", 0.02 * (top - bottom))
     _axes_mark(axes)
 
 
@@ -209,13 +207,13 @@ def _overview(axes: Axes, facts: SceneFacts, sensor: Sensor, pose: Transform) ->
     half = np.maximum(np.abs(high - middle), reach)
     wide = (middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1])
     inside = _outline(axes, facts, sensor, pose, wide)
-    axes.add_patch(Rectangle(_pair(low), *_pair(high - low), facecolor=_OTHER, edgecolor="none", zorder=1))
+    axes.add_patch(Rectangle(_pair(low), *_pair(high - low), facecolor=OTHER_SHAPE, edgecolor="none", zorder=1))
     axes.plot(*_pair(stand), **_SENSOR_MARK, zorder=6)
     shown = np.concatenate([np.stack([low, high, stand]), inside])
     margin = 0.08 * float(np.ptp(shown, axis=0).max())
     axes.set_xlim(shown[:, 0].min() - margin, shown[:, 0].max() + margin)
     axes.set_ylim(shown[:, 1].min() - margin, shown[:, 1].max() + margin)
-    _frame(axes)
+    bare(axes)
     axes.set_anchor("NE")
     axes.set_facecolor("white")
 
@@ -240,35 +238,13 @@ def _axes_mark(axes: Axes) -> None:
         )
 
 
-def _scale_bar(axes: Axes, place: tuple[float, float], length: float, label: str, rise: float) -> None:
-    x, y = place
-    axes.plot([x, x + length], [y, y], color=INK, lw=2.2, solid_capstyle="butt", zorder=6)
-    text = axes.text(x, y + rise, label, fontsize=8, va="bottom", zorder=6)
-    text.set_bbox({"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.8})
-
-
-def _round_length(length: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is at most ``length``."""
-    power = 10.0 ** math.floor(math.log10(length))
-    return max(m for m in (1.0, 2.0, 5.0) if m * power <= length * 1.0000001) * power
-
-
-def _frame(axes: Axes) -> None:
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.set_aspect("equal")
-    for spine in axes.spines.values():
-        spine.set_visible(True)
-        spine.set_color(MUTED)
-
-
 def _features(facts: SceneFacts, colours: list[str]) -> list[Patch | Line2D]:
-    named = [i for i, colour in enumerate(colours) if colour != _OTHER]
+    named = [i for i, colour in enumerate(colours) if colour != OTHER_SHAPE]
     handles: list[Patch | Line2D] = [
         Patch(facecolor=colours[i], edgecolor=MUTED, lw=0.5, label=_label(facts.shapes[i])) for i in named
     ]
     if rest := len(colours) - len(named):
-        handles.append(Patch(facecolor=_OTHER, edgecolor=MUTED, lw=0.5, label=f"{rest} more shapes"))
+        handles.append(Patch(facecolor=OTHER_SHAPE, edgecolor=MUTED, lw=0.5, label=f"{rest} more shapes"))
     return handles
 
 

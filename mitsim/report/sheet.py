@@ -17,10 +17,10 @@ from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 
 from characterisation.files.atomic_io import atomic_write
+from characterisation.plots.style import INK, MUTED, drawing
 from mitsim.report.first_screen import FirstScreen, Tone, of_choice, of_run
 from mitsim.report.placement_figure import draw_placement
 from mitsim.report.statement_section import exposed_in_words
-from mitsim.report.style import INK, MUTED, drawing
 from mitsim.running.numbers import listed, rounded, two_digits
 from mitsim.study.choice_document import CHOICE, ChoiceDocument, read_choice
 from mitsim.study.run_folder import Run, read_run

@@ -14,11 +14,13 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
+from characterisation.plots.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
+from mitsim.capture.picture import STRETCH_EXPONENT
 from mitsim.maps.data_sheet import DataSheet, Recovery
-from mitsim.report.cloud_figures import REASONS, STRETCH_EXPONENT
-from mitsim.report.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing, plain_log
+from mitsim.report.cloud_figures import REASONS
+from mitsim.report.style import plain_log
 from mitsim.running.numbers import two_digits
 from mitsim.sensor.preset_covariance import preset_covariance
 

@@ -9,23 +9,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from characterisation.plots.statements import GROUPS
 from characterisation.statements.losses import Loss, common_losses
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
 from mitsim.running.numbers import NONE, listed, percent, quantity, rounded, two_digits
 from mitsim.study.statement_file import ExposureEntry, StatedMeasurement, StatementDocument
-
-#: colour and name of a group of unknowns (Okabe and Ito, safe for colour-blind readers)
-GROUPS = {
-    "calibration": ("#0072b2", "calibration and drift"),
-    "finish": ("#e69f00", "finish of the part"),
-    "form": ("#f0e442", "form of the part"),
-    "light": ("#cc79a7", "room light, power, exposure"),
-    "temperature": ("#d55e00", "temperature"),
-    "unit": ("#999999", "fixed pattern of the unit"),
-    "pose": ("#009e73", "place and pose of the part"),
-    "noise": ("#56b4e9", "noise and speckle"),
-    "beyond_map": ("#000000", "effects outside the map"),
-}
 
 
 def statement_section(document: StatementDocument) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Define the style of all figures of a report, and embed figures in a page.
+"""Write figures as pictures, and embed them in a page.
 
 Figures use matplotlib's ``Figure`` directly, never pyplot. The page embeds them as inline SVG in which CSS variables
 replace the text colours, so that one picture serves light and dark themes.
@@ -9,69 +9,26 @@ from __future__ import annotations
 import html
 import io
 import re
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from matplotlib import rc_context
-from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from characterisation.files.atomic_io import atomic_write
+from characterisation.plots.style import BLUE, FIELD, INK, MUTED, PAPER, drawing
 
-#: colours that the page may replace: text, muted lines, areas without data, background, and points
-INK, MUTED, FIELD, PAPER, BLUE = "#1a1c20", "#6a7079", "#e3e5e9", "#fdfdfc", "#0072b2"
+#: colours that the page replaces by its own
 _VARIABLES = {INK: "--ink", MUTED: "--muted", FIELD: "--field", PAPER: "--paper", BLUE: "--blue"}
-
-#: for highlights (Okabe and Ito's palette, as is BLUE)
-VERMILION = "#d55e00"
-
-#: colour maps whose order colour-blind readers can see
-SEQUENTIAL, NOISE = "viridis", "cividis"
-
-#: ``text.parse_math`` is off, since names of features and measurements are text, not formulae
-STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9.0,
-    "axes.titlesize": 9.5,
-    "axes.titleweight": "normal",
-    "text.parse_math": False,
-    "text.color": INK,
-    "axes.edgecolor": MUTED,
-    "axes.labelcolor": INK,
-    "axes.titlecolor": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "xtick.labelsize": 8.0,
-    "ytick.labelsize": 8.0,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.7,
-    "axes.facecolor": "none",
-    "figure.facecolor": "none",
-    "legend.frameon": False,
-    "legend.fontsize": 8.0,
-    "image.interpolation": "none",
-    "svg.fonttype": "path",
-    "svg.hashsalt": "mitsim",
-    "axes.unicode_minus": True,
-}
 
 _DPI = 160
 
 #: of SVG in matplotlib, whatever is asked for
 _SVG_DPI = 72
-
-
-def drawing() -> AbstractContextManager[None]:
-    """Return the context in which every figure is drawn."""
-    return rc_context(STYLE)
 
 
 @dataclass(frozen=True)
@@ -122,20 +79,6 @@ def write_png(figure: Figure, path: Path, dpi: int = _DPI) -> Path:
     with atomic_write(path) as file:  # Pillow, given the file itself, would report "encoder error" on a full disk
         file.write_bytes(picture.getvalue())
     return path
-
-
-def disc(axes: Axes, radius: float, colour: str = FIELD) -> Circle:
-    """Turn axes into an empty disc about the origin, and return its circle for clipping."""
-    axes.set_aspect("equal")
-    axes.set_xlim(-1.08 * radius, 1.08 * radius)
-    axes.set_ylim(-1.08 * radius, 1.08 * radius)
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-    circle = Circle((0, 0), radius, facecolor=colour, edgecolor="none", zorder=0)
-    axes.add_patch(circle)
-    return circle
 
 
 def plain_log(axis: Axis, few: bool = False) -> None:

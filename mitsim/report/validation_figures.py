@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from characterisation.maps.validation import Pair, within_limits
-from mitsim.report.style import BLUE, VERMILION, drawing
+from characterisation.plots.style import BLUE, VERMILION, drawing
 from mitsim.running.numbers import finish_name
 
 #: residuals are drawn up to this many standard deviations

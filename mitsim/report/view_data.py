@@ -18,8 +18,8 @@ from markupsafe import Markup
 from matplotlib.colors import to_hex
 from numpy.typing import ArrayLike, NDArray
 
+from characterisation.plots.style import NOISE, SEQUENTIAL
 from mitsim.report.agreement import agreement
-from mitsim.report.style import NOISE, SEQUENTIAL
 from mitsim.report.view_clouds import (
     MOST_POINTS,
     MOST_POINTS_IN_ALL,

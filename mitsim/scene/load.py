@@ -14,10 +14,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from characterisation.files.errors import InputError, nearest
 from mitsim.scene import backend
@@ -25,6 +25,11 @@ from mitsim.scene.materials import Finish, loading, register
 from mitsim.scene.scene_errors import explain_error
 from mitsim.scene.surface.scatter import NOMINAL, Deviation
 from mitsim.scene.xml_check import checked_xml
+from mitsim.sensor.poses import as_pose
+from mitsim.sensor.transforms import Transform
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _registered = False
 
@@ -61,6 +66,40 @@ class Scene:
     def centre(self) -> NDArray[np.float64]:
         """Centre of the bounding box, (3,) [mm]."""
         return np.asarray(self.bounds.mean(axis=0))
+
+    def plot(self, ax: Axes | None = None, *, pose: Transform | ArrayLike | None = None) -> Axes:
+        """Draw the shapes in colours with their names, to scale.
+
+        Parameters
+        ----------
+        ax
+            Axes to draw into; by default those of a new figure.
+        pose
+            ``world_from_sensor``, from :func:`mitsim.look_at`, or a (4, 4) matrix [mm]: draw what a sensor sees from
+            there, along parallel rays. By default the view is from the front and above.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+            x is to the right and y up in the picture [mm].
+
+        Raises
+        ------
+        InputError
+            If the pose is not a rigid motion, or ``ax`` is something else.
+
+        Examples
+        --------
+        >>> import mitsim as ms
+        >>> scene = ms.load_scene("two_pillars.xml", ms.load_sensor("small.toml"))
+        >>> axes = scene.plot(pose=ms.look_at((0, -300, 400)))
+        >>> sorted(text.get_text() for text in axes.texts if text.get_text() in scene.names)
+        ['pillar1', 'pillar1_top', 'pillar2', 'pillar2_top', 'plane']
+        """
+        # imported here because a scene alone needs neither matplotlib nor rays
+        from mitsim.scene.picture import draw_scene
+
+        return draw_scene(self, ax, None if pose is None else as_pose(pose, "plot"))
 
     def only(self, *names: str) -> Scene:
         """Return a scene with these shapes alone, in the order given."""

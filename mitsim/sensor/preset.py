@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from characterisation.files.documents import Document, Name, missing_error, missing_keys, read_toml_table, validate
 from characterisation.files.errors import InputError, nearest
@@ -30,6 +30,7 @@ from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.opencv_calibration import with_calibration
 from mitsim.sensor.pattern import DotPattern, dot_frames
 from mitsim.sensor.projector import Projector
+from mitsim.sensor.projector_images import ImageFolder, ProjectorImages, checked_images, read_images
 from mitsim.sensor.published_noise import PublishedNoise
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.sensor_file import (
@@ -106,7 +107,7 @@ class Sensor:
     projector: Projector
     imager: Imager
     focus_mm: float | None
-    pattern: DotPattern | LightCode | AmplitudeModulation | None
+    pattern: DotPattern | LightCode | ProjectorImages | AmplitudeModulation | None
     exposure: ExposurePolicy
     ambient_image: bool
     matcher: MatcherSettings | None
@@ -217,9 +218,49 @@ class Sensor:
             raise missing_error(f"sensor {self.name}", ["pattern"])
         if isinstance(pattern, DotPattern):
             return dot_frames(pattern, optics.width, optics.height)
+        if isinstance(pattern, ProjectorImages):
+            return pattern.patterns()
         if isinstance(pattern, AmplitudeModulation):
             return np.empty((0, optics.height, optics.width), np.float32)
         return patterns(pattern, optics.width, optics.height)
+
+    def with_patterns(self, images: ArrayLike) -> Sensor:
+        """Return this sensor with images of one's own as its pattern: a new code, or another mask of dots.
+
+        Parameters
+        ----------
+        images
+            (P, H, W) in projector pixels, or (H, W) for one image: floats 0 to 1 relative to white, or uint8 or uint16
+            of which the largest number is white. A capture has an image of each camera for each of them.
+
+        Returns
+        -------
+        Sensor
+            A sensor of two cameras that match dots decodes its captures as before; several images need
+            ``matcher.method = "correlation"``. A structured-light sensor does not know the code: decode
+            ``capture.images`` yourself, and triangulate the coordinate with :func:`mitsim.triangulate`.
+
+        Raises
+        ------
+        InputError
+            If the images do not have the projector's size, a value is not between 0 and 1, or the sensor's technology
+            needs the pattern of its own.
+
+        Examples
+        --------
+        >>> import mitsim as ms
+        >>> import numpy as np
+        >>> sensor = ms.load_sensor("small.toml")
+        >>> height, width = sensor.rig.projector.height, sensor.rig.projector.width
+        >>> dots = np.random.default_rng(1).random((height, width)) < 0.3
+        >>> scene = ms.load_scene("matt_white.xml", sensor)
+        >>> capture = ms.render(scene, sensor.with_patterns(dots), ms.look_at((0, -300, 400)), samples=2, depth=1)
+        >>> capture.settings["pattern"]["count"]
+        1
+        """
+        optics = self.projector.optics
+        pattern = checked_images(images, optics.width, optics.height, f"patterns of {self.name}")
+        return replace(self, pattern=_allowed(pattern, self.technology, self.matcher, f"sensor {self.name}"))
 
     def electrons(self) -> float:
         """Return the photo-electrons per unit of radiance and second [e- / (s W mm^-2 sr^-1)]."""
@@ -352,7 +393,7 @@ def _assemble(path: Path, table: SensorFile, missing: frozenset[str], notes: tup
         projector=projector,
         imager=imager,
         focus_mm=written.focus_mm,
-        pattern=table.pattern,
+        pattern=_pattern(path, table, projector),
         exposure=_exposure(path, table, projector, imager),
         ambient_image=table.ambient_image,
         matcher=table.matcher,
@@ -366,6 +407,29 @@ def _assemble(path: Path, table: SensorFile, missing: frozenset[str], notes: tup
         missing=missing,
         notes=notes,
     )
+
+
+def _allowed(pattern: ProjectorImages, technology: str, matcher: MatcherSettings | None, where: str) -> ProjectorImages:
+    """Return own images that a technology can project; else raise an error."""
+    if technology not in ("active_stereo", "structured_light"):
+        raise InputError(where, "pattern", f"images, for {technology}", "images for active_stereo or structured_light")
+    if pattern.count > 1 and matcher is not None and matcher.method != "correlation":
+        hint = 'set method = "correlation" in [matcher], which matches all images at once'
+        raise InputError(where, "pattern", f"{pattern.count} images, for matcher.method {matcher.method}", "one", hint)
+    return pattern
+
+
+def _pattern(
+    path: Path, table: SensorFile, projector: Projector
+) -> DotPattern | LightCode | ProjectorImages | AmplitudeModulation | None:
+    """Return the pattern of a sensor file; the folder of own images is relative to the file."""
+    pattern, optics = table.pattern, projector.optics
+    if not isinstance(pattern, ImageFolder):
+        return pattern
+    if not optics.width:  # a rig of two cameras, which match images of any projector
+        return None
+    images = read_images(path.parent / pattern.folder, optics.width, optics.height)
+    return _allowed(images, table.technology, table.matcher, str(path))
 
 
 def _unknowns(path: Path, table: SensorFile) -> UnknownsTable:

@@ -29,6 +29,7 @@ from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.opencv_calibration import CalibrationTable
 from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
+from mitsim.sensor.projector_images import ImageFolder
 from mitsim.sensor.published_noise import PublishedNoise
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import UnknownsTable
@@ -199,6 +200,7 @@ class SensorFile(Document):
             | GrayCode
             | GrayCodePhaseShift
             | ImageSequence
+            | ImageFolder
             | AmplitudeModulation,
             Field(discriminator="kind"),
         ]
@@ -241,7 +243,9 @@ class SensorFile(Document):
 def _check_code(file: SensorFile, decoder: DecoderSettings) -> None:
     """Raise an error if a structured-light sensor lacks what its decoder needs."""
     if isinstance(file.pattern, DotPattern):
-        raise ValueError("structured_light needs a pattern of kind phase_shift, gray_code, both or image_sequence")
+        raise ValueError(
+            "structured_light needs a pattern of kind phase_shift, gray_code, both, image_sequence or images"
+        )
     if decoder.triangulate == "cameras" and len(file.cameras) != 2:
         raise ValueError('decoder.triangulate = "cameras" needs two cameras')
     unknown = sorted(set(file.images or {}) - set(file.cameras))
@@ -269,12 +273,15 @@ def _check_dots(file: SensorFile) -> None:
     if len(file.cameras) != cameras or file.matcher is None or file.decoder is not None:
         number = {1: "one camera", 2: "two cameras"}[cameras]
         raise ValueError(f"{file.technology} needs {number} and [matcher], and has no [decoder]")
-    if file.pattern is not None and not isinstance(file.pattern, DotPattern):
-        raise ValueError(
-            f"{file.technology} needs a pattern of kind random_dots or diffraction_spots, not {file.pattern.kind}"
-        )
-    shifted = file.pattern is not None and file.pattern.frames > 1
-    if shifted and (file.matcher.method != "correlation" or file.technology != "active_stereo"):
+    own = isinstance(file.pattern, ImageFolder) and file.technology == "active_stereo"
+    if file.pattern is not None and not isinstance(file.pattern, DotPattern) and not own:
+        kinds = "random_dots, diffraction_spots or images" if cameras == 2 else "random_dots or diffraction_spots"
+        raise ValueError(f"{file.technology} needs a pattern of kind {kinds}, not {file.pattern.kind}")
+    if (
+        isinstance(file.pattern, DotPattern)
+        and file.pattern.frames > 1
+        and (file.matcher.method != "correlation" or file.technology != "active_stereo")
+    ):
         raise ValueError('pattern.shifts_px needs technology "active_stereo" and matcher.method "correlation"')
     if (file.matcher.reference_mm is None) == (file.technology == "reference_stereo"):
         raise ValueError("matcher.reference_mm is for reference_stereo, which needs it")

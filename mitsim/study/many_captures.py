@@ -25,7 +25,7 @@ from mitsim.capture.folder import write_packed
 from mitsim.capture.packed_files import packed
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.capture.simulated.truth import encode_exr, true_image
+from mitsim.capture.simulated.truth import encode_exr, true_images
 from mitsim.maps.campaign.orders import prepared_sensor
 from mitsim.maps.campaign.plan import sensor_checksum
 from mitsim.running.progress import track
@@ -232,20 +232,10 @@ def _taken(job: Job, simulated: SimulatedSensor) -> dict[str, bytes]:
     }
     truth: dict[str, bytes] = {}
     if job.truth:
-        truth = {
-            name: encode_exr(
-                true_image(
-                    simulated,
-                    scene,
-                    job.world_from_sensor,
-                    name,
-                    samples=job.samples,
-                    depth=max(job.depth, 3),
-                    seed=job.seed,
-                )
-            )
-            for name in job.sensor.rig.cameras
-        }
+        every = true_images(
+            simulated, scene, job.world_from_sensor, samples=job.samples, depth=job.depth, seed=job.seed
+        )
+        truth = {name: encode_exr(one) for name, one in every.items()}
     return packed(capture, job.place, truth=truth)
 
 

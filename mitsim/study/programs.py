@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 import xarray as xr
 
 from characterisation.files.errors import InputError
-from characterisation.statements.statement import Statement
+from characterisation.statements.statement import Statements
 from mitsim.study import StatementTable, Study
 from mitsim.study.session import Session
 
@@ -69,7 +69,7 @@ def score(study: Study) -> xr.Dataset:
 
 def statement(
     study: Study, view: int, *, trials: int | None = None, pairs: int | None = None, folder: str | Path | None = None
-) -> list[Statement]:
+) -> Statements:
     """State the uncertainty of every measurement from one view, by virtual measurements of it.
 
     Each trial draws calibration, finish, room light, temperature, pose and noise anew, renders, decodes and measures
@@ -94,7 +94,8 @@ def statement(
     Returns
     -------
     list of Statement
-        One for each measurement: ``bias``, ``standard_uncertainty`` and the 95 % ``interval`` of the error, in
+        One for each measurement, in a list whose ``plot()`` draws them: ``bias``, ``standard_uncertainty`` and the 95 %
+        ``interval`` of the error, in
         ``unit`` (mm or deg); ``settled``, whether one significant digit of u is certain; ``budget`` by group of
         unknowns, each a :class:`BudgetLine`; ``verdict``, ``no tolerance`` if the task has none.
 
@@ -120,7 +121,7 @@ def statement(
     with nullcontext(folder) if folder is not None else TemporaryDirectory() as place:
         session = Session(study, place)
         session.claim(f"budget of view {view}")
-        return session.state(chosen, table).statements
+        return Statements(session.state(chosen, table).statements)
 
 
 def _checked(name: str, value: int, least: int) -> int:

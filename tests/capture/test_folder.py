@@ -24,8 +24,8 @@ from mitsim.capture.capture_document import capture_schema, schema_text
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.npy import decode_npy, encode_npy
-from mitsim.capture.png import decode_png, encode_png
 from mitsim.sensor.camera import Camera, Rectification, Rig
+from mitsim.sensor.png import decode_png, encode_png
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT = 24, 16

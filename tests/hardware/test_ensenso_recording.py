@@ -13,8 +13,8 @@ from mitsim.capture.calibration import calibration_table
 from mitsim.capture.devices.device_error import DeviceError
 from mitsim.capture.devices.ensenso import EnsensoSettings, open_ensenso
 from mitsim.capture.devices.maker_captures import ensenso_capture
-from mitsim.capture.png import decode_png
 from mitsim.capture.recordings.ensenso import read_ensenso
+from mitsim.sensor.png import decode_png
 
 nxlib = pytest.importorskip("nxlib", reason="pip install ensenso-nxlib: live Ensenso cameras")
 

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -47,6 +48,14 @@ def prepared(tmp_path_factory) -> Path:
     (folder / "study.toml").write_text(study.replace('"ensenso-n10"', f'"{sensor}"'), encoding="utf-8")
     capture_into(folder)
     return folder
+
+
+@pytest.fixture(autouse=True)
+def _closed_figures():
+    """Close the figures that a test has opened: pyplot keeps them, and warns when they are many."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import pytest
 
 import characterisation
 import mitsim
+from characterisation.statements.statement import Statements
 
 
 def public() -> dict[str, object]:
@@ -16,6 +17,9 @@ def public() -> dict[str, object]:
         for name in package.__all__:
             if inspect.isfunction(one := getattr(package, name)):
                 out[f"{package.__name__}.{name}"] = one
+    for drawn in (mitsim.Capture, mitsim.Scene, mitsim.PointCloud, mitsim.PerformanceMap, mitsim.Statement):
+        out[f"mitsim.{drawn.__name__}.plot"] = drawn.plot
+    out["Statements.plot"] = Statements.plot
     out["characterisation.PointCloud.to_open3d"] = characterisation.PointCloud.to_open3d
     return out
 

@@ -167,7 +167,7 @@ def _decode_foreign(path):
 
 
 def _image(folder):
-    from mitsim.capture.png import encode_png
+    from mitsim.sensor.png import encode_png
 
     path = folder / "image.png"
     path.write_bytes(encode_png(np.random.default_rng(1).integers(0, 255, (40, 60)).astype(np.uint8)))
@@ -178,6 +178,12 @@ def _read_image(path):
     from mitsim.capture.grey_image import read_grey
 
     read_grey(path)
+
+
+def _read_projector_image(path):
+    from mitsim.sensor.projector_images import read_images
+
+    read_images(path.parent, 60, 40)
 
 
 def _opencv(suffix):
@@ -522,6 +528,7 @@ READERS: dict[str, Reader] = {
     "cloud.ply": Reader(_cloud, _read_cloud),
     "foreign.ply": Reader(_foreign, _decode_foreign),
     "image.png": Reader(_image, _read_image),
+    "image.png of a projector": Reader(_image, _read_projector_image),
     "calibration.yml": Reader(_opencv(".yml"), _read_calibration),
     "calibration.xml": Reader(_opencv(".xml"), _read_calibration),
     "calibration.json": Reader(_opencv(".json"), _read_calibration),

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from characterisation.plots.style import BLUE, INK, MUTED, VERMILION, drawing
 from characterisation.scores.screening import (
     Screened,
     attainable_recall,
@@ -25,7 +26,7 @@ from characterisation.scores.screening import (
     recall,
     reliability,
 )
-from mitsim.report.style import BLUE, INK, MUTED, VERMILION, drawing, write_png
+from mitsim.report.style import write_png
 from tests.proofs.part_cases import PartCase
 from tests.proofs.screening_run import ALONE, COSINE, POINTS, PREDICTED, TALK, JudgedScreening
 from tests.proofs.tables import markdown, number, write_csv

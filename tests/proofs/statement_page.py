@@ -13,8 +13,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from characterisation.files.atomic_io import atomic_write
+from characterisation.plots.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing
 from characterisation.statements.judgement import Regret, Share, share
-from mitsim.report.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing, write_png
+from mitsim.report.style import write_png
 from tests.proofs.judged_statements import (
     PREDICTED,
     RACE,

@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
-from mitsim.capture.png import encode_png
 from mitsim.capture.recordings.ensenso import ensenso_originals, read_ensenso
 from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of
 from mitsim.decode.cloud import decoder_settings
+from mitsim.sensor.png import encode_png
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, BASELINE = 40, 24, 101.0

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mitsim.capture.png import decode_png
+from mitsim.sensor.png import decode_png
 
 from .chromium import BROWSER
 from .conftest import CHECKED

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from mitsim.report.placement_figure import depth_buffer, face_verdicts, placement_figure, spread
+from characterisation.plots.labels import spread
+from mitsim.report.placement_figure import depth_buffer, face_verdicts, placement_figure
 from mitsim.study.scene_geometry import read_scene_geometry
 
 from .conftest import write_scene_geometry

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
+import mitsim as ms
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.capture.simulated.truth import encode_exr, read_exr, true_image
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
+from mitsim.scene.ray_casting.raycast import PixelRays, cast
+from mitsim.sensor.sensor_file import MisalignmentTable
 from mitsim.sensor.transforms import look_at
 
 POSE = look_at([40, -480, 300], [0, 0, 20], [0, 0, 1], 10)
@@ -98,3 +103,46 @@ def test_the_image_keeps_every_channel(ball, tmp_path):
     assert np.array_equal(channels["lit"], ball.lit)
     assert np.array_equal(channels["indirect"], ball.indirect, equal_nan=True)
     assert len(channels) == 10
+
+
+def floor_scene(half_size):
+    to_world = mi.ScalarTransform4f().scale([half_size, half_size, 1])
+    return scene_from_dict({"floor": {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "matt_white"}}}, 850)
+
+
+def test_truth_is_of_the_camera_as_it_is_and_not_as_it_was_calibrated(n10):
+    """A camera turned by 5 mrad about its x axis sees a floor elsewhere than its calibration says."""
+    floor = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().scale([300, 300, 1]),
+        "bsdf": {"type": "matt_white"},
+    }
+    scene = scene_from_dict({"floor": floor}, 850)
+    turned = replace(n10, misalignment=MisalignmentTable(row_mrad=5.0))
+    seen = true_image(SimulatedSensor(turned), scene, POSE, "right", samples=1)
+    eye = turned.true_rig.cameras["right"]
+    directions = POSE.directions(eye.pixel_directions().reshape(-1, 3)).reshape(*seen.distance.shape, 3)
+    distance = -POSE.points(eye.centre)[2] / directions[..., 2]
+    known = np.isfinite(seen.distance)
+    assert known.sum() > 1000
+    np.testing.assert_allclose(seen.distance[known], distance[known], atol=0.01)
+    calibrated = n10.rig.cameras["right"].pixel_directions()
+    assert np.abs(calibrated - eye.pixel_directions()).max() > 4e-3  # 2 mm of distance here
+
+
+def test_render_gives_the_truth_of_every_camera_beside_the_same_capture(n10):
+    floor = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().scale([150, 150, 1]),
+        "bsdf": {"type": "matt_white"},
+    }
+    scene = scene_from_dict({"floor": floor}, 850)
+    alone = ms.render(scene, n10, POSE, samples=1, depth=1)
+    capture, truth = ms.render(scene, n10, POSE, samples=1, depth=1, truth=True)
+    assert list(truth) == list(capture.images)
+    for name, seen in truth.items():
+        np.testing.assert_array_equal(capture.images[name], alone.images[name])
+        rays = PixelRays.of_camera(n10.rig.cameras[name])
+        np.testing.assert_array_equal(seen.distance, cast(scene, rays, POSE, np.zeros((1, 3))).distance)
+        assert seen.feature_names == ("floor",)
+        np.testing.assert_array_equal(seen.feature == 0, np.isfinite(seen.depth))

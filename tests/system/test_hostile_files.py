@@ -17,13 +17,13 @@ from characterisation.files.errors import InputError
 from characterisation.maps.shipped import map_path
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.grey_image import read_grey
-from mitsim.capture.recordings.image_folder import counted
 from mitsim.capture.recordings.ply import decode_ply
 from mitsim.report.choice_page import write_choice_page
 from mitsim.scene.authoring.read_mesh import read_mesh
 from mitsim.scene.surface.measured import read_height_map, read_profile
 from mitsim.scene.xml_check import checked_xml
 from mitsim.sensor.calibration_tree import read_tree
+from mitsim.sensor.projector_images import counted
 from mitsim.study.scene_geometry import read_scene_geometry
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial

@@ -33,10 +33,10 @@ from mitsim.capture.devices.depthai_camera import DepthaiCamera, DepthaiShot, op
 from mitsim.capture.devices.depthai_settings import DepthaiSettings
 from mitsim.capture.devices.device_error import DeviceError
 from mitsim.capture.devices.ensenso import EnsensoCamera, EnsensoSettings, EnsensoShot, open_ensenso
-from mitsim.capture.png import encode_png
 from mitsim.capture.recordings.depthai_calibration import read_depthai_calibration
 from mitsim.capture.recordings.ensenso import read_ensenso
 from mitsim.sensor.camera import Rectification, Rig
+from mitsim.sensor.png import encode_png
 
 #: largest median difference of points and disparity in the same frame, relative to the distance
 AGREEMENT = 1e-4

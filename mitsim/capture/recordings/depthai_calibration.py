@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.documents import shown
 from characterisation.files.errors import InputError
-from mitsim.capture.png import LONGEST_SIDE_PX
 from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.png import LONGEST_SIDE_PX
 from mitsim.sensor.transforms import Transform
 
 #: values of DepthAI's cameraType

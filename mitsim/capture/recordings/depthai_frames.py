@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
-from mitsim.capture.png import LONGEST_SIDE_PX
 from mitsim.capture.recordings.mcap_messages import mcap_messages
+from mitsim.sensor.png import LONGEST_SIDE_PX
 
 _IMG_FRAME = "dai.proto.img_frame.ImgFrame"
 

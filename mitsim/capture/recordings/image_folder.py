@@ -9,7 +9,6 @@ the images; an ``image_sequence`` lists them in any order.
 
 from __future__ import annotations
 
-import re
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import LightCode, roles
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.projector_images import ProjectorImages, counted, described
 
 
 def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNELS["green"]) -> Capture:
@@ -43,12 +43,13 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
     folder, rig = Path(folder), sensor.rig
     code, decoder = sensor.pattern, sensor.settings
     projector_size = (sensor.projector.optics.width, sensor.projector.optics.height)
-    if not isinstance(code, LightCode) or not isinstance(decoder, DecoderSettings):
+    if not isinstance(code, LightCode | ProjectorImages) or not isinstance(decoder, DecoderSettings):
         hint = "recordings of an Ensenso are imported without --sensor"
         raise InputError(f"sensor {sensor.name}", "technology", sensor.technology, "structured_light", hint)
     if not folder.is_dir():
         raise InputError(folder, "", "no such folder", "a folder of images")
-    count = len(roles(code, *projector_size)) + sensor.ambient_image
+    shown = code.count if isinstance(code, ProjectorImages) else len(roles(code, *projector_size))
+    count = shown + sensor.ambient_image
     both = len(rig.cameras) == 2 and (decoder.triangulate == "cameras" or len(sensor.images or {}) == 2)
     used = list(rig.cameras) if both else list(rig.cameras)[:1]
     images, names, colour = {}, {}, False
@@ -60,14 +61,16 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
                 f"images of {name}",
                 f"{len(found)}{_ends(found)}",
                 f"{count}, as the pattern of {sensor.name}",
-                advice(found, name, code, projector_size, count) if found else _content(folder, used),
+                advice(found, name, code, projector_size, count)
+                if found and isinstance(code, LightCode)
+                else _content(folder, used),
             )
         images[name] = _stack(found, rig.cameras[name], sensor.bits, channel)
         colour |= is_colour(found[0])
         names[name] = [path.relative_to(folder).as_posix() for path in found]
     decoding = Decoding(
         decoder=decoder,
-        pattern=code,
+        pattern=described(code),
         projector_size_px=projector_size if rig.projector is None else None,
         exposure_s=None if sensor.exposure.bracket else sensor.exposure.base_s,
         black_level_dn=sensor.imager.black_level,
@@ -114,12 +117,6 @@ def bits_of(stack: Image) -> int:
     if stack.dtype == np.uint8:
         return 8
     return next(bits for bits in (10, 12, 14, 16) if stack.max() < 2**bits)
-
-
-def counted(path: Path) -> tuple[Any, ...]:
-    """Return a key that sorts names with numbers by value."""
-    parts = re.split(r"(\d+)", path.as_posix().lower())
-    return tuple((int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts)
 
 
 def _files(folder: Path, sensor: Sensor, camera: str, cameras: int) -> list[Path]:

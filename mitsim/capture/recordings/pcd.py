@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from characterisation.files.checked_files import LARGEST_FILE
 from characterisation.files.errors import InputError
-from mitsim.capture.png import LONGEST_SIDE_PX
 from mitsim.capture.recordings.lzf import decode_lzf
 from mitsim.capture.recordings.number_text import number_words
+from mitsim.sensor.png import LONGEST_SIDE_PX
 
 _KINDS = ("ascii", "binary", "binary_compressed")
 _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")

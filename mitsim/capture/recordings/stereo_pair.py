@@ -16,9 +16,10 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import CHANNELS, SUFFIXES, channel_name, is_colour, read_grey
 from mitsim.capture.recordings.calibration_file import camera_of, read_calibration
-from mitsim.capture.recordings.image_folder import counted, size_of_images
+from mitsim.capture.recordings.image_folder import size_of_images
 from mitsim.capture.recordings.recording_files import frame_of
 from mitsim.sensor.camera import Rig
+from mitsim.sensor.projector_images import counted
 
 
 def read_stereo_pair(

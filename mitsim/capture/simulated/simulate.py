@@ -46,6 +46,7 @@ from mitsim.sensor.image_formation import converter
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.projector_images import described
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.speckle import SpeckleField
 from mitsim.sensor.transforms import Transform
@@ -302,7 +303,7 @@ class SimulatedSensor:
         decoding = Decoding(
             decoder=sensor.settings,
             imager=sensor.imager,
-            pattern=sensor.pattern,
+            pattern=described(sensor.pattern),
             exposure_s=exposures[0] if len(exposures) == 1 else tuple(exposures),
             black_level_dn=adc.black_level,
             gamma=adc.gamma,

@@ -73,7 +73,8 @@ def true_image(
 
     ``samples``, ``depth`` and ``seed`` apply to the share of indirect light.
     """
-    eye, projector = simulated.sensor.rig.cameras[camera], simulated.sensor.projector
+    # the camera as it is, not as its calibration says: these are the rays that the image shows
+    eye, projector = simulated.sensor.true_rig.cameras[camera], simulated.sensor.projector
     directions = eye.pixel_directions()
     surfaces = cast(scene, PixelRays(eye.centre, directions), world_from_sensor, projector.optics.centre[None])
     points = eye.centre + directions * surfaces.distance[..., None].astype(float)
@@ -111,6 +112,19 @@ def true_image(
         lit=surfaces.seen[0] & inside,
         indirect=np.clip(indirect, 0.0, 1.0).astype(np.float32),
     )
+
+
+def true_images(
+    simulated: SimulatedSensor, scene: Scene, world_from_sensor: Transform, *, samples: int, depth: int, seed: int
+) -> dict[str, Truth]:
+    """Return the ground truth of every camera by name; see :func:`true_image`.
+
+    The share of indirect light follows paths of at least three surfaces, also where a capture has direct light alone.
+    """
+    return {
+        name: true_image(simulated, scene, world_from_sensor, name, samples=samples, depth=max(depth, 3), seed=seed)
+        for name in simulated.sensor.rig.cameras
+    }
 
 
 def encode_exr(truth: Truth) -> bytes:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
-from characterisation.region_of_interest import checked_roi
+from characterisation.region_of_interest import Roi, checked_roi
 from mitsim.decode.blocks import in_blocks
 from mitsim.decode.grey_levels import MeasuredNoise
 from mitsim.decode.grid_cloud import cloud_on_grid
@@ -159,25 +159,61 @@ def decode_structured_light(
             full_scale=context.full_scale,
             imager=context.imager,
         )
-    coordinate = coordinates[geometry.axis]
-    points, sigma, in_range = _points(coordinate, geometry, settings, region)
-    status = coordinate.status.copy()
-    decoded = status == Status.VALID
-    status[decoded & ~in_range] = Status.OUT_OF_RANGE
-    status[(status == Status.LOW_MODULATION) & ~geometry.seen[region]] = Status.NO_SURFACE
+    points, sigma, status = _triangulated(
+        coordinates[geometry.axis], geometry, (settings.near_mm, settings.far_mm), region
+    )
     for axis, second in coordinates.items():
         if axis != geometry.axis:
             _reject_contradictions(points, status, second, projector, axis, settings.epipolar_px)
+    return _cloud(points, sigma, status, roi, geometry, context)
+
+
+def triangulate_coordinate(
+    coordinate: ProjectorCoordinate, geometry: StructuredLightGeometry, context: ImageContext
+) -> PointCloud:
+    """Return the cloud of a whole camera from the projector coordinate of each pixel, whatever code gave it.
+
+    Status and ``sigma`` are those of :func:`decode_structured_light`; the range is that of the geometry. ``context``
+    names sensor and source.
+    """
+    whole = Roi.whole(geometry.camera.width, geometry.camera.height)
+    found = _triangulated(coordinate, geometry, (geometry.near, geometry.far), whole.slices)
+    return _cloud(*found, whole, geometry, context)
+
+
+def _cloud(
+    points: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    status: NDArray[np.uint8],
+    roi: Roi,
+    geometry: StructuredLightGeometry,
+    context: ImageContext,
+) -> PointCloud:
+    """Return the cloud of a region; its points and sigma become NaN where the status is not valid."""
     missing = status != Status.VALID
     points[missing], sigma[missing] = np.nan, np.nan
     cloud_sigma = sigma if np.isfinite(sigma).any() else None
     return cloud_on_grid(points, status, cloud_sigma, roi, geometry, context.sensor, context.source)
 
 
+def _triangulated(
+    coordinate: ProjectorCoordinate,
+    geometry: StructuredLightGeometry,
+    range_mm: tuple[float, float],
+    region: tuple[slice, slice],
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+    """Return points (h, w, 3), noise along the ray (h, w) [mm] and status (h, w) of a region."""
+    points, sigma, in_range = _points(coordinate, geometry, range_mm, region)
+    status = coordinate.status.copy()
+    status[(status == Status.VALID) & ~in_range] = Status.OUT_OF_RANGE
+    status[(status == Status.LOW_MODULATION) & ~geometry.seen[region]] = Status.NO_SURFACE
+    return points, sigma, status
+
+
 def _points(
     coordinate: ProjectorCoordinate,
     geometry: StructuredLightGeometry,
-    settings: DecoderSettings,
+    range_mm: tuple[float, float],
     region: tuple[slice, slice],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """Return points (h, w, 3) and noise along the ray (h, w) [mm] of a region, and whether they are in range (h, w)."""
@@ -187,7 +223,7 @@ def _points(
     value, value_sigma = coordinate.value.ravel(), coordinate.sigma.ravel()
     nodes, differences = (each[:, *region].reshape(count, -1) for each in (geometry.nodes, geometry.differences))
     rays, seen = geometry.ray[region].reshape(-1, 3), geometry.seen[region].ravel()
-    nearest_w, farthest_w = 1 / settings.near_mm, 1 / settings.far_mm
+    nearest_w, farthest_w = 1 / range_mm[0], 1 / range_mm[1]
 
     @np.errstate(invalid="ignore", divide="ignore")
     def triangulate_blocks(blocks: list[slice]) -> None:

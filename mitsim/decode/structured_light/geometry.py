@@ -86,7 +86,7 @@ class StructuredLightGeometry:
 
 
 def structured_light_geometry(
-    rig: Rig, camera_name: str, code: LightCode, near_mm: float, far_mm: float
+    rig: Rig, camera_name: str, code: LightCode | Axis, near_mm: float, far_mm: float
 ) -> StructuredLightGeometry:
     """Prepare one camera of a rig and its projector for a code.
 
@@ -98,7 +98,7 @@ def structured_light_geometry(
     rig, camera_name
         The rig, and the name of the camera in it.
     code
-        The code, which determines the axis.
+        The code, which determines the axis, or the axis itself.
     near_mm, far_mm
         Range of depths along the camera's axis [mm].
 
@@ -115,7 +115,7 @@ def structured_light_geometry(
         raise InputError("rig", "projector", "none", "a calibrated projector, for structured light of one camera")
     camera, projector = rig.cameras[camera_name], rig.projector
     offset = projector.sensor_from_camera.inverse().directions(camera.centre - projector.centre)
-    code_axes = axes(code)
+    code_axes = (code,) if isinstance(code, str) else axes(code)
     axis = code_axes[0] if len(code_axes) == 1 or abs(offset[0]) >= abs(offset[1]) else code_axes[1]
     return _prepared(camera_name, camera, projector, axis, near_mm, far_mm)
 

@@ -37,7 +37,6 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
-from mitsim.capture.png import encode_png
 from mitsim.decode.cloud import capture_cloud, capture_geometry, decoder_settings
 from mitsim.report.export.run_scene import sensor_from_grid
 from mitsim.running.progress import track
@@ -45,6 +44,7 @@ from mitsim.running.version import __version__
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.ray_casting.raycast import PixelRays, cast, shapes_met
 from mitsim.scene.ray_casting.triangles import triangles
+from mitsim.sensor.png import encode_png
 from mitsim.sensor.transforms import Transform
 
 #: wavelength for loading scenes; only their geometry is used

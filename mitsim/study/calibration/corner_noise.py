@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsim.decode.cloud import unknown_code
 from mitsim.decode.grey_levels import grey_level_variance
 from mitsim.decode.matching.reference_matching import reference_geometry
 from mitsim.decode.structured_light.phase_shift import fringe_sigma
@@ -30,6 +31,7 @@ from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.projector_images import ProjectorImages
 from mitsim.sensor.sensor_file import AutomaticExposure
 
 Floats = NDArray[np.float64]
@@ -130,6 +132,8 @@ def coordinate_noise(sensor: Sensor, distance_mm: float, square_px: float, seed:
     level = board_level(sensor, distance_mm)
     if isinstance(pattern, DotPattern):
         return float(_matching_noise(sensor, level) / np.sqrt(max(white / _block(sensor) ** 2, 1.0)))
+    if isinstance(pattern, ProjectorImages):
+        raise unknown_code(f"sensor {sensor.name}", pattern.count)
     assert isinstance(pattern, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence)
     optics = sensor.projector.optics
     every = roles(pattern, optics.width, optics.height)

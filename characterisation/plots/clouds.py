@@ -1,0 +1,117 @@
+"""Draw an organised cloud as an image: a quantity where a pixel has a point, the reason where it has none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.patches import Patch
+from matplotlib.transforms import ScaledTranslation
+from numpy.typing import NDArray
+
+from characterisation.plots.style import DIVERGING, FIELD, SEQUENTIAL, figure_of, side_bar
+
+#: meaning and colour of each status, by name: Okabe and Ito's palette, and greys of different lightness
+REASONS: dict[str, tuple[str, str]] = {
+    "VALID": ("a point", "#009e73"),
+    "NO_SURFACE": ("no surface visible", FIELD),
+    "OUT_OF_RANGE": ("out of range, or outside the map", "#56b4e9"),
+    "SATURATED": ("saturated", "#f0e442"),
+    "LOW_MODULATION": ("low modulation", "#5b6b8c"),
+    "SHADOWED": ("in the projector's shadow", "#2b2b2b"),
+    "HIDDEN": ("hidden from the second camera, or rejected by it", "#d55e00"),
+    "AMBIGUOUS": ("ambiguous match", "#cc79a7"),
+    "PHASE_INCONSISTENT": ("phase inconsistent", "#9467bd"),
+    "INTERREFLECTION": ("interreflection", "#8c564b"),
+    "DROPPED": ("lost at random, 1 − F", "#e69f00"),
+}
+
+#: share of the points beyond each end of the colour scale [%], since false matches can lie at any distance; with a
+#: predicted cloud beside it, and for a cloud alone
+_BEYOND_PREDICTED, _BEYOND = 0.5, 2.0
+
+#: distance of the legend from the picture: its ticks and label lie between [in]
+_UNDER_IN = 0.42
+
+#: end of the colour scale of residuals, in standard deviations by the median (1.4826 MAD of a normal distribution)
+_RESIDUAL_SIGMAS = 3.0
+
+
+def depth_limits(values: NDArray[np.floating], beyond: float = _BEYOND_PREDICTED) -> tuple[float, float]:
+    """Return the ends of a colour scale of depths or distances [mm]; ``beyond`` per cent lie outside each end."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return 0.0, 1.0
+    near, far = (float(np.percentile(known, p)) for p in (beyond, 100 - beyond))
+    return (near, far) if far > near else (near - 0.5, far + 0.5)
+
+
+def residual_limit(values: NDArray[np.floating]) -> float:
+    """Return the end of a symmetric colour scale of residuals [mm]."""
+    known = np.abs(values[np.isfinite(values)])
+    limit = _RESIDUAL_SIGMAS * 1.4826 * float(np.median(known)) if len(known) else 0.0
+    return limit if limit > 0 else 1.0
+
+
+def draw_cloud(
+    axes: Axes,
+    values: NDArray[np.floating],
+    status: NDArray[np.integer],
+    names: Mapping[int, str],
+    label: str,
+    residual: bool = False,
+) -> None:
+    """Draw a quantity of the pixels (H, W) with a scale, and the status of all other pixels with a legend.
+
+    Parameters
+    ----------
+    axes
+        To draw into; x is the column and y the row of a pixel.
+    values
+        (H, W) [mm], NaN where a pixel has no point.
+    status
+        (H, W) number of each pixel's status.
+    names
+        Name of each status by its number, as in :data:`REASONS`.
+    label
+        Of the colour scale.
+    residual
+        Whether the values are signed: the scale is then symmetric about 0.
+    """
+    missing = ~np.isfinite(values)
+    numbers = sorted(names)
+    colours = ListedColormap([REASONS[names[number]][1] for number in numbers])
+    steps = BoundaryNorm(np.append(np.array(numbers) - 0.5, numbers[-1] + 0.5), len(numbers))
+    axes.imshow(np.ma.masked_array(status, ~missing), cmap=colours, norm=steps, interpolation="nearest")
+    if residual:
+        limit = residual_limit(values)
+        low, high, scale = -limit, limit, DIVERGING
+    else:
+        low, high = depth_limits(values, _BEYOND)
+        scale = SEQUENTIAL
+    shown = axes.imshow(np.ma.masked_invalid(values), cmap=scale, vmin=low, vmax=high, interpolation="nearest")
+    axes.set(xlabel="column [px]", ylabel="row [px]")
+    side_bar(axes, shown, label)
+    counts = np.bincount(status[missing].ravel(), minlength=numbers[-1] + 1)
+    order = [number for number in np.argsort(-counts, kind="stable").tolist() if counts[number]]
+    legend = [
+        Patch(
+            facecolor=REASONS[names[number]][1],
+            label=f"{REASONS[names[number]][0]}: {100 * counts[number] / status.size:.2g} %",
+        )
+        for number in order
+    ]
+    if legend:
+        axes.legend(
+            handles=legend,
+            title="pixels without a point",
+            title_fontsize=8.0,
+            loc="upper left",
+            bbox_to_anchor=(0.0, 0.0),
+            bbox_transform=axes.transAxes + ScaledTranslation(0, -_UNDER_IN, figure_of(axes).dpi_scale_trans),
+            borderaxespad=0.0,
+            handlelength=1.1,
+            alignment="left",
+        )

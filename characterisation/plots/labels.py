@@ -1,0 +1,90 @@
+"""Place names and scales on pictures of parts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from characterisation.plots.style import INK, MUTED
+
+Floats = NDArray[np.float64]
+
+#: rows of labels in the height of a picture
+_ROWS = 7
+
+#: distance of the columns of labels from the picture, and the space for them, as a share of its longer side
+_ASIDE, _ROOM = 0.09, 0.34
+
+
+def label_columns(
+    axes: Axes, places: Mapping[str, Floats], low: Floats, high: Floats, most: int = 9, longest: int = 16
+) -> None:
+    """Draw names in columns left and right of a picture, with lines to their places that do not cross.
+
+    Parameters
+    ----------
+    axes
+        To draw into. Its limits are set to hold the picture and the names.
+    places
+        Place (2,) of each name, the most important names first.
+    low, high
+        Corners (2,) of the picture.
+    most
+        Largest number of names on a side; the least important others are left out.
+    longest
+        Largest number of characters of a name; longer ones are cut.
+    """
+    span = high - low
+    step = float(max(span[1], 0.62 * span[0])) / _ROWS
+    aside = _ASIDE * float(span.max())
+    from_left = sorted(places, key=lambda name: places[name][0])
+    middle = float(low[0] + high[0]) / 2
+    first = sum(bool(places[name][0] < middle) for name in from_left)
+    if max(first, len(from_left) - first) > most:
+        first = len(from_left) // 2
+    left, right = from_left[:first], from_left[first:]
+    every = [float(low[1]), float(high[1])]
+    for names, x, side, way in ((left, low[0] - aside, "right", -1), (right, high[0] + aside, "left", 1)):
+        kept = [name for name in places if name in names][:most]
+        chosen = sorted(kept, key=lambda name: places[name][1])
+        heights = spread([float(places[name][1]) for name in chosen], step)
+        every += heights
+        for name, y in zip(chosen, heights, strict=True):
+            place = places[name]
+            axes.plot([x, place[0]], [y, place[1]], color=MUTED, lw=0.7, zorder=4)
+            axes.plot(*place, "o", ms=2.5, color=INK, zorder=5)
+            short = name if len(name) <= longest else f"{name[: longest - 1]}…"
+            axes.text(x + way * 0.01 * float(span.max()), y, short, ha=side, va="center", fontsize=8, zorder=8)
+    room = aside + _ROOM * float(span.max())
+    axes.set_xlim(low[0] - room, high[0] + room)
+    axes.set_ylim(min(every) - step / 2, max(every) + step / 2)
+
+
+def spread(heights: Sequence[float], step: float) -> list[float]:
+    """Return ascending heights, moved as little as possible to be at least ``step`` apart (pooled neighbours)."""
+    groups = list[list[float]]()  # first height and number of labels of each group of touching labels
+    for height in heights:
+        groups.append([height, 1.0])
+        while len(groups) > 1 and groups[-1][0] < groups[-2][0] + groups[-2][1] * step:
+            (first, one), (second, two) = groups[-2], groups[-1]
+            # least squares: the mean of the shifts of its labels is 0
+            groups[-2:] = [[(first * one + (second - one * step) * two) / (one + two), one + two]]
+    return [first + k * step for first, number in groups for k in range(int(number))]
+
+
+def scale_bar(axes: Axes, place: tuple[float, float], length: float, label: str, rise: float) -> None:
+    """Draw a bar from a place to the right, with its label ``rise`` above it."""
+    x, y = place
+    axes.plot([x, x + length], [y, y], color=INK, lw=2.2, solid_capstyle="butt", zorder=6)
+    text = axes.text(x, y + rise, label, fontsize=8, va="bottom", zorder=6)
+    text.set_bbox({"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.8})
+
+
+def round_length(length: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is at most ``length``."""
+    power = 10.0 ** math.floor(math.log10(length))
+    return max(m for m in (1.0, 2.0, 5.0) if m * power <= length * 1.0000001) * power
