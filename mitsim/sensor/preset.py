@@ -7,7 +7,6 @@ only describes a rig whose images exist; :meth:`Sensor.missing_for` names the ke
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields, replace
 from importlib.resources import files
 from pathlib import Path
@@ -21,7 +20,7 @@ from characterisation.files.errors import InputError, nearest
 from mitsim.running.progress import say
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.exposure import automatic, bracket
+from mitsim.sensor.exposure import ExposurePolicy, exposure_policy
 from mitsim.sensor.imager import Imager, electrons_per_radiance
 from mitsim.sensor.lens_keys import with_lenses
 from mitsim.sensor.light_code import LightCode, patterns
@@ -30,13 +29,10 @@ from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.opencv_calibration import with_calibration
 from mitsim.sensor.pattern import DotPattern, dot_frames
 from mitsim.sensor.projector import Projector
-from mitsim.sensor.projector_images import ImageFolder, ProjectorImages, checked_images, read_images
+from mitsim.sensor.projector_images import ImageFolder, ProjectorImages, allowed_images, checked_images, read_images
 from mitsim.sensor.published_noise import PublishedNoise
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.sensor_file import (
-    AutomaticExposure,
-    Bracket,
-    FixedExposure,
     MisalignmentTable,
     Purpose,
     RoomTable,
@@ -46,37 +42,6 @@ from mitsim.sensor.sensor_file import (
     with_depths,
 )
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
-
-
-@dataclass(frozen=True)
-class ExposurePolicy:
-    """Exposure rule of a sensor.
-
-    - ``rule`` in words.
-    - ``base_s``: the exposure; None if it follows the scene by ``control``, or is unknown.
-    - ``bracket``: the exposures around it.
-    - ``limits_s``: the limits of the device.
-    """
-
-    rule: str
-    base_s: float | None
-    control: AutomaticExposure | None
-    bracket: Bracket | None
-    limits_s: tuple[float, float]
-
-    def exposures(self, brightest: NDArray[np.floating] | None, full_well: float) -> tuple[float, ...]:
-        """Return the exposures of one capture [s], shortest first.
-
-        ``brightest``: electrons per second of the brightest image of all cameras; only automatic control needs it.
-        """
-        base = self.base_s
-        if base is None:
-            assert self.control is not None and brightest is not None
-            control = self.control
-            base = automatic(brightest, full_well, control.level, control.percentile, self.limits_s)
-        if self.bracket is None:
-            return (base,)
-        return bracket(base, self.bracket.count, self.bracket.factor, self.limits_s)
 
 
 @dataclass(frozen=True)
@@ -260,7 +225,7 @@ class Sensor:
         """
         optics = self.projector.optics
         pattern = checked_images(images, optics.width, optics.height, f"patterns of {self.name}")
-        return replace(self, pattern=_allowed(pattern, self.technology, self.matcher, f"sensor {self.name}"))
+        return replace(self, pattern=allowed_images(pattern, self.technology, self.matcher, f"sensor {self.name}"))
 
     def electrons(self) -> float:
         """Return the photo-electrons per unit of radiance and second [e- / (s W mm^-2 sr^-1)]."""
@@ -394,7 +359,7 @@ def _assemble(path: Path, table: SensorFile, missing: frozenset[str], notes: tup
         imager=imager,
         focus_mm=written.focus_mm,
         pattern=_pattern(path, table, projector),
-        exposure=_exposure(path, table, projector, imager),
+        exposure=exposure_policy(path, table.exposure, projector, imager, table.wavelength_nm),
         ambient_image=table.ambient_image,
         matcher=table.matcher,
         decoder=table.decoder,
@@ -409,16 +374,6 @@ def _assemble(path: Path, table: SensorFile, missing: frozenset[str], notes: tup
     )
 
 
-def _allowed(pattern: ProjectorImages, technology: str, matcher: MatcherSettings | None, where: str) -> ProjectorImages:
-    """Return own images that a technology can project; else raise an error."""
-    if technology not in ("active_stereo", "structured_light"):
-        raise InputError(where, "pattern", f"images, for {technology}", "images for active_stereo or structured_light")
-    if pattern.count > 1 and matcher is not None and matcher.method != "correlation":
-        hint = 'set method = "correlation" in [matcher], which matches all images at once'
-        raise InputError(where, "pattern", f"{pattern.count} images, for matcher.method {matcher.method}", "one", hint)
-    return pattern
-
-
 def _pattern(
     path: Path, table: SensorFile, projector: Projector
 ) -> DotPattern | LightCode | ProjectorImages | AmplitudeModulation | None:
@@ -429,7 +384,7 @@ def _pattern(
     if not optics.width:  # a rig of two cameras, which match images of any projector
         return None
     images = read_images(path.parent / pattern.folder, optics.width, optics.height)
-    return _allowed(images, table.technology, table.matcher, str(path))
+    return allowed_images(images, table.technology, table.matcher, str(path))
 
 
 def _unknowns(path: Path, table: SensorFile) -> UnknownsTable:
@@ -441,33 +396,3 @@ def _unknowns(path: Path, table: SensorFile) -> UnknownsTable:
         table.unknowns,
         UnknownsTable.model_validate({"calibration": {"covariance": str((path.parent / covariance).absolute())}}),
     )
-
-
-def _exposure(path: Path, table: SensorFile, projector: Projector, imager: Imager) -> ExposurePolicy:
-    rule = table.exposure
-    if rule is None:
-        return ExposurePolicy("unknown", None, None, None, (math.nan, math.nan))
-    shortest, longest = rule.limits_s
-    if shortest > longest:
-        raise InputError(path, "exposure.limits_s", f"[{shortest:g}, {longest:g}]", "shortest before longest")
-    several = "" if rule.bracket is None else f"; {rule.bracket.count} exposures a factor {rule.bracket.factor:g} apart"
-    if isinstance(rule, AutomaticExposure):
-        words = f"automatic: {rule.percentile:g} % of the pixels under {100 * rule.level:g} % of full scale"
-        return ExposurePolicy(words + several, None, rule, rule.bracket, rule.limits_s)
-    if isinstance(rule, FixedExposure):
-        return ExposurePolicy(
-            f"fixed at {rule.exposure_s:g} s{several}", rule.exposure_s, None, rule.bracket, rule.limits_s
-        )
-    radiance = rule.reflectance / np.pi * projector.plane_irradiance / rule.distance_mm**2
-    wanted = rule.level * imager.full_well
-    exposure = float(wanted / (radiance * electrons_per_radiance(imager, table.wavelength_nm, 1.0)))
-    if math.isnan(exposure):
-        return ExposurePolicy("unknown", None, None, rule.bracket, rule.limits_s)
-    if not shortest <= exposure <= longest:
-        hint = f"the rule asks for {exposure:.3g} s: change projector.flux_w, exposure.level or exposure.distance_mm"
-        raise InputError(path, "exposure.limits_s", f"[{shortest:g}, {longest:g}] s", "limits that hold", hint)
-    words = (
-        f"fixed at {exposure:.3g} s: matt white (reflectance {rule.reflectance:g}) at {rule.distance_mm:g} mm "
-        f"shows the bright pattern at {100 * rule.level:g} % of full scale"
-    )
-    return ExposurePolicy(words + several, exposure, None, rule.bracket, rule.limits_s)

@@ -22,6 +22,7 @@ from pydantic import Field
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
+from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.png import decode_png
 
 Pattern = TypeVar("Pattern")
@@ -116,6 +117,33 @@ def checked_images(images: ArrayLike, width: int, height: int, where: str) -> Pr
             raise InputError(where, "images", f"{values.min():g} to {values.max():g}", "values from 0 to 1, white")
         values = values.astype(np.float32)
     return ProjectorImages.of(np.array(values))  # a copy: the caller may change the array
+
+
+def allowed_images(
+    pattern: ProjectorImages, technology: str, matcher: MatcherSettings | None, where: str
+) -> ProjectorImages:
+    """Return images of the user's own, checked against what a sensor can project and decode.
+
+    Parameters
+    ----------
+    pattern
+        The images.
+    technology, matcher
+        Of the sensor.
+    where
+        What names the images in messages.
+
+    Raises
+    ------
+    InputError
+        If the technology has a pattern of its own, or the matcher takes one image only.
+    """
+    if technology not in ("active_stereo", "structured_light"):
+        raise InputError(where, "pattern", f"images, for {technology}", "images for active_stereo or structured_light")
+    if pattern.count > 1 and matcher is not None and matcher.method != "correlation":
+        hint = 'set method = "correlation" in [matcher], which matches all images at once'
+        raise InputError(where, "pattern", f"{pattern.count} images, for matcher.method {matcher.method}", "one", hint)
+    return pattern
 
 
 def read_images(folder: Path, width: int, height: int) -> ProjectorImages:
