@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from characterisation.files.errors import MissingEnvironmentError
 
@@ -44,6 +45,7 @@ class Status(IntEnum):
     PHASE_INCONSISTENT = 8  #: the code's images contradict one another
     INTERREFLECTION = 9  #: light that came over another surface
     DROPPED = 10  #: removed at random by the performance map (predicted clouds)
+    UNCALIBRATED = 11  #: the calibrated lens distortion gives the pixel no unique ray, or no unique depth on it
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,8 @@ class ViewGrid:
 
     ``normalised`` (height, width, 2) float32 holds x/z and y/z of each pixel's ray in grid coordinates, for a camera
     with lens distortion. For a pinhole it is None, and the rays follow from ``fx, fy, cx, cy``. With distortion these
-    four describe the camera's axis and its angular pitch there.
+    four describe the camera's axis and its angular pitch there. It is NaN for a pixel without a unique ray, which no
+    point has.
     """
 
     fx: float
@@ -123,9 +126,14 @@ class ViewGrid:
 
         Fixed-point iteration p <- p + (wanted - shown at p), which converges while the distortion changes by less than
         1 px per px. Rays are interpolated between pixels (to 1e-3 px for ordinary lenses) and extrapolated beyond the
-        edge.
+        edge, and beyond pixels without a ray; a position on such a pixel is NaN.
         """
         table = self.pinhole_positions()
+        lost = np.isnan(table[..., 0])
+        if lost.any() and not lost.all():
+            row, column = distance_transform_edt(lost, return_distances=False, return_indices=True)
+            rows, columns = np.indices(lost.shape)
+            table = table[row, column] + np.stack([columns - column, rows - row], axis=-1)
         last = np.array([self.width, self.height]) - 1
         at = pinhole
         for _ in range(60):
@@ -139,6 +147,9 @@ class ViewGrid:
             at = at + step
             if not (np.abs(step) > 1e-9).any():
                 break
+        if lost.any():
+            nearest = np.clip(np.rint(np.nan_to_num(at)), 0, last).astype(np.intp)
+            at = np.where(lost[nearest[..., 1], nearest[..., 0]][..., None], np.nan, at)
         return at
 
     def pinhole_positions(self) -> NDArray[np.float64]:

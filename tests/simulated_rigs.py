@@ -7,8 +7,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from mitsim.sensor.light_code import roles, value
+
+#: prints in place of waves: without repetition, and lines that repeat every few pixels
+SPECKS, LINES = "specks", "lines"
 
 
 @lru_cache(maxsize=4)
@@ -29,10 +33,16 @@ def surface_seen(camera, *, depth=500.0, tilt=0.1, ball=True):
 
 def images_seen(code, camera, projector, points, *, full=255, noise=1.0, seed=1, gamma=1.0, texture=0.25):
     """Images (P, H, W) of a code by exact projection on a printed surface, blurred over the footprint of a pixel."""
-    place = projector.project(points)
+    place = np.nan_to_num(projector.project(points), nan=-99.0)  # beyond the fold of its distortion: dark
     lit = ((place > -0.5) & (place < [projector.width - 0.5, projector.height - 0.5])).all(axis=-1)
     x, y, _ = np.moveaxis(points, -1, 0)
-    albedo = 0.6 + texture * np.sin(x / 13.5) * np.cos(y / 17.3)
+    if texture is SPECKS:
+        print_px = gaussian_filter(np.random.default_rng(0).normal(size=(512, 512)), 2.0, mode="wrap")
+        albedo = 0.6 + 0.12 * map_coordinates(print_px / print_px.std(), [y + 256, x + 256], order=1, mode="grid-wrap")
+    elif texture is LINES:
+        albedo = 0.6 + 0.15 * np.sign(np.sin(1.2 * y))
+    else:
+        albedo = 0.6 + texture * np.sin(x / 13.5) * np.cos(y / 17.3)
     draw, out = np.random.default_rng(seed), []
     spread = {}
     for axis, component in (("columns", 0), ("rows", 1)):

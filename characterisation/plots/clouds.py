@@ -26,6 +26,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "PHASE_INCONSISTENT": ("phase inconsistent", "#9467bd"),
     "INTERREFLECTION": ("interreflection", "#8c564b"),
     "DROPPED": ("lost at random, 1 − F", "#e69f00"),
+    "UNCALIBRATED": ("no unique ray by the calibration", "#0072b2"),
 }
 
 #: share of the points beyond each end of the colour scale [%], since false matches can lie at any distance; with a

@@ -105,7 +105,8 @@ def decode_depth_map(
     Returns
     -------
     PointCloud
-        Points in the sensor frame [mm]. Status ``NO_SURFACE`` where the map is NaN, ``OUT_OF_RANGE`` outside the range.
+        Points in the sensor frame [mm]. Status ``NO_SURFACE`` where the map is NaN, ``OUT_OF_RANGE`` outside the range,
+        ``UNCALIBRATED`` where the pixel has no ray, since the distortion of the camera folds over before it.
 
     Raises
     ------
@@ -119,7 +120,10 @@ def decode_depth_map(
     columns, rows = roi.pixels()
     z, rays = depth[roi.slices].astype(np.float64), grid.rays_at(columns, rows)
     points = grid.origin + rays * (z / (rays @ grid.rotation[:, 2]))[..., None]
-    return _cloud_in_range(points, z, geometry, (near_mm, far_mm), sensor, source, roi)
+    cloud = _cloud_in_range(points, z, geometry, (near_mm, far_mm), sensor, source, roi)
+    without_ray = np.isnan(rays[..., 0])
+    cloud.status[roi.slices][without_ray] = Status.UNCALIBRATED
+    return cloud
 
 
 def decode_disparity_map(

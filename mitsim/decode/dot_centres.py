@@ -85,7 +85,7 @@ def dot_centres(image: NDArray[np.uint8], dark: bool = True) -> NDArray[np.float
 
 def resample_to_grid(image: NDArray[np.uint8], camera: Camera, grid: ViewGrid) -> NDArray[np.uint8]:
     """Return a camera's image (H, W) resampled to the pixels of a grid with the same origin, by cubic interpolation."""
-    positions = camera.project(grid.origin + _DEPTH_MM * grid.rays()).astype(np.float32)
+    positions = np.nan_to_num(camera.project(grid.origin + _DEPTH_MM * grid.rays()), nan=-1.0).astype(np.float32)
     return np.asarray(
         cv2.remap(image, positions[..., 0], positions[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     )

@@ -179,6 +179,7 @@ def decode_time_of_flight(
         - ``NO_SURFACE``: the same, where the light source does not reach the ray.
         - ``PHASE_INCONSISTENT``: no path fits all phases.
         - ``OUT_OF_RANGE``: the depth of the path is not between near and far.
+        - ``UNCALIBRATED``: the pixel has no ray, since the distortion of the camera folds over before it.
 
     Raises
     ------
@@ -221,6 +222,7 @@ def decode_time_of_flight(
     )
     status[(status == Status.VALID) & ~in_range] = Status.OUT_OF_RANGE
     status[(status == Status.LOW_MODULATION) & ~geometry.seen[region]] = Status.NO_SURFACE
+    status[np.isnan(geometry.ray[region]).any(axis=-1)] = Status.UNCALIBRATED
     missing = status != Status.VALID
     points[missing], sigma[missing] = np.nan, np.nan
     cloud_sigma = None if imager is None else sigma

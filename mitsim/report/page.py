@@ -59,6 +59,7 @@ REMEDIES: dict[Status, str] = {
     Status.PHASE_INCONSISTENT: "keep the part still, or use more images",
     Status.INTERREFLECTION: "choose a view in which shiny faces do not reflect light onto one another",
     Status.DROPPED: "the map predicts this loss for the finish: choose another view, or a duller finish",
+    Status.UNCALIBRATED: "calibrate with boards that reach the corners, and with fewer distortion coefficients",
 }
 
 

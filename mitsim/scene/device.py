@@ -48,6 +48,14 @@ def vectors_to_device(vectors: NDArray[np.floating]) -> Any:
     return mi.Vector3f(*[to_device(component) for component in vectors.T])
 
 
+def known_to_device(vectors: NDArray[np.floating]) -> tuple[Any, Any]:
+    """Return unit vectors (n, 3) on the device, and a mask of those that are not NaN, or True for all."""
+    known = np.isfinite(vectors).all(axis=1)
+    if known.all():
+        return vectors_to_device(vectors), True
+    return vectors_to_device(np.where(known[:, None], vectors, [0.0, 0.0, 1.0])), mi.Bool(known)
+
+
 def vectors_to_host(vectors: Any, kind: DTypeLike = np.float32) -> NDArray[Any]:
     """Return the vectors of the device as an array (n, 3) of a kind of numbers."""
     return np.stack([np.array(component, kind) for component in vectors], axis=-1)

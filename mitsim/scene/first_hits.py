@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.device import vectors_to_device, vectors_to_host
+from mitsim.scene.device import known_to_device, vectors_to_device, vectors_to_host
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.raycast import PixelRays, cast, shape_indices, shapes_met
 from mitsim.sensor.camera import Rig
@@ -57,11 +57,12 @@ class Hits:
 def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.floating]) -> Hits:
     """Trace n rays to the first surface, whichever side it shows.
 
-    ``origins`` (n, 3) [mm] and unit ``directions`` (n, 3), world frame.
+    ``origins`` (n, 3) [mm] and unit ``directions`` (n, 3), world frame. A direction of NaN meets nothing.
     """
-    start, along = (vectors_to_device(np.asarray(a).reshape(-1, 3)) for a in (origins, directions))
+    start = vectors_to_device(np.asarray(origins).reshape(-1, 3))
+    along, active = known_to_device(np.asarray(directions).reshape(-1, 3))
     ray = mi.Ray3f(mi.Point3f(start), along)
-    surface = scene.mitsuba.ray_intersect(ray)
+    surface = scene.mitsuba.ray_intersect(ray, active)
     behind = dr.dot(surface.n, ray.d) > 0
     two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
     front = ~behind | two_sided

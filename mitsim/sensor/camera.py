@@ -5,6 +5,9 @@ is a camera whose pixels emit light instead of receiving it; it uses the same cl
 
 Distortion coefficients are in OpenCV's order (k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty), 0 to 14 of them, or the four
 of its fisheye model. Pixel centres lie at integers.
+
+Far outside the calibrated image a distortion may fold over (:mod:`mitsim.sensor.distortion_fold`). Directions beyond
+the fold have no pixel, and pixels without a direction before it have no ray: both are NaN.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsim.sensor.distortion_fold import before_fold, inverse_fold_radii
 from mitsim.sensor.transforms import Transform
 
 # OpenCV's default stops after 5 steps, up to 0.013 px from the solution on real lenses
@@ -23,6 +27,12 @@ _EXACT = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 
 #: largest error of OpenCV's centre of a rectified image that is accepted, as a share of the image width
 LOST_SHARE = 0.1
+
+#: largest distance [px] of a pixel from the projection of its ray
+_ROUND_TRIP_PX = 1e-6
+
+#: steps from the axis to a pixel in which the ray is found where OpenCV's iteration fails, and Newton steps of each
+_STEPS, _NEWTON_STEPS = 12, 5
 
 #: points projected at once, to stay in the processor's cache: OpenCV also computes derivatives, 400 bytes per point
 _TOGETHER = 1 << 14
@@ -65,7 +75,10 @@ class Camera:
         return self.sensor_from_camera.translation
 
     def rays(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return unit view directions in the camera frame, (..., 3), of pixels (..., 2) given as (column, row)."""
+        """Return unit view directions in the camera frame, (..., 3), of pixels (..., 2) given as (column, row).
+
+        NaN where the pixel has no unique direction, since the distortion folds over before it.
+        """
         flat = np.ascontiguousarray(pixels, np.float64).reshape(-1, 1, 2)
         if flat.size == 0:  # OpenCV returns None for no points
             return np.empty((*pixels.shape[:-1], 3))
@@ -73,26 +86,117 @@ class Camera:
             ideal = cv2.fisheye.undistortPoints(flat, self.matrix, self.distortion.reshape(-1, 1), criteria=_EXACT)
         else:
             ideal = cv2.undistortPointsIter(flat, self.matrix, self.distortion, np.eye(3), np.eye(3), _EXACT)
-        x, y = ideal.reshape(-1, 2).T
+        ideal = self._unique(np.asarray(ideal.reshape(-1, 2), np.float64), flat[:, 0])
+        x, y = ideal.T
         rays = np.stack([x, y, np.ones_like(x)], axis=-1) / np.sqrt(x * x + y * y + 1)[:, None]
         return np.asarray(rays.reshape(*pixels.shape[:-1], 3))
+
+    def rays_to_fold(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return :meth:`rays` of pixels (..., 2), with the direction at the fold in place of NaN.
+
+        For outlines of the field of view, and for simulated images, which have no missing pixels.
+        """
+        rays = self.rays(pixels)
+        lost = np.isnan(rays[..., 0])
+        if not lost.any():
+            return rays
+        inverse = inverse_fold_radii(self.distortion, self.model)
+        column, row = np.moveaxis(pixels[lost] - self._at(np.zeros((1, 2))), -1, 0)
+        angle = np.arctan2(row / self.matrix[1, 1], column / self.matrix[0, 0])
+        around = 2 * np.pi * np.arange(len(inverse)) / len(inverse)
+        radius = 0.999 / np.maximum(np.interp(angle, around, inverse, period=2 * np.pi), 1e-3)
+        local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones_like(angle)], axis=-1)
+        rays[lost] = local / np.linalg.norm(local, axis=-1, keepdims=True)
+        return rays
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return pixel positions (..., 2), as (column, row), of points (..., 3) in the *sensor* frame [mm].
 
-        Points behind the camera are NaN.
+        Points behind the camera are NaN, and points beyond the fold of the distortion.
         """
         local = self.sensor_from_camera.inverse().points(points)
         flat = np.ascontiguousarray(local, np.float64).reshape(-1, 1, 3)
         if flat.size == 0:
             return np.empty((*points.shape[:-1], 2))
-        out = np.empty((len(flat), 2))
+        out = self._pixels(flat)
+        out[flat[:, 0, 2] <= 0] = np.nan
+        radii = inverse_fold_radii(self.distortion, self.model)
+        if radii.any():
+            with np.errstate(all="ignore"):  # points behind the camera
+                x, y = (flat[:, 0, :2] / flat[:, 0, 2:]).T
+                out[~before_fold(x, y, radii)] = np.nan
+        return out.reshape(*points.shape[:-1], 2)
+
+    def _pixels(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return pixel positions (n, 2) of points (n, 1, 3) in the camera frame, also behind it or beyond a fold."""
+        out = np.empty((len(local), 2))
         tilted = self.distortion[12:].any()
         project = self._by_opencv if self.model == "fisheye" or tilted else self._without_derivatives
-        for start in range(0, len(flat), _TOGETHER):
-            out[start : start + _TOGETHER] = project(flat[start : start + _TOGETHER])
-        out[flat[:, 0, 2] <= 0] = np.nan
-        return out.reshape(*points.shape[:-1], 2)
+        for start in range(0, len(local), _TOGETHER):
+            out[start : start + _TOGETHER] = project(local[start : start + _TOGETHER])
+        return out
+
+    def _at(self, ideal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return pixel positions (n, 2) of ideal image points (n, 2)."""
+        return self._pixels(np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1)[:, None])
+
+    def _unique(self, ideal: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the ideal image points (n, 2) of pixels (n, 2), NaN where there is none before the fold.
+
+        ``ideal`` (n, 2) are OpenCV's results. Its iteration can diverge, or stop on a direction beyond the fold. Such
+        pixels are traced from the axis outward, where the solution is unique, by Newton's method in steps.
+        """
+        if not self.distortion.any():
+            return ideal
+        radii = inverse_fold_radii(self.distortion, self.model)
+        with np.errstate(all="ignore"):
+            exact = np.abs(self._at(ideal) - pixels).max(axis=1) < _ROUND_TRIP_PX
+            failed = np.flatnonzero(~(exact & before_fold(ideal[:, 0], ideal[:, 1], radii)))
+        if not failed.size:
+            return ideal
+        ideal = ideal.copy()
+        ideal[failed] = np.nan
+        failed = failed[self._within_fold(pixels[failed], radii)]
+        if failed.size:
+            ideal[failed] = self._traced(pixels[failed], radii)
+        return ideal
+
+    def _within_fold(self, pixels: NDArray[np.float64], radii: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether pixels (n, 2) lie inside the image of the fold, or in a margin of 1 % around it."""
+        if not (radii > 0).all():
+            return np.ones(len(pixels), bool)
+        axis = self._at(np.zeros((1, 2)))
+        angle = 2 * np.pi * np.arange(len(radii)) / len(radii)
+        fold = self._at(np.stack([np.cos(angle), np.sin(angle)], axis=1) / radii[:, None]) - axis
+        at, reach = np.arctan2(fold[:, 1], fold[:, 0]), np.linalg.norm(fold, axis=1)
+        off = pixels - axis
+        limit = np.interp(np.arctan2(off[:, 1], off[:, 0]), at, reach, period=2 * np.pi)
+        return np.asarray(np.linalg.norm(off, axis=1) < 1.01 * limit)
+
+    @np.errstate(all="ignore")
+    def _traced(self, pixels: NDArray[np.float64], radii: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ideal image points (n, 2) of pixels (n, 2), followed from the axis outward; NaN at the fold."""
+        axis = self._at(np.zeros((1, 2)))
+        ideal = np.zeros_like(pixels)
+        for step in range(1, _STEPS + 1):
+            wanted = axis + (pixels - axis) * (step / _STEPS)
+            for _ in range(_NEWTON_STEPS * (1 if step < _STEPS else 4)):
+                width = 1e-6 * (1e-3 + np.abs(ideal).max(axis=1, keepdims=True))
+                by_x, by_y = (
+                    (self._at(ideal + width * unit) - self._at(ideal - width * unit)) / (2 * width)
+                    for unit in np.eye(2)
+                )
+                off = wanted - self._at(ideal)
+                determinant = by_x[:, 0] * by_y[:, 1] - by_x[:, 1] * by_y[:, 0]
+                ideal = ideal + np.stack(
+                    [
+                        (off[:, 0] * by_y[:, 1] - off[:, 1] * by_y[:, 0]) / determinant,
+                        (off[:, 1] * by_x[:, 0] - off[:, 0] * by_x[:, 1]) / determinant,
+                    ],
+                    axis=1,
+                )
+        exact = np.abs(self._at(ideal) - pixels).max(axis=1) < _ROUND_TRIP_PX
+        return np.where((exact & before_fold(ideal[:, 0], ideal[:, 1], radii))[:, None], ideal, np.nan)
 
     def _by_opencv(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return pixel positions (n, 2) of points (n, 1, 3) in the camera frame."""

@@ -88,15 +88,21 @@ def described(pattern: Pattern | ProjectorImages) -> Pattern | ImagesDescription
 
 
 def checked_images(images: ArrayLike, width: int, height: int, where: str) -> ProjectorImages:
-    """Return images as the pattern of a projector of ``width`` x ``height`` pixels.
+    """Return images as the pattern of a projector.
 
-    ``images`` (P, H, W), or (H, W) for one: uint8, uint16 or bool, or floats 0..1.
+    Parameters
+    ----------
+    images
+        (P, H, W), or (H, W) for one: uint8, uint16 or bool, or floats 0..1.
+    width, height
+        Of the projector [px].
+    where
+        What names the images in messages.
 
     Raises
     ------
     InputError
-        If they have another size or type, are too many, or a value is not between 0 and 1. ``where`` says in the
-        message what was given.
+        If they have another size or type, are too many, or a value is not between 0 and 1.
     """
     values = np.asarray(images)
     if values.ndim == 2:

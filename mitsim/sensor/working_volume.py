@@ -1,8 +1,7 @@
 """Compute where a sensor can measure: the common view of its eyes between its working distances.
 
 An eye is a camera or the projector. The working distances are depths along the axis of the reference camera. A point is
-in an eye's view if it projects into its image. The distortion polynomial folds back far outside the image, so points
-farther off the axis than the corners of the image are excluded.
+in an eye's view if it projects into its image. Points farther off the axis than the corners of the image are excluded.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ def in_image(camera: Camera, points: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return whether points (..., 3) [mm], sensor frame, project into a camera's or projector's image."""
     local = camera.sensor_from_camera.inverse().points(np.asarray(points, float))
     right, bottom = camera.width - 0.5, camera.height - 0.5
-    corners = camera.rays(np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]]))
+    corners = camera.rays_to_fold(np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]]))
     near_axis = local[..., 2] >= corners[:, 2].min() * np.linalg.norm(local, axis=-1)
     pixels = camera.project(points)
     with np.errstate(invalid="ignore"):

@@ -54,7 +54,7 @@ def write_scene_geometry(folder: Path, scene: Scene, sensor: Sensor) -> None:
     rays = []
     for eye in eyes:
         right, bottom = eye.width - 0.5, eye.height - 0.5
-        around = eye.rays(np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]]))
+        around = eye.rays_to_fold(np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]]))
         directions = eye.sensor_from_camera.directions(around)
         rays.append(directions / np.linalg.norm(directions, axis=1, keepdims=True))
     out = io.BytesIO()

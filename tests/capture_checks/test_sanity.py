@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from pydantic import TypeAdapter
-from simulated_rigs import images_seen, surface_seen
+from simulated_rigs import LINES, SPECKS, images_seen, surface_seen
 
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
@@ -308,6 +308,50 @@ def test_rows_of_a_blank_surface_are_not_known(noise):
     assert (found.warnings, np.isnan(found.row_error)) == ([], True)
     assert "unknown; the code has no rows" in row_error_in_words(capture, PAIRED, found, float("nan"))
     assert row_error_in_words(capture, SETTINGS, found, float("nan")) == ""
+
+
+COLUMNS = {**{f"stripes of {128 >> n}": GrayCode(bits=n + 1) for n in (2, 3, 4, 5, 6)}, "phases": CODES["phases"]}
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_columns_alone_reveal_exchanged_cameras_and_another_rig(name):
+    """All three have depths like any other: only the texture of the surface, in other rows, contradicts them."""
+    capture = taken(COLUMNS[name], pair(), texture=SPECKS)
+    found = capture_findings(capture, PAIRED)
+    assert found.warnings == []
+    assert abs(found.row_error) < 0.1
+    images = dict(zip(capture.images, list(capture.images.values())[::-1], strict=True))
+    assert "fit the calibration if they are exchanged" in said(replace(capture, images=images), PAIRED)
+    for turn, place in (((9.0, -6.0, 0.0), 60.0), ((1.0, -12.0, 4.0), 90.0)):
+        other = with_rig(capture, {"left": camera(), "right": camera(place, turn)})
+        assert "check that the calibration belongs to these images" in said(other, PAIRED)
+
+
+@pytest.mark.parametrize("name", ["stripes of 8", "phases"])
+@pytest.mark.parametrize("noise", [0.3, 3.0])
+def test_a_blank_surface_gives_no_reason_to_doubt_a_pair(name, noise):
+    capture = taken(COLUMNS[name], pair(), texture=0.0, noise=noise)
+    assert said(capture, PAIRED) == ""
+
+
+@pytest.mark.parametrize("turn", [-6.0, -20.0])
+@pytest.mark.parametrize("texture", [LINES, 0.25])
+def test_prints_that_repeat_give_no_reason_to_doubt_a_pair(turn, texture):
+    cameras = {"left": camera(), "right": camera(60.0 - 4.0 * turn, (1.5, turn, 2.0))}
+    assert said(taken(COLUMNS["stripes of 4"], cameras, texture=texture), PAIRED) == ""
+
+
+@pytest.mark.parametrize("off", [0.0, 1.2])
+def test_rows_of_two_cameras_by_stripes_higher_than_the_rows_compared(off):
+    """The median change of the projector row over a few rows is 0; it was divided by."""
+    code = sequence(gray(bits=5), gray("rows", bits=3), "white", "black")
+    cameras = pair()
+    turned = camera(60.0, (np.degrees(off / 260.0), -6.0, 0.0))
+    capture = with_rig(taken(code, {"left": cameras["left"], "right": turned}), cameras)
+    found = capture_findings(capture, PAIRED)
+    assert found.row_error_source == "by the code of the rows"
+    assert abs(found.row_error - off) < 0.25
+    assert bool(found.warnings) == (off > 0.3)
 
 
 def test_a_calibration_of_another_pair():

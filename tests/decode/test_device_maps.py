@@ -55,6 +55,18 @@ def test_depths_of_a_plane_become_points_of_the_plane(distortion, model):
     np.testing.assert_allclose(camera.project(cloud.points.astype(float)), camera.pixel_grid(), atol=1e-3)
 
 
+def test_pixels_beyond_the_fold_of_the_distortion_are_left_out_with_their_reason():
+    """r (1 - 1.5 r^2) ends at 0.3143, 22 px from the axis."""
+    camera = Camera(K, np.array([-1.5, 0, 0, 0, 0]), WIDTH, HEIGHT)
+    depth = np.full((HEIGHT, WIDTH), 500.0, np.float32)
+    depth[::3] = np.nan
+    cloud = decode_depth_map(depth, camera_map_geometry(Rig({"camera": camera})), 1.0, 1e5, sensor="s", source="device")
+    radius = np.linalg.norm((camera.pixel_grid() - K[:2, 2]) / [70.0, 72.0], axis=-1)
+    assert (cloud.status[radius > 0.3145] == Status.UNCALIBRATED).all()
+    assert cloud.valid[(radius < 0.314) & np.isfinite(depth)].all()
+    assert (cloud.status[(radius < 0.314) & np.isnan(depth)] == Status.NO_SURFACE).all()
+
+
 def test_what_is_missing_or_out_of_range_says_so():
     camera = Camera(K, np.zeros(5), WIDTH, HEIGHT)
     depth = np.full((HEIGHT, WIDTH), 500.0, np.float32)

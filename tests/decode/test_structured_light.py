@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from simulated_rigs import images_seen, surface_seen
 
 from characterisation.cloud_files import read_ply, write_ply
 from characterisation.files.errors import InputError
@@ -405,3 +406,55 @@ def test_a_code_along_the_rows_is_no_use_to_cameras_side_by_side():
             (320, 200),
             ImageContext("drawn", "simulated", 255),
         )
+
+
+#: of a public calibration of a projector: its radius is not smooth, and folds at 0.565
+UNEVEN = np.array([-0.0486, 1.4234, -0.0075, -0.0020, -7.3645])
+
+
+@pytest.mark.parametrize("beamer", [UNEVEN, np.array([-0.05, 0, 0, 0, -60.0])])
+@pytest.mark.parametrize("range_mm", [(50.0, 20000.0), (300.0, 800.0)])
+def test_a_strongly_distorted_projector_is_decoded_where_its_rays_are_unique(beamer, range_mm):
+    """It was refused: "a polynomial of 16 points follows to 0.14 px"."""
+    K = np.array([[300.0, 0, 127.5], [0, 300, 95.5], [0, 0, 1]])
+    eye = Camera(np.array([[240.0, 0, 109.5], [0, 240, 84.5], [0, 0, 1]]), np.zeros(5), 220, 170)
+    lit = Camera(K, beamer, 256, 192, Transform.from_degrees((2.0, -20.0, 3.0), (160.0, 10.0, 40.0)))
+    code, points = PhaseShift(periods_px=[260, 40, 8]), surface_seen(eye, depth=480.0)
+    stack = images_seen(code, eye, lit, points, noise=0.3)
+    settings = DecoderSettings(near_mm=range_mm[0], far_mm=range_mm[1])
+    context = ImageContext(full_scale=255, sensor="rig", source="device", imager=None)
+    cloud = decode_structured_light(stack, Rig({"eye": eye}, lit), "eye", code, settings, context)
+    off = np.linalg.norm(cloud.points - points, axis=-1)[cloud.valid]
+    place = lit.project(points)
+    with np.errstate(invalid="ignore"):
+        inside = ((place > 2) & (place < [253, 189])).all(axis=-1)
+    assert inside.mean() > 0.2
+    assert cloud.valid[inside].mean() > 0.97
+    assert np.quantile(off, 0.99) < 0.5
+
+
+def test_pixels_beyond_the_fold_of_the_camera_are_left_out_with_their_reason():
+    """r (1 - 0.9 r^2) ends at 0.4057: 97 of 110 px along a row."""
+    eye = Camera(np.array([[240.0, 0, 109.5], [0, 240, 84.5], [0, 0, 1]]), np.array([-0.9, 0, 0, 0]), 220, 170)
+    lit = Camera(
+        np.array([[270.0, 0, 127.5], [0, 270, 95.5], [0, 0, 1]]),
+        np.zeros(5),
+        256,
+        192,
+        Transform.from_degrees((0.5, -11.0, 0.3), (100.0, 3.0, 5.0)),
+    )
+    radius = np.linalg.norm(eye.pixel_grid() - [109.5, 84.5], axis=-1)
+    points = surface_seen(eye, ball=False)
+    code = GrayCode()
+    shown = np.where(np.isfinite(points), points, [0.0, 0.0, 500.0])  # such pixels show something, too
+    stack = images_seen(code, eye, lit, shown, noise=0.3)
+    context = ImageContext(full_scale=255, sensor="rig", source="device", imager=None)
+    settings = DecoderSettings(near_mm=300, far_mm=800)
+    cloud = decode_structured_light(stack, Rig({"eye": eye}, lit), "eye", code, settings, context)
+    assert (cloud.status[radius > 98] == Status.UNCALIBRATED).all()
+    assert not (cloud.status[radius < 97] == Status.UNCALIBRATED).any()
+    assert not cloud.valid[radius > 98].any()
+    assert np.nanmedian(np.linalg.norm(cloud.points - points, axis=-1)) < 2.0
+    back = cloud.grid.project(cloud.points[cloud.valid].astype(float))
+    rows, columns = np.nonzero(cloud.valid)
+    assert np.abs(back - np.stack([columns, rows], axis=-1))[radius[cloud.valid] < 80].max() < 0.01

@@ -335,3 +335,15 @@ def test_what_cannot_be_decoded_is_told():
         time_of_flight_geometry(Rig(rig().cameras), "depth", 400, 4600)
     with pytest.raises(InputError, match="found 'left'; allowed: depth"):
         time_of_flight_geometry(rig(), "left", 400, 4600)
+
+
+def test_pixels_beyond_the_fold_of_the_distortion_are_left_out_with_their_reason():
+    """r (1 - 1.5 r^2) ends at 0.3143, 28 px from the axis."""
+    own = rig(distortion=(-1.5, 0, 0, 0, 0))
+    geometry, code = geometry_of(own), modulation()
+    distance = np.where(np.isfinite(geometry.ray[..., 0]), 900.0, 700.0)
+    path = np.nan_to_num(path_to(geometry, own, distance), nan=1500.0)
+    cloud = decode(draw(code, path), geometry, code)
+    radius = np.linalg.norm((own.reference.pixel_grid() - [60.3, 44.1]) / [90.0, 91.0], axis=-1)
+    assert (cloud.status[radius > 0.3145] == Status.UNCALIBRATED).all()
+    assert cloud.valid[radius < 0.314].all()

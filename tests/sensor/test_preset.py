@@ -16,14 +16,14 @@ from mitsim.sensor.transforms import Transform
 PRESET = Path(__file__).parents[2] / "mitsim/sensor/presets/ensenso-n10.toml"
 
 
-def test_the_n10_is_the_n10(n10):
-    left, right = n10.rig.cameras.values()
-    assert (left.width, left.height) == (752, 480)
-    assert np.isclose(left.matrix[0, 0], 626, atol=1)
-    assert np.isclose(np.linalg.norm(right.centre - left.centre), 101.04, atol=0.01)
-    cosine = left.sensor_from_camera.rotation[:, 2] @ right.sensor_from_camera.rotation[:, 2]
-    assert np.isclose(np.degrees(np.arccos(cosine)), 8.3, atol=0.01)
-    assert n10.wavelength_nm == 850
+@pytest.mark.parametrize("name", [name for name in presets() if load_sensor(name).technology == "active_stereo"])
+def test_both_cameras_of_a_stereo_preset_see_the_middle_of_its_range(name):
+    sensor = load_sensor(name)
+    middle = np.array([[0.0, 0.0, sum(sensor.working_range_mm) / 2]])
+    reference = sensor.rig.reference
+    for camera in sensor.rig.cameras.values():
+        column, row = camera.project(reference.sensor_from_camera.points(middle))[0]
+        assert 0.1 < column / camera.width < 0.9 and 0.3 < row / camera.height < 0.7
 
 
 def test_the_exposure_rule_gives_the_level_that_it_states(n10):

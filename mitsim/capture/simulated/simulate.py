@@ -210,7 +210,7 @@ class SimulatedSensor:
         ]
         eye, depth = self.sensor.rig.cameras[camera], float(np.mean(self.sensor.working_range_mm))
         pixels = np.stack(roi.pixels(), axis=-1).astype(float)
-        rays = eye.sensor_from_camera.directions(eye.rays(pixels))
+        rays = eye.sensor_from_camera.directions(eye.rays_to_fold(pixels))
         points = eye.centre + rays * ((depth - eye.centre[2]) / rays[..., 2:])
         return self.apply_lens(np.asarray(relative * self.sensor.room_irradiance(points), np.float32), camera, roi)
 

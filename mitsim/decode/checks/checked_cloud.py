@@ -12,7 +12,14 @@ from pathlib import Path
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Settings
-from mitsim.decode.checks.sanity import Findings, cloud_warnings, code_findings, pair_row_error, row_error_in_words
+from mitsim.decode.checks.sanity import (
+    Findings,
+    cloud_warnings,
+    code_findings,
+    pair_row_error,
+    row_error_in_words,
+    uncalibrated_in_words,
+)
 from mitsim.decode.cloud import capture_cloud
 from mitsim.decode.coded_images import CodedImages
 from mitsim.decode.depth_range import range_warning, surface_beyond
@@ -71,6 +78,8 @@ def checked_cloud(
         found = code_findings(images, capture.rig, capture.source == "device")
     matched = pair_row_error(capture, cloud)
     warnings = [*capture.settings.get("warnings", []), *found.warnings, *cloud_warnings(matched)]
+    if lost := uncalibrated_in_words(cloud):
+        warnings.append(lost)
     beyond = surface_beyond(capture, cloud, settings)
     if beyond is not None:
         known = f"a coarse search over a wider range finds it in {100 * beyond.share:.0f} % of the pixels"

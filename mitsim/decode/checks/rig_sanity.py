@@ -17,10 +17,11 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.decode.checks.row_texture import textured_row_error, uniform_light_mean
+from mitsim.decode.checks.texture_matches import COMPARED_ROWS, LEAST_BLOCKS, texture_matches
 from mitsim.decode.matching.row_error import row_error
 from mitsim.decode.matching.stereo import StereoGeometry, stereo_geometry
 from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
-from mitsim.decode.structured_light.two_cameras import find_coordinates
+from mitsim.decode.structured_light.two_cameras import LARGEST_STEP_PX, find_coordinates
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
@@ -42,6 +43,12 @@ LARGEST_MISS_PX = 3.0
 #: least share of the first camera's decoded pixels that the second has in the same rows; allowed variation of the row
 #: error over the image [px]
 _LEAST_MATCHED, _LARGEST_SPREAD = 0.1, 0.5
+
+#: row error [px] of a rig that has moved; beyond, the calibration is of another rig
+_MOVED = 6.0
+
+#: half the distance [px] over which the slope of the projector rows is measured
+_SLOPE_ROWS = 6.0
 
 #: parts of an image along either side for averaging rows, and least number of pixels of a mean
 _PARTS, _ENOUGH = 6, 30
@@ -82,12 +89,13 @@ def camera_warnings(decoded: Mapping[Axis, ProjectorCoordinate], rig: Rig, setti
     places = np.s_[step // 2 :: step, step // 2 :: step]
     found = {axis: each.part(places) for axis, each in decoded.items()}
     rays = eye.sensor_from_camera.directions(eye.rays(eye.pixel_grid()[places]))
-    known = np.all([each.status == Status.VALID for each in found.values()], axis=0)
+    known = np.all([each.status == Status.VALID for each in found.values()], axis=0) & np.isfinite(rays).all(axis=-1)
     if known.mean() < 0.005:
         return []
     coordinates = {axis: each.value[known] for axis, each in found.items()}
     depth, miss = _meeting(eye, projector, rays[known], coordinates)
-    behind = float(np.mean(~(depth > 0)))
+    solved = depth[~np.isnan(depth)]  # without light beyond the fold of the projector's distortion
+    behind = float(np.mean(~(solved > 0))) if solved.size else 0.0
     doubt = "check that the calibration belongs to these images, and that R and T are those of cv2.stereoCalibrate"
     out = []
     if behind > _BEHIND:
@@ -160,7 +168,7 @@ def _meeting(eye: Camera, projector: Camera, rays: Floats, coordinates: dict[Axi
         np.full_like(value, end) for end in (0.0, (projector.height if axis == "columns" else projector.width) - 1.0)
     ]
     pixels = [np.stack([value, end] if axis == "columns" else [end, value], axis=-1) for end in ends]
-    one, other = (projector.sensor_from_camera.directions(projector.rays(each)) for each in pixels)
+    one, other = (projector.sensor_from_camera.directions(projector.rays_to_fold(each)) for each in pixels)
     normal = np.cross(one, other)
     with np.errstate(invalid="ignore", divide="ignore"):
         return -(normal @ start) / np.einsum("ij,ij->i", normal, rays), np.zeros(len(rays))
@@ -182,28 +190,109 @@ def pair_warnings(
     of the surface. NaN and "" if neither gives it, or the calibration is doubtful.
     """
     geometry = stereo_geometry(rig)
+    exchangeable = geometry.raw_size[0] == geometry.raw_size[1]
+    names = " and ".join(list(rig.cameras)[:2])
+    exchanged = (
+        f"the images of {names} fit the calibration if they are exchanged: check whether left and right are exchanged"
+    )
     found = list(decoded)
     matches = _Matches.of(found, geometry)
     if matches.decoded < 0.005:
         return [], float("nan"), ""
+    textures = None
+    if not np.isfinite(matches.row_error):
+        image_roles = roles(code, *size)
+        textures = [uniform_light_mean(stack, image_roles, full_scale) for stack in stacks]
+        columns = found[0]["columns"].value, found[1]["columns"].value
+        contradiction, other_order = _texture_contradiction((textures[0], textures[1]), columns, rig, geometry)
+        if contradiction:
+            fits = exchangeable and other_order
+            return (
+                [exchanged if fits else f"{contradiction}: check that the calibration belongs to these images"],
+                np.nan,
+                "",
+            )
     if matches.doubtful:
-        names = " and ".join(list(rig.cameras)[:2])
-        if geometry.raw_size[0] == geometry.raw_size[1] and not _Matches.of(found[::-1], geometry).doubtful:
-            doubt = f"the images of {names} fit the calibration if they are exchanged"
-            return [f"{doubt}: check whether left and right are exchanged"], float("nan"), ""
+        if exchangeable and not _Matches.of(found[::-1], geometry).doubtful:
+            return [exchanged], float("nan"), ""
         return [f"{matches}: check that the calibration belongs to these images"], float("nan"), ""
     offset, source = matches.row_error, "by the code of the rows"
-    if "rows" not in found[0]:
-        image_roles = roles(code, *size)
+    if textures is not None:
         source = "by the texture of the surface"
-        one, other = (uniform_light_mean(stack, image_roles, full_scale) for stack in stacks)
-        offset = textured_row_error((one, other), (found[0]["columns"].value, found[1]["columns"].value), geometry)
+        offset, variation = textured_row_error((textures[0], textures[1]), columns, geometry)
+        if variation > _LARGEST_SPREAD + 0.5 * abs(offset if np.isfinite(offset) else 0.0):
+            swapped = textured_row_error((textures[1], textures[0]), columns[::-1], geometry) if exchangeable else None
+            if swapped is not None and abs(swapped[0]) < LARGEST_ROW_ERROR and not swapped[1] > _LARGEST_SPREAD:
+                return [exchanged], float("nan"), ""
+            told = (
+                f"the rows of the two cameras vary by {variation:.1f} px over the image, by the texture of the surface"
+            )
+            return [f"{told}: check that the calibration belongs to these images"], float("nan"), ""
     if not np.isfinite(offset):
         return [], offset, ""
     return (
         ([row_error_warning(offset)] if abs(offset) > LARGEST_ROW_ERROR else []),
         offset,
         source,
+    )
+
+
+def _texture_contradiction(
+    textures: tuple[Floats, Floats], columns: tuple[Floats, Floats], rig: Rig, geometry: StereoGeometry
+) -> tuple[str, bool]:
+    """Describe how texture matched over all rows contradicts the calibration, and whether the other order fits.
+
+    "" if the texture agrees, or does not suffice.
+    """
+    pixels = texture_matches(textures, columns)
+    if len(pixels[0]) < LEAST_BLOCKS:
+        return "", False
+    step = max(1.0, textures[0].shape[0] / COMPARED_ROWS)  # rows are compared to a fraction of this
+    found, other = (_row_errors(*order, rig, geometry) for order in (pixels, pixels[::-1]))
+    if found.fits(step):
+        return "", False
+    return f"{found}, by the texture of the surface", other.fits(step)
+
+
+@dataclass(frozen=True)
+class _RowErrors:
+    """Row error [px] of matched texture: its ``median`` and ``spread``; share that lies ``behind`` the cameras."""
+
+    median: float
+    spread: float
+    behind: float
+
+    def fits(self, step: float) -> bool:
+        """Return whether the calibration explains the matches, whose rows are accurate to a share of ``step`` [px]."""
+        return self.behind <= 0.5 and self.spread <= _LARGEST_SPREAD * step + 0.5 * min(abs(self.median), _MOVED)
+
+    def __str__(self) -> str:
+        if self.behind > 0.5:
+            return f"{100 * self.behind:.0f} % of the common points lie behind the cameras"
+        return f"the rows of the two cameras are {self.spread:.1f} px apart after rectification"
+
+
+def _row_errors(left: Floats, right: Floats, rig: Rig, geometry: StereoGeometry) -> _RowErrors:
+    """Return the row error of raw pixels (n, 2) of the first and second camera that show the same point."""
+    pair, places = geometry.rectification, []
+    for eye, pixels, turn, matrix in zip(
+        rig.cameras.values(),
+        (left, right),
+        (pair.rotation_left, pair.rotation_right),
+        (pair.matrix_left, pair.matrix_right),
+        strict=False,
+    ):
+        rays = eye.rays(pixels) @ turn.T
+        with np.errstate(invalid="ignore", divide="ignore"):
+            places.append((rays / rays[:, 2:]) @ matrix.T)
+    error = places[1][:, 1] - places[0][:, 1]
+    disparity = places[0][:, 0] - places[1][:, 0] + pair.matrix_right[0, 2] - pair.matrix_left[0, 2]
+    known = np.isfinite(error)
+    if known.mean() < 0.5:
+        return _RowErrors(np.inf, np.inf, 1.0)
+    core = _core(error, 1.0)
+    return _RowErrors(
+        float(np.median(error[known])), float(np.sqrt(np.mean(core**2))), float(np.mean(disparity[known] <= 0))
     )
 
 
@@ -241,6 +330,8 @@ class _Matches:
             return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
         offset, slope = _row_by_code(found, geometry, lines, place)
         # the effect of a stripe, less than a step in depth
+        if not np.isfinite(offset).any():
+            return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
         edge = 1.5 * (2 * _half_stripe(found[0]["rows"]) / abs(slope) + 1)
         # stripe quantisation averages out over a part of the image
         row, column = np.nonzero(matched)
@@ -300,8 +391,10 @@ def _row_by_code(
         return np.asarray(map_coordinates(found[1]["rows"].value, raw[::-1], order=1, cval=np.nan))
 
     v = np.asarray(map_coordinates(found[0]["rows"].value, mine[::-1], order=1, cval=np.nan))
-    slope = (at_right(2.0) - at_right(-2.0)) / 4  # over five rows, for stripes of one or two pixels
-    usual = float(np.nanmedian(slope)) if np.isfinite(slope).any() else float("nan")
+    # in high stripes the median change is zero; the mean is right for every height, without steps between surfaces
+    slope = (at_right(_SLOPE_ROWS) - at_right(-_SLOPE_ROWS)) / (2 * _SLOPE_ROWS)
+    plausible = slope[np.abs(slope) <= LARGEST_STEP_PX / 2 + _half_stripe(found[1]["rows"]) / _SLOPE_ROWS]
+    usual = float(np.mean(plausible)) if plausible.size else float("nan")
     return ((v - at_right(0.0)) / usual if abs(usual) > 1e-3 else np.full(len(v), np.nan)), usual
 
 

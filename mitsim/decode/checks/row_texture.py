@@ -33,6 +33,9 @@ _ROWS, _PATCH, _MATCHED = 6, 40, 0.3
 #: share of the median, because a rotated camera has an uneven row error
 _OF_A_PATCH, _LEAST, _OF_ALL, _UNEVEN = 0.25, 8, 0.06, 0.05
 
+#: largest scatter of the patches about a smooth variation, as a share of the variation
+_FOLLOWED = 0.3
+
 
 def uniform_light_mean(stack: Levels, image_roles: Sequence[Role], full_scale: float) -> Floats:
     """Return the mean (H, W) [DN] of a code's images that light every place equally; NaN if saturated.
@@ -55,8 +58,11 @@ def uniform_light_mean(stack: Levels, image_roles: Sequence[Role], full_scale: f
 
 def textured_row_error(
     textures: tuple[Floats, Floats], columns: tuple[Floats, Floats], geometry: StereoGeometry
-) -> float:
-    """Return the row error [px] of the right image of a pair; NaN if its texture does not give it.
+) -> tuple[float, float]:
+    """Return the row error [px] of the right image of a pair, and its smooth variation over the image (rms) [px].
+
+    The row error is NaN if the texture does not give it. The variation is NaN unless the patches agree on it: they lie
+    near a bilinear function of the image position, as with a wrong calibration, but not with highlights that move.
 
     ``textures`` [DN] and ``columns`` [projector px], (H, W) each: raw left and right, NaN where unknown.
     """
@@ -69,18 +75,39 @@ def textured_row_error(
     )
     place = np.stack([find_coordinates(one, other)[0] for one, other in zip(left[1], right[1], strict=True)])
     place[~np.isfinite(left[0])] = np.nan
-    shifts = []
+    shifts, places = [], []
     for row in range(_ROWS, place.shape[0] - _PATCH - _ROWS, _PATCH):
         for column in range(0, place.shape[1] - _PATCH, _PATCH):
             rows, at = np.nonzero(np.isfinite(place[row : row + _PATCH, column : column + _PATCH]))
             if len(rows) >= _MATCHED * _PATCH**2:
                 shifts.append(_of_a_patch(left, right, rows + row, at + column, place[rows + row, at + column]))
-    known = np.array([off for off, error in shifts if error < _OF_A_PATCH])
+                places.append((row, column))
+    precise = [number for number, (_, error) in enumerate(shifts) if error < _OF_A_PATCH]
+    known = np.array([shifts[number][0] for number in precise])
     if len(known) < _LEAST:
-        return float("nan")
+        return float("nan"), float("nan")
+    variation = _smooth_variation(np.array(places, float)[precise] / place.shape, known)
     middle = float(np.median(known))
     spread = 1.4826 * float(np.median(np.abs(known - middle)))
-    return middle if 1.2533 * spread / np.sqrt(len(known)) <= _OF_ALL + _UNEVEN * abs(middle) else float("nan")
+    agreed = 1.2533 * spread / np.sqrt(len(known)) <= _OF_ALL + _UNEVEN * abs(middle)
+    return (middle if agreed else float("nan")), variation
+
+
+def _smooth_variation(places: Floats, errors: Floats) -> float:
+    """Return the rms [px] of the bilinear function that row errors (n,) at ``places`` (n, 2) follow; NaN if none.
+
+    The function is fitted by least absolute deviations, by reweighting.
+    """
+    if len(errors) < 2 * _LEAST:
+        return float("nan")
+    table = np.stack([np.ones(len(errors)), *places.T, places.prod(axis=1)], axis=1)
+    weight = np.ones(len(errors))
+    for _ in range(20):
+        fitted = table @ np.linalg.lstsq(table * weight[:, None], errors * weight)[0]
+        weight = 1 / np.sqrt(np.maximum(np.abs(errors - fitted), 0.02))
+    left = 1.4826 * float(np.median(np.abs(errors - fitted)))
+    varying = float(np.std(fitted))
+    return varying if left < _FOLLOWED * varying else float("nan")
 
 
 def _rectified(values: Floats, positions: NDArray[np.float32], seen: NDArray[np.bool_]) -> Floats:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from characterisation.files.errors import InputError
-from characterisation.point_cloud import PointCloud
+from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Settings
 from mitsim.decode.checks.gray_origin import gray_origin_warning
@@ -123,3 +123,15 @@ def row_error_in_words(capture: Capture, settings: Settings, found: Findings, ma
 def cloud_warnings(offset: float) -> list[str]:
     """Return warnings about a decoded pair with a row error ``offset`` [px]."""
     return [row_error_warning(offset)] if np.isfinite(offset) and abs(offset) > LARGEST_ROW_ERROR else []
+
+
+def uncalibrated_in_words(cloud: PointCloud) -> str:
+    """Describe the pixels without a unique ray or depth by the calibration; "" without such pixels."""
+    share = float(np.mean(cloud.status == Status.UNCALIBRATED))
+    if not share:
+        return ""
+    return (
+        f"{100 * share:.2g} % of the pixels are left out (uncalibrated): the lens distortion of the calibration folds "
+        "over there, so that they have no unique ray or depth. Calibrate with boards that reach the corners, and with "
+        "fewer distortion coefficients"
+    )

@@ -46,6 +46,7 @@ from mitsim.decode.matching.evidence import (
 )
 from mitsim.decode.matching.sgbm import local_contrast, match_both_ways, search_range
 from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
+from mitsim.sensor.distortion_fold import before_fold, inverse_fold_radii
 from mitsim.sensor.matcher import MatcherSettings
 
 Raw = NDArray[np.uint8] | NDArray[np.uint16]
@@ -160,7 +161,7 @@ def decode_stereo(
         On the rectified left grid, points in the sensor frame [mm]. Status of a pixel without a point, by the first
         condition that holds:
 
-        - ``NO_SURFACE``: outside an image
+        - ``NO_SURFACE``: outside an image, or beyond the fold of a camera's distortion
         - ``SATURATED``: a quarter of the block, in either image
         - ``LOW_MODULATION``: too little contrast, in either image
         - ``OUT_OF_RANGE``: the depth is not between near and far
@@ -284,11 +285,16 @@ def _rectifying_map(
     else:
         raw = cv2.initUndistortRectifyMap(camera.matrix, camera.distortion, rotation, K, size, cv2.CV_32FC1)
     column, row = np.asarray(raw[0]), np.asarray(raw[1])
-    # Far outside the calibrated image, a distortion polynomial may fold back; the map then changes its orientation.
+    # Beyond the fold of a distortion the camera has no such pixel; at the fold, the map changes its orientation.
+    across, down = np.meshgrid(np.arange(size[0], dtype=float), np.arange(size[1], dtype=float))
+    ideal = np.stack([across, down, np.ones_like(across)], axis=-1).reshape(-1, 3) @ np.linalg.inv(K).T @ rotation
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = (ideal[:, :2] / ideal[:, 2:]).T
+    unique = before_fold(x, y, inverse_fold_radii(camera.distortion, camera.model)).reshape(across.shape)
     (column_dy, column_dx), (row_dy, row_dx) = np.gradient(column), np.gradient(row)
     orientation_kept = column_dx * row_dy - column_dy * row_dx > 0
     exists = (column >= -0.5) & (column <= camera.width - 0.5) & (row >= -0.5) & (row <= camera.height - 0.5)
-    return np.stack([column, row]), orientation_kept & exists
+    return np.stack([column, row]), orientation_kept & exists & unique
 
 
 def _centred(strips: Strips, raw: Raw, read_out: Roi | None, full_scale: float) -> NDArray[np.float32]:

@@ -25,7 +25,12 @@ from mitsim.decode.blocks import in_blocks
 from mitsim.decode.grey_levels import MeasuredNoise
 from mitsim.decode.grid_cloud import cloud_on_grid
 from mitsim.decode.image_context import ImageContext
-from mitsim.decode.structured_light.geometry import StructuredLightGeometry, evaluate, structured_light_geometry
+from mitsim.decode.structured_light.geometry import (
+    StructuredLightGeometry,
+    evaluate,
+    exact_inverse_depth,
+    structured_light_geometry,
+)
 from mitsim.decode.structured_light.gray_code import decode_gray_code, decode_gray_code_phase_shift
 from mitsim.decode.structured_light.image_sequence import decode_image_sequence
 from mitsim.decode.structured_light.phase_shift import decode_phase_shift
@@ -125,6 +130,7 @@ def decode_structured_light(
         - ``OUT_OF_RANGE``: the pixel is decoded, but its depth is not between near and far.
         - ``NO_SURFACE``: the pixel shows no code, and the projector does not reach its ray.
         - ``LOW_MODULATION``: the pixel shows no code. Shadow cannot be distinguished from a dark surface.
+        - ``UNCALIBRATED``: the lens distortion gives the pixel no unique ray, or no unique depth on it.
 
     Raises
     ------
@@ -203,9 +209,11 @@ def _triangulated(
     region: tuple[slice, slice],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
     """Return points (h, w, 3), noise along the ray (h, w) [mm] and status (h, w) of a region."""
-    points, sigma, in_range = _points(coordinate, geometry, range_mm, region)
+    points, sigma, in_range, unsolved = _points(coordinate, geometry, range_mm, region)
     status = coordinate.status.copy()
-    status[(status == Status.VALID) & ~in_range] = Status.OUT_OF_RANGE
+    decoded = status == Status.VALID
+    status[decoded & ~in_range] = Status.OUT_OF_RANGE
+    status[geometry.undetermined[region] | (decoded & unsolved)] = Status.UNCALIBRATED
     status[(status == Status.LOW_MODULATION) & ~geometry.seen[region]] = Status.NO_SURFACE
     return points, sigma, status
 
@@ -215,11 +223,14 @@ def _points(
     geometry: StructuredLightGeometry,
     range_mm: tuple[float, float],
     region: tuple[slice, slice],
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Return points (h, w, 3) and noise along the ray (h, w) [mm] of a region, and whether they are in range (h, w)."""
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return points (h, w, 3) and noise along the ray (h, w) [mm] of a region.
+
+    Also return masks (h, w) of the points in range, and of coordinates in the ray's field for which no depth was found.
+    """
     shape, count = coordinate.value.shape, len(geometry.nodes)
     points, sigma = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
-    in_range = np.empty(shape, bool)
+    in_range, unsolved = np.empty(shape, bool), np.zeros(shape, bool)
     value, value_sigma = coordinate.value.ravel(), coordinate.sigma.ravel()
     nodes, differences = (each[:, *region].reshape(count, -1) for each in (geometry.nodes, geometry.differences))
     rays, seen = geometry.ray[region].reshape(-1, 3), geometry.seen[region].ravel()
@@ -230,10 +241,14 @@ def _points(
         for block in blocks:
             u = value[block]
             w, slope = evaluate(nodes[:, block], differences[:, block], u)
-            depth = 1 / w
             # the polynomial holds one pixel beyond its ends; farther out it may turn back into the range
             lowest, highest = nodes[:, block].min(axis=0), nodes[:, block].max(axis=0)
             inside = (u > lowest - 1) & (u < highest + 1) & seen[block]
+            if geometry.exact:
+                chosen = np.flatnonzero(inside)
+                w[chosen], slope[chosen] = exact_inverse_depth(geometry, rays[block][chosen], w[chosen], u[chosen])
+                unsolved.reshape(-1)[block] = inside & np.isnan(w)
+            depth = 1 / w
             in_range.reshape(-1)[block] = inside & (w >= farthest_w) & (w <= nearest_w)
             block_rays = rays[block]
             points.reshape(-1, 3)[block] = geometry.camera.centre + block_rays * depth[:, None]
@@ -241,7 +256,7 @@ def _points(
             sigma.reshape(-1)[block] = np.abs(slope) * depth * depth * length * value_sigma[block]
 
     in_blocks(triangulate_blocks, value.size)
-    return points, sigma, in_range
+    return points, sigma, in_range, unsolved
 
 
 def _reject_contradictions(

@@ -8,8 +8,11 @@ parallel axes. The coordinate u is computed exactly, with the distortion of both
 These are the Chebyshev points of the interval that the projector reaches. They are computed once for a rig.
 
 The polynomial w(u) through these points is Newton's, with divided differences, so decoding needs no iteration. The
-number of points is increased until the error between them is below :data:`TARGET_ERROR_PX`. If it exceeds
-:data:`MAXIMUM_ERROR_PX` with the largest number, the rig is rejected.
+number of points is increased until the error between them is below :data:`TARGET_ERROR_PX`. If no number suffices, as
+for strong distortion over a long range, the polynomial is only the start, and :func:`exact_inverse_depth` iterates.
+
+A ray whose coordinate rises and falls with depth has no unique depth, and a pixel beyond the fold of the camera's
+distortion has no ray. Both are ``undetermined``.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from characterisation.files.threads import in_threads
 from characterisation.point_cloud import ViewGrid
 from mitsim.decode.blocks import BLOCK
 from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.distortion_fold import inverse_fold_radii
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.light_code import LightCode, axes
 
@@ -34,11 +38,17 @@ Floats = NDArray[np.float64]
 #: intended error of the polynomial w(u) against the exact projection [projector px]
 TARGET_ERROR_PX = 1e-5
 
-#: largest permitted error, with the largest number of points [projector px]: a tenth of the noise of a good phase
+#: largest permitted error of an iterated depth [projector px]: a tenth of the noise of a good phase
 MAXIMUM_ERROR_PX = 1e-3
 
-#: numbers of points of the polynomial, in the order of trial
-_POINT_COUNTS = (6, 8, 10, 13, 16)
+#: numbers of points of the polynomial, in the order of trial; number if the polynomial is only a start
+_POINT_COUNTS, _START_COUNT = (6, 8, 10, 13, 16), 10
+
+#: largest number of iterations of an exact depth
+_ITERATIONS = 12
+
+#: depths on a ray at which the part in the projector's field is searched
+_SEARCHED_DEPTHS = 64
 
 #: margin around the projector's field within which a ray still counts as reached, as a share of the field
 _FIELD_MARGIN = 0.03
@@ -66,7 +76,11 @@ class StructuredLightGeometry:
     differences
         (K, H, W) divided differences of w(u) [1/mm/px^k].
     seen
-        (H, W) whether the projector reaches the ray between near and far.
+        (H, W) whether the projector reaches the ray between near and far, and its coordinate determines the depth.
+    undetermined
+        (H, W) whether the lens distortion gives the pixel no ray, or several depths for one coordinate.
+    exact
+        Whether the polynomial is only the start of :func:`exact_inverse_depth`.
     grid, baseline
         Pixels of the cloud, and unit vector (3,) from the camera to the projector.
     """
@@ -81,6 +95,8 @@ class StructuredLightGeometry:
     nodes: Floats
     differences: Floats
     seen: NDArray[np.bool_]
+    undetermined: NDArray[np.bool_]
+    exact: bool
     grid: ViewGrid
     baseline: Floats
 
@@ -105,8 +121,7 @@ def structured_light_geometry(
     Raises
     ------
     InputError
-        If the rig has no such camera or no projector, or the code's coordinate changes with depth at no pixel, or too
-        unevenly.
+        If the rig has no such camera or no projector, or the code's coordinate changes with depth at no pixel.
     """
     if camera_name not in rig.cameras:
         hint = nearest(camera_name, list(rig.cameras))
@@ -130,9 +145,12 @@ def _prepared(
     with np.errstate(divide="ignore", invalid="ignore"):
         local = rays / rays[..., 2:]
     ray = camera.sensor_from_camera.directions(local)
+    known = np.isfinite(local).all(axis=-1)
     low, high = _depth_limits(camera, projector, ray, near_mm, far_mm)
-    seen = (high > low) & np.isfinite(local).all(axis=-1)
+    seen = (high > low) & known
     low, high = np.where(seen, low, 1 / far_mm), np.where(seen, high, 1 / near_mm)
+    if inverse_fold_radii(projector.distortion, projector.model).any():
+        _shorten(camera, projector, ray, low, high, seen)
 
     def coordinate(inverse_depth: Floats, rays: Floats) -> Floats:
         return _projected_component(projector, camera.centre + rays / inverse_depth[..., None], component)
@@ -141,27 +159,20 @@ def _prepared(
     sample = np.s_[::7, ::7]
     for count in _POINT_COUNTS:
         nodes, differences = _polynomial(coordinate, ray[sample], low[sample], high[sample], count)
-        change = np.diff(nodes, axis=0)
-        usable = seen[sample] & _monotonic(change)
+        usable = seen[sample] & _monotonic(np.diff(nodes, axis=0))
         tested = low[sample] + (high - low)[sample] * np.linspace(0.02, 0.98, 2 * count + 1)[:, None, None]
         exact = np.stack([coordinate(w, ray[sample]) for w in tested])
         fitted, slope = zip(*(evaluate(nodes, differences, u) for u in exact), strict=True)
         with np.errstate(divide="ignore", invalid="ignore"):
             error = np.abs((np.stack(fitted) - tested) / np.stack(slope))[:, usable]
-        largest_error = float(error.max(initial=0.0))
-        if largest_error < TARGET_ERROR_PX:
+        iterated = not float(error.max(initial=0.0)) < TARGET_ERROR_PX
+        if not iterated:
             break
-    if largest_error > MAXIMUM_ERROR_PX:
-        raise InputError(
-            "rig",
-            "projector",
-            f"a coordinate that a polynomial of {count} points along a ray follows to {largest_error:.2g} px only",
-            f"{MAXIMUM_ERROR_PX:g} px",
-            "shorten the range near_mm to far_mm, or correct the distortion of the projector",
-        )
-    nodes, differences = _polynomial(coordinate, ray, low, high, count)
+    nodes, differences = _polynomial(coordinate, ray, low, high, _START_COUNT if iterated else count)
     change = np.diff(nodes, axis=0)
-    seen &= _monotonic(change) & (np.abs(change.sum(axis=0)) > MINIMUM_CHANGE_PX)
+    monotonic, changes = _monotonic(change), np.ptp(nodes, axis=0) > MINIMUM_CHANGE_PX
+    undetermined = ~known | (seen & ~monotonic & changes)
+    seen &= monotonic & changes
     if not seen.any():
         raise InputError(
             "pattern",
@@ -183,6 +194,8 @@ def _prepared(
         nodes,
         differences,
         seen,
+        undetermined,
+        iterated,
         camera_grid(camera, local),
         baseline / np.linalg.norm(baseline),
     )
@@ -208,7 +221,7 @@ def camera_grid(camera: Camera, local: Floats | None = None) -> ViewGrid:
         return pinhole
     if local is None:
         local = camera.rays(camera.pixel_grid())
-    return replace(pinhole, normalised=(local[..., :2] / local[..., 2:]).astype(np.float32))
+    return replace(pinhole, normalised=(local[..., :2] / local[..., 2:]).astype(np.float32))  # NaN without a ray
 
 
 def _depth_limits(camera: Camera, projector: Camera, ray: Floats, near: float, far: float) -> tuple[Floats, Floats]:
@@ -221,7 +234,7 @@ def _depth_limits(camera: Camera, projector: Camera, ray: Floats, near: float, f
     columns[-33:] = projector.width - 0.5
     rows = np.concatenate([np.full(33, -0.5)] * 2 + [np.linspace(-0.5, projector.height - 0.5, 33)] * 2)
     rows[33:66] = projector.height - 0.5
-    boundary = projector.rays(np.stack([columns, rows], axis=-1))
+    boundary = projector.rays_to_fold(np.stack([columns, rows], axis=-1))
     boundary = boundary[:, :2] / boundary[:, 2:]
     margin = _FIELD_MARGIN * (boundary.max(axis=0) - boundary.min(axis=0))
     lowest, highest = boundary.min(axis=0) - margin, boundary.max(axis=0) + margin
@@ -239,6 +252,70 @@ def _depth_limits(camera: Camera, projector: Camera, ray: Floats, near: float, f
         else:
             high = np.where(constant >= 0, high, -np.inf)
     return low, high
+
+
+def _shorten(
+    camera: Camera, projector: Camera, ray: Floats, low: Floats, high: Floats, seen: NDArray[np.bool_]
+) -> None:
+    """Shorten, in place, the inverse depths of rays that leave the field of a projector whose distortion folds over.
+
+    Such rays pass a corner of the box around the field. They keep the longest part in the image and its margin.
+    """
+    with np.errstate(invalid="ignore"):
+        ends = np.stack([projector.project(camera.centre + ray / end[..., None]) for end in (low, high)])
+    outside = np.nonzero(seen & np.isnan(ends).any(axis=(0, -1)))
+    if not outside[0].size:
+        return
+    share = np.linspace(0, 1, _SEARCHED_DEPTHS)[:, None]
+    tried = low[outside] + (high - low)[outside] * share
+    pixels = projector.project(camera.centre + ray[outside] / tried[..., None])
+    size = np.array([projector.width, projector.height])
+    with np.errstate(invalid="ignore"):
+        inside = np.all((pixels > -_FIELD_MARGIN * size) & (pixels < (1 + _FIELD_MARGIN) * size), axis=-1)
+    run, longest = np.zeros(inside.shape[1], int), np.zeros(inside.shape[1], int)
+    last = np.zeros(inside.shape[1], int)
+    for index, row in enumerate(inside):
+        run = np.where(row, run + 1, 0)
+        last = np.where(run > longest, index, last)
+        longest = np.maximum(run, longest)
+    ray_number = np.arange(inside.shape[1])
+    found = longest > 1
+    first = np.where(found, last - longest + 1, 0)
+    low[outside], high[outside] = (
+        np.where(found, tried[first, ray_number], low[outside]),
+        np.where(found, tried[last, ray_number], high[outside]),
+    )
+    seen[outside] = found
+
+
+def exact_inverse_depth(
+    geometry: StructuredLightGeometry, ray: Floats, start: Floats, u: Floats
+) -> tuple[Floats, Floats]:
+    """Return w and dw/du (n,) at which rays (n, 3) have coordinates ``u`` (n,), by the secant method from ``start``.
+
+    NaN where the exact projection does not reach ``u`` to :data:`MAXIMUM_ERROR_PX`.
+    """
+    component = 0 if geometry.axis == "columns" else 1
+
+    def missed(inverse_depth: Floats, chosen: NDArray[np.intp]) -> Floats:
+        places = geometry.camera.centre + ray[chosen] / inverse_depth[:, None]
+        return _projected_component(geometry.projector, places, component) - u[chosen]
+
+    everywhere = np.arange(len(u))
+    with np.errstate(all="ignore"):
+        before, w = start * (1 + 1e-5), start.copy()
+        error_before, error = missed(before, everywhere), missed(w, everywhere)
+        slope = (before - w) / (error_before - error)
+        for _ in range(_ITERATIONS):
+            active = np.flatnonzero(np.abs(error) > TARGET_ERROR_PX)
+            if not active.size:
+                break
+            moved = w[active] - error[active] * slope[active]
+            found = missed(moved, active)
+            slope[active] = (moved - w[active]) / (found - error[active])
+            w[active], error[active] = moved, found
+        exact = np.abs(error) <= MAXIMUM_ERROR_PX
+    return np.where(exact, w, np.nan), np.where(exact, slope, np.nan)
 
 
 def _projected_component(projector: Camera, points: Floats, component: int) -> Floats:

@@ -236,6 +236,7 @@ def _grey(capture: Capture, grid: ViewGrid) -> NDArray[np.uint8] | None:
     if capture.decoding.ambient_image and len(lit) > 1:
         lit = lit[:-1]
     place = camera.project((camera.centre + 1000.0 * grid.rays()).reshape(-1, 3)).reshape(grid.height, grid.width, 2)
+    place = np.nan_to_num(place, nan=-9.0)  # outside the image
     mean = lit.mean(axis=0, dtype=np.float64) * 255 / (2**capture.bits - 1)
     sampled = map_coordinates(mean, [place[..., 1], place[..., 0]], order=1, mode="constant", cval=0.0)
     return np.asarray(np.rint(np.nan_to_num(sampled)).clip(0, 255), np.uint8)

@@ -81,7 +81,8 @@ class CameraRays:
         down, across = (_spline(size + 1, _GRID_PX) for size in (camera.height, camera.width))
         columns, rows = np.meshgrid(across.knots - 0.5, down.knots - 0.5)
         corners = np.stack([columns, rows], axis=-1)
-        before, after = (rays[..., :2] / rays[..., 2:] for rays in (self.camera.rays(corners), camera.rays(corners)))
+        pair = self.camera.rays_to_fold(corners), camera.rays_to_fold(corners)
+        before, after = (rays[..., :2] / rays[..., 2:] for rays in pair)
         differences = [
             down.coefficients @ component @ across.coefficients.T for component in np.moveaxis(after - before, -1, 0)
         ]
@@ -108,7 +109,7 @@ class CameraRays:
 def _ideal_corners(camera: Camera) -> tuple[Any, Any]:
     """Return the ideal image coordinates x/z and y/z at the pixel corners, row by row."""
     columns, rows = np.meshgrid(np.arange(camera.width + 1) - 0.5, np.arange(camera.height + 1) - 0.5)
-    rays = camera.rays(np.stack([columns, rows], axis=-1))
+    rays = camera.rays_to_fold(np.stack([columns, rows], axis=-1))
     return tuple(to_device(np.ravel(rays[..., i] / rays[..., 2])) for i in (0, 1))
 
 
@@ -118,8 +119,11 @@ def bilinear(corners: list[Any], a: Any, b: Any) -> Any:
 
 
 def pixel_area(x: list[Any], y: list[Any]) -> Any:
-    """Return the area of a pixel on the plane z = 1 from its four corners: half the cross product of the diagonals."""
-    return 0.5 * dr.abs((x[3] - x[0]) * (y[2] - y[1]) - (x[2] - x[1]) * (y[3] - y[0]))
+    """Return the area of a pixel on the plane z = 1 from its four corners: half the cross product of the diagonals.
+
+    It is positive, also where all corners lie on the fold of a distortion.
+    """
+    return dr.maximum(0.5 * dr.abs((x[3] - x[0]) * (y[2] - y[1]) - (x[2] - x[1]) * (y[3] - y[0])), 1e-20)
 
 
 @dataclass(frozen=True)

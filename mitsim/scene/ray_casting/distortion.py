@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mitsim.scene.backend import dr
 from mitsim.scene.device import opaque
 from mitsim.sensor.camera import Camera
+from mitsim.sensor.distortion_fold import inverse_fold_radii
 
 #: largest radius that is projected, over the ideal radius of the farthest corner. Beyond it, a distortion polynomial
 #: may fold back into the image
@@ -32,7 +33,8 @@ class Distortion:
     def __init__(self, optics: Camera) -> None:
         k = optics.matrix
         self.border = ideal_border(optics)
-        self.reach = float(np.linalg.norm(self.border, axis=1).max()) * _BEYOND
+        fold = inverse_fold_radii(optics.distortion, optics.model).max()
+        self.reach = min(float(np.linalg.norm(self.border, axis=1).max()) * _BEYOND, 1 / fold if fold else np.inf)
         coefficients = np.concatenate([optics.distortion, np.zeros(14)])[:14]
         homography = _tilt(*coefficients[12:])
         self._fisheye, self._distorted = optics.model == "fisheye", bool(coefficients.any())
@@ -96,7 +98,7 @@ def _tilt(tx: float, ty: float) -> list[list[float]] | None:
 
 
 def ideal_border(optics: Camera) -> NDArray[np.float64]:
-    """Return ideal image points (260, 2) along the border of an image, 65 on each side."""
+    """Return ideal image points (260, 2) along the border of an image, or of the fold before it, 65 on each side."""
     columns, rows = np.linspace(-0.5, optics.width - 0.5, 65), np.linspace(-0.5, optics.height - 0.5, 65)
     border = np.concatenate(
         [
@@ -106,5 +108,5 @@ def ideal_border(optics: Camera) -> NDArray[np.float64]:
             np.stack([np.full(65, optics.width - 0.5), rows], 1),
         ]
     )
-    rays = optics.rays(border)
+    rays = optics.rays_to_fold(border)
     return np.asarray(rays[:, :2] / rays[:, 2:])

@@ -190,6 +190,7 @@ class MappedScene:
             mi.Ray3f(frame.position, direction),
             ray_flags=mi.RayFlags.dPdUV if self.with_lay else mi.RayFlags.Minimal,
             coherent=True,
+            active=True if view.rays.active is True else dr.gather(mi.Bool, view.rays.active, pixel),
         )
         number = dr.reinterpret_array(mi.UInt32, surface.shape)
         met = surface.is_valid() & (number < self.count)  # shapes inside an instance have larger numbers

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import ViewGrid
 from mitsim.scene.backend import dr, mi
-from mitsim.scene.device import opaque_point, vectors_to_device, vectors_to_host
+from mitsim.scene.device import known_to_device, opaque_point, vectors_to_host
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
 from mitsim.sensor.camera import Camera
@@ -46,13 +46,14 @@ class Surfaces:
 class PixelRays:
     """Rays from one point, on the device.
 
-    ``origin`` (3,) [mm] and unit ``directions`` (H, W, 3), both in the sensor frame.
+    ``origin`` (3,) [mm] and unit ``directions`` (H, W, 3), both in the sensor frame. A direction of NaN meets nothing;
+    ``active`` is a mask of the others on the device, or True for all.
     """
 
     def __init__(self, origin: NDArray[np.floating], directions: NDArray[np.floating]) -> None:
         self.origin = np.asarray(origin, float)
         self.size = (directions.shape[0], directions.shape[1])
-        self.directions = vectors_to_device(directions.reshape(-1, 3))
+        self.directions, self.active = known_to_device(directions.reshape(-1, 3))
 
     def frame(self, world_from_sensor: Transform) -> Eye:
         """Return the origin of the rays and the axes of the sensor, in the world frame."""
@@ -82,7 +83,7 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
         (E, 3) [mm], sensor frame: optical centres of the other cameras and the projector.
     """
     frame = rays.frame(world_from_sensor)
-    surface = scene.mitsuba.ray_intersect(mi.Ray3f(frame.position, frame.to_world(rays.directions)))
+    surface = scene.mitsuba.ray_intersect(mi.Ray3f(frame.position, frame.to_world(rays.directions)), rays.active)
     facing = dr.select(dr.dot(surface.n, frame.to_world(rays.directions)) > 0, -1.0, 1.0)
     two_sided = (surface.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.BackSide))) != 0
     hit = surface.is_valid() & ((facing > 0) | two_sided)
@@ -115,7 +116,8 @@ def shapes_met(scene: Scene, rays: PixelRays, world_from_sensor: Transform) -> N
     It takes a tenth of the time of :func:`cast`.
     """
     frame = rays.frame(world_from_sensor)
-    met = scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(frame.position, frame.to_world(rays.directions)))
+    ray = mi.Ray3f(frame.position, frame.to_world(rays.directions))
+    met = scene.mitsuba.ray_intersect_preliminary(ray, active=rays.active)
     return shape_indices(scene, dr.reinterpret_array(mi.UInt32, met.shape)).reshape(rays.size)
 
 

@@ -194,7 +194,7 @@ def seen_by_all(points: Floats, eyes: Mapping[str, Camera]) -> NDArray[np.bool_]
 def _unfolded(eye: Camera, points: Floats) -> NDArray[np.bool_]:
     """Return whether points lie in the field of the image's corners; beyond, the distortion polynomial may fold."""
     local = eye.sensor_from_camera.inverse().points(points)
-    corner = eye.rays(np.array([[0.0, 0.0], [eye.width - 1.0, eye.height - 1.0]]))
+    corner = eye.rays_to_fold(np.array([[0.0, 0.0], [eye.width - 1.0, eye.height - 1.0]]))
     widest = np.max(np.linalg.norm(corner[:, :2], axis=1) / corner[:, 2])
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = np.linalg.norm(local[:, :2], axis=1) / local[:, 2]

@@ -54,7 +54,7 @@ class SpecimenPatches:
     Image: ``levels`` (P, 2^bits) are pixels of each grey level. ``contrast`` (P,) [1] is local deviation over local
     mean. ``crossings`` (P,) count crossings of the local mean in ``pixels`` (P,) pixels. ``finest`` (P,) is in DN.
 
-    Cloud: ``status`` (Q, 11) are pixels of each :class:`Status`. ``sigma`` (Q,) [mm] is along the rays, ``sigma_px``
+    Cloud: ``status`` (Q, 12) are pixels of each :class:`Status`. ``sigma`` (Q,) [mm] is along the rays, ``sigma_px``
     [px] in disparity. ``distance`` (Q,) [mm] is that of the patch's plane along its mean ray. ``products`` and
     ``pairs`` (Q, k, k) are those of residuals by lag. ``row_error`` (Q,) [px] is that of the right image. ``cloud`` is
     the cloud, ``on_grid`` (H, W) are the specimen's pixels, ``residual`` (H, W) [mm] is about the planes of the

@@ -157,5 +157,5 @@ def _wider(roi: Roi, width: int, height: int) -> Roi:
 
 
 def _slopes(camera: Any, roi: Roi) -> Floats:
-    rays = camera.rays(np.stack(roi.pixels(), axis=-1).astype(float))
+    rays = camera.rays_to_fold(np.stack(roi.pixels(), axis=-1).astype(float))
     return np.asarray(camera.sensor_from_camera.directions(rays))
