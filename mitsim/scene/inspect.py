@@ -24,8 +24,11 @@ from mitsim.scene.mesh_facts import MeshFacts, mesh_facts
 
 Floats = NDArray[np.float64]
 
-#: number of points on each shape; number of rays along one side of the square grid of each direction
-_SAMPLES, _ROW = 2048, 96
+#: points on each shape
+_SAMPLES = 2048
+
+#: rays along one side of the square grid of each direction
+_ROW = 96
 
 #: spacing of the grid in which vertices are merged, as a share of the size of the scene
 _MERGE = 1e-6

@@ -169,13 +169,6 @@ def diffraction_spots(
     return np.minimum(field[reach : reach + height, reach : reach + width], 1.0)
 
 
-def mean_run_length(image: NDArray[np.floating], threshold: NDArray[np.floating] | float) -> float:
-    """Return the mean length [px] of bright and dark runs along the rows of an image (H, W)."""
-    bright = np.asarray(image > threshold)
-    changes = np.count_nonzero(bright[:, 1:] != bright[:, :-1])
-    return float(bright.size / max(changes + bright.shape[0], 1))
-
-
 def _cut(mask: NDArray[np.float32], left: float, top: float, width: int, height: int) -> NDArray[np.float32]:
     """Interpolate a part of a mask bilinearly; its pixel (0, 0) is at (left, top) of the mask."""
     column, row = int(np.floor(left)), int(np.floor(top))

@@ -38,8 +38,12 @@ from characterisation.files.errors import InputError
 _FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))
 #: speckles smaller than this [px] leave neighbouring pixels independent (correlation under 0.2 %)
 _INDEPENDENT_PX = 0.7
-#: the normal variable of the gamma tables spans +-_REACH
-_REACH, _STEPS, _CONTRASTS = 6.0, 1024, 65
+#: the normal variable of the gamma tables spans +-_REACH: beyond it lie 2e-9 of all pixels
+_REACH = 6.0
+#: steps of a table over that span
+_STEPS = 1024
+#: tables for contrasts from 0 to 1
+_CONTRASTS = 65
 
 
 @dataclass(frozen=True)

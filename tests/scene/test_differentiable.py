@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from figures_of_surfaces import lobe_factor
 from hypothesis import given
 from hypothesis import strategies as st
-from lobe_formulas import lobe_factor
 
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor

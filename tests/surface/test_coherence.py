@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from lobe_formulas import lobe_factor
+from figures_of_surfaces import lobe_factor
 
 from mitsim.scene.surface.coherence import coherent_weight
 from mitsim.scene.surface.energy import facets

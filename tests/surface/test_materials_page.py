@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lobe_formulas import alpha_of_half_width, short_wave_height
+from figures_of_surfaces import alpha_of_half_width, short_wave_height
 from scipy.optimize import brentq
 
 from mitsim.scene.surface.diffraction import coherent_share, lobe_alpha

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from figures_of_surfaces import alpha_of_half_width
 from hypothesis import given
 from hypothesis import strategies as st
-from lobe_formulas import alpha_of_half_width
 from scipy.integrate import quad
 
 from mitsim.scene.surface.microfacet import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from lobe_formulas import short_wave_height
+from figures_of_surfaces import short_wave_height
 from scipy.integrate import quad
 
 from mitsim.scene.surface.processes import PROCESSES, feed, feed_slope, micro_roughness

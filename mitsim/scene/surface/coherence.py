@@ -32,7 +32,11 @@ EVEN_FROM = float(np.cos(np.radians(45)))
 #: incidence [rad] up to which A holds and energy is conserved
 LARGEST_INCIDENCE = float(np.radians(75))
 
-_ANGLES, _COUNTS = 12, (96, 48, 4)
+#: angles of incidence at which energy is conserved
+_ANGLES = 12
+
+#: facets of the quadrature at each angle, as of :func:`~mitsim.scene.surface.energy.facets`
+_COUNTS = (96, 48, 4)
 
 
 def coherent_weight(phase_variance: float, mean_cosine: ArrayLike) -> NDArray[np.float64]:

@@ -22,7 +22,8 @@ from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, Distribution, fres
 #: incidence at which the compensation is exact [rad]
 NOMINAL_INCIDENCE = float(np.radians(30))
 
-_RADII, _AZIMUTHS, _VIEWS = 300, 96, 12
+#: facets of the quadrature: radii and azimuths of their slopes, and azimuths of the light for an elongated lobe
+_COUNTS = (300, 96, 12)
 
 
 @lru_cache(maxsize=4096)
@@ -46,7 +47,7 @@ def directional_albedo(
     index
         n and k of the material [1]; None for a perfect mirror.
     """
-    weights, _ = facets(incidence, alpha_u, alpha_v, distribution, (_RADII, _AZIMUTHS, _VIEWS), index)
+    weights, _ = facets(incidence, alpha_u, alpha_v, distribution, _COUNTS, index)
     return float(weights.sum())
 
 

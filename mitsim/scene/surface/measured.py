@@ -25,7 +25,12 @@ from characterisation.files.checked_files import read_bounded, read_text_bounded
 from characterisation.files.errors import InputError
 from mitsim.scene.surface.diffraction import Autocorrelation, sampled
 
-_FEWEST_POINTS, _SMALLEST_MAP, _LARGEST_MAP = 200, 64, 4096
+#: fewest points of a trace
+_FEWEST_POINTS = 200
+
+#: least and most heights of a map along each side
+_SMALLEST_MAP, _LARGEST_MAP = 64, 4096
+
 #: largest text table [bytes]
 _LARGEST_TABLE = 128 * 1024**2
 

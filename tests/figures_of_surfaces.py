@@ -1,4 +1,4 @@
-"""Closed forms of lobes and heights with which tests compare."""
+"""Figures of lobes, heights and patterns with which tests compare."""
 
 from __future__ import annotations
 
@@ -29,3 +29,10 @@ def alpha_of_half_width(width: float, distribution: Distribution) -> float:
 def short_wave_height(sigma_um: float, correlation_um: float, nu: float, longest_um: float) -> float:
     """Return Rq [um] of a Matern surface from spatial wavelengths below ``longest_um`` only."""
     return float(sigma_um * (1 + (2 * np.pi * correlation_um / longest_um) ** 2) ** (-nu / 2))
+
+
+def mean_run_length(image: NDArray[np.floating], threshold: NDArray[np.floating] | float) -> float:
+    """Return the mean length [px] of bright and dark runs along the rows of an image (H, W)."""
+    bright = np.asarray(image > threshold)
+    changes = np.count_nonzero(bright[:, 1:] != bright[:, :-1])
+    return float(bright.size / max(changes + bright.shape[0], 1))
