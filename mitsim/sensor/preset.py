@@ -120,7 +120,7 @@ class Sensor:
 
     @property
     def bits(self) -> int | None:
-        """Return the bits of the images; None if the file states neither them nor a complete imager."""
+        """Return the bits of the images; None if the file states neither them nor all that simulation needs."""
         return None if self.missing_for("bits") else self.imager.bits
 
     @property
@@ -317,7 +317,7 @@ def _sensor_of(path: Path, written: dict[str, Any], purpose: Purpose, notes: tup
         table = validate(path, with_depths(written), SensorFile)
     except InputError as error:
         raise (missing_error(path, _lacking(written, purpose)) if error.found == "nothing" else error) from None
-    if _lacking(written, "decoding"):
+    if absent_keys(written, needed_keys(written, "decoding")):
         raise missing_error(path, _lacking(written, purpose))
     near, far = table.working_range_mm
     if near >= far:

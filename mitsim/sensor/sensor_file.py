@@ -13,12 +13,13 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from characterisation.files.documents import Document, Name
+from characterisation.files.errors import InputError
 from mitsim.sensor.calibration_qualifiers import check_intrinsics
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -302,7 +303,15 @@ _LIGHT = ("wavelength_nm", "working_range_mm", "projector.flux_w", "exposure.rul
 
 
 def needed_keys(table: dict[str, Any], purpose: Purpose) -> tuple[str, ...]:
-    """Return the keys that a purpose needs in a sensor file's table, beyond those that every file has."""
+    """Return the keys that a purpose needs in a sensor file's table, beyond those that every file has.
+
+    Raises
+    ------
+    InputError
+        If there is no such purpose.
+    """
+    if purpose not in get_args(Purpose):
+        raise InputError("sensor", "purpose", repr(purpose), ", ".join(get_args(Purpose)))
     technology, decoder = table.get("technology"), table.get("decoder")
     between_cameras = isinstance(decoder, dict) and decoder.get("triangulate") == "cameras"
     match purpose:

@@ -164,6 +164,8 @@ def test_a_complete_sensor_is_the_same_rig(name):
 def test_a_rig_names_what_each_purpose_lacks_and_the_simulation_refuses_it(tmp_path):
     rig = load_sensor(written(tmp_path, smallest() + "[imager]\npixel_um = 3.45\nf_number = 8\n"), "decoding")
     assert rig.missing_for("decoding") == ()
+    with pytest.raises(InputError, match="purpose: found 'decode'; allowed: simulation, decoding"):
+        rig.missing_for("decode")
     assert rig.missing_for("bits") == ("imager.bits",)
     assert rig.missing_for("noise") == ("imager.quantum_efficiency", "imager.full_well_e", "imager.read_noise_e")
     assert set(rig.missing_for("noise")) < set(rig.missing_for("simulation"))
