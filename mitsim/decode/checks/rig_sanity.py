@@ -21,7 +21,7 @@ from mitsim.decode.checks.texture_matches import COMPARED_ROWS, LEAST_BLOCKS, te
 from mitsim.decode.matching.row_error import row_error
 from mitsim.decode.matching.stereo import StereoGeometry, stereo_geometry
 from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
-from mitsim.decode.structured_light.two_cameras import LARGEST_STEP_PX, find_coordinates
+from mitsim.decode.structured_light.two_cameras import find_coordinates
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
@@ -47,8 +47,8 @@ _LEAST_MATCHED, _LARGEST_SPREAD = 0.1, 0.5
 #: row error [px] of a rig that has moved; beyond, the calibration is of another rig
 _MOVED = 6.0
 
-#: half the distance [px] over which the slope of the projector rows is measured
-_SLOPE_ROWS = 6.0
+#: half the distances [px] over which the slope of the projector rows is measured, until they span two stripes
+_SLOPE_ROWS = (2.0, 4.0, 8.0, 16.0, 32.0)
 
 #: parts of an image along either side for averaging rows, and least number of pixels of a mean
 _PARTS, _ENOUGH = 6, 30
@@ -391,10 +391,12 @@ def _row_by_code(
         return np.asarray(map_coordinates(found[1]["rows"].value, raw[::-1], order=1, cval=np.nan))
 
     v = np.asarray(map_coordinates(found[0]["rows"].value, mine[::-1], order=1, cval=np.nan))
-    # in high stripes the median change is zero; the mean is right for every height, without steps between surfaces
-    slope = (at_right(_SLOPE_ROWS) - at_right(-_SLOPE_ROWS)) / (2 * _SLOPE_ROWS)
-    plausible = slope[np.abs(slope) <= LARGEST_STEP_PX / 2 + _half_stripe(found[1]["rows"]) / _SLOPE_ROWS]
-    usual = float(np.mean(plausible)) if plausible.size else float("nan")
+    # a median over less than a stripe is zero
+    for half_distance in _SLOPE_ROWS:
+        slope = (at_right(half_distance) - at_right(-half_distance)) / (2 * half_distance)
+        usual = float(np.nanmedian(slope)) if np.isfinite(slope).any() else float("nan")
+        if abs(usual) * half_distance >= 2 * _half_stripe(found[1]["rows"]):
+            break
     return ((v - at_right(0.0)) / usual if abs(usual) > 1e-3 else np.full(len(v), np.nan)), usual
 
 
