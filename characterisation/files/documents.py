@@ -7,15 +7,18 @@ type or value it names the file, the field, the value found and the allowed valu
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 import re
 import tomllib
 import unicodedata
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, WithJsonSchema
+from pydantic.fields import FieldInfo
 
 from characterisation.files.checked_files import read_text_bounded
 from characterisation.files.errors import InputError, nearest
@@ -76,6 +79,17 @@ def read_toml(path: str | Path, model: type[Model]) -> Model:
     InputError
         If the file is missing, is not TOML, or violates the model.
     """
+    return validate(path, read_toml_table(path), model)
+
+
+def read_toml_table(path: str | Path) -> dict[str, Any]:
+    """Read one TOML file as a table, of which only nesting and numbers are checked.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or is not TOML.
+    """
     path = Path(path)
     text = read_text_bounded(path, "a TOML file", _neighbours(path), LARGEST_TOML).replace("\r\n", "\n")
     _check_nesting(path, text)
@@ -85,7 +99,7 @@ def read_toml(path: str | Path, model: type[Model]) -> Model:
         cause = " ".join(str(error).split())[:200]
         raise InputError(path, "", f"text that is not TOML ({cause})", "TOML, see https://toml.io") from None
     _check_numbers(path, table)
-    return validate(path, table, model)
+    return table
 
 
 def _check_nesting(path: Path, text: str) -> None:
@@ -120,6 +134,13 @@ def validate(where: str | Path, table: dict[str, Any], model: type[Model], conte
         return model.model_validate(table, context=context)
     except ValidationError as error:
         raise _explain(where, table, model, error, missing_keys(table, model, context)) from None
+
+
+def missing_error(where: str | Path, keys: Iterable[str]) -> InputError:
+    """Return the error that names missing keys."""
+    names = list(keys)
+    allowed = "a value: this key is required" if len(names) == 1 else "a value for each: these keys are required"
+    return InputError(where, ", ".join(names), "nothing", allowed)
 
 
 def missing_keys(table: dict[str, Any], model: type[Document], context: Any = None) -> list[str]:
@@ -185,14 +206,14 @@ def _explain(
 ) -> InputError:
     faults = error.errors()
     # a misspelt key usually makes the correct key "missing" too: report the misspelling first, as the cause
-    order = {"extra_forbidden": 0, "missing": 2, "union_tag_not_found": 2}
+    order = {"extra_forbidden": 0, "unexpected_keyword_argument": 0, "missing": 2, "union_tag_not_found": 2}
     fault = min(faults, key=lambda each: order.get(each["type"], 1))
     location = _location(table, fault["loc"])
     field = ".".join(str(part) for part in location)
     context = fault.get("ctx", {})
     also = f"Also missing: {', '.join(missing)}" if missing else ""
     match fault["type"]:
-        case "extra_forbidden":
+        case "extra_forbidden" | "unexpected_keyword_argument":
             key = str(location[-1])
             known = _keys_at(model, fault["loc"][:-1])
             meant = nearest(key, known)
@@ -200,9 +221,7 @@ def _explain(
             also = f"Also missing: {', '.join(others)}" if others else ""
             return InputError(where, field, "an unknown key", ", ".join(known) or "no keys", _joined(meant, also))
         case "missing" | "union_tag_not_found":
-            if len(missing) < 2:
-                return InputError(where, missing[0] if missing else field, "nothing", "a value: this key is required")
-            return InputError(where, ", ".join(missing), "nothing", "a value for each: these keys are required")
+            return missing_error(where, missing or [field])
         case "union_tag_invalid":
             key = f"{field}.{context['discriminator'].strip(chr(39))}".strip(".")
             known = [each.strip("' ") for each in context["expected_tags"].split(",")]
@@ -220,7 +239,7 @@ def _explain(
                 field = f"{field}.{key}".removeprefix(".")
                 return InputError(where, field, shown(fault["input"][key], where), allowed, also)
             return InputError(where, field, shown(fault["input"], where), allowed, also)
-        case "model_type" | "model_attributes_type" | "dict_type":
+        case "model_type" | "model_attributes_type" | "dict_type" | "dataclass_type":
             keys = ", ".join(_keys_at(model, fault["loc"]))
             return InputError(where, field, shown(fault["input"], where), "a table" + f": {keys}" * bool(keys), also)
         case "int_parsing_size" | "int_type" if isinstance(fault["input"], int):
@@ -245,9 +264,9 @@ def _keys_at(model: type[Document], location: tuple[Any, ...]) -> list[str]:
     here: list[Any] = [model]
     for part in location:
         here = [each for option in here for each in _options(option)]
-        models = [each for each in here if isinstance(each, type) and issubclass(each, BaseModel)]
+        models = [each for each in here if _is_table(each)]
         variants = [each for each in models if part in _tags(each)]
-        inside = [each.model_fields[part].annotation for each in models if part in each.model_fields]
+        inside = [fields_of(each)[part].annotation for each in models if part in fields_of(each)]
         values = [get_args(each)[-1] for each in here if get_origin(each) is dict]
         items = [part_of for each in here if get_origin(each) in (list, tuple, set) for part_of in get_args(each)]
         if isinstance(part, int):
@@ -255,8 +274,24 @@ def _keys_at(model: type[Document], location: tuple[Any, ...]) -> list[str]:
         elif part != "[key]" and not str(part).startswith("function-"):
             here = variants or inside or values or here
     here = [each for option in here for each in _options(option)]
-    models = [each for each in here if isinstance(each, type) and issubclass(each, BaseModel)]
-    return list(dict.fromkeys(name for each in models for name in each.model_fields))
+    return list(dict.fromkeys(name for each in here if _is_table(each) for name in fields_of(each)))
+
+
+def _is_table(annotation: Any) -> bool:
+    return isinstance(annotation, type) and (issubclass(annotation, BaseModel) or dataclasses.is_dataclass(annotation))
+
+
+def fields_of(model: type) -> Mapping[str, FieldInfo]:
+    """Return the fields of a model, or of a data class that a model contains, by their keys in the file."""
+    if issubclass(model, BaseModel):
+        return model.model_fields
+    assert dataclasses.is_dataclass(model)
+    hints = get_type_hints(model, include_extras=True)
+    infos = {
+        each.name: FieldInfo.from_annotated_attribute(hints[each.name], each.default)
+        for each in dataclasses.fields(model)
+    }
+    return {info.alias or name: info for name, info in infos.items()}
 
 
 def _options(annotation: Any) -> list[Any]:
@@ -268,9 +303,9 @@ def _options(annotation: Any) -> list[Any]:
     return [annotation]
 
 
-def _tags(model: type[BaseModel]) -> set[str]:
+def _tags(model: type) -> set[str]:
     """Return the values and the name by which pydantic tells a table variant from others."""
-    literals = [field.annotation for field in model.model_fields.values() if get_origin(field.annotation) is Literal]
+    literals = [field.annotation for field in fields_of(model).values() if get_origin(field.annotation) is Literal]
     return {model.__name__, *(value for each in literals for value in get_args(each))}
 
 

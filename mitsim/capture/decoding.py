@@ -24,14 +24,12 @@ from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.sensor.decoder_settings import DecoderSettings, DeviceMapSettings
 from mitsim.sensor.image_sequence import ImageSequence
-from mitsim.sensor.imager import Imager
+from mitsim.sensor.imager import WrittenImager
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.projector_images import ImagesDescription
-from mitsim.sensor.sensor_file import ImagerTable
-from mitsim.sensor.written_imager import imager_of, written_imager
 
 Settings = MatcherSettings | DecoderSettings | TimeOfFlightSettings | DeviceMapSettings
 
@@ -51,10 +49,6 @@ Depth = Annotated[float, Field(gt=0, le=1e7)]
 Side = Annotated[int, Field(ge=16, le=20000)]
 
 
-def _imager(value: Any) -> Any:
-    return imager_of(ImagerTable.model_validate(value)) if isinstance(value, dict) else value
-
-
 def _roi(value: Any) -> Any:
     if isinstance(value, Roi):
         return value
@@ -64,7 +58,6 @@ def _roi(value: Any) -> Any:
     return Roi(*numbers)
 
 
-WrittenImager = Annotated[InstanceOf[Imager], BeforeValidator(_imager), PlainSerializer(written_imager)]
 WrittenRoi = Annotated[
     InstanceOf[Roi],
     BeforeValidator(_roi),
@@ -168,5 +161,5 @@ def settings_table(decoding: Decoding, records: dict[str, Any]) -> dict[str, Any
     both = set(records) & set(Decoding.model_fields)
     if both:
         raise InputError("capture", "settings", ", ".join(sorted(both)), "records; Capture.decoding has these values")
-    written, default = decoding.model_dump(mode="json"), Decoding().model_dump(mode="json")
+    written, default = decoding.model_dump(mode="json", by_alias=True), Decoding().model_dump(mode="json")
     return {name: value for name, value in written.items() if value != default[name]} | records

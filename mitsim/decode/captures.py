@@ -27,29 +27,34 @@ from mitsim.sensor import preset
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.poses import as_pose
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.sensor_file import Purpose
 from mitsim.sensor.transforms import Transform
 
 #: the last sensor and its simulation: preparing the patterns takes longer than tracing an image
 _prepared: list[tuple[Sensor, SimulatedSensor]] = []
 
 
-def load_sensor(name_or_path: str | Path) -> Sensor:
+def load_sensor(name_or_path: str | Path, purpose: Purpose = "simulation") -> Sensor:
     """Load a sensor: a preset by its name, or a sensor TOML file by its path.
 
     Parameters
     ----------
     name_or_path
         ``"ensenso-n10"`` or another preset of ``docs/reference/sensors.md``, or a path that ends in ``.toml``.
+    purpose
+        ``"simulation"``, or ``"decoding"`` for the file of a rig whose images exist, which may leave out its light and
+        imager.
 
     Returns
     -------
     Sensor
-        Cameras, projector, pattern, imager, exposure and decoder.
+        Cameras, projector, pattern, imager, exposure and decoder. ``missing_for("simulation")`` names the keys that
+        simulation needs and the file lacks.
 
     Raises
     ------
     InputError
-        For an unknown name, or a file that does not describe a complete sensor; the error names the key.
+        For an unknown name, or a file that lacks keys for the purpose; the error names all of them.
 
     Examples
     --------
@@ -58,7 +63,7 @@ def load_sensor(name_or_path: str | Path) -> Sensor:
     >>> sensor.name, sensor.technology, sensor.working_range_mm
     ('small', 'active_stereo', (400.0, 800.0))
     """
-    return preset.load_sensor(str(name_or_path))
+    return preset.load_sensor(str(name_or_path), purpose)
 
 
 def load_scene(

@@ -37,9 +37,8 @@ from mitsim.decode.grid_cloud import empty_cloud
 from mitsim.sensor.decoder_settings import DecoderSettings, DeviceMapSettings
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.preset import Sensor, presets
+from mitsim.sensor.preset import Sensor, load_sensor, presets
 from mitsim.sensor.projector_images import ImagesDescription, ProjectorImages
-from mitsim.sensor.recorded_rig import load_recorded_rig
 
 __all__ = [
     "Geometry",
@@ -110,7 +109,7 @@ def in_range(settings: Settings, range_mm: tuple[float, float] | None, where: st
 def _settings(capture: Capture, sensor: Sensor | str | Path | None) -> tuple[Settings, Imager | None]:
     """Return settings and imager of the sensor or of the capture, without a requested range."""
     if isinstance(sensor, Sensor):
-        return sensor.settings, sensor.imager
+        return sensor.settings, sensor.described_imager
     stored, technology = capture.decoding, technology_of(capture.technology)
     model = SETTINGS_OF[capture.technology]
     if sensor is None and stored.decoder is not None:
@@ -121,8 +120,8 @@ def _settings(capture: Capture, sensor: Sensor | str | Path | None) -> tuple[Set
     name = sensor or (capture.sensor if capture.sensor in presets() else None)
     if name is not None:
         camera = capture.rig.reference
-        recorded = load_recorded_rig(name, (camera.width, camera.height))
-        return recorded.settings, recorded.imager
+        other = load_sensor(name, "decoding", (camera.width, camera.height))
+        return other.settings, other.described_imager
     near, far = technology.range_mm
     defaults: dict[str, Any] = {
         "near_mm": near if stored.near_mm is None else stored.near_mm,

@@ -27,7 +27,7 @@ from characterisation.maps.shipped import shipped_maps
 from characterisation.tasks.definitions import DEFINITIONS
 from mitsim.report.view_clouds import box_around, fewer_triangles, packed
 from mitsim.report.view_data import COLOURS, as_json
-from mitsim.scene.authoring.check import Finding, TaskFeatures
+from mitsim.scene.authoring.check import SceneFinding, TaskFeatures
 from mitsim.scene.inspect import SceneFacts
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.triangles import triangles_by_shape
@@ -54,7 +54,7 @@ class Authored:
     scene: Scene
     facts: SceneFacts
     sensor: Sensor
-    found: Sequence[Finding]
+    found: Sequence[SceneFinding]
     task_path: Path | None
     task: TaskFeatures | None
 
@@ -123,7 +123,7 @@ def page_data(about: Authored, served: str) -> dict[str, Any]:
     }
 
 
-def findings_data(found: Sequence[Finding]) -> list[dict[str, str]]:
+def findings_data(found: Sequence[SceneFinding]) -> list[dict[str, str]]:
     """Return the findings for the script."""
     return [{"severity": one.severity, "about": one.about, "what": one.what, "advice": one.advice} for one in found]
 

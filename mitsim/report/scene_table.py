@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from mitsim.running.text_table import aligned
-from mitsim.scene.authoring.check import Finding
+from mitsim.scene.authoring.check import SceneFinding
 from mitsim.scene.first_hits import VisibleSurfaces
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 
 _NONE = "-"
 
 
-def as_text(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[Finding]) -> str:
+def as_text(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[SceneFinding]) -> str:
     """Return tables of features and materials, then one line for each finding."""
     features = [("feature", "material", "Ra um", "area mm2", "size mm", "from mm", "to mm", "triangles", "seen px")]
     materials = [("material", "Ra um", "alpha u, v", "1-sigma", "from")]
@@ -45,7 +45,7 @@ def as_text(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[Finding
     return "\n".join(lines if found else [*lines, "no problems found"])
 
 
-def as_data(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[Finding]) -> dict[str, Any]:
+def as_data(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[SceneFinding]) -> dict[str, Any]:
     """Return the same as data; lengths in mm, null without a value."""
     shapes = []
     for number, shape in enumerate(facts.shapes):

@@ -12,7 +12,7 @@ import numpy as np
 
 from mitsim.scene.coherent_blend import NAME, NUMBERS, register_coherent_blend
 from mitsim.scene.surface.coherence import LARGEST_INCIDENCE
-from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, fresnel
+from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, Distribution, fresnel
 from mitsim.scene.surface.paint import INDEX, surface_share
 from mitsim.scene.surface.scatter import Scatter
 
@@ -54,16 +54,8 @@ def metal_bsdf(index: tuple[float, float], scatter: Scatter, reflected: float = 
         Factor on all reflected light [1].
     """
 
-    def lobe(distribution: str, alphas: tuple[float, float], factor: float) -> dict[str, Any]:
-        return {
-            "type": "roughconductor",
-            "distribution": distribution,
-            "alpha_u": alphas[0],
-            "alpha_v": alphas[1],
-            "eta": index[0],
-            "k": index[1],
-            "specular_reflectance": {"type": "uniform", "value": factor * reflected},
-        }
+    def lobe(distribution: Distribution, alphas: tuple[float, float], factor: float) -> dict[str, Any]:
+        return conductor_bsdf(distribution, alphas, index, factor * reflected)
 
     ggx, beckmann = scatter.energy_factor
     incoherent = _blend(
@@ -108,14 +100,7 @@ def powder_coat_bsdf(reflectance: float, scatter: Scatter) -> dict[str, Any]:
     """
     alpha = scatter.ggx_alpha[0]
     body = reflectance * (1 - surface_share(GGX_PER_BECKMANN * scatter.alpha_u, "ggx"))
-    coat = {
-        "type": "roughconductor",
-        "distribution": "ggx",
-        "alpha": alpha,
-        "eta": INDEX[0],
-        "k": 0.0,
-        "specular_reflectance": {"type": "uniform", "value": scatter.energy_factor[0] / _COAT_WEIGHT},
-    }
+    coat = conductor_bsdf("ggx", (alpha, alpha), INDEX, scatter.energy_factor[0] / _COAT_WEIGHT)
     return _blend(diffuse_bsdf(body / (1 - _COAT_WEIGHT)), coat, _COAT_WEIGHT)
 
 
@@ -129,6 +114,29 @@ def _blend(first: dict[str, Any], second: dict[str, Any], weight: float) -> dict
     if weight > 1 - 1e-3:
         return second
     return {"type": "blendbsdf", "weight": weight, "first": first, "second": second}
+
+
+def conductor_bsdf(
+    distribution: Distribution, alphas: tuple[float, float], index: tuple[float, float], factor: float = 1.0
+) -> dict[str, Any]:
+    """Return the Mitsuba description of one microfacet lobe.
+
+    Parameters
+    ----------
+    distribution, alphas
+        Of the normals; its widths along u and v [1], in the sense of the distribution.
+    index, factor
+        n and k of the surface [1], and a factor on all reflected light [1].
+    """
+    return {
+        "type": "roughconductor",
+        "distribution": distribution,
+        "alpha_u": alphas[0],
+        "alpha_v": alphas[1],
+        "eta": index[0],
+        "k": index[1],
+        "specular_reflectance": {"type": "uniform", "value": factor},
+    }
 
 
 def diffuse_bsdf(reflectance: float) -> dict[str, Any]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from characterisation.files.errors import InputError, nearest
 
 
-def only_known(props: Any, where: str, known: tuple[str, ...]) -> None:
+def only_known(props: Any, where: str, known: Sequence[str]) -> None:
     """Raise :class:`InputError` if a BSDF has a property that is not ``known``."""
     for key in props.keys():  # noqa: SIM118 - not a dict
         if key not in known:
@@ -15,7 +16,16 @@ def only_known(props: Any, where: str, known: tuple[str, ...]) -> None:
 
 
 def choice(props: Any, where: str, key: str, default: str, known: list[str]) -> str:
-    """Return a text property, which must be one of ``known``; ``default`` if it is not given.
+    """Return a text property of a BSDF.
+
+    Parameters
+    ----------
+    props, where
+        Mitsuba's properties of the BSDF, and its name for messages.
+    key, default
+        Of the property; the default is for a BSDF without it.
+    known
+        Allowed values.
 
     Raises
     ------
@@ -29,7 +39,16 @@ def choice(props: Any, where: str, key: str, default: str, known: list[str]) -> 
 
 
 def number_within(props: Any, where: str, key: str, default: float | None, low: float, high: float, unit: str) -> float:
-    """Return a numeric property from ``low`` to ``high``; ``default`` if it is not given.
+    """Return a numeric property of a BSDF.
+
+    Parameters
+    ----------
+    props, where
+        Mitsuba's properties of the BSDF, and its name for messages.
+    key, default
+        Of the property; the default is for a BSDF without it, None if it is required.
+    low, high, unit
+        Allowed values, and their unit for messages.
 
     Raises
     ------

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from mitsim.scene import backend
 from mitsim.scene.backend import dr, mi
+from mitsim.scene.bsdf_descriptions import conductor_bsdf
 from mitsim.scene.coherent_blend import NAME, NUMBERS, register_coherent_blend
 from mitsim.scene.load import Scene, scene_from_dict
 from mitsim.scene.surface.coherence import EVEN_FROM
@@ -80,22 +81,11 @@ class SpecularLobe:
 
     def __init__(self, index: tuple[float, float]) -> None:
         backend.activate()
-
-        def lobe(distribution: str) -> dict[str, Any]:
-            return {
-                "type": "roughconductor",
-                "distribution": distribution,
-                "alpha_u": 0.1,
-                "alpha_v": 0.1,
-                "eta": index[0],
-                "k": index[1],
-                "specular_reflectance": {"type": "uniform", "value": 1.0},
-            }
-
         register_coherent_blend()
-        incoherent = {"type": "blendbsdf", "weight": 0.5, "first": lobe("ggx"), "second": lobe("beckmann")}
+        ggx, beckmann, mirror = (conductor_bsdf(name, (0.1, 0.1), index) for name in ("ggx", "beckmann", "beckmann"))
+        incoherent = {"type": "blendbsdf", "weight": 0.5, "first": ggx, "second": beckmann}
         numbers = dict.fromkeys(NUMBERS, 0.0)
-        tree = {"type": NAME, "phase_variance": 1.0, **numbers, "mirror": lobe("beckmann"), "lobe": incoherent}
+        tree = {"type": NAME, "phase_variance": 1.0, **numbers, "mirror": mirror, "lobe": incoherent}
         self._bsdf = mi.load_dict(tree, parallel=False, optimize=False)  # equal textures must not be merged
         self._parameters = mi.traverse(self._bsdf)
 

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import known_to_device, vectors_to_device, vectors_to_host
 from mitsim.scene.load import Scene
-from mitsim.scene.ray_casting.raycast import PixelRays, cast, shapes_met
-from mitsim.sensor.camera import Camera, Rig
+from mitsim.scene.ray_casting.raycast import PixelRays, cast, shape_indices, shapes_met
+from mitsim.sensor.camera import Rig
+from mitsim.sensor.rig_parameters import eyes
 from mitsim.sensor.transforms import Transform
 
 Floats = NDArray[np.float64]
@@ -25,18 +26,10 @@ Floats = NDArray[np.float64]
 class VisibleSurfaces:
     """Surfaces that the pixels of the reference camera see.
 
-    Attributes
-    ----------
-    shape
-        (H, W) index of the first shape on the ray, whichever side it shows; -1 for none.
-    front
-        (H, W) whether the reflecting side of the shape is seen.
-    normal
-        (H, W, 3) unit normal toward the camera, sensor frame; NaN without a shape.
-    point
-        (H, W, 3) [mm], sensor frame; NaN without a shape.
-    seen_by_all
-        (H, W) whether the front is seen and every other camera and the projector has a free line to the point.
+    - ``shape`` (H, W): index of the first shape on the ray, whichever side it shows; -1 for none.
+    - ``front`` (H, W): whether the reflecting side of the shape is seen.
+    - ``normal`` (H, W, 3) toward the camera and ``point`` (H, W, 3) [mm], sensor frame; NaN without a shape.
+    - ``seen_by_all`` (H, W): whether the front is seen and every other camera and the projector has a free line to it.
     """
 
     shape: NDArray[np.int16]
@@ -50,16 +43,9 @@ class VisibleSurfaces:
 class Hits:
     """First surfaces on n rays.
 
-    Attributes
-    ----------
-    shape
-        (n,) index of the shape, of the instance for a shape in a group; -1 for none.
-    front
-        (n,) whether the ray meets the reflecting side.
-    normal
-        (n, 3) unit normal on the side of the ray's origin, world frame; NaN without a surface.
-    distance
-        (n,) [mm]; NaN without a surface.
+    - ``shape`` (n,): index of the shape, of the instance for a shape in a group; -1 for none.
+    - ``front`` (n,): whether the ray meets the reflecting side.
+    - ``normal`` (n, 3) on the side of the ray's origin, world frame, and ``distance`` (n,) [mm]; NaN without a surface.
     """
 
     shape: NDArray[np.int16]
@@ -85,36 +71,27 @@ def trace(scene: Scene, origins: NDArray[np.floating], directions: NDArray[np.fl
     shape_id_of_ray = dr.select(surface.is_valid(), dr.select(instance != 0, instance, inside), 0)
     distance = dr.select(surface.is_valid(), surface.t, dr.nan)
     dr.eval(front, normal, shape_id_of_ray, distance)
-    ids = np.array(shape_id_of_ray)
-    lookup = np.full(int(ids.max(initial=0)) + 1, -1, np.int16)
-    for index, mitsuba_shape in enumerate(scene.shapes):
-        shape_id = int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(mitsuba_shape))))[0])
-        if shape_id < len(lookup):
-            lookup[shape_id] = index
-    lookup[0] = -1
-    shape = lookup[ids]
+    shape = shape_indices(scene, shape_id_of_ray)
     vectors = np.where((shape >= 0)[:, None], vectors_to_host(normal, float), np.nan)
     return Hits(shape, np.array(front, bool) & (shape >= 0), vectors, np.array(distance, float))
 
 
 def sees_nothing(scene: Scene, rig: Rig, world_from_sensor: Transform) -> list[str]:
     """Return the names of the cameras, and ``projector``, in whose images no pixel shows the scene."""
-    eyes: dict[str, Camera] = rig.cameras | ({"projector": rig.projector} if rig.projector else {})
-    seen = {name: shapes_met(scene, PixelRays.of_camera(eye), world_from_sensor) for name, eye in eyes.items()}
+    seen = {name: shapes_met(scene, PixelRays.of_camera(eye), world_from_sensor) for name, eye in eyes(rig).items()}
     return [name for name, shape in seen.items() if not (shape >= 0).any()]
 
 
 def visible_surfaces(scene: Scene, rig: Rig, world_from_sensor: Transform) -> VisibleSurfaces:
     """Return the surfaces that the pixels of a rig's reference camera see from one pose."""
     camera = rig.reference
-    eyes = [*list(rig.cameras.values())[1:], *([rig.projector] if rig.projector else [])]
     directions = camera.pixel_directions()
     shape = directions.shape[:2]
     origin = world_from_sensor.points(camera.centre)
     world = world_from_sensor.directions(directions.reshape(-1, 3))
     hits = trace(scene, np.broadcast_to(origin, world.shape), world)
     rays = PixelRays(camera.centre, directions)  # PixelRays.of_camera would undistort all pixels again
-    seen = cast(scene, rays, world_from_sensor, np.array([eye.centre for eye in eyes])).seen
+    seen = cast(scene, rays, world_from_sensor, np.array([eye.centre for eye in list(eyes(rig).values())[1:]])).seen
     normal = world_from_sensor.inverse().directions(hits.normal).reshape(*shape, 3)
     point = camera.centre + directions * hits.distance.reshape(*shape, 1)
     seen_by_all = np.asarray(hits.front.reshape(shape) & seen.all(axis=0))

@@ -24,8 +24,11 @@ from mitsim.scene.mesh_facts import MeshFacts, mesh_facts
 
 Floats = NDArray[np.float64]
 
-#: number of points on each shape; number of rays along one side of the square grid of each direction
-_SAMPLES, _ROW = 2048, 96
+#: points on each shape
+_SAMPLES = 2048
+
+#: rays along one side of the square grid of each direction
+_ROW = 96
 
 #: spacing of the grid in which vertices are merged, as a share of the size of the scene
 _MERGE = 1e-6
@@ -35,41 +38,21 @@ _MERGE = 1e-6
 class ShapeFacts:
     """Facts about one shape of a scene.
 
-    Attributes
-    ----------
-    name
-        Name of the shape in the scene.
-    named
-        Whether its author gave it an id.
-    kind, bsdf
-        Types of the shape and its BSDF in the XML, also if the BSDF was replaced by a finish.
-    finish
-        Its finish; None for a stock BSDF.
-    alpha
-        Width of the lobe along u and v in Beckmann's sense [1]; NaN if there is none.
-    alpha_factor
-        One-sigma factor of alpha [1]; NaN if unknown.
-    provenance
-        Source of alpha, in words.
-    lay
-        Direction of the machining marks.
-    area
-        Surface area [mm^2]; NaN if Mitsuba does not compute it, as for an instance or a curve.
-    bounds
-        (2, 3) corners of the bounding box [mm], world frame.
-    delta
-        Whether it only reflects as a mirror or refracts.
-    two_sided
-        Whether its back reflects too.
-    emitter
-        Whether it emits light.
-    mesh
-        Its triangles; None for a shape that is no mesh.
-    points, normals
-        (n, 3) points spread evenly over it [mm], world frame, and unit normals on the reflecting side.
-    front_hits, back_hits
-        Number of rays from all directions that meet its front and its back first. If no ray meets it: number of rays
-        that leave the scene from its front and its back.
+    - ``name`` in the scene; ``named``: whether its author gave it an id.
+    - ``kind``, ``bsdf``: types of the shape and its BSDF in the XML, also if the BSDF was replaced by a finish.
+    - ``finish``; None for a stock BSDF.
+    - ``alpha``: width of the lobe along u and v in Beckmann's sense [1]; ``alpha_factor``: its one-sigma factor [1].
+      NaN if there is none. ``provenance``: source of alpha, in words.
+    - ``lay``: direction of the machining marks.
+    - ``area`` [mm^2]; NaN if Mitsuba does not compute it, as for an instance or a curve.
+    - ``bounds`` (2, 3): corners of the bounding box [mm], world frame.
+    - ``delta``: whether it only reflects as a mirror or refracts; ``two_sided``: whether its back reflects too;
+      ``emitter``: whether it emits light.
+    - ``mesh``; None for a shape that is no mesh.
+    - ``points``, ``normals`` (n, 3): points spread evenly over it [mm], world frame, and unit normals on the reflecting
+      side.
+    - ``front_hits``, ``back_hits``: number of rays from all directions that meet its front and its back first. If no
+      ray meets it: number of rays that leave the scene from its front and its back.
     """
 
     name: str
@@ -97,16 +80,10 @@ class ShapeFacts:
 class SceneFacts:
     """Facts about a scene.
 
-    Attributes
-    ----------
-    shapes
-        Facts about each shape.
-    bounds
-        (2, 3) corners of the bounding box [mm], world frame.
-    merged_mesh
-        All meshes as one, without emitters; None if there are none.
-    emitters
-        Kind and flux [W] of each. The flux is NaN for an emitter without a position (sky, directional light).
+    - ``shapes`` of the scene; ``bounds`` (2, 3): corners of the bounding box [mm], world frame.
+    - ``merged_mesh``: all meshes as one, without emitters; None if there are none.
+    - ``emitters``: kind and flux [W] of each. The flux is NaN for an emitter without a position (sky, directional
+      light).
     """
 
     shapes: tuple[ShapeFacts, ...]

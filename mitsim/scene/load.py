@@ -38,18 +38,11 @@ _registered = False
 class Scene:
     """A loaded scene.
 
-    Attributes
-    ----------
-    mitsuba
-        The ``mi.Scene``.
-    names
-        Ids of the shapes, in Mitsuba's order.
-    finishes
-        Finish of each shape; None for a stock BSDF, about which nothing is known.
-    bounds
-        (2, 3) corners of the bounding box [mm], world frame.
-    where
-        File that it was loaded from, or a description.
+    - ``mitsuba``: the ``mi.Scene``.
+    - ``names``: ids of the shapes, in Mitsuba's order.
+    - ``finishes`` of the shapes; None for a stock BSDF, about which nothing is known.
+    - ``bounds`` (2, 3): corners of the bounding box [mm], world frame.
+    - ``where``: file that it was loaded from, or a description.
     """
 
     mitsuba: Any = field(repr=False)

@@ -31,7 +31,7 @@ from characterisation.files.errors import InputError
 from characterisation.maps.light import Light
 from mitsim.scene.bsdf_descriptions import diffuse_bsdf, gloss_paint_bsdf, metal_bsdf, powder_coat_bsdf
 from mitsim.scene.bsdf_properties import choice, number_within, only_known
-from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.scene.surface.measured import HeightMap, Profile, read_height_map, read_profile
 from mitsim.scene.surface.metals import CONSTANTS, refractive_index
 from mitsim.scene.surface.microfacet import fresnel
@@ -45,18 +45,11 @@ from mitsim.scene.surface.surface_light import USUAL_REFLECTANCE, surface_light
 class Finish:
     """Material of a surface, as performance maps distinguish it.
 
-    Attributes
-    ----------
-    name
-        Family: ``matt_white``, ``aluminium/ground``.
-    roughness
-        Ra [um]; NaN if it has no meaning.
-    scatter
-        Scattering at the wavelength of the sensor. This and the next two do not count in comparisons.
-    light
-        The part of the scattering that a map stores.
-    description
-        Mitsuba description of the BSDF.
+    - ``name`` of the family: ``matt_white``, ``aluminium/ground``.
+    - ``roughness``: Ra [um]; NaN if it has no meaning.
+    - ``scatter`` at the wavelength of the sensor. This and the next two do not count in comparisons.
+    - ``light``: the part of the scattering that a map stores.
+    - ``description`` of the BSDF for Mitsuba.
     """
 
     name: str
@@ -73,18 +66,11 @@ class Finish:
 class Loading:
     """State while one scene is loaded.
 
-    Attributes
-    ----------
-    wavelength_nm, where
-        Wavelength [nm], and the scene's file for messages.
-    folder
-        Folder to which the file names of materials are relative.
-    deviation
-        Deviation of a finish from its best estimate, by the id of its BSDF.
-    finishes
-        Finishes loaded so far, by the id of the BSDF.
-    fault
-        First error of the author. It is kept here because Mitsuba replaces our exceptions by its own.
+    - ``where``: the scene's file, for messages.
+    - ``folder`` to which the file names of materials are relative.
+    - ``deviation`` of a finish from its best estimate, by the id of its BSDF.
+    - ``finishes`` loaded so far, by the id of the BSDF.
+    - ``fault``: first error of the author. It is kept here because Mitsuba replaces our exceptions by its own.
     """
 
     wavelength_nm: float = 850.0
@@ -113,8 +99,14 @@ def loading(
 ) -> Iterator[Loading]:
     """Make BSDFs for one wavelength [nm] inside this block; yield the state, which collects the finishes.
 
-    ``folder`` and ``deviation`` are as in :class:`Loading`; one deviation applies to all finishes. Only one block is
-    active at a time; others wait.
+    Only one block is active at a time; others wait.
+
+    Parameters
+    ----------
+    wavelength_nm, where, folder
+        As in :class:`Loading`.
+    deviation
+        Of all finishes, or a function from the id of a BSDF to its deviation.
     """
     global _current
     with _lock:
@@ -127,36 +119,19 @@ def loading(
 
 
 _METAL_KEYS = (
-    "metal",
-    "process",
-    "Ra",
-    "Rq",
-    "Rdq",
-    "RSm",
-    "profile",
-    "profile_along",
-    "height_map",
-    "spacing_um",
-    "gloss",
-    "alpha",
-    "alpha_u",
-    "alpha_v",
-    "lay",
-    "nose_radius_mm",
-    "feed_marks",
-    "alpha_factor",
-    "wide_angle_share",
+    "metal process Ra Rq Rdq RSm profile profile_along height_map spacing_um gloss alpha alpha_u alpha_v lay "
+    "nose_radius_mm feed_marks alpha_factor wide_angle_share"
 )
 
 
 def _machined_metal(props: Any) -> Any:
     where = _where(props)
-    only_known(props, where, _METAL_KEYS)
+    only_known(props, where, _METAL_KEYS.split())
 
     def number(key: str, low: float, high: float, unit: str) -> float | None:
         return number_within(props, where, key, None, low, high, unit) if key in props else None
 
-    face = Face(
+    face = MachinedFace(
         metal=choice(props, where, "metal", "aluminium", list(CONSTANTS)),
         process=choice(props, where, "process", "ground", list(PROCESSES)) if "process" in props else None,
         Ra=number("Ra", 0.005, 10.0, "um"),

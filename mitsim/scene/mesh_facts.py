@@ -18,22 +18,12 @@ Floats = NDArray[np.float64]
 class MeshFacts:
     """The triangles of a shape, world frame.
 
-    Attributes
-    ----------
-    vertices
-        (n, 3) [mm], after merging.
-    triangles
-        (m, 3) indices of vertices.
-    open_edges, nonmanifold_edges
-        Number of edges of only one triangle, and of more than two.
-    volume
-        Signed volume [mm^3], positive if the normals point outward; 0 if the mesh is not closed.
-    degenerate, duplicate
-        Number of triangles without area, and of repeated triangles.
-    texture, smooth
-        Whether the vertices have texture coordinates u, v, and normals.
-    open_edge_ends
-        (open_edges, 2, 3) end points of the open edges [mm].
+    - ``vertices`` (n, 3) [mm], after merging, and ``triangles`` (m, 3), indices of vertices.
+    - ``open_edges``, ``nonmanifold_edges``: number of edges of only one triangle, and of more than two.
+    - ``volume`` [mm^3], positive if the normals point outward; 0 if the mesh is not closed.
+    - ``degenerate``, ``duplicate``: number of triangles without area, and of repeated triangles.
+    - ``texture``, ``smooth``: whether the vertices have texture coordinates u, v, and normals.
+    - ``open_edge_ends`` (open_edges, 2, 3): end points of the open edges [mm].
     """
 
     vertices: Floats
@@ -56,10 +46,16 @@ class MeshFacts:
 def mesh_facts(
     vertices: Floats, triangles: NDArray[np.int64], merge: float, texture: bool = False, smooth: bool = False
 ) -> MeshFacts:
-    """Return the facts about triangles (m, 3) on vertices (n, 3) [mm].
+    """Return the facts about a mesh. The volume is a sum over triangles of a . (b x c) / 6, about the mean vertex.
 
-    Vertices in one cell of a grid of ``merge`` [mm] are merged. ``texture`` and ``smooth`` are stored as they are. The
-    volume is a sum over triangles of a . (b x c) / 6, about the mean vertex.
+    Parameters
+    ----------
+    vertices, triangles
+        (n, 3) [mm], and (m, 3) indices of vertices.
+    merge
+        Vertices in one cell of a grid of this spacing [mm] are merged.
+    texture, smooth
+        Whether the vertices have u, v and normals.
     """
     _, first, inverse = np.unique(np.round(vertices / merge), axis=0, return_index=True, return_inverse=True)
     vertices, triangles = vertices[first], inverse.reshape(-1)[triangles]

@@ -13,59 +13,32 @@ from pathlib import Path
 from characterisation.files.errors import InputError, nearest
 
 #: properties of the Mitsuba plugins that parts use (Mitsuba's documentation, version 3.9), to suggest the nearest name
-_EVERY_SHAPE = ("to_world", "flip_normals")
+_SHAPE = "to_world flip_normals"
+_MESH = f"filename face_normals flip_tex_coords {_SHAPE}"
 _PROPERTIES: dict[str, tuple[str, ...]] = {
-    "rectangle": _EVERY_SHAPE,
-    "disk": _EVERY_SHAPE,
-    "cube": _EVERY_SHAPE,
-    "sphere": ("center", "radius", *_EVERY_SHAPE),
-    "cylinder": ("p0", "p1", "radius", *_EVERY_SHAPE),
-    "ply": ("filename", "face_normals", "flip_tex_coords", *_EVERY_SHAPE),
-    "obj": ("filename", "face_normals", "flip_tex_coords", *_EVERY_SHAPE),
-    "diffuse": ("reflectance",),
-    "twosided": (),
-    "blendbsdf": ("weight",),
-    "mask": ("opacity",),
-    "conductor": ("material", "eta", "k", "specular_reflectance"),
-    "roughconductor": (
-        "material",
-        "eta",
-        "k",
-        "specular_reflectance",
-        "distribution",
-        "alpha",
-        "alpha_u",
-        "alpha_v",
-        "sample_visible",
-    ),
-    "dielectric": ("int_ior", "ext_ior", "specular_reflectance", "specular_transmittance"),
-    "roughdielectric": ("int_ior", "ext_ior", "distribution", "alpha", "alpha_u", "alpha_v"),
-    "plastic": ("diffuse_reflectance", "nonlinear", "int_ior", "ext_ior", "specular_reflectance"),
-    "roughplastic": (
-        "diffuse_reflectance",
-        "nonlinear",
-        "int_ior",
-        "ext_ior",
-        "specular_reflectance",
-        "distribution",
-        "alpha",
-        "sample_visible",
-    ),
-    "principled": (
-        "base_color",
-        "roughness",
-        "anisotropic",
-        "metallic",
-        "specular",
-        "clearcoat",
-        "clearcoat_gloss",
-        "sheen",
-        "sheen_tint",
-        "spec_tint",
-        "spec_trans",
-        "flatness",
-        "eta",
-    ),
+    plugin: tuple(names.split())
+    for plugin, names in {
+        "rectangle": _SHAPE,
+        "disk": _SHAPE,
+        "cube": _SHAPE,
+        "sphere": f"center radius {_SHAPE}",
+        "cylinder": f"p0 p1 radius {_SHAPE}",
+        "ply": _MESH,
+        "obj": _MESH,
+        "diffuse": "reflectance",
+        "twosided": "",
+        "blendbsdf": "weight",
+        "mask": "opacity",
+        "conductor": "material eta k specular_reflectance",
+        "roughconductor": "material eta k specular_reflectance distribution alpha alpha_u alpha_v sample_visible",
+        "dielectric": "int_ior ext_ior specular_reflectance specular_transmittance",
+        "roughdielectric": "int_ior ext_ior distribution alpha alpha_u alpha_v",
+        "plastic": "diffuse_reflectance nonlinear int_ior ext_ior specular_reflectance",
+        "roughplastic": "diffuse_reflectance nonlinear int_ior ext_ior specular_reflectance "
+        "distribution alpha sample_visible",
+        "principled": "base_color roughness anisotropic metallic specular clearcoat clearcoat_gloss "
+        "sheen sheen_tint spec_tint spec_trans flatness eta",
+    }.items()
 }
 _PLUGINS = [*_PROPERTIES, "machined_metal", "matt_white", "gloss_paint", "powder_coat"]
 

@@ -26,7 +26,17 @@ def ball(radius_mm: float, finish: str, wavelength_nm: float) -> Scene:
 
 
 def ball_on_plate(radius_mm: float, size_mm: float, finish: str, wavelength_nm: float) -> Scene:
-    """Return a ball on a square plate in the plane z = 0, both of one finish."""
+    """Return a ball on a square plate in the plane z = 0, both of one finish.
+
+    Parameters
+    ----------
+    radius_mm, size_mm
+        Of the ball, and side of the plate.
+    finish
+        One of :data:`FINISHES`.
+    wavelength_nm
+        Of the sensor.
+    """
     sphere = {"type": "sphere", "radius": radius_mm, "center": [0.0, 0.0, radius_mm], "bsdf": FINISHES[finish]}
     return _scene({"plate": _square(size_mm, finish), "ball": sphere}, finish, wavelength_nm)
 

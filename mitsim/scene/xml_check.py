@@ -17,8 +17,17 @@ from typing import Any
 from characterisation.files.checked_files import is_file, read_bounded
 from characterisation.files.errors import InputError, nearest
 
-#: limits of one XML: size [bytes], number of elements, depth of nested elements and of nested BSDFs
-LARGEST_XML, MOST_ELEMENTS, DEEPEST, DEEPEST_BSDF = 16 * 1024**2, 200_000, 40, 6
+#: largest XML [bytes]
+LARGEST_XML = 16 * 1024**2
+
+#: most elements of one XML
+MOST_ELEMENTS = 200_000
+
+#: deepest nesting of elements; Mitsuba crashes at some thousands
+DEEPEST = 40
+
+#: deepest nesting of BSDFs, which take minutes beyond
+DEEPEST_BSDF = 6
 
 #: largest file that a scene may refer to [bytes]
 LARGEST_NAMED_FILE = 1024**3

@@ -29,23 +29,18 @@ _FOCAL_SHARE = (0.05, 1000.0)
 #: farthest principal point from the image's corner, over the longer side
 _CENTRE_SHARE = 20.0
 
-#: names of units of length, and their lengths [mm]
+#: units of length by the words of files [mm]
 UNITS_MM = {
-    "um": 1e-3,
-    "mm": 1.0,
-    "millimeter": 1.0,
-    "millimetre": 1.0,
-    "cm": 10.0,
-    "centimeter": 10.0,
-    "centimetre": 10.0,
-    "m": 1000.0,
-    "meter": 1000.0,
-    "metre": 1000.0,
-    "in": 25.4,
-    "inch": 25.4,
-    "inches": 25.4,
-    "ft": 304.8,
-    "feet": 304.8,
+    word: size
+    for size, words in {
+        1e-3: "um micron microns micrometer micrometers micrometre micrometres",
+        1.0: "mm millimeter millimeters millimetre millimetres",
+        10.0: "cm centimeter centimeters centimetre centimetres",
+        1000.0: "m meter meters metre metres",
+        25.4: "in inch inches",
+        304.8: "ft foot feet",
+    }.items()
+    for word in words.split()
 }
 
 #: names under which files state their unit of length
@@ -83,7 +78,12 @@ class ReadOut:
 
 
 def check_intrinsics(focal: tuple[float, float], principal: tuple[float, float], width: int, height: int) -> None:
-    """Check that a focal length and a principal point [px] belong to images of a size.
+    """Check that a focal length and a principal point belong to images of a size.
+
+    Parameters
+    ----------
+    focal, principal, width, height
+        All [px].
 
     Raises
     ------
@@ -260,7 +260,7 @@ def unit_mm(table: dict[str, Any], where: str | Path) -> float | None:
     for name in _UNIT_NAMES:
         text = table.get(name)
         if isinstance(text, str) and text:
-            unit = UNITS_MM.get(text.lower(), UNITS_MM.get(text.lower().removesuffix("s")))
+            unit = UNITS_MM.get(text.lower())
             if unit is None and text.lower() in _NOT_LENGTHS:
                 continue
             if unit is None:

@@ -39,8 +39,11 @@ _SUFFIXES = (".yml", ".yaml", ".xml", ".json", ".mat", ".npz")
 _KINDS = "a calibration: YAML, .xml or .json of OpenCV, .mat of MATLAB, .npz of NumPy"
 
 
-#: largest file [bytes] and largest unpacked size; calibrations are small
-_LARGEST, _MOST_NUMBERS = 64 * 1024**2, 16 * 1024**2
+#: largest file [bytes]; calibrations are small
+_LARGEST = 64 * 1024**2
+
+#: most numbers in a file of MATLAB or NumPy, unpacked
+_MOST_NUMBERS = 16 * 1024**2
 
 #: files of OpenCV above this size [bytes] contain maps of pixels; OpenCV reads them ten times as fast
 _OF_OPENCV = 2 * 1024**2
@@ -48,7 +51,8 @@ _OF_OPENCV = 2 * 1024**2
 #: deepest allowed nesting of values in OpenCV's files, and the marks that nest
 _DEEPEST = 64
 _NESTING = re.compile(rb"<!--.*?-->|<[^<>]*>|[][{}]", re.DOTALL)
-_INDENT, _DASHES = re.compile(rb"^([ \t]+)", re.MULTILINE), re.compile(rb"(?:[-?:][ \t]+){40}")
+_INDENT = re.compile(rb"^([ \t]+)", re.MULTILINE)
+_DASHES = re.compile(rb"(?:[-?:][ \t]+){40}")
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,36 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
 from characterisation.files.documents import Document
 
 
-class DecoderSettings(Document):
+class DepthSettings(Document):
+    """Settings of any decoder: points are accepted between the depths ``near_mm`` and ``far_mm``."""
+
+    #: setting of the least level, which refers to an exposure
+    level_key: ClassVar[str] = ""
+
+    near_mm: float = Field(ge=1e-3, le=1e7)
+    far_mm: float = Field(ge=1e-3, le=1e7)
+
+    @model_validator(mode="after")
+    def _check_depths(self) -> Self:
+        if self.near_mm >= self.far_mm:
+            raise ValueError("near_mm under far_mm")
+        return self
+
+    def at_exposure(self, share: float) -> Self:
+        """Return the settings for an exposure shorter by ``share`` than the one to which the limits refer."""
+        return (
+            self.model_copy(update={self.level_key: getattr(self, self.level_key) * share}) if self.level_key else self
+        )
+
+
+class DecoderSettings(DepthSettings):
     """Limits of a structured-light decoder. Nothing is filtered or filled: lost points stay lost.
 
     - ``near_mm``, ``far_mm``: range of accepted depths along the camera's axis.
@@ -27,8 +49,8 @@ class DecoderSettings(Document):
       the projector only provides the code.
     """
 
-    near_mm: float = Field(ge=1e-3, le=1e7)
-    far_mm: float = Field(ge=1e-3, le=1e7)
+    level_key = "minimum_modulation_dn"
+
     minimum_modulation_dn: float = Field(default=2.0, ge=0)
     consistency_sigma: float = Field(default=5.0, gt=0)
     systematic_rad: float = Field(default=0.05, ge=0, le=1)
@@ -37,25 +59,6 @@ class DecoderSettings(Document):
     correct_gamma: bool = False
     triangulate: Literal["projector", "cameras"] = "projector"
 
-    @model_validator(mode="after")
-    def _ordered(self) -> DecoderSettings:
-        if self.near_mm >= self.far_mm:
-            raise ValueError("near_mm under far_mm")
-        return self
 
-    def at_exposure(self, share: float) -> DecoderSettings:
-        """Return the settings for an exposure shorter by ``share`` than the one to which the limits refer."""
-        return self.model_copy(update={"minimum_modulation_dn": self.minimum_modulation_dn * share})
-
-
-class DeviceMapSettings(Document):
+class DeviceMapSettings(DepthSettings):
     """Range of depths along the camera's axis in which points are accepted: ``near_mm`` to ``far_mm``."""
-
-    near_mm: float = Field(gt=0)
-    far_mm: float = Field(gt=0)
-
-    @model_validator(mode="after")
-    def _ordered(self) -> DeviceMapSettings:
-        if self.near_mm >= self.far_mm:
-            raise ValueError("near_mm under far_mm")
-        return self

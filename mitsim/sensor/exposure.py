@@ -1,4 +1,4 @@
-"""Compute exposures by a rule: automatic exposure, and brackets.
+"""Compute exposures by the rule of a sensor: fixed, of a matt white plate or automatic, and brackets.
 
 Signal chain: electrons per second in every pixel -> exposure [s], or several of them.
 
@@ -8,12 +8,17 @@ measured with it predicts nothing for another scene. The rule is included becaus
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
+from mitsim.sensor.imager import Imager, electrons_per_radiance
+from mitsim.sensor.projector import Projector
+from mitsim.sensor.sensor_file import AutomaticExposure, Bracket, FixedExposure, MattWhiteExposure
 
 
 @dataclass(frozen=True)
@@ -30,6 +35,86 @@ class PlannedExposure:
     def seconds(self) -> float:
         """Return the total exposure of each image of the pattern [s]."""
         return float(sum(self.exposures_s))
+
+
+@dataclass(frozen=True)
+class ExposurePolicy:
+    """Exposure rule of a sensor.
+
+    - ``rule`` in words.
+    - ``base_s``: the exposure; None if it follows the scene by ``control``, or is unknown.
+    - ``bracket``: the exposures around it.
+    - ``limits_s``: the limits of the device.
+    """
+
+    rule: str
+    base_s: float | None
+    control: AutomaticExposure | None
+    bracket: Bracket | None
+    limits_s: tuple[float, float]
+
+    def exposures(self, brightest: NDArray[np.floating] | None, full_well: float) -> tuple[float, ...]:
+        """Return the exposures of one capture [s], shortest first.
+
+        ``brightest``: electrons per second of the brightest image of all cameras; only automatic control needs it.
+        """
+        base = self.base_s
+        if base is None:
+            assert self.control is not None and brightest is not None
+            control = self.control
+            base = automatic(brightest, full_well, control.level, control.percentile, self.limits_s)
+        if self.bracket is None:
+            return (base,)
+        return bracket(base, self.bracket.count, self.bracket.factor, self.limits_s)
+
+
+def exposure_policy(
+    path: Path,
+    rule: MattWhiteExposure | FixedExposure | AutomaticExposure | None,
+    projector: Projector,
+    imager: Imager,
+    wavelength_nm: float,
+) -> ExposurePolicy:
+    """Return the exposure policy of a sensor file.
+
+    Parameters
+    ----------
+    path, rule
+        The file, and its ``[exposure]``; None if it has none.
+    projector, imager, wavelength_nm
+        Of the sensor, for a rule that refers to a matt white plate; NaN if unknown.
+
+    Raises
+    ------
+    InputError
+        If the rule asks for an exposure beyond its limits.
+    """
+    if rule is None:
+        return ExposurePolicy("unknown", None, None, None, (math.nan, math.nan))
+    shortest, longest = rule.limits_s
+    if shortest > longest:
+        raise InputError(path, "exposure.limits_s", f"[{shortest:g}, {longest:g}]", "shortest before longest")
+    several = "" if rule.bracket is None else f"; {rule.bracket.count} exposures a factor {rule.bracket.factor:g} apart"
+    if isinstance(rule, AutomaticExposure):
+        words = f"automatic: {rule.percentile:g} % of the pixels under {100 * rule.level:g} % of full scale"
+        return ExposurePolicy(words + several, None, rule, rule.bracket, rule.limits_s)
+    if isinstance(rule, FixedExposure):
+        return ExposurePolicy(
+            f"fixed at {rule.exposure_s:g} s{several}", rule.exposure_s, None, rule.bracket, rule.limits_s
+        )
+    radiance = rule.reflectance / np.pi * projector.plane_irradiance / rule.distance_mm**2
+    wanted = rule.level * imager.full_well
+    exposure = float(wanted / (radiance * electrons_per_radiance(imager, wavelength_nm, 1.0)))
+    if math.isnan(exposure):
+        return ExposurePolicy("unknown", None, None, rule.bracket, rule.limits_s)
+    if not shortest <= exposure <= longest:
+        hint = f"the rule asks for {exposure:.3g} s: change projector.flux_w, exposure.level or exposure.distance_mm"
+        raise InputError(path, "exposure.limits_s", f"[{shortest:g}, {longest:g}] s", "limits that hold", hint)
+    words = (
+        f"fixed at {exposure:.3g} s: matt white (reflectance {rule.reflectance:g}) at {rule.distance_mm:g} mm "
+        f"shows the bright pattern at {100 * rule.level:g} % of full scale"
+    )
+    return ExposurePolicy(words + several, exposure, None, rule.bracket, rule.limits_s)
 
 
 def automatic(
@@ -70,6 +155,15 @@ def bracket(base_s: float, count: int, factor: float, limits_s: tuple[float, flo
     Exposure i of n is base factor^(i - (n-1)/2). An odd count includes the base; an even count lies half a step to
     either side. Exposures beyond the limits are clipped to them and equal exposures are merged, so fewer than
     ``count`` may be returned.
+
+    Parameters
+    ----------
+    base_s
+        Exposure in the middle [s].
+    count, factor
+        Number n of exposures, and ratio of each to the one before.
+    limits_s
+        Shortest and longest exposure of the device [s].
 
     Raises
     ------

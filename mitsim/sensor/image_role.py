@@ -41,8 +41,17 @@ class Role:
 
 
 def offset_in_pixels(offset: Offset | None, bits: int, stripe: float, extent: int) -> float:
-    """Return the offset of a Gray code of ``bits`` bits and stripes of ``stripe`` px over ``extent`` pixels [px].
+    """Return the offset of a Gray code [px].
 
+    Parameters
+    ----------
+    offset
+        As its file states it; None is 0.
+    bits, stripe, extent
+        Number of bits, width of the finest stripe [px], and pixels along the axis.
+
+    Notes
+    -----
     A centred code has the offset floor((2^bits stripe - extent) / 2), as in the programs of Lanman and Taubin
     (SIGGRAPH 2009 course), and of Moreno and Taubin (3DIMPVT 2012).
     """

@@ -6,10 +6,10 @@ from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from characterisation.files.documents import Document
+from mitsim.sensor.decoder_settings import DepthSettings
 
 
-class MatcherSettings(Document):
+class MatcherSettings(DepthSettings):
     """Search range and limits of a stereo matcher. No filling, no speckle filter: lost points stay lost.
 
     - ``near_mm``, ``far_mm``: range of accepted depths along the axis of the rectified left camera.
@@ -28,8 +28,8 @@ class MatcherSettings(Document):
     - ``reference_mm``: depth of the plane whose image is the reference of a sensor with one camera.
     """
 
-    near_mm: float = Field(ge=1e-3, le=1e7)
-    far_mm: float = Field(ge=1e-3, le=1e7)
+    level_key = "minimum_contrast_dn"
+
     method: Literal["sgbm", "correlation"] = "sgbm"
     contrast_window_px: int = Field(default=0, ge=0, le=101)
     block_size: int = Field(default=5, ge=3, le=31)
@@ -58,13 +58,7 @@ class MatcherSettings(Document):
         return size
 
     @model_validator(mode="after")
-    def _ordered(self) -> MatcherSettings:
-        if self.near_mm >= self.far_mm:
-            raise ValueError("near_mm under far_mm")
+    def _check_penalties(self) -> MatcherSettings:
         if self.p2 < self.p1:
             raise ValueError("p1 not over p2")
         return self
-
-    def at_exposure(self, share: float) -> MatcherSettings:
-        """Return the settings for an exposure shorter by ``share`` than the one to which the limits refer."""
-        return self.model_copy(update={"minimum_contrast_dn": self.minimum_contrast_dn * share})

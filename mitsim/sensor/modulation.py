@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from characterisation.files.documents import Document
+from mitsim.sensor.decoder_settings import DepthSettings
 from mitsim.sensor.image_formation import FixedPattern, converter, expose
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise
@@ -90,7 +91,7 @@ class AmplitudeModulation(Document):
         return np.repeat(self.frequencies_hz, self.steps), delays, np.repeat(self.contrasts, self.steps)
 
 
-class TimeOfFlightSettings(Document):
+class TimeOfFlightSettings(DepthSettings):
     """Limits of a time-of-flight decoder. Nothing is filtered or filled: lost points stay lost.
 
     - ``near_mm``, ``far_mm``: range of accepted depths along the camera's axis.
@@ -99,21 +100,11 @@ class TimeOfFlightSettings(Document):
     - ``systematic_rad``: standard deviation added to the noise of every phase for systematic errors.
     """
 
-    near_mm: float = Field(gt=0)
-    far_mm: float = Field(gt=0)
+    level_key = "minimum_amplitude_dn"
+
     minimum_amplitude_dn: float = Field(default=0.1, ge=0)
     consistency_sigma: float = Field(default=5.0, gt=0)
     systematic_rad: float = Field(default=0.05, ge=0, le=1)
-
-    @model_validator(mode="after")
-    def _ordered(self) -> TimeOfFlightSettings:
-        if self.near_mm >= self.far_mm:
-            raise ValueError("near_mm under far_mm")
-        return self
-
-    def at_exposure(self, share: float) -> TimeOfFlightSettings:
-        """Return the settings for an exposure shorter by ``share`` than the one to which the limits refer."""
-        return self.model_copy(update={"minimum_amplitude_dn": self.minimum_amplitude_dn * share})
 
 
 def delay_pattern(code: AmplitudeModulation, shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float32]:

@@ -81,7 +81,7 @@ def with_calibration(
     Parameters
     ----------
     size
-        (width, height) [px] of the cameras' images, if known.
+        (width, height) [px] of the cameras' images, if known; cameras without a size get it.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def with_calibration(
         If a file cannot be read, or values are missing or invalid; the error names the file and the keys.
     """
     if "calibration" not in table:
-        return table, []
+        return _sized(table, size), []
     calibration_table = validate(path, {"calibration": table["calibration"]}, _Calibrated).calibration
     eyes = [*calibration_table.cameras, *(["projector"] if calibration_table.projector else [])]
     for name in calibration_table.keys:
@@ -116,7 +116,17 @@ def with_calibration(
         for name in eyes
         if not (out["projector"] if name == "projector" else out["cameras"][name]).get("distortion")
     ]
-    return out, [*values.notes, *_notes(values.tree, straight)]
+    return _sized(out, size), [*values.notes, *_notes(values.tree, straight)]
+
+
+def _sized(table: dict[str, Any], size: tuple[int, int] | None) -> dict[str, Any]:
+    """Return the table with an image size for cameras that have none."""
+    cameras = table.get("cameras")
+    if size is None or not isinstance(cameras, dict):
+        return table
+    width_height = {"width": size[0], "height": size[1]}
+    sized = {name: width_height | each if isinstance(each, dict) else each for name, each in cameras.items()}
+    return table | {"cameras": sized}
 
 
 def has_pair(path: Path) -> bool:

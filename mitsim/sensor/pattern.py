@@ -101,8 +101,20 @@ def random_blobs(
 ) -> NDArray[np.float32]:
     """Return one pattern (height, width), values 0..1.
 
-    ``run_length_px``: mean length of a bright or dark run along a row, in projector pixels, before the blur.
-    ``blur_px``: standard deviation of the lens's point spread function, in projector pixels.
+    Parameters
+    ----------
+    width, height
+        Of the projector [px].
+    run_length_px, bright_share
+        Mean length of a bright or dark run along a row before the blur [projector px], and share of bright pixels [1].
+    blur_px
+        Standard deviation of the lens's point spread function [projector px].
+    seed
+        Selects the pattern.
+
+    See Also
+    --------
+    diffraction_spots : bright spots on a dark field
     """
     binary = _sharp_blobs(width, height, run_length_px, bright_share, seed)
     for axis in (0, 1) if blur_px > 0 else ():
@@ -122,8 +134,18 @@ def diffraction_spots(
 ) -> NDArray[np.float32]:
     """Return one pattern (height, width), values 0..1: a Gaussian spot with peak 1 in each cell of ``cell_px``.
 
-    Cells are counted from the field's upper left corner. The pattern repeats in (across, down) ``tiles`` of whole
-    cells; the last tile ends at the field's edge.
+    Cells are counted from the field's upper left corner.
+
+    Parameters
+    ----------
+    width, height
+        Of the field [projector px].
+    cell_px, places, spot_px
+        Side of a cell, number of positions of its spot along each axis, and standard deviation of the spot.
+    tiles
+        (across, down) tiles of whole cells in which the pattern repeats; the last tile ends at the field's edge.
+    seed
+        Selects the pattern.
     """
     down, across = int(np.ceil(height / cell_px)), int(np.ceil(width / cell_px))
     tile = (int(np.ceil(down / tiles[1])), int(np.ceil(across / tiles[0])))
@@ -145,13 +167,6 @@ def diffraction_spots(
                 field, (near_row[inside] + i + reach, near_column[inside] + j + reach), value[inside].astype(np.float32)
             )
     return np.minimum(field[reach : reach + height, reach : reach + width], 1.0)
-
-
-def mean_run_length(image: NDArray[np.floating], threshold: NDArray[np.floating] | float) -> float:
-    """Return the mean length [px] of bright and dark runs along the rows of an image (H, W)."""
-    bright = np.asarray(image > threshold)
-    changes = np.count_nonzero(bright[:, 1:] != bright[:, :-1])
-    return float(bright.size / max(changes + bright.shape[0], 1))
 
 
 def _cut(mask: NDArray[np.float32], left: float, top: float, width: int, height: int) -> NDArray[np.float32]:

@@ -1,26 +1,26 @@
 """Load a sensor from one TOML file: its parts, its exposure and its decoder.
 
 ``load_sensor("ensenso-n10")`` loads a preset of this package, ``load_sensor("my.toml")`` a file of the user's. The
-file's tables are in :mod:`mitsim.sensor.sensor_file`.
+file's tables are in :mod:`mitsim.sensor.sensor_file`. ``load_sensor("rig.toml", "decoding")`` also loads a file that
+only describes a rig whose images exist; :meth:`Sensor.missing_for` names the keys that it lacks for other purposes.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import ConfigDict
 
-from characterisation.files.documents import Document, read_toml, validate
+from characterisation.files.documents import Document, Name, missing_error, missing_keys, read_toml_table, validate
 from characterisation.files.errors import InputError, nearest
 from mitsim.running.progress import say
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
-from mitsim.sensor.exposure import automatic, bracket
+from mitsim.sensor.exposure import ExposurePolicy, exposure_policy
 from mitsim.sensor.imager import Imager, electrons_per_radiance
 from mitsim.sensor.lens_keys import with_lenses
 from mitsim.sensor.light_code import LightCode, patterns
@@ -29,57 +29,28 @@ from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.opencv_calibration import with_calibration
 from mitsim.sensor.pattern import DotPattern, dot_frames
 from mitsim.sensor.projector import Projector
-from mitsim.sensor.projector_images import ImageFolder, ProjectorImages, checked_images, read_images
+from mitsim.sensor.projector_images import ImageFolder, ProjectorImages, allowed_images, checked_images, read_images
 from mitsim.sensor.published_noise import PublishedNoise
-from mitsim.sensor.recorded_keys import for_recordings, lacking_keys
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.sensor_file import (
-    AutomaticExposure,
-    Bracket,
-    FixedExposure,
     MisalignmentTable,
+    Purpose,
     RoomTable,
     SensorFile,
+    absent_keys,
+    needed_keys,
+    with_depths,
 )
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
-from mitsim.sensor.written_imager import imager_of
-
-
-@dataclass(frozen=True)
-class ExposurePolicy:
-    """Exposure rule of a sensor.
-
-    - ``rule`` in words.
-    - ``base_s``: the exposure; None if it follows the scene by ``control``.
-    - ``bracket``: the exposures around it.
-    - ``limits_s``: the limits of the device.
-    """
-
-    rule: str
-    base_s: float | None
-    control: AutomaticExposure | None
-    bracket: Bracket | None
-    limits_s: tuple[float, float]
-
-    def exposures(self, brightest: NDArray[np.floating] | None, full_well: float) -> tuple[float, ...]:
-        """Return the exposures of one capture [s], shortest first.
-
-        ``brightest``: electrons per second of the brightest image of all cameras; only automatic control needs it.
-        """
-        base = self.base_s
-        if base is None:
-            assert self.control is not None and brightest is not None
-            control = self.control
-            base = automatic(brightest, full_well, control.level, control.percentile, self.limits_s)
-        if self.bracket is None:
-            return (base,)
-        return bracket(base, self.bracket.count, self.bracket.factor, self.limits_s)
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor ready for use.
+    """A sensor. Parts that its file may leave out have unknown values, and :meth:`missing_for` names their keys.
 
+    - ``wavelength_nm``, ``working_range_mm``, the flux of the projector and numbers of the imager: NaN if unknown.
+    - ``rig``: without a projector if that is not calibrated; ``projector.optics`` then has only a size, or 0 px.
+    - ``pattern``: None if unknown.
     - ``linewidth_nm`` of its light; None if unknown, which disables speckle.
     - ``focus_mm`` of the cameras' lenses; None for pinholes.
     - ``ambient_image``: one additional image with the projector off.
@@ -88,6 +59,8 @@ class Sensor:
       suffice.
     - ``unknowns`` of this type of sensor.
     - ``room`` light and ``misalignment`` of one unit in its place, fitted to captures by ``mitsim fit sensor``.
+    - ``missing``: keys that any purpose needs and the file leaves out.
+    - ``notes``: warnings about the calibration.
     """
 
     name: str
@@ -99,7 +72,7 @@ class Sensor:
     projector: Projector
     imager: Imager
     focus_mm: float | None
-    pattern: DotPattern | LightCode | ProjectorImages | AmplitudeModulation
+    pattern: DotPattern | LightCode | ProjectorImages | AmplitudeModulation | None
     exposure: ExposurePolicy
     ambient_image: bool
     matcher: MatcherSettings | None
@@ -110,6 +83,53 @@ class Sensor:
     unknowns: UnknownsTable = field(default=UnknownsTable(), repr=False)
     room: RoomTable | None = field(default=None, repr=False)
     misalignment: MisalignmentTable = field(default=MisalignmentTable(), repr=False)
+    missing: frozenset[str] = field(default=frozenset(), repr=False)
+    notes: tuple[str, ...] = field(default=(), repr=False)
+
+    def missing_for(self, purpose: Purpose) -> tuple[str, ...]:
+        """Return the keys of the sensor file that a purpose needs and the file lacks, as ``imager.pixel_um``.
+
+        ``purpose``: ``simulation``, ``decoding``, ``noise`` (that of images, from the imager's description) or
+        ``bits`` (of images).
+        """
+        table = {"technology": self.technology, "decoder": {"triangulate": self.decoder and self.decoder.triangulate}}
+        return tuple(key for key in needed_keys(table, purpose) if key in self.missing)
+
+    def require(self, purpose: Purpose, where: str | Path = "") -> None:
+        """Check that the sensor has all that a purpose needs.
+
+        Raises
+        ------
+        InputError
+            If not; it names all missing keys, and ``where`` or the sensor.
+        """
+        missing = self.missing_for(purpose)
+        if missing:
+            raise InputError(
+                where or f"sensor {self.name}",
+                ", ".join(missing),
+                "nothing",
+                f"a value for each: {purpose} needs them",
+                "the file describes a recorded rig: mitsim import and mitsim decode accept it",
+            )
+
+    @property
+    def described_imager(self) -> Imager | None:
+        """Return the imager; None if its description lacks a number that the noise of images needs."""
+        return None if self.missing_for("noise") else self.imager
+
+    @property
+    def bits(self) -> int | None:
+        """Return the bits of the images; None if the file states neither them nor all that simulation needs."""
+        return None if self.missing_for("bits") else self.imager.bits
+
+    @property
+    def range_mm(self) -> tuple[float, float] | None:
+        """Return the depths that the file states: the working range, else those of its decoder; None without both."""
+        if "working_range_mm" not in self.missing:
+            return self.working_range_mm
+        stated = not any(key.endswith((".near_mm", ".far_mm")) for key in self.missing)
+        return (self.settings.near_mm, self.settings.far_mm) if stated else None
 
     @property
     def settings(self) -> MatcherSettings | DecoderSettings | TimeOfFlightSettings:
@@ -159,6 +179,8 @@ class Sensor:
         A time-of-flight sensor has none: its light is modulated in time, not in space.
         """
         optics, pattern = self.projector.optics, self.pattern
+        if pattern is None:
+            raise missing_error(f"sensor {self.name}", ["pattern"])
         if isinstance(pattern, DotPattern):
             return dot_frames(pattern, optics.width, optics.height)
         if isinstance(pattern, ProjectorImages):
@@ -203,7 +225,7 @@ class Sensor:
         """
         optics = self.projector.optics
         pattern = checked_images(images, optics.width, optics.height, f"patterns of {self.name}")
-        return replace(self, pattern=_allowed(pattern, self.technology, self.matcher, f"sensor {self.name}"))
+        return replace(self, pattern=allowed_images(pattern, self.technology, self.matcher, f"sensor {self.name}"))
 
     def electrons(self) -> float:
         """Return the photo-electrons per unit of radiance and second [e- / (s W mm^-2 sr^-1)]."""
@@ -225,94 +247,95 @@ def presets() -> list[str]:
     return sorted(p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml"))
 
 
-def load_sensor(name: str | Path) -> Sensor:
+def load_sensor(name: str | Path, purpose: Purpose = "simulation", size: tuple[int, int] | None = None) -> Sensor:
     """Load a preset by name, or a sensor TOML file by path.
 
-    Raises
-    ------
-    InputError
-        For an unknown name, or a file that does not describe a sensor. If the file describes a recorded rig
-        (:mod:`mitsim.sensor.recorded_rig`), the error names all keys that simulation needs.
-    """
-    path, table, notes = sensor_table(name)
-    for note in notes:
-        say(f"warning: {note}")
-    lacking = lacking_keys(table)
-    if lacking and _is_recorded_rig(path, table):
-        raise InputError(
-            path,
-            ", ".join(lacking),
-            "nothing",
-            "a value for each: simulation needs them",
-            "the file describes a recorded rig: mitsim import and mitsim decode accept it",
-        )
-    return sensor_of(path, table)
-
-
-def sensor_table(name: str | Path, size: tuple[int, int] | None = None) -> tuple[Path, dict[str, Any], list[str]]:
-    """Return the path of a preset or sensor file, its unchecked table with the calibration filled in, and warnings.
-
-    ``size`` (width, height) [px] of the images, if known, tells whether they show a part of the calibrated imager.
+    Parameters
+    ----------
+    name
+        Of a preset, or path of a file.
+    purpose
+        What the sensor is for. Only for ``simulation`` warnings about the calibration are printed; for others they are
+        in ``notes``.
+    size
+        (width, height) [px] of images, if known. It tells whether they show a part of the calibrated imager, and is
+        the size of cameras without one: OpenCV's pair of ``intrinsics.yml`` and ``extrinsics.yml`` has none.
 
     Raises
     ------
     InputError
-        For an unknown name, or a file or calibration that cannot be read.
+        For an unknown name, or a file that does not describe a sensor. The error names all keys that the purpose needs
+        and the file lacks.
     """
-    path, written = written_table(name)
-    return path, *with_calibration(path, with_lenses(path, written), size)
+    path, written = _written_table(name)
+    table, notes = with_calibration(path, with_lenses(path, written), size)
+    sensor = _sensor_of(path, table, purpose, tuple(notes))
+    if purpose == "simulation":
+        for note in notes:
+            say(f"warning: {note}")
+    sensor.require(purpose, path)
+    return sensor
 
 
-def written_table(name: str | Path) -> tuple[Path, dict[str, Any]]:
-    """Return the path of a preset or sensor file, and its table as written.
+def named_sensor(name: str | Path) -> tuple[str, str]:
+    """Return name and technology of a preset or sensor file. Nothing else is checked; its calibration is not read.
 
     Raises
     ------
     InputError
-        For an unknown name, or a file that cannot be read.
+        For an unknown name, or a file that cannot be read or lacks one of the two.
     """
+    path, table = _written_table(name)
+    if not {"name", "technology"} <= set(table):
+        # the unread calibration may contain these keys
+        held = ("cameras", "projector") if "calibration" in table else ("\0",)
+        raise missing_error(path, [key for key in _lacking(table, "decoding") if not key.startswith(held)])
+    named = validate(path, {key: table[key] for key in ("name", "technology")}, _Named)
+    return named.name, named.technology
+
+
+def _written_table(name: str | Path) -> tuple[Path, dict[str, Any]]:
+    """Return the path of a preset or sensor file, and its table as written."""
     path = Path(name)
     if path.suffix != ".toml":
         if str(name) not in presets():
             allowed = f"{', '.join(presets())}, or the path of a .toml file"
             raise InputError("--sensor", "", repr(str(name)), allowed, nearest(str(name), presets()))
         path = Path(str(files("mitsim.sensor") / "presets" / f"{name}.toml"))
-    return path, read_toml(path, _Written).model_extra or {}
+    return path, read_toml_table(path)
 
 
-def sensor_of(path: Path, written: dict[str, Any]) -> Sensor:
-    """Make a sensor from a complete table.
+def _lacking(table: dict[str, Any], purpose: Purpose) -> list[str]:
+    """Return the keys that a sensor file's table lacks for a purpose, including those that every file has."""
+    absent = absent_keys(table, needed_keys(table, purpose))
+    return list(dict.fromkeys([*missing_keys(with_depths(table), SensorFile), *absent]))
 
-    Raises
-    ------
-    InputError
-        If a value is missing or not allowed.
-    """
-    table = validate(path, written, SensorFile)
+
+def _sensor_of(path: Path, written: dict[str, Any], purpose: Purpose, notes: tuple[str, ...]) -> Sensor:
+    """Make a sensor from the table of its file, which has at least what decoding needs."""
+    try:
+        table = validate(path, with_depths(written), SensorFile)
+    except InputError as error:
+        raise (missing_error(path, _lacking(written, purpose)) if error.found == "nothing" else error) from None
+    if absent_keys(written, needed_keys(written, "decoding")):
+        raise missing_error(path, _lacking(written, purpose))
     near, far = table.working_range_mm
     if near >= far:
         raise InputError(path, "working_range_mm", f"[{near:g}, {far:g}]", "near before far")
-    return _assemble(path, table)
+    absent = absent_keys(written, needed_keys(written, "simulation"))
+    if absent:  # the bits of a complete imager have a default
+        absent += absent_keys(written, needed_keys(written, "bits"))
+    return _assemble(path, table, frozenset(absent), notes)
 
 
-def _is_recorded_rig(path: Path, table: dict[str, Any]) -> bool:
-    """Return whether a table lacks only keys that simulation needs."""
-    try:
-        sensor_of(path, for_recordings(table))
-    except InputError:
-        return False
-    return True
+class _Named(Document):
+    name: Name
+    technology: str
 
 
-class _Written(Document):
-    """A sensor file as written, before its calibration is read."""
-
-    model_config = ConfigDict(extra="allow")
-
-
-def _assemble(path: Path, table: SensorFile) -> Sensor:
+def _assemble(path: Path, table: SensorFile, missing: frozenset[str], notes: tuple[str, ...]) -> Sensor:
     cameras = {name: optics.camera() for name, optics in table.cameras.items()}
-    keys, given = table.projector, table.imager
+    keys, written = table.projector, table.imager
     projector = Projector(
         keys.camera(),
         keys.flux_w,
@@ -323,19 +346,20 @@ def _assemble(path: Path, table: SensorFile) -> Sensor:
         corner_illumination=keys.corner_illumination,
         pixel_gap=keys.pixel_gap,
     )
-    imager = imager_of(given)
+    imager = Imager(**{each.name: getattr(written, each.name) for each in fields(Imager)})
+    calibrated = not missing & {"projector.focal_px", "projector.principal_px"}
     return Sensor(
         name=table.name,
         technology=table.technology,
         wavelength_nm=table.wavelength_nm,
         linewidth_nm=keys.linewidth_nm,
         working_range_mm=table.working_range_mm,
-        rig=Rig(cameras, projector.optics),
+        rig=Rig(cameras, projector.optics if calibrated else None),
         projector=projector,
         imager=imager,
-        focus_mm=given.focus_mm,
+        focus_mm=written.focus_mm,
         pattern=_pattern(path, table, projector),
-        exposure=_exposure(path, table, projector, imager),
+        exposure=exposure_policy(path, table.exposure, projector, imager, table.wavelength_nm),
         ambient_image=table.ambient_image,
         matcher=table.matcher,
         decoder=table.decoder,
@@ -345,29 +369,22 @@ def _assemble(path: Path, table: SensorFile) -> Sensor:
         unknowns=_unknowns(path, table),
         room=table.room,
         misalignment=table.misalignment,
+        missing=missing,
+        notes=notes,
     )
-
-
-def _allowed(pattern: ProjectorImages, technology: str, matcher: MatcherSettings | None, where: str) -> ProjectorImages:
-    """Return own images that a technology can project; else raise an error."""
-    if technology not in ("active_stereo", "structured_light"):
-        raise InputError(where, "pattern", f"images, for {technology}", "images for active_stereo or structured_light")
-    if pattern.count > 1 and matcher is not None and matcher.method != "correlation":
-        hint = 'set method = "correlation" in [matcher], which matches all images at once'
-        raise InputError(where, "pattern", f"{pattern.count} images, for matcher.method {matcher.method}", "one", hint)
-    return pattern
 
 
 def _pattern(
     path: Path, table: SensorFile, projector: Projector
-) -> DotPattern | LightCode | ProjectorImages | AmplitudeModulation:
+) -> DotPattern | LightCode | ProjectorImages | AmplitudeModulation | None:
     """Return the pattern of a sensor file; the folder of own images is relative to the file."""
-    pattern = table.pattern
+    pattern, optics = table.pattern, projector.optics
     if not isinstance(pattern, ImageFolder):
         return pattern
-    optics = projector.optics
+    if not optics.width:  # a rig of two cameras, which match images of any projector
+        return None
     images = read_images(path.parent / pattern.folder, optics.width, optics.height)
-    return _allowed(images, table.technology, table.matcher, str(path))
+    return allowed_images(images, table.technology, table.matcher, str(path))
 
 
 def _unknowns(path: Path, table: SensorFile) -> UnknownsTable:
@@ -379,29 +396,3 @@ def _unknowns(path: Path, table: SensorFile) -> UnknownsTable:
         table.unknowns,
         UnknownsTable.model_validate({"calibration": {"covariance": str((path.parent / covariance).absolute())}}),
     )
-
-
-def _exposure(path: Path, table: SensorFile, projector: Projector, imager: Imager) -> ExposurePolicy:
-    rule = table.exposure
-    shortest, longest = rule.limits_s
-    if shortest > longest:
-        raise InputError(path, "exposure.limits_s", f"[{shortest:g}, {longest:g}]", "shortest before longest")
-    several = "" if rule.bracket is None else f"; {rule.bracket.count} exposures a factor {rule.bracket.factor:g} apart"
-    if isinstance(rule, AutomaticExposure):
-        words = f"automatic: {rule.percentile:g} % of the pixels under {100 * rule.level:g} % of full scale"
-        return ExposurePolicy(words + several, None, rule, rule.bracket, rule.limits_s)
-    if isinstance(rule, FixedExposure):
-        return ExposurePolicy(
-            f"fixed at {rule.exposure_s:g} s{several}", rule.exposure_s, None, rule.bracket, rule.limits_s
-        )
-    radiance = rule.reflectance / np.pi * projector.plane_irradiance / rule.distance_mm**2
-    wanted = rule.level * imager.full_well
-    exposure = float(wanted / (radiance * electrons_per_radiance(imager, table.wavelength_nm, 1.0)))
-    if not shortest <= exposure <= longest:
-        hint = f"the rule asks for {exposure:.3g} s: change projector.flux_w, exposure.level or exposure.distance_mm"
-        raise InputError(path, "exposure.limits_s", f"[{shortest:g}, {longest:g}] s", "limits that hold", hint)
-    words = (
-        f"fixed at {exposure:.3g} s: matt white (reflectance {rule.reflectance:g}) at {rule.distance_mm:g} mm "
-        f"shows the bright pattern at {100 * rule.level:g} % of full scale"
-    )
-    return ExposurePolicy(words + several, exposure, None, rule.bracket, rule.limits_s)

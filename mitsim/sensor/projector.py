@@ -23,25 +23,16 @@ from mitsim.sensor.camera import Camera
 class Projector:
     """A projector.
 
-    Parameters
-    ----------
-    optics
-        Its geometry: OpenCV's camera model, all 14 coefficients or fisheye.
-    flux
-        Flux of an all-white frame, without the loss toward the corners [W].
-    black_level
-        Light of a black pixel relative to white [1].
-    gamma
-        Exponent of the response curve: a pixel of value p emits p^gamma [1].
-    aperture_mm
-        Diameter of the lens's exit pupil [mm]; 0 is a point.
-    focus_mm
-        Distance of the plane of sharp focus along the axis [mm]. A point at depth z receives light from the projector
-        pixels in a disc of diameter aperture f |1/z - 1/focus| px.
-    corner_illumination
-        Illumination of the image's corner relative to the centre [1], in the form of the cos^4 law.
-    pixel_gap
-        Dark share of the pitch between two pixels [1], as between the mirrors of a DMD; 0 is a continuous image.
+    - ``optics``: OpenCV's camera model, all 14 coefficients or fisheye.
+    - ``flux`` of an all-white frame, without the loss toward the corners [W].
+    - ``black_level``: light of a black pixel relative to white [1].
+    - ``gamma`` of the response curve: a pixel of value p emits p^gamma [1].
+    - ``aperture_mm``: diameter of the lens's exit pupil; 0 is a point.
+    - ``focus_mm``: distance of the plane of sharp focus along the axis. A point at depth z receives light from the
+      projector pixels in a disc of diameter aperture f |1/z - 1/focus| px.
+    - ``corner_illumination`` of the image's corner relative to the centre [1], in the form of the cos^4 law.
+    - ``pixel_gap``: dark share of the pitch between two pixels [1], as between the mirrors of a DMD; 0 is a continuous
+      image.
     """
 
     optics: Camera

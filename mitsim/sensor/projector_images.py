@@ -22,6 +22,7 @@ from pydantic import Field
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
+from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.png import decode_png
 
 Pattern = TypeVar("Pattern")
@@ -87,15 +88,21 @@ def described(pattern: Pattern | ProjectorImages) -> Pattern | ImagesDescription
 
 
 def checked_images(images: ArrayLike, width: int, height: int, where: str) -> ProjectorImages:
-    """Return images as the pattern of a projector of ``width`` x ``height`` pixels.
+    """Return images as the pattern of a projector.
 
-    ``images`` (P, H, W), or (H, W) for one: uint8, uint16 or bool, or floats 0..1.
+    Parameters
+    ----------
+    images
+        (P, H, W), or (H, W) for one: uint8, uint16 or bool, or floats 0..1.
+    width, height
+        Of the projector [px].
+    where
+        What names the images in messages.
 
     Raises
     ------
     InputError
-        If they have another size or type, are too many, or a value is not between 0 and 1. ``where`` says in the
-        message what was given.
+        If they have another size or type, are too many, or a value is not between 0 and 1.
     """
     values = np.asarray(images)
     if values.ndim == 2:
@@ -116,6 +123,33 @@ def checked_images(images: ArrayLike, width: int, height: int, where: str) -> Pr
             raise InputError(where, "images", f"{values.min():g} to {values.max():g}", "values from 0 to 1, white")
         values = values.astype(np.float32)
     return ProjectorImages.of(np.array(values))  # a copy: the caller may change the array
+
+
+def allowed_images(
+    pattern: ProjectorImages, technology: str, matcher: MatcherSettings | None, where: str
+) -> ProjectorImages:
+    """Return images of the user's own, checked against what a sensor can project and decode.
+
+    Parameters
+    ----------
+    pattern
+        The images.
+    technology, matcher
+        Of the sensor.
+    where
+        What names the images in messages.
+
+    Raises
+    ------
+    InputError
+        If the technology has a pattern of its own, or the matcher takes one image only.
+    """
+    if technology not in ("active_stereo", "structured_light"):
+        raise InputError(where, "pattern", f"images, for {technology}", "images for active_stereo or structured_light")
+    if pattern.count > 1 and matcher is not None and matcher.method != "correlation":
+        hint = 'set method = "correlation" in [matcher], which matches all images at once'
+        raise InputError(where, "pattern", f"{pattern.count} images, for matcher.method {matcher.method}", "one", hint)
+    return pattern
 
 
 def read_images(folder: Path, width: int, height: int) -> ProjectorImages:

@@ -36,10 +36,14 @@ _WAVELENGTHS = np.arange(360.0, 1101.0, 1.0)
 
 
 def room_irradiance(illuminance: float, daylight: float, wavelength_nm: float, filter_nm: float = 0.0) -> float:
-    """Return the irradiance [W/mm^2] within a sensor's band for an illuminance [lx].
+    """Return the irradiance of a room within a sensor's band [W/mm^2].
 
-    ``daylight`` is the share of the illuminance that comes from the sky [1]. ``filter_nm`` is the full width of the
-    band about ``wavelength_nm``, 0 for the whole range of silicon.
+    Parameters
+    ----------
+    illuminance, daylight
+        Illuminance [lx], and the share of it that comes from the sky [1].
+    wavelength_nm, filter_nm
+        Middle and full width of the band; 0 for the whole range of silicon.
     """
     low, high = SILICON_NM
     if filter_nm > 0:

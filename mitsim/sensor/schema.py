@@ -1,8 +1,8 @@
 """Make the JSON schema of the sensor TOML file, for editors: ``python -m mitsim.sensor.schema > sensor.schema.json``.
 
 The schema is derived from :class:`~mitsim.sensor.sensor_file.SensorFile`, so it has every key, its type and its limits.
-Keys that only simulation needs are optional, as in the file of a recorded rig. The schema does not express conditions
-between keys; ``mitsim`` itself checks those.
+Keys that only some purposes need are optional. The schema does not express conditions between keys; ``mitsim`` itself
+checks those.
 """
 
 from __future__ import annotations
@@ -13,15 +13,18 @@ from typing import Any
 
 from mitsim.sensor.sensor_file import SensorFile
 
-#: keys, by table, that a calibration file may contain instead or that only simulation needs
+#: keys, by table, that a calibration file or the working range may contain instead
 _OPTIONAL = {
     "OpticsTable": ("width", "height", "focal_px", "principal_px"),
-    "ProjectorTable": ("width", "height", "focal_px", "principal_px", "flux_w"),
-    "ImagerTable": ("pixel_um", "quantum_efficiency", "full_well_e", "read_noise_e", "f_number"),
     "DecoderSettings": ("near_mm", "far_mm"),
     "MatcherSettings": ("near_mm", "far_mm"),
 }
-_OPTIONAL_TABLES = ("cameras", "wavelength_nm", "working_range_mm", "projector", "imager", "pattern", "exposure")
+
+#: keys, by table, whose default stands for unknown: NaN, or 0 px
+_UNKNOWN = {
+    "mitsim sensor": ("working_range_mm", "projector", "imager"),
+    "ProjectorTable": ("width", "height", "focal_px", "principal_px"),
+}
 
 
 def sensor_schema() -> dict[str, Any]:
@@ -35,11 +38,13 @@ def sensor_schema() -> dict[str, Any]:
     lens = {"anyOf": [{"type": "number"}, {"type": "array", "items": {"type": "number"}}]}
     for name in ("OpticsTable", "ProjectorTable"):  # alternatives to focal_px, see mitsim.sensor.lens_keys
         schema["$defs"][name]["properties"] |= {"focal_mm": lens, "pixel_um": lens}
-    schema["required"] = [key for key in schema["required"] if key not in _OPTIONAL_TABLES]
-    for table in schema["$defs"].values():
-        for entry in table.get("properties", {}).values():
-            if entry.get("default") in (math.inf, -math.inf):
-                del entry["default"]  # infinity is not JSON
+    schema["required"].remove("cameras")
+    for table in (schema, *schema["$defs"].values()):
+        for key, entry in table.get("properties", {}).items():
+            default = entry.get("default")
+            unfinite = isinstance(default, float) and not math.isfinite(default)  # not JSON
+            if unfinite or (table.get("title") in _UNKNOWN and key in _UNKNOWN[table["title"]]):
+                del entry["default"]
     return schema
 
 

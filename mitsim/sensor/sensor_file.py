@@ -1,4 +1,7 @@
-"""Define the sensor TOML file: every table and key, with its limits.
+"""Define the sensor TOML file: every table and key, with its limits, and the keys that a purpose needs.
+
+A file may describe only a rig whose images exist. What it leaves out is NaN, 0 px or None, and :func:`needed_keys` says
+which purposes need it.
 
 The fields are described in docs/reference/formats/sensor.md. Comments in the presets give the source of each number
 and mark unconfirmed ones as *assumed*. :mod:`mitsim.sensor.preset` makes a sensor from the file.
@@ -6,17 +9,22 @@ and mark unconfirmed ones as *assumed*. :mod:`mitsim.sensor.preset` makes a sens
 
 from __future__ import annotations
 
+import math
 import re
-from typing import Annotated, Literal
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from characterisation.files.documents import Document, Name
+from characterisation.files.errors import InputError
 from mitsim.sensor.calibration_qualifiers import check_intrinsics
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
+from mitsim.sensor.imager import DESCRIPTION, Imager
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
@@ -64,7 +72,8 @@ class OpticsTable(Document):
     def _possible(self) -> OpticsTable:
         if self.width * self.height > MOST_PIXELS:
             raise ValueError(f"at most {MOST_PIXELS:,} pixels, not {self.width} x {self.height}")
-        check_intrinsics(self.focal_px, self.principal_px, self.width, self.height)
+        if not np.isnan([*self.focal_px, *self.principal_px]).any() and self.width and self.height:
+            check_intrinsics(self.focal_px, self.principal_px, self.width, self.height)
         if not all(abs(place) <= 1e5 for place in self.position_mm):
             raise ValueError("position_mm within 100 m of the sensor's frame")
         return self
@@ -82,9 +91,13 @@ class OpticsTable(Document):
 
 
 class ProjectorTable(OpticsTable):
-    """The projector: its optics, its light and its losses."""
+    """The projector: its optics, its light and its losses. Unknown numbers are NaN, an unknown size is 0."""
 
-    flux_w: Positive
+    width: int = Field(default=0, ge=16, le=20000)
+    height: int = Field(default=0, ge=16, le=20000)
+    focal_px: tuple[Positive, Positive] = (math.nan, math.nan)
+    principal_px: Pair = (math.nan, math.nan)
+    flux_w: Positive = math.nan
     linewidth_nm: Annotated[float, Field(gt=0, le=500)] | None = None
     black_level: Share = 0.0
     gamma: Annotated[float, Field(ge=0.2, le=5)] = 1.0
@@ -94,43 +107,11 @@ class ProjectorTable(OpticsTable):
     pixel_gap: Annotated[float, Field(ge=0, le=0.5)] = 0.0
 
 
-class ImagerTable(Document):
-    """The imager of every camera of the sensor, in EMVA 1288 terms, and its lens."""
+@dataclass(frozen=True)
+class ImagerTable(Imager):
+    """The imager of every camera of the sensor, and the depth of the plane of focus of its lens [mm]."""
 
-    pixel_um: Positive
-    quantum_efficiency: Annotated[float, Field(gt=0, le=1)]
-    full_well_e: Positive
-    read_noise_e: Annotated[float, Field(ge=0)]
-    dsnu_e: Annotated[float, Field(ge=0)] = 0.0
-    prnu: Share = 0.0
-    bits: int = Field(default=8, ge=1, le=16)
-    black_level_dn: Annotated[float, Field(ge=0)] = 0.0
-    gamma: Annotated[float, Field(ge=0.2, le=5)] = 1.0
-    companding_dn: list[tuple[Positive, Positive]] = Field(default=[], max_length=32)
-    row_noise_e: Annotated[float, Field(ge=0)] = 0.0
-    column_pattern_e: Annotated[float, Field(ge=0)] = 0.0
-    dark_current_e_s: Annotated[float, Field(ge=0)] = 0.0
-    f_number: Positive
     focus_mm: Annotated[float, Field(ge=10)] | None = None
-    corner_illumination: Annotated[float, Field(gt=0, le=1)] | None = None
-    blur_px: Annotated[float, Field(ge=0, le=5)] = 0.0
-    smoothing_px: Annotated[float, Field(ge=0, le=5)] = 0.0
-    corner_blur_px: Annotated[float, Field(ge=0, le=10)] | None = None
-
-    @model_validator(mode="after")
-    def _knees(self) -> ImagerTable:
-        if not self.companding_dn:
-            return self
-        if self.gamma != 1:
-            raise ValueError("companding_dn and gamma are two curves: give one of them")
-        levels = np.array([(0.0, 0.0), *self.companding_dn])
-        if (np.diff(levels, axis=0) <= 0).any():
-            raise ValueError("companding_dn must rise from knee to knee, in and out")
-        if levels[-1].tolist() not in [[2**n, 2**self.bits] for n in range(self.bits, 17)]:
-            raise ValueError(f"companding_dn ends with [2^(bits of the converter, up to 16), {2**self.bits}]")
-        if self.black_level_dn >= 2**self.bits:
-            raise ValueError("black_level_dn must be under full scale")
-        return self
 
 
 class RoomTable(Document):
@@ -206,24 +187,29 @@ class SensorFile(Document):
 
     name: Name
     technology: Literal["active_stereo", "reference_stereo", "structured_light", "time_of_flight"]
-    wavelength_nm: Annotated[float, Field(ge=400, le=1000)]
-    working_range_mm: tuple[Annotated[float, Field(ge=50)], Annotated[float, Field(le=20000)]]
+    wavelength_nm: Annotated[float, Field(ge=400, le=1000)] = math.nan
+    working_range_mm: tuple[Annotated[float, Field(ge=50)], Annotated[float, Field(le=20000)]] = (math.nan, math.nan)
     calibration: CalibrationTable | None = None
     cameras: dict[CameraName, OpticsTable] = Field(min_length=1, max_length=2)
-    projector: ProjectorTable
-    imager: ImagerTable
-    pattern: Annotated[
-        RandomDots
-        | DiffractionSpots
-        | PhaseShift
-        | GrayCode
-        | GrayCodePhaseShift
-        | ImageSequence
-        | ImageFolder
-        | AmplitudeModulation,
-        Field(discriminator="kind"),
-    ]
-    exposure: Annotated[MattWhiteExposure | FixedExposure | AutomaticExposure, Field(discriminator="rule")]
+    projector: ProjectorTable = ProjectorTable()
+    imager: ImagerTable = ImagerTable()
+    pattern: (
+        Annotated[
+            RandomDots
+            | DiffractionSpots
+            | PhaseShift
+            | GrayCode
+            | GrayCodePhaseShift
+            | ImageSequence
+            | ImageFolder
+            | AmplitudeModulation,
+            Field(discriminator="kind"),
+        ]
+        | None
+    ) = None
+    exposure: Annotated[MattWhiteExposure | FixedExposure | AutomaticExposure, Field(discriminator="rule")] | None = (
+        None
+    )
     ambient_image: bool = False
     room: RoomTable | None = None
     misalignment: MisalignmentTable = MisalignmentTable()
@@ -243,7 +229,8 @@ class SensorFile(Document):
             return self
         if self.demodulation is not None or isinstance(self.pattern, AmplitudeModulation):
             raise ValueError("[demodulation] and patterns of kind amplitude_modulation are for time_of_flight")
-        if self.imager.companding_dn and (self.technology == "structured_light" or self.exposure.bracket is not None):
+        bracket = self.exposure is not None and self.exposure.bracket is not None
+        if self.imager.companding and (self.technology == "structured_light" or bracket):
             raise ValueError("imager.companding_dn is for stereo at one exposure: no structured_light, no bracket")
         if self.technology in ("active_stereo", "reference_stereo"):
             _check_dots(self)
@@ -269,14 +256,15 @@ def _check_code(file: SensorFile, decoder: DecoderSettings) -> None:
 
 def _check_modulation(file: SensorFile) -> None:
     """Raise an error if a time-of-flight sensor lacks a part, or has one that differences of taps do not allow."""
-    if not isinstance(file.pattern, AmplitudeModulation):
+    if file.pattern is not None and not isinstance(file.pattern, AmplitudeModulation):
         raise ValueError(f"time_of_flight needs a pattern of kind amplitude_modulation, not {file.pattern.kind}")
     if len(file.cameras) != 1 or file.demodulation is None or file.matcher is not None or file.decoder is not None:
         raise ValueError("time_of_flight needs one camera and [demodulation], and has no [matcher] or [decoder]")
     if file.imager.smoothing_px > 0 or file.room is not None:
         raise ValueError("imager.smoothing_px and [room] are for images of light, not for time_of_flight")
-    bent = file.imager.gamma != 1 or bool(file.imager.companding_dn)
-    if file.ambient_image or file.exposure.bracket is not None or bent:
+    bent = file.imager.gamma != 1 or bool(file.imager.companding)
+    bracket = file.exposure is not None and file.exposure.bracket is not None
+    if file.ambient_image or bracket or bent:
         raise ValueError("time_of_flight takes differences of two taps: no ambient_image, bracket, gamma, companding")
 
 
@@ -287,7 +275,7 @@ def _check_dots(file: SensorFile) -> None:
         number = {1: "one camera", 2: "two cameras"}[cameras]
         raise ValueError(f"{file.technology} needs {number} and [matcher], and has no [decoder]")
     own = isinstance(file.pattern, ImageFolder) and file.technology == "active_stereo"
-    if not isinstance(file.pattern, DotPattern) and not own:
+    if file.pattern is not None and not isinstance(file.pattern, DotPattern) and not own:
         kinds = "random_dots, diffraction_spots or images" if cameras == 2 else "random_dots or diffraction_spots"
         raise ValueError(f"{file.technology} needs a pattern of kind {kinds}, not {file.pattern.kind}")
     if (
@@ -298,3 +286,63 @@ def _check_dots(file: SensorFile) -> None:
         raise ValueError('pattern.shifts_px needs technology "active_stereo" and matcher.method "correlation"')
     if (file.matcher.reference_mm is None) == (file.technology == "reference_stereo"):
         raise ValueError("matcher.reference_mm is for reference_stereo, which needs it")
+
+
+#: purposes that need more than every sensor file has: simulation, decoding, the noise of images from the imager's
+#: description, the bits of images
+Purpose = Literal["simulation", "decoding", "noise", "bits"]
+
+#: the table that describes a technology's decoder, and default depths [mm] of decoding recordings. A code is
+#: unambiguous at every depth; a matcher searches all of them.
+DECODERS = {"structured_light": ("decoder", (50.0, 20000.0)), "active_stereo": ("matcher", (300.0, 2000.0))}
+
+_OPTICS = ("projector.focal_px", "projector.principal_px")
+_SHOWN = ("pattern.kind", "projector.width", "projector.height")
+_NOISE = tuple(f"imager.{key}" for key in DESCRIPTION)
+_LIGHT = ("wavelength_nm", "working_range_mm", "projector.flux_w", "exposure.rule")
+
+
+def needed_keys(table: dict[str, Any], purpose: Purpose) -> tuple[str, ...]:
+    """Return the keys that a purpose needs in a sensor file's table, beyond those that every file has.
+
+    Raises
+    ------
+    InputError
+        If there is no such purpose.
+    """
+    if purpose not in get_args(Purpose):
+        raise InputError("sensor", "purpose", repr(purpose), ", ".join(get_args(Purpose)))
+    technology, decoder = table.get("technology"), table.get("decoder")
+    between_cameras = isinstance(decoder, dict) and decoder.get("triangulate") == "cameras"
+    match purpose:
+        case "bits":
+            return ("imager.bits",)
+        case "noise":
+            return _NOISE
+        case "decoding" if technology == "active_stereo":
+            return ()
+        case "decoding":
+            return _SHOWN if between_cameras else (*_SHOWN, *_OPTICS)
+    searched = [f"{DECODERS[technology][0]}.{end}" for end in ("near_mm", "far_mm")] if technology in DECODERS else []
+    return (*_LIGHT[:2], *_SHOWN, *_OPTICS, *_LIGHT[2:], *_NOISE, *searched)
+
+
+def absent_keys(table: dict[str, Any], keys: Iterable[str]) -> tuple[str, ...]:
+    """Return those of some dotted keys that a table does not have."""
+    return tuple(key for key in keys if not _has(table, key))
+
+
+def _has(table: Any, key: str) -> bool:
+    first, _, rest = key.partition(".")
+    if not isinstance(table, dict):
+        return True  # a wrong type, which the model reports
+    return first in table and (not rest or _has(table[first], rest))
+
+
+def with_depths(table: dict[str, Any]) -> dict[str, Any]:
+    """Return a sensor file's table whose decoder has a range of depths: its own, the working range, or a default."""
+    name, depths = DECODERS.get(str(table.get("technology")), ("", (0.0, 0.0)))
+    near_far, decoder = table.get("working_range_mm", depths), table.get(name, {})
+    if not name or not isinstance(decoder, dict) or not isinstance(near_far, list | tuple) or len(near_far) != 2:
+        return table
+    return table | {name: {"near_mm": near_far[0], "far_mm": near_far[1]} | decoder}

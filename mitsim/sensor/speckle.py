@@ -38,8 +38,12 @@ from characterisation.files.errors import InputError
 _FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))
 #: speckles smaller than this [px] leave neighbouring pixels independent (correlation under 0.2 %)
 _INDEPENDENT_PX = 0.7
-#: the normal variable of the gamma tables spans +-_REACH
-_REACH, _STEPS, _CONTRASTS = 6.0, 1024, 65
+#: the normal variable of the gamma tables spans +-_REACH: beyond it lie 2e-9 of all pixels
+_REACH = 6.0
+#: steps of a table over that span
+_STEPS = 1024
+#: tables for contrasts from 0 to 1
+_CONTRASTS = 65
 
 
 @dataclass(frozen=True)
@@ -69,14 +73,9 @@ def speckle_size_um(wavelength_nm: float, f_number: float) -> float:
 class SpeckleSurface:
     """Properties of a surface that decide on its speckle.
 
-    Attributes
-    ----------
-    height_um
-        Rq of a metal [um]. For a paint, the spread of path lengths inside it [*assumed* by the caller].
-    coherent_share
-        A, share of the light reflected as by a mirror [1]; 1 leaves no speckle.
-    depolarising
-        Whether the surface scrambles polarisation, as white paint does and metal does not.
+    - ``height_um``: Rq of a metal; for a paint, the spread of path lengths inside it [*assumed* by the caller].
+    - ``coherent_share``: A, share of the light reflected as by a mirror [1]; 1 leaves no speckle.
+    - ``depolarising``: whether the surface scrambles polarisation, as white paint does and metal does not.
     """
 
     height_um: float
@@ -92,14 +91,10 @@ class SpeckleSurface:
 class SpeckleOptics:
     """Properties of light and lenses that decide on speckle.
 
-    Attributes
-    ----------
-    wavelength_nm, linewidth_nm
-        Of the light; the linewidth is its full width at half maximum, 0 for an ideal laser [nm].
-    u_illumination, u_observation
-        Half-angles of the projector's and the camera's aperture, seen from the surface [rad].
-    pixel_um, f_number
-        Pitch of the imager [um], and the working f-number of its lens [1].
+    - ``wavelength_nm``, ``linewidth_nm`` of the light: the full width at half maximum, 0 for an ideal laser.
+    - ``u_illumination``, ``u_observation``: half-angles of the projector's and the camera's aperture, seen from the
+      surface [rad].
+    - ``pixel_um``: pitch of the imager; ``f_number``: working f-number of its lens [1].
     """
 
     wavelength_nm: float

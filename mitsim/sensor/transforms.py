@@ -73,10 +73,16 @@ class Transform:
 
 
 def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike, roll_deg: float = 0.0) -> Transform:
-    """Return ``world_from_sensor`` of a sensor at ``position`` that looks at ``target`` [mm].
+    """Return ``world_from_sensor`` of a sensor at one place that looks at another.
 
-    The image's up direction (minus y) is as close to ``up`` as possible. ``roll_deg`` then rotates the sensor about its
-    own view axis, clockwise as the sensor sees it (x toward y).
+    Parameters
+    ----------
+    position, target
+        The two places (3,) [mm].
+    up
+        Direction to which the image's up direction (minus y) is as close as possible.
+    roll_deg
+        Rotation about the view axis after that, clockwise as the sensor sees it (x toward y).
     """
     position, target = np.asarray(position, float), np.asarray(target, float)
     z = target - position

@@ -14,13 +14,8 @@ from numpy.typing import NDArray
 from characterisation.coupon.orientations import sphere_directions
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.rig_parameters import eyes
 from mitsim.sensor.transforms import Transform, look_at
-
-
-def eyes_of(sensor: Sensor) -> dict[str, Camera]:
-    """Return cameras and projector of a sensor by name, the reference first."""
-    projector = sensor.rig.projector
-    return {**sensor.rig.cameras, **({"projector": projector} if projector else {})}
 
 
 def in_image(camera: Camera, points: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -45,7 +40,7 @@ def in_working_volume(sensor: Sensor, points: NDArray[np.floating]) -> NDArray[n
     near, far = sensor.working_range_mm
     along = depth(sensor, points)
     inside = (along >= near) & (along <= far)
-    for camera in eyes_of(sensor).values():
+    for camera in eyes(sensor.rig).values():
         inside &= in_image(camera, points)
     return np.asarray(inside)
 
@@ -63,7 +58,7 @@ def common_view(sensor: Sensor, depth_mm: float, step: int = 1) -> NDArray[np.bo
 def _seen_by_others(sensor: Sensor, rays: NDArray[np.floating], depth_mm: float) -> NDArray[np.bool_]:
     points = sensor.rig.reference.sensor_from_camera.points(rays / rays[..., 2:] * depth_mm)
     seen = np.ones(rays.shape[:-1], bool)
-    for other in list(eyes_of(sensor).values())[1:]:
+    for other in list(eyes(sensor.rig).values())[1:]:
         seen &= in_image(other, points)
     return seen
 
@@ -104,6 +99,14 @@ def usual_place(sensor: Sensor, centre: NDArray[np.floating]) -> NDArray[np.floa
 def pose_at(
     sensor: Sensor, position: NDArray[np.floating], target: NDArray[np.floating], roll_deg: float = 0.0
 ) -> Transform:
-    """Return ``world_from_sensor`` with the reference camera's axis from ``position`` to ``target`` [mm], z up."""
+    """Return ``world_from_sensor`` with the axis of the reference camera along a line, z up.
+
+    Parameters
+    ----------
+    sensor, roll_deg
+        The sensor, and its rotation about the axis [deg].
+    position, target
+        Ends of the line (3,) [mm].
+    """
     camera = sensor.rig.reference.sensor_from_camera
     return look_at(position, target, (0.0, 0.0, 1.0), roll_deg) @ camera.inverse()

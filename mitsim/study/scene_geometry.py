@@ -20,7 +20,7 @@ from characterisation.files.errors import InputError
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.triangles import triangles_by_shape
 from mitsim.sensor.preset import Sensor
-from mitsim.sensor.working_volume import eyes_of
+from mitsim.sensor.rig_parameters import eyes as eyes_of
 
 Floats = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ class SceneGeometry:
 def write_scene_geometry(folder: Path, scene: Scene, sensor: Sensor) -> None:
     """Write ``stand.npz`` atomically into a folder."""
     parts = triangles_by_shape(scene)
-    eyes = list(eyes_of(sensor).values())
+    eyes = list(eyes_of(sensor.rig).values())
     rays = []
     for eye in eyes:
         right, bottom = eye.width - 0.5, eye.height - 0.5

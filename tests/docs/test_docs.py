@@ -18,6 +18,7 @@ from pydantic.fields import FieldInfo
 from characterisation.cloud_files import write_ply
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.files.documents import Document, validate
+from characterisation.files.documents import fields_of as keys_of
 from characterisation.files.errors import InputError
 from characterisation.maps.building import SampleTable, build_map
 from characterisation.maps.joined import with_directions
@@ -35,7 +36,7 @@ from mitsim.maps.campaign.run import _all_patches
 from mitsim.maps.campaign.stage_pose import StageCalibrationFile
 from mitsim.scene.surface.surface_light import nominal_light
 from mitsim.sensor.rig_covariance import CovarianceFile
-from mitsim.sensor.sensor_file import SensorFile
+from mitsim.sensor.sensor_file import ImagerTable, ProjectorTable, SensorFile
 from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.study import StudyFile
 from mitsim.study.choice_document import ChoiceDocument
@@ -119,8 +120,8 @@ def model_of(path: str) -> type[BaseModel]:
 def fields_of(marker: str) -> dict[str, FieldInfo]:
     """Fields of the model of a ``keys:`` marker; of ``MODEL - BASE`` those that the base does not have."""
     path, _, base = marker.removeprefix("keys: ").partition(" - ")
-    without = set(model_of(base).model_fields) if base else set()
-    return {name: field for name, field in model_of(path).model_fields.items() if name not in without}
+    without = set(keys_of(model_of(base))) if base else set()
+    return {name: field for name, field in keys_of(model_of(path)).items() if name not in without}
 
 
 def test_each_shell_block_of_the_readme_works_in_an_empty_clone():
@@ -226,6 +227,9 @@ def check_default(where: str, field: FieldInfo, key: str, told: str) -> None:
         assert type(default) in (type(shown), tuple, float), where
     elif told == "infinity":
         assert default == float("inf"), where
+    elif told == "simulation needs it":
+        unknown = default in (None, ProjectorTable(), ImagerTable()) or np.isnan(default).all()
+        assert unknown, where
     elif told == "its defaults":
         assert isinstance(default, BaseModel), where
     else:
@@ -267,18 +271,20 @@ def test_every_model_of_a_toml_file_is_documented():
     while todo:
         model = todo.pop()
         seen.add(model.__name__)
-        text = " ".join(str(field.annotation) for field in model.model_fields.values())
+        fields = keys_of(model).values()
+        text = " ".join(str(field.annotation) for field in fields)
         module = importlib.import_module(model.__module__)
         names = set(re.findall(r"[\w.]+\.(\w+)", text)) | {
-            getattr(field.annotation, "__name__", "") for field in model.model_fields.values()
+            getattr(field.annotation, "__name__", "") for field in fields
         }
-        todo += [
-            getattr(module, name)
-            for name in names
-            if hasattr(getattr(module, name, None), "model_fields") and name not in seen
-        ]
+        todo += [getattr(module, name) for name in names if is_table(getattr(module, name, None)) and name not in seen]
     assert {"CheckTable", "Band", "ImagerTable", "MatcherSettings", "FixedExposure", "Measurement"} <= seen
     assert seen - {UnknownsOfFile.__name__} <= documented
+
+
+def is_table(value: object) -> bool:
+    """Whether a value is a model, or a data class with limits for a file."""
+    return hasattr(value, "model_fields") or hasattr(value, "__pydantic_config__")
 
 
 def test_index_of_formats_links_every_page_and_names_every_command():

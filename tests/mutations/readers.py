@@ -59,9 +59,9 @@ def _sensor(path):
 
 
 def _rig(path):
-    from mitsim.sensor.recorded_rig import load_recorded_rig
+    from mitsim.sensor.preset import load_sensor
 
-    load_recorded_rig(path)
+    load_sensor(path, "decoding")
 
 
 def _task(path):

@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from figures_of_surfaces import mean_run_length
 
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.region_of_interest import Roi
@@ -21,7 +22,6 @@ from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.pattern import mean_run_length
 from mitsim.sensor.transforms import Transform
 
 pytestmark = pytest.mark.real

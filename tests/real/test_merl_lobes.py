@@ -6,8 +6,9 @@ import csv
 
 import numpy as np
 import pytest
+from figures_of_surfaces import alpha_of_half_width
 
-from mitsim.scene.surface.microfacet import alpha_of_half_width, half_width
+from mitsim.scene.surface.microfacet import half_width
 
 pytestmark = pytest.mark.real
 

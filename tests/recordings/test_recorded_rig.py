@@ -10,15 +10,18 @@ import pytest
 from simulated_rigs import images_seen, save_calibration, save_images, surface_seen
 from typer.testing import CliRunner
 
+import mitsim as ms
 from characterisation.cloud_files import read_ply
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture
+from mitsim.capture.recordings.image_folder import read_image_folder
+from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.program import app
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.preset import load_sensor, presets
-from mitsim.sensor.recorded_rig import RecordedRig, load_recorded_rig, rig_named
+from mitsim.sensor.preset import load_sensor, named_sensor, presets
 from mitsim.sensor.transforms import Transform
 
+SCENES = Path(__file__).parents[2] / "scenes"
 HOW_TO = Path(__file__).parents[2] / "docs/how-to/import-a-rig.md"
 
 TURN = Transform.from_degrees([0.5, -12.0, 0.3], [100.0, 3.0, 5.0])
@@ -59,7 +62,7 @@ def run(*arguments: object):
 def test_the_smallest_file_of_the_how_to_imports_and_decodes_at_the_first_try(tmp_path):
     file = written(tmp_path, smallest())
     truth = surface_seen(CAMERA)
-    save_images(tmp_path / "images", images_seen(load_recorded_rig(file).pattern, CAMERA, PROJECTOR, truth))
+    save_images(tmp_path / "images", images_seen(load_sensor(file, "decoding").pattern, CAMERA, PROJECTOR, truth))
     run("import", tmp_path / "images", "--sensor", file, "-o", tmp_path / "capture")
     done = run("decode", tmp_path / "capture", "-o", tmp_path / "cloud.ply")
     assert "50 to 20000 mm" in done.output
@@ -108,7 +111,7 @@ def test_simulation_names_all_that_it_needs_at_once(tmp_path):
 def test_all_that_a_rig_lacks_comes_in_one_message(tmp_path, text, lacking):
     (tmp_path / "my.toml").write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as caught:
-        load_recorded_rig(tmp_path / "my.toml")
+        load_sensor(tmp_path / "my.toml", "decoding")
     assert set(lacking) <= set(caught.value.field.split(", "))
     assert not {each for each in caught.value.field.split(", ") if each.startswith(("imager", "exposure", "wave"))}
 
@@ -123,7 +126,7 @@ def test_all_that_a_rig_lacks_comes_in_one_message(tmp_path, text, lacking):
 def test_import_names_all_that_is_missing_before_a_calibration_is_read(tmp_path, text, lacking):
     (tmp_path / "my.toml").write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as caught:
-        rig_named(tmp_path / "my.toml")
+        named_sensor(tmp_path / "my.toml")
     assert lacking <= set(caught.value.field.split(", "))
     assert ("cameras" in caught.value.field) == (not text)
 
@@ -131,7 +134,7 @@ def test_import_names_all_that_is_missing_before_a_calibration_is_read(tmp_path,
 def test_a_misspelt_key_is_told_first_and_what_is_missing_beside_it(tmp_path):
     text = smallest().replace('name = "my-rig"\n', "") + "[imager]\nfull_wel_e = 1000\n"
     with pytest.raises(InputError, match=r"did you mean 'full_well_e'.*Also missing: name") as caught:
-        load_recorded_rig(written(tmp_path, text))
+        load_sensor(written(tmp_path, text), "decoding")
     assert caught.value.field == "imager.full_wel_e"
 
 
@@ -146,30 +149,59 @@ def test_a_misspelt_key_is_told_first_and_what_is_missing_beside_it(tmp_path):
 )
 def test_a_misspelt_kind_or_file_names_the_nearest(tmp_path, old, new, told):
     with pytest.raises(InputError, match=told):
-        load_recorded_rig(written(tmp_path, smallest().replace(old, new)), (CAMERA.width, CAMERA.height))
+        load_sensor(written(tmp_path, smallest().replace(old, new)), "decoding", (CAMERA.width, CAMERA.height))
 
 
 @pytest.mark.parametrize("name", presets())
 def test_a_complete_sensor_is_the_same_rig(name):
-    assert load_recorded_rig(name).lacking == ()
-    assert load_recorded_rig(name).imager == RecordedRig.of(load_sensor(name)).imager
+    sensor = load_sensor(name, "decoding")
+    for purpose in ("simulation", "decoding", "noise", "bits"):
+        assert sensor.missing_for(purpose) == ()
+    assert repr(sensor) == repr(load_sensor(name))
+    assert sensor.described_imager == sensor.imager
+
+
+def test_a_rig_names_what_each_purpose_lacks_and_the_simulation_refuses_it(tmp_path):
+    rig = load_sensor(written(tmp_path, smallest() + "[imager]\npixel_um = 3.45\nf_number = 8\n"), "decoding")
+    assert rig.missing_for("decoding") == ()
+    with pytest.raises(InputError, match="purpose: found 'decode'; allowed: simulation, decoding"):
+        rig.missing_for("decode")
+    assert rig.missing_for("bits") == ("imager.bits",)
+    assert rig.missing_for("noise") == ("imager.quantum_efficiency", "imager.full_well_e", "imager.read_noise_e")
+    assert set(rig.missing_for("noise")) < set(rig.missing_for("simulation"))
+    with pytest.raises(InputError, match="simulation needs them") as caught:
+        SimulatedSensor(rig)
+    assert caught.value.field == ", ".join(rig.missing_for("simulation"))
+    pair = 'name = "pair"\ntechnology = "active_stereo"\n' + "".join(
+        f"[cameras.{name}]\nwidth = 640\nheight = 480\nfocal_px = [500, 500]\nprincipal_px = [320, 240]\n{place}"
+        for name, place in (("left", ""), ("right", "position_mm = [60, 0, 0]\n"))
+    )
+    (tmp_path / "pair.toml").write_text(pair, encoding="utf-8")
+    stereo = load_sensor(tmp_path / "pair.toml", "decoding")
+    assert (stereo.rig.projector, stereo.pattern, stereo.range_mm) == (None, None, None)
+    with pytest.raises(InputError, match="pattern: found nothing"):
+        stereo.patterns()
+    assert {"projector.width", "projector.focal_px", "pattern.kind", "matcher.near_mm"} <= set(
+        stereo.missing_for("simulation")
+    )
 
 
 def test_what_was_completed_is_nobodys(tmp_path):
     """No imager, no exposure, no range, no projector of ours is taken for the rig's."""
     text = smallest() + "[imager]\nbits = 12\nblack_level_dn = 64\n"
-    rig = load_recorded_rig(written(tmp_path, text))
-    assert (rig.bits, rig.black_level, rig.imager, rig.exposure_s, rig.range_mm) == (12, 64, None, None, None)
-    rig = load_recorded_rig(written(tmp_path, text + '[exposure]\nrule = "fixed"\nexposure_s = 0.02\n'))
-    assert rig.exposure_s == 0.02
+    rig = load_sensor(written(tmp_path, text), "decoding")
+    assert (rig.bits, rig.imager.black_level, rig.described_imager) == (12, 64, None)
+    assert (rig.exposure.base_s, rig.range_mm) == (None, None)
+    rig = load_sensor(written(tmp_path, text + '[exposure]\nrule = "fixed"\nexposure_s = 0.02\n'), "decoding")
+    assert rig.exposure.base_s == 0.02
     ranged = smallest() + "[decoder]\nnear_mm = 200\nfar_mm = 800\n"
-    assert load_recorded_rig(written(tmp_path, ranged)).range_mm == (200, 800)
+    assert load_sensor(written(tmp_path, ranged), "decoding").range_mm == (200, 800)
 
 
 def test_fringes_without_an_imager_have_the_sigma_of_their_own_noise_and_decode_says_so(tmp_path):
     text = smallest().partition("[pattern]")[0] + '[pattern]\nkind = "phase_shift"\nperiods_px = [170, 16]\n'
     file = written(tmp_path, text + '[exposure]\nrule = "fixed"\nexposure_s = 0.02\n')
-    stack = images_seen(load_recorded_rig(file).pattern, CAMERA, PROJECTOR, surface_seen(CAMERA), full=4095)
+    stack = images_seen(load_sensor(file, "decoding").pattern, CAMERA, PROJECTOR, surface_seen(CAMERA), full=4095)
     save_images(tmp_path / "images", stack)
     done = run("import", tmp_path / "images", "--sensor", file, "-o", tmp_path / "capture")
     capture = read_capture(tmp_path / "capture")
@@ -178,3 +210,13 @@ def test_fringes_without_an_imager_have_the_sigma_of_their_own_noise_and_decode_
     done = run("decode", tmp_path / "capture", "--range", 300, 800, "-o", tmp_path / "cloud.ply")
     assert "sigma of the points: from the contrast of the fringes and the residuals of their fit, 16 DN" in done.output
     assert np.isfinite(read_ply(tmp_path / "cloud.ply").sigma).sum() > 5000
+
+
+def test_a_program_decodes_with_a_rig_and_cannot_simulate_it(tmp_path):
+    file = written(tmp_path, smallest())
+    rig, truth = ms.load_sensor(file, "decoding"), surface_seen(CAMERA)
+    save_images(tmp_path / "images", images_seen(rig.pattern, CAMERA, PROJECTOR, truth))
+    cloud = ms.decode(read_image_folder(tmp_path / "images", rig), rig)
+    assert cloud.valid.mean() > 0.8
+    with pytest.raises(InputError, match=r"sensor my-rig: wavelength_nm, .*simulation needs them"):
+        ms.render(ms.load_scene(SCENES / "coupon/coupon.xml", ms.load_sensor("ensenso-n10")), rig, np.eye(4))

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from characterisation.cloud_files import read_ply
 from mitsim.cli.program import app
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.recorded_rig import load_recorded_rig
+from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform
 
 PAGE = (Path(__file__).parents[2] / "docs/how-to/rig-files.md").read_text(encoding="utf-8")
@@ -191,7 +191,7 @@ def test_a_rig_file_of_the_how_to_works_at_the_first_try(tmp_path, name):
     cameras = list(rig.cameras.values())
     second = cameras[1] if len(cameras) == 2 else rig.projector
     rig.calibration(tmp_path, cameras[0], second)
-    known = load_recorded_rig(tmp_path / "rig.toml", (240, 180))
+    known = load_sensor(tmp_path / "rig.toml", "decoding", (240, 180))
     for number, (camera, each) in enumerate(rig.cameras.items()):
         stack = images_seen(known.pattern, each, rig.projector, surface_seen(each), full=rig.full, seed=number)
         if known.ambient_image:

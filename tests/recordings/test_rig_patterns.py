@@ -14,7 +14,7 @@ import pytest
 from test_rig_files import FILES, RIGS
 
 from mitsim.sensor.light_code import patterns
-from mitsim.sensor.recorded_rig import load_recorded_rig
+from mitsim.sensor.preset import load_sensor
 
 Image = np.ndarray[Any, Any]
 ON, OFF = 1.0, 0.0
@@ -154,7 +154,7 @@ def code_of(tmp_path, name, text=None):
     (tmp_path / "rig.toml").write_text(text or FILES[name], encoding="utf-8")
     cameras = list(RIGS[name].cameras.values())
     RIGS[name].calibration(tmp_path, cameras[0], cameras[1] if len(cameras) == 2 else RIGS[name].projector)
-    return load_recorded_rig(tmp_path / "rig.toml", (240, 180)).pattern
+    return load_sensor(tmp_path / "rig.toml", "decoding", (240, 180)).pattern
 
 
 def test_every_rig_file_has_its_program():

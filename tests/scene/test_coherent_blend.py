@@ -16,7 +16,7 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.bsdf_descriptions import metal_bsdf
 from mitsim.scene.coherent_blend import NAME, register_coherent_blend
 from mitsim.scene.surface.energy import directional_albedo, energy_factors
-from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.machined import MachinedFace, machined
 
 ANGLES_DEG = (0, 30, 45, 60, 75)
 
@@ -26,7 +26,7 @@ NARROW = 0.015
 
 def mirror(roughness, wavelength, process="lapped"):
     """Scatter and BSDF of a face made of a perfect mirror (n = 0, k = 1), without its wide-angle share."""
-    scatter = machined(Face(process=process, Ra=roughness, wide_angle=0.0), wavelength)
+    scatter = machined(MachinedFace(process=process, Ra=roughness, wide_angle=0.0), wavelength)
     scatter = dataclasses.replace(scatter, energy_factor=energy_factors(scatter.alpha_u, scatter.alpha_v, 1.0))
     register_coherent_blend()
     bsdf = mi.load_dict(metal_bsdf((0.0, 1.0), scatter))

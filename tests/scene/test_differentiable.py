@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from figures_of_surfaces import lobe_factor
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,8 +14,7 @@ from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
-from mitsim.scene.surface.coherence import lobe_factor
-from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.scene.surface.metals import refractive_index
 from mitsim.scene.surface.microfacet import fresnel, shadowing, slope_density
 from mitsim.sensor.transforms import look_at
@@ -68,7 +68,7 @@ def closed_form(scatter, view, lamp):
 @pytest.mark.parametrize("roughness", [0.09, 0.37, 0.74])
 def test_the_lobe_is_the_closed_form(lobe, rng, roughness):
     view, lamp = directions(rng, 2000, 0.3), directions(rng, 2000, 0.3)
-    scatter = machined(Face("aluminium", "ground", roughness), 850.0)
+    scatter = machined(MachinedFace("aluminium", "ground", roughness), 850.0)
     expected = closed_form(scatter, view, lamp)
     # single precision of a tangent near 0, over alpha 0.005 of the coherent share
     np.testing.assert_allclose(lobe.reflectance(scatter, Directions(view, lamp)), expected, rtol=2e-4, atol=1e-5)

@@ -14,7 +14,7 @@ from mitsim.scene.bsdf_descriptions import gloss_paint_bsdf, metal_bsdf, powder_
 from mitsim.scene.load import load_scene
 from mitsim.scene.materials import Finish
 from mitsim.scene.surface.energy import directional_albedo, energy_factors
-from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.scene.surface.metals import normal_reflectance, refractive_index
 from mitsim.scene.surface.paint import ALPHA_RANGE, paint
 from mitsim.scene.surface.processes import PROCESSES
@@ -52,7 +52,7 @@ def furnace(description, degrees=FURNACE_DEG, azimuths=(0.0,), side=128):
 
 def perfect(process, roughness, lay=None):
     """The description of a face made of a perfect mirror (n = 0, k = 1), all its lobes compensated for it."""
-    scatter = machined(Face(process=process, Ra=roughness, lay=lay), 850)
+    scatter = machined(MachinedFace(process=process, Ra=roughness, lay=lay), 850)
     factors = energy_factors(scatter.alpha_u, scatter.alpha_v, 1.0)
     return metal_bsdf((0.0, 1.0), dataclasses.replace(scatter, energy_factor=factors))
 
@@ -106,7 +106,7 @@ def test_metal_reflects_what_its_constants_say(roughness):
 
     R [wide + (1 - wide)(E + R (1 - E))], E of the lobes.
     """
-    scatter = machined(Face(process="ground", Ra=roughness), 850)
+    scatter = machined(MachinedFace(process="ground", Ra=roughness), 850)
     found = furnace(metal_bsdf(refractive_index("aluminium", 850), scatter), degrees=[30])
     r, nominal = normal_reflectance("aluminium", 850), np.radians(30)
     kept = scatter.beckmann * directional_albedo(nominal, scatter.alpha_u, scatter.alpha_v, "beckmann")

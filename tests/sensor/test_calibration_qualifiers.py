@@ -14,7 +14,7 @@ from characterisation.files.errors import InputError
 from mitsim.capture.recordings.calibration_file import read_calibration
 from mitsim.sensor.calibration_qualifiers import ReadOut, check_intrinsics, of_images
 from mitsim.sensor.camera import Camera
-from mitsim.sensor.recorded_rig import load_recorded_rig
+from mitsim.sensor.preset import load_sensor
 
 K = np.array([[600.0, 0, 322.3], [0, 601.2, 241.7], [0, 0, 1]])
 K2 = np.array([[598.0, 0, 318.9], [0, 599.0, 238.2], [0, 0, 1]])
@@ -119,10 +119,10 @@ def test_a_sensor_file_has_the_part_too(tmp_path):
         'position_mm = [100.0, 0.0, 0.0]\n[pattern]\nkind = "gray_code"\n[decoder]\n'
     )
     for size in (None, (400, 300)):
-        rig = load_recorded_rig(tmp_path / "my.toml", size)
+        rig = load_sensor(tmp_path / "my.toml", "decoding", size)
         np.testing.assert_allclose(rig.rig.reference.matrix[:2, 2], [202.3, 161.7], atol=1e-9)
         assert len(rig.notes) == 1
-    np.testing.assert_array_equal(load_recorded_rig(tmp_path / "my.toml", SIZE).rig.reference.matrix, K)
+    np.testing.assert_array_equal(load_sensor(tmp_path / "my.toml", "decoding", SIZE).rig.reference.matrix, K)
 
 
 # --- values that are no pixels
@@ -323,9 +323,9 @@ def test_names_of_a_projector_of_three_letters(tmp_path):
         'name = "rig"\ntechnology = "structured_light"\n[calibration]\nfile = "a.yml"\n[pattern]\nkind = "gray_code"\n'
         "[decoder]\n"
     )
-    rig = load_recorded_rig(tmp_path / "my.toml", SIZE)
+    rig = load_sensor(tmp_path / "my.toml", "decoding", SIZE)
     sees(rig.rig.projector, K2, -D, R, T)
-    assert rig.projector_size == (912, 570) and rig.notes == ()
+    assert (rig.projector.optics.width, rig.projector.optics.height, rig.notes) == (912, 570, ())
 
 
 def test_dotted_names_and_maps_are_read_or_named(tmp_path):

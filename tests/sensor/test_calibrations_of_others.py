@@ -8,7 +8,7 @@ import pytest
 from scipy.io import savemat
 
 from characterisation.files.errors import InputError
-from mitsim.sensor.recorded_rig import load_recorded_rig
+from mitsim.sensor.preset import load_sensor
 
 K1 = np.array([[900.5, 0, 317.2], [0, 901.25, 241.4], [0, 0, 1]])
 K2 = np.array([[1250.0, 0, 455.5], [0, 1251.0, 300.0], [0, 0, 1]])
@@ -53,7 +53,7 @@ def storage(path, **values):
 
 def loaded(folder, text, file, size=(640, 480), more=""):
     (folder / "my.toml").write_text(text.replace("FILE", file) + more, encoding="utf-8")
-    return load_recorded_rig(folder / "my.toml", size)
+    return load_sensor(folder / "my.toml", "decoding", size)
 
 
 def is_the_rig(rig, second, distortion=D2):
@@ -74,7 +74,7 @@ def test_the_pair_of_files_of_opencvs_sample(tmp_path):
     is_the_rig(found.rig, found.rig.cameras["right"])
     assert (found.rig.reference.width, found.rig.reference.height) == (640, 480)
     assert found.rig.projector is None
-    assert found.projector_size == (912, 570)
+    assert (found.projector.optics.width, found.projector.optics.height) == (912, 570)
     assert found.notes == ()
     with pytest.raises(InputError, match=r"width, cameras.left.height, cameras.right.width, cameras.right.height"):
         loaded(tmp_path, PAIR, '["intrinsics.yml", "extrinsics.yml"]', size=None)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import TypeAdapter
 from scipy import stats
 
 from characterisation.files.errors import InputError
@@ -262,7 +263,7 @@ def imager_table(**changes) -> ImagerTable:
         "f_number": 1.6,
         "companding_dn": [[89.333, 89.333], [488, 189], [1024, 256]],
     }
-    return ImagerTable.model_validate(given | changes)
+    return TypeAdapter(ImagerTable).validate_python(given | changes)
 
 
 @pytest.mark.parametrize(
@@ -276,7 +277,7 @@ def imager_table(**changes) -> ImagerTable:
     ],
 )
 def test_a_companding_curve_that_no_chip_has_is_refused(changes, said):
-    assert imager_table().companding_dn[-1] == (1024, 256)
+    assert imager_table().companding[-1] == (1024, 256)
     with pytest.raises(ValueError, match=said):
         imager_table(**changes)
 

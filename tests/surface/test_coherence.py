@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from figures_of_surfaces import lobe_factor
 
-from mitsim.scene.surface.coherence import coherent_weight, lobe_factor
+from mitsim.scene.surface.coherence import coherent_weight
 from mitsim.scene.surface.energy import facets
-from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.scene.surface.processes import PROCESSES
 
 
@@ -32,7 +33,7 @@ def returned(scatter, angle, shared):
 def test_the_lobe_keeps_its_share_of_the_energy(process, wavelength):
     """From 0 to 75 deg, over Ra from all mirror to none, to half a percent of the light."""
     for roughness in np.geomspace(0.02, 0.6, 6) * (4 if PROCESSES[process].feed_marks else 1):
-        scatter = machined(Face(process=process, Ra=float(roughness)), wavelength)
+        scatter = machined(MachinedFace(process=process, Ra=float(roughness)), wavelength)
         for angle in np.radians([0, 31, 47, 58, 63, 69, 75]):
             share = np.exp(-scatter.phase_variance * np.cos(angle) ** 2)
             lost = (1 - share) * returned(scatter, angle, False) - returned(scatter, angle, True)
@@ -40,7 +41,7 @@ def test_the_lobe_keeps_its_share_of_the_energy(process, wavelength):
 
 
 def test_a_lay_is_kept_on_average_over_the_azimuth():
-    scatter = machined(Face(process="ground", Ra=0.2, lay="u"), 850)
+    scatter = machined(MachinedFace(process="ground", Ra=0.2, lay="u"), 850)
     assert scatter.alpha_u < scatter.alpha_v
     for angle in np.radians([30, 60, 75]):
         lobe = (1 - scatter.coherent_at(angle)) * returned(scatter, angle, False)
@@ -48,6 +49,6 @@ def test_a_lay_is_kept_on_average_over_the_azimuth():
 
 
 def test_no_light_is_moved_where_there_is_no_coherence():
-    rough = machined(Face(process="bead_blasted", Ra=2.0), 465)
+    rough = machined(MachinedFace(process="bead_blasted", Ra=2.0), 465)
     assert rough.coherent_at(np.radians(75)) < 1e-9
     assert np.abs(lobe_factor(rough.lobe_numbers, np.linspace(0.25, 1, 50)) - 1).max() < 0.005

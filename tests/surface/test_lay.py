@@ -3,7 +3,7 @@
 import pytest
 
 from mitsim.scene.surface.lay import lay_left_out, lays_in_words
-from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.scene.surface.paint import matt_white
 
 
@@ -19,7 +19,10 @@ from mitsim.scene.surface.paint import matt_white
     ],
 )
 def test_marks_are_left_out_only_where_their_direction_is_not_given(process, lay, left_out):
-    assert lay_left_out(f"aluminium/{process}", machined(Face("aluminium", process, 0.8, lay=lay), 850.0)) == left_out
+    assert (
+        lay_left_out(f"aluminium/{process}", machined(MachinedFace("aluminium", process, 0.8, lay=lay), 850.0))
+        == left_out
+    )
 
 
 def test_a_face_without_marks_leaves_nothing_out():
@@ -28,7 +31,7 @@ def test_a_face_without_marks_leaves_nothing_out():
 
 
 def test_an_omission_is_one_sentence_that_names_its_faces():
-    turned, marked = (machined(Face("brass", "turned", 0.8, lay=lay), 850.0) for lay in (None, "u"))
+    turned, marked = (machined(MachinedFace("brass", "turned", 0.8, lay=lay), 850.0) for lay in (None, "u"))
     finishes = {"top": ("brass/turned", turned), "bore": ("brass/turned", turned), "rim": ("brass/turned", marked)}
     (left_round,) = lays_in_words(finishes | {"plate": ("matt_white", matt_white())})
     assert left_round.startswith("top (brass/turned), bore (brass/turned): no direction of the marks is given")

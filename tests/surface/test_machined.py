@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from characterisation.files.errors import InputError
 from mitsim.scene.surface.gloss import lobe_gloss
-from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.scene.surface.measured import height_map, profile
 from mitsim.scene.surface.metals import CONSTANTS, refractive_index
 from mitsim.scene.surface.processes import PROCESSES, feed, feed_slope
@@ -40,7 +40,7 @@ def test_lapped_metal_has_the_tabulated_widths():
         0.8: [0.257, 0.249, 0.221, 0.204, 0.197],
     }
     for roughness, expected in table.items():
-        face = Face(process="lapped", Ra=roughness)
+        face = MachinedFace(process="lapped", Ra=roughness)
         found = [machined(face, wavelength).alpha_u for wavelength in (405, 450, 660, 850, 940)]
         assert np.allclose(found, expected, atol=0.0006)
 
@@ -49,7 +49,7 @@ def test_ground_metal_scatters_as_the_maps_were_made_with():
     """Ra: coherent share and alpha at 850 nm."""
     table = {0.05: (0.42, 0.030), 0.09: (0.06, 0.034), 0.2: (0, 0.074), 0.37: (0, 0.129), 0.74: (0, 0.229)}
     for roughness, (coherent, alpha) in table.items():
-        found = machined(Face(process="ground", Ra=roughness), 850)
+        found = machined(MachinedFace(process="ground", Ra=roughness), 850)
         assert np.isclose(found.coherent, coherent, atol=0.005)
         assert np.isclose(found.alpha_u, alpha, atol=0.0005)
         assert found.alpha_u == found.alpha_v
@@ -57,14 +57,14 @@ def test_ground_metal_scatters_as_the_maps_were_made_with():
 
 @pytest.mark.parametrize("process", sorted(PROCESSES))
 def test_more_roughness_is_a_wider_lobe(process):
-    widths = [machined(Face(process=process, Ra=ra), 850).alpha_v for ra in (0.1, 0.2, 0.4, 0.8)]
+    widths = [machined(MachinedFace(process=process, Ra=ra), 850).alpha_v for ra in (0.1, 0.2, 0.4, 0.8)]
     assert widths == sorted(widths)
 
 
 @pytest.mark.parametrize("process", [name for name, process in PROCESSES.items() if process.lay_ratio < 1])
 def test_the_lobe_is_narrow_along_the_lay(process):
     ratio = PROCESSES[process].lay_ratio
-    none, u, v = (machined(Face(process=process, Ra=0.6, lay=lay), 850) for lay in (None, "u", "v"))
+    none, u, v = (machined(MachinedFace(process=process, Ra=0.6, lay=lay), 850) for lay in (None, "u", "v"))
     assert (u.alpha_u, u.alpha_v) == (v.alpha_v, v.alpha_u)
     assert u.alpha_v == none.alpha_v == none.alpha_u
     assert u.alpha_u <= ratio * u.alpha_v * (1 + 1e-9)
@@ -74,8 +74,8 @@ def test_the_lobe_is_narrow_along_the_lay(process):
 
 
 def test_feed_marks_widen_the_lobe_across_them_and_leave_no_spike():
-    blurred = machined(Face(process="turned", Ra=0.8, lay="u"), 850)
-    resolved = machined(Face(process="turned", Ra=0.8, lay="u", feed_marks="resolved"), 850)
+    blurred = machined(MachinedFace(process="turned", Ra=0.8, lay="u"), 850)
+    resolved = machined(MachinedFace(process="turned", Ra=0.8, lay="u", feed_marks="resolved"), 850)
     marks = 2 * feed_slope(feed(0.8, 0.8), 0.8) ** 2
     assert np.isclose(blurred.alpha_v**2, resolved.alpha_v**2 + marks)
     assert blurred.alpha_u == resolved.alpha_u
@@ -83,24 +83,24 @@ def test_feed_marks_widen_the_lobe_across_them_and_leave_no_spike():
     assert resolved.coherent_alpha == (0.005, 0.005)
     # A is that of the micro-roughness, a quarter of Ra; that of the whole Ra would be nothing
     assert np.isclose(resolved.height_um, rms_height(0.2))
-    assert machined(Face(process="turned", Ra=0.4), 850).coherent > 0.01
+    assert machined(MachinedFace(process="turned", Ra=0.4), 850).coherent > 0.01
     assert blurred.beckmann > 0.5 > resolved.beckmann
 
 
 def test_a_sharper_nose_makes_steeper_marks():
-    sharp, blunt = (machined(Face(process="turned", Ra=0.8, nose_radius=r), 850).alpha_v for r in (0.4, 1.6))
+    sharp, blunt = (machined(MachinedFace(process="turned", Ra=0.8, nose_radius=r), 850).alpha_v for r in (0.4, 1.6))
     assert sharp > blunt
 
 
 def test_spacing_of_turned_marks_is_the_feed():
     """Ra and feed fix the nose radius: Rdq = 9 Ra / f."""
     marks = feed(0.8, 0.8) * 1e3
-    found = machined(Face(process="turned", Ra=0.8, RSm=marks), 850)
+    found = machined(MachinedFace(process="turned", Ra=0.8, RSm=marks), 850)
     assert np.isclose(found.alpha_v, np.sqrt(2) * feed_slope(feed(0.8, 0.8), 0.8))
 
 
 def test_a_measured_slope_takes_the_place_of_the_prior():
-    found = machined(Face(process="ground", Ra=0.4, Rdq=0.05), 850)
+    found = machined(MachinedFace(process="ground", Ra=0.4, Rdq=0.05), 850)
     nu = (PROCESSES["ground"].exponent - 1) / 2
     assert np.isclose(band_limited_slope(rms_height(0.4), found.correlation_um, nu), np.sqrt(2) * 0.05)
     assert found.alpha_factor == 1.25
@@ -110,28 +110,30 @@ def test_a_measured_slope_takes_the_place_of_the_prior():
 def test_spacing_is_slope():
     """RSm = 2 pi Rq / Rdq says the same as Rdq."""
     spacing = 2 * np.pi * rms_height(0.4) / 0.05
-    one, other = (machined(Face(process="ground", Ra=0.4, **more), 850) for more in ({"Rdq": 0.05}, {"RSm": spacing}))
+    one, other = (
+        machined(MachinedFace(process="ground", Ra=0.4, **more), 850) for more in ({"Rdq": 0.05}, {"RSm": spacing})
+    )
     assert np.isclose(one.alpha_u, other.alpha_u)
 
 
 def test_a_trace_gives_the_width_of_its_heights(rng):
     """Gaussian autocorrelation of length 8 um: alpha = 2 Rq / l; some 600 lengths, so 5 %."""
     trace = random_profile(rng)
-    found = machined(Face(process="ground", profile=trace, lay="v"), 450)
+    found = machined(MachinedFace(process="ground", profile=trace, lay="v"), 450)
     assert np.isclose(found.alpha_u, 2 * 0.5 / 8, rtol=0.05)
     assert np.isclose(found.alpha_v, found.alpha_u * PROCESSES["ground"].lay_ratio)
     assert np.isclose(found.height_um, trace.Rq)
     assert found.alpha_factor == 1.15
     along = random_profile(rng, length=64.0)
-    both = machined(Face(process="ground", profile=trace, profile_along=along, lay="v"), 450)
+    both = machined(MachinedFace(process="ground", profile=trace, profile_along=along, lay="v"), 450)
     assert np.isclose(both.alpha_v, 2 * 0.5 / 32, rtol=0.1)
 
 
 def test_a_height_map_gives_both_widths(rng):
-    found = machined(Face(process="ground", height_map=areal(rng, length_u=48.0), lay="u"), 450)
+    found = machined(MachinedFace(process="ground", height_map=areal(rng, length_u=48.0), lay="u"), 450)
     assert np.isclose(found.alpha_v, 2 * 0.5 / 8, rtol=0.08)
     assert np.isclose(found.alpha_u, 2 * 0.5 / 48, rtol=0.12)
-    round_one = machined(Face(process="bead_blasted", height_map=areal(rng)), 450)
+    round_one = machined(MachinedFace(process="bead_blasted", height_map=areal(rng)), 450)
     assert round_one.alpha_u == round_one.alpha_v
     assert np.isclose(round_one.alpha_u, 2 * 0.5 / 8, rtol=0.05)
     assert found.alpha_factor == 1.1
@@ -139,31 +141,31 @@ def test_a_height_map_gives_both_widths(rng):
 
 def test_a_gloss_reading_comes_back_from_the_lobe():
     """The lobe that a reading was turned into reads it, at 555 nm: 0.85 GGX and 0.15 Beckmann, and 5 % wide-angle."""
-    found = machined(Face(process="ground", Ra=0.2, gloss=300), 555)
+    found = machined(MachinedFace(process="ground", Ra=0.2, gloss=300), 555)
     index = refractive_index("aluminium", 555)
     lobe = 0.85 * lobe_gloss(found.ggx_alpha[0], index, "ggx") + 0.15 * lobe_gloss(found.alpha_u, index, "beckmann")
     coherent = np.exp(-((4 * np.pi * rms_height(0.2) * 0.5 / 0.555) ** 2))
     mirror = lobe_gloss(0.005, index, "beckmann")
     assert np.isclose(0.95 * ((1 - coherent) * lobe + coherent * mirror), 300, atol=0.5)
-    assert machined(Face(process="ground", Ra=0.2, gloss=300), 850).alpha_u < found.alpha_u
+    assert machined(MachinedFace(process="ground", Ra=0.2, gloss=300), 850).alpha_u < found.alpha_u
 
 
 def test_alpha_is_taken_as_it_is():
-    found = machined(Face(Ra=0.4, alpha=0.1, alpha_factor=1.5), 850)
+    found = machined(MachinedFace(Ra=0.4, alpha=0.1, alpha_factor=1.5), 850)
     assert np.isclose(found.alpha_u, 0.15)
     assert found.alpha_factor == 1.0
-    two = machined(Face(Ra=0.4, alpha_u=0.03, alpha_v=0.1), 850)
+    two = machined(MachinedFace(Ra=0.4, alpha_u=0.03, alpha_v=0.1), 850)
     assert (two.alpha_u, two.alpha_v) == (0.03, 0.1)
 
 
 def test_better_knowledge_has_a_smaller_factor(rng):
     faces = [
-        Face(process="ground", height_map=areal(rng)),
-        Face(process="ground", profile=random_profile(rng)),
-        Face(process="ground", Ra=0.4, gloss=150),
-        Face(process="ground", Ra=0.4, Rdq=0.08),
-        Face(process="ground", Ra=0.4),
-        Face(Ra=0.4),
+        MachinedFace(process="ground", height_map=areal(rng)),
+        MachinedFace(process="ground", profile=random_profile(rng)),
+        MachinedFace(process="ground", Ra=0.4, gloss=150),
+        MachinedFace(process="ground", Ra=0.4, Rdq=0.08),
+        MachinedFace(process="ground", Ra=0.4),
+        MachinedFace(Ra=0.4),
     ]
     assert [machined(face, 850).alpha_factor for face in faces] == [1.1, 1.15, 1.2, 1.25, 1.6, 2.0]
 
@@ -176,7 +178,7 @@ def test_better_knowledge_has_a_smaller_factor(rng):
     st.floats(0.1, 10.0),
 )
 def test_every_metal_process_and_roughness_gives_shares_and_widths_that_can_be(metal, process, ra, wavelength, factor):
-    found = machined(Face(metal=metal, process=process, Ra=ra, alpha_factor=factor), wavelength)
+    found = machined(MachinedFace(metal=metal, process=process, Ra=ra, alpha_factor=factor), wavelength)
     assert 0 <= found.coherent <= 1
     assert 0 <= found.beckmann <= 1
     assert 0 < found.alpha_u <= 0.5
@@ -216,13 +218,13 @@ def test_every_metal_process_and_roughness_gives_shares_and_widths_that_can_be(m
 def test_what_cannot_stand_together_is_refused_by_name(rng, said, field, says):
     given = {"Ra": 0.4, **{key: random_profile(rng) if value == "trace" else value for key, value in said.items()}}
     with pytest.raises(InputError, match=says) as caught:
-        machined(Face(**given), 850, "part.xml")
+        machined(MachinedFace(**given), 850, "part.xml")
     assert caught.value.field == field
     assert caught.value.where == "part.xml"
 
 
 def test_a_roughness_that_is_not_given_is_that_of_the_trace(rng):
     trace = random_profile(rng)
-    assert Face(profile=trace).roughness == trace.Ra
-    assert Face(Ra=0.42, profile=trace).roughness == 0.42
-    assert np.isclose(machined(Face(profile=trace), 850).height_um, 0.5, rtol=0.01)
+    assert MachinedFace(profile=trace).roughness == trace.Ra
+    assert MachinedFace(Ra=0.42, profile=trace).roughness == 0.42
+    assert np.isclose(machined(MachinedFace(profile=trace), 850).height_um, 0.5, rtol=0.01)

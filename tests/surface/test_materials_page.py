@@ -6,18 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from figures_of_surfaces import alpha_of_half_width, short_wave_height
 from scipy.optimize import brentq
 
 from mitsim.scene.surface.diffraction import coherent_share, lobe_alpha
 from mitsim.scene.surface.energy import directional_albedo, energy_factors
-from mitsim.scene.surface.machined import Face, machined
-from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, alpha_of_half_width, half_width
+from mitsim.scene.surface.machined import MachinedFace, machined
+from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, half_width
 from mitsim.scene.surface.processes import PROCESSES
 from mitsim.scene.surface.roughness import (
     ALPHA_LARGEST,
     correlation_length,
     rms_height,
-    short_wave_height,
     stylus_slope,
 )
 from mitsim.scene.surface.scatter import ALPHA_FORM
@@ -51,7 +51,7 @@ def wide_angle():
 
 def returned(process, roughness):
     """What a perfect mirror of that finish returns at 0, 15, 30, 45, 60 and 75 deg."""
-    scatter = machined(Face(process=process, Ra=roughness), 850)
+    scatter = machined(MachinedFace(process=process, Ra=roughness), 850)
     ggx, beckmann = energy_factors(scatter.alpha_u, scatter.alpha_v, 1.0)
     lobes = np.array(
         [
@@ -85,7 +85,7 @@ def white_light_contrast(roughness):
 
 
 def alpha(process, roughness, wavelength=550.0, lay=None):
-    return machined(Face(process=process, Ra=roughness, lay=lay), wavelength)
+    return machined(MachinedFace(process=process, Ra=roughness, lay=lay), wavelength)
 
 
 def spike_limit():

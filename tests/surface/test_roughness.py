@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from figures_of_surfaces import short_wave_height
 from scipy.integrate import quad
 
 from mitsim.scene.surface.processes import PROCESSES, feed, feed_slope, micro_roughness
@@ -12,7 +13,6 @@ from mitsim.scene.surface.roughness import (
     correlation_length,
     matern,
     rms_height,
-    short_wave_height,
     slope_of_spacing,
     stylus_slope,
 )

@@ -24,7 +24,7 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.program import app
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
-from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.sensor.image_formation import expose
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise
@@ -123,7 +123,7 @@ def test_the_noise_of_a_mean_is_what_exposing_makes(rng):
 @given(st.floats(0.09, 1.5))
 def test_ra_and_alpha_are_inverse_on_the_rising_branch(ground, roughness):
     """The table has 61 places over a factor of 27: interpolation is off by a few parts in 10^4."""
-    alpha = machined(Face("aluminium", "ground", roughness), 850.0).alpha_u
+    alpha = machined(MachinedFace("aluminium", "ground", roughness), 850.0).alpha_u
     found, uncertainty = ground.roughness(alpha, 0.01)
     assert found == pytest.approx(roughness, rel=1e-3)
     # alpha grows a little slower than Ra, or a little faster: the law's exponent is 0.6 before diffraction
@@ -139,7 +139,7 @@ def test_no_ra_is_told_where_none_has_the_lobe(ground):
 
 
 def test_a_finish_of_a_given_ra_is_met_by_its_alpha(ground):
-    wanted = machined(Face("aluminium", "ground", 0.37), 850.0)
+    wanted = machined(MachinedFace("aluminium", "ground", 0.37), 850.0)
     found = ground.scatter(math.log(wanted.alpha_u))
     assert found.coherent == pytest.approx(wanted.coherent, abs=1e-6)
     assert found.beckmann == wanted.beckmann
@@ -303,7 +303,7 @@ def test_alpha_and_power_are_recovered_from_noisy_captures(captures, tmp_path):
         app, ["fit", *map(str, captures), "-o", str(tmp_path / "fit.json"), "--figure", str(tmp_path / "fit.png")]
     )
     assert result.exit_code == 0, result.output
-    true = machined(Face("aluminium", "ground", 0.46), 850.0)
+    true = machined(MachinedFace("aluminium", "ground", 0.46), 850.0)
     numbers = json.loads((tmp_path / "fit.json").read_text())
     alpha, power = numbers["alpha"], numbers["power_w"]
     assert alpha["value"] == pytest.approx(true.alpha_u, rel=0.10)
@@ -465,7 +465,7 @@ def test_what_does_not_go_together_is_refused(captures, tmp_path, n10, scenes):
 def test_a_finish_that_has_no_one_width_is_refused(coupon):
     with pytest.raises(InputError, match="matt_white for a diffuse sheet"):
         metal_finish(replace(load_scene(coupon, 850.0).finishes[0], name="powder_coat"), 850.0, "coupon")
-    scatter = machined(Face("aluminium", "ground", 0.4, lay="u"), 850.0)
+    scatter = machined(MachinedFace("aluminium", "ground", 0.4, lay="u"), 850.0)
     with pytest.raises(InputError, match="a round lobe"):
         metal_finish(replace(load_scene(coupon, 850.0).finishes[0], scatter=scatter), 850.0, "coupon")
 

@@ -23,7 +23,7 @@ from mitsim.scene.authoring.face import surface_distance
 from mitsim.scene.authoring.part_folder import Finishing, scene_xml, write_part
 from mitsim.scene.authoring.read_mesh import read_mesh
 from mitsim.scene.authoring.read_step import read_step, step_installed
-from mitsim.scene.authoring.segment_mesh import segment_mesh
+from mitsim.scene.authoring.segment_mesh import _joined, segment_mesh
 from mitsim.scene.inspect import inspect
 from mitsim.scene.load import load_scene
 from mitsim.scene.surface.named_finishes import NAMED_FINISHES
@@ -32,9 +32,15 @@ needs_step = pytest.mark.skipif(not step_installed(), reason="OpenCASCADE, which
 
 
 def cut_of(mesh, **options):
-    """A mesh as a file in single precision holds it."""
+    """The faces of a mesh as a file in single precision holds it, by kind and number, the largest first."""
     part = segment_mesh(np.asarray(mesh.vertices, np.float32).astype(float), np.asarray(mesh.faces), **options)
-    return {face.name: face for face in part.faces}, part.remarks
+    count = {"plane": 0, "cylinder": 0, "sphere": 0, "face": 0}
+    order, faces = list(count), {}
+    keys = {id(one): (order.index(one.kind), -round(one.area, 6), *one.vertices.mean(0)) for one in part.faces}
+    for face in sorted(part.faces, key=lambda one: keys[id(one)]):
+        count[face.kind] += 1
+        faces[f"{face.kind}_{count[face.kind]}"] = face
+    return faces, part.remarks
 
 
 def plate_with_pillar():
@@ -233,14 +239,14 @@ def test_walls_that_run_into_fillets_are_still_planes():
     assert all(face.surface.radius == pytest.approx(4, abs=1e-4) for face in fillets)
 
 
-def test_the_two_halves_of_a_drawn_cylinder_are_joined():
+def test_neighbours_on_one_surface_are_joined():
     mesh = trimesh.creation.cylinder(20, 60, sections=64)
     middles, normals = mesh.triangles_center, mesh.face_normals
-    drawn = np.where(np.abs(normals[:, 2]) > 0.5, normals[:, 2] > 0, 2 + (middles[:, 0] > 0)).astype(int)
-    assert set(drawn.tolist()) == {0, 1, 2, 3}
-    faces, _ = cut_of(mesh, drawn=drawn)
-    assert list(faces) == ["plane_1", "plane_2", "cylinder_1"]
-    assert len(faces["cylinder_1"].triangles) == 128
+    number = np.where(np.abs(normals[:, 2]) > 0.5, normals[:, 2] > 0, 2 + (middles[:, 0] > 0)).astype(int)
+    pieces = [np.flatnonzero(number == k) for k in range(4)]
+    faces = _joined(mesh, pieces, mesh.face_adjacency)
+    assert sorted(face.kind for face in faces) == ["cylinder", "plane", "plane"]
+    assert max(len(face.triangles) for face in faces) == 128
 
 
 def test_inward_bodies_are_turned_and_told_but_cavities_are_not():
@@ -301,7 +307,8 @@ def test_normals_in_the_files_are_those_of_the_surface(plate):
 def test_units_are_turned_into_mm(tmp_path, units, length_mm):
     plate_with_pillar().apply_scale(1 / length_mm).export(tmp_path / "plate.stl")
     mesh = read_mesh(tmp_path / "plate.stl", units)
-    assert segment_mesh(mesh.vertices, mesh.triangles).faces[-1].surface.radius == pytest.approx(15, rel=1e-6)
+    (pillar,) = (face for face in segment_mesh(mesh.vertices, mesh.triangles).faces if face.kind == "cylinder")
+    assert pillar.surface.radius == pytest.approx(15, rel=1e-6)
 
 
 def test_a_part_in_metres_is_noticed(tmp_path):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from figures_of_surfaces import mean_run_length
 
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.coupon.patches import measure_patches
@@ -26,7 +27,6 @@ from mitsim.maps.campaign.run import run_campaign
 from mitsim.maps.prediction import Predictor, feature_statistics, performance
 from mitsim.scene.load import load_scene
 from mitsim.sensor.noise_sources import Noise
-from mitsim.sensor.pattern import mean_run_length
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import look_at
 from mitsim.study import open_study

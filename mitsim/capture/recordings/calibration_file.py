@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from characterisation.files.checked_files import read_bounded
-from characterisation.files.documents import Document, read_toml, validate
+from characterisation.files.documents import Document, read_toml_table, validate
 from characterisation.files.errors import InputError
 from mitsim.capture.calibration import CalibrationDocument, rig_of
 from mitsim.capture.recordings.depthai_calibration import is_depthai_calibration, read_depthai_calibration
@@ -32,8 +32,7 @@ from mitsim.capture.recordings.nxlib_tree import NxLibTree
 from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.opencv_calibration import CalibrationTable, has_pair, with_calibration
-from mitsim.sensor.preset import presets
-from mitsim.sensor.recorded_rig import load_recorded_rig
+from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.sensor_file import OpticsTable
 
 
@@ -69,10 +68,6 @@ class PinholeFile(Document):
     height: Annotated[int, Field(ge=1, le=16384)]
     distortion: list[float] = Field(default=[], max_length=14)
     name: str = ""
-
-
-class _Written(Document):
-    model_config = ConfigDict(extra="allow")
 
 
 def read_calibration(source: str | Path, size: tuple[int, int] | None = None) -> Calibrated:
@@ -158,13 +153,13 @@ def _scaled_hint(camera: Camera, size: tuple[int, int]) -> str:
 
 def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
     if path.suffix.lower() == ".toml":
-        written = read_toml(path, _Written).model_extra or {}
+        written = read_toml_table(path)
         if "technology" not in written:
             optics, notes = with_calibration(path, written, size)
-            table = validate(path, _sized(optics, size), RigFile)
+            table = validate(path, optics, RigFile)
             rig = Rig({name: each.camera() for name, each in table.cameras.items()})
             return Calibrated(rig, table.name, notes=tuple(notes))
-    sensor = load_recorded_rig(path, size)
+    sensor = load_sensor(path, "decoding", size)
     return Calibrated(sensor.rig, sensor.name, sensor.range_mm, sensor.notes)
 
 
@@ -173,19 +168,8 @@ def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:
     cameras = ["left", "right"] if has_pair(path) else ["camera"]
     asked = {"file": path.name, "projector": False, "cameras": cameras}
     table, notes = with_calibration(path, {"calibration": asked}, size)
-    read = validate(path, _sized(table, size), RigFile)
+    read = validate(path, table, RigFile)
     return Calibrated(Rig({name: each.camera() for name, each in read.cameras.items()}), "", notes=tuple(notes))
-
-
-def _sized(table: dict[str, Any], size: tuple[int, int] | None) -> dict[str, Any]:
-    """Set the image size of cameras that have none."""
-    cameras = table.get("cameras")
-    if size is None or not isinstance(cameras, dict):
-        return table
-    sized = {"width": size[0], "height": size[1]}
-    return table | {
-        "cameras": {name: sized | each if isinstance(each, dict) else each for name, each in cameras.items()}
-    }
 
 
 def _of_pinhole(path: Path, table: dict[str, Any]) -> Calibrated:

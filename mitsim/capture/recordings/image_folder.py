@@ -25,10 +25,9 @@ from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import LightCode, roles
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.projector_images import ProjectorImages, counted, described
-from mitsim.sensor.recorded_rig import RecordedRig
 
 
-def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig, channel: int = CHANNELS["green"]) -> Capture:
+def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNELS["green"]) -> Capture:
     """Read the images of one measurement.
 
     Without ``[images]`` in the sensor file, a rig of one camera uses all images in the folder. A rig of two cameras
@@ -41,57 +40,58 @@ def read_image_folder(folder: str | Path, sensor: Sensor | RecordedRig, channel:
         If the sensor is not a structured-light one, images are missing or too many, or an image cannot be read or
         differs in size or depth from the sensor file.
     """
-    folder, rig = Path(folder), sensor if isinstance(sensor, RecordedRig) else RecordedRig.of(sensor)
-    code, decoder = rig.pattern, rig.settings
+    folder, rig = Path(folder), sensor.rig
+    code, decoder = sensor.pattern, sensor.settings
+    projector_size = (sensor.projector.optics.width, sensor.projector.optics.height)
     if not isinstance(code, LightCode | ProjectorImages) or not isinstance(decoder, DecoderSettings):
         hint = "recordings of an Ensenso are imported without --sensor"
-        raise InputError(f"sensor {rig.name}", "technology", rig.technology, "structured_light", hint)
+        raise InputError(f"sensor {sensor.name}", "technology", sensor.technology, "structured_light", hint)
     if not folder.is_dir():
         raise InputError(folder, "", "no such folder", "a folder of images")
-    shown = code.count if isinstance(code, ProjectorImages) else len(roles(code, *rig.projector_size))
-    count = shown + rig.ambient_image
-    both = len(rig.rig.cameras) == 2 and (decoder.triangulate == "cameras" or len(rig.images or {}) == 2)
-    used = list(rig.rig.cameras) if both else list(rig.rig.cameras)[:1]
+    shown = code.count if isinstance(code, ProjectorImages) else len(roles(code, *projector_size))
+    count = shown + sensor.ambient_image
+    both = len(rig.cameras) == 2 and (decoder.triangulate == "cameras" or len(sensor.images or {}) == 2)
+    used = list(rig.cameras) if both else list(rig.cameras)[:1]
     images, names, colour = {}, {}, False
     for name in used:
-        found = _files(folder, rig, name, len(used))
+        found = _files(folder, sensor, name, len(used))
         if len(found) != count:
             raise InputError(
                 folder,
                 f"images of {name}",
                 f"{len(found)}{_ends(found)}",
-                f"{count}, as the pattern of {rig.name}",
-                advice(found, name, code, rig.projector_size, count)
+                f"{count}, as the pattern of {sensor.name}",
+                advice(found, name, code, projector_size, count)
                 if found and isinstance(code, LightCode)
                 else _content(folder, used),
             )
-        images[name] = _stack(found, rig.rig.cameras[name], rig.bits, channel)
+        images[name] = _stack(found, rig.cameras[name], sensor.bits, channel)
         colour |= is_colour(found[0])
         names[name] = [path.relative_to(folder).as_posix() for path in found]
     decoding = Decoding(
         decoder=decoder,
         pattern=described(code),
-        projector_size_px=rig.projector_size if rig.rig.projector is None else None,
-        exposure_s=rig.exposure_s,
-        black_level_dn=rig.black_level,
-        gamma=rig.gamma,
-        ambient_image=rig.ambient_image,
+        projector_size_px=projector_size if rig.projector is None else None,
+        exposure_s=None if sensor.exposure.bracket else sensor.exposure.base_s,
+        black_level_dn=sensor.imager.black_level,
+        gamma=sensor.imager.gamma,
+        ambient_image=sensor.ambient_image,
         near_mm=decoder.near_mm,
         far_mm=decoder.far_mm,
     )
     settings: dict[str, Any] = {"imported_from": folder.resolve().name, "files": names}
     if colour:
         settings["channel"] = channel_name(channel)
-    bits = rig.bits
+    bits = sensor.bits
     if bits is None:
         bits = max(bits_of(stack) for stack in images.values())
         if bits > 8:
             settings["bits_from"] = "the brightest pixel, since the sensor file has no imager.bits"
     return Capture(
-        sensor=rig.name,
-        technology=rig.technology,
+        sensor=sensor.name,
+        technology=sensor.technology,
         source="device",
-        rig=rig.rig,
+        rig=rig,
         images=images,
         bits=bits,
         decoding=decoding,
@@ -119,7 +119,7 @@ def bits_of(stack: Image) -> int:
     return next(bits for bits in (10, 12, 14, 16) if stack.max() < 2**bits)
 
 
-def _files(folder: Path, sensor: RecordedRig, camera: str, cameras: int) -> list[Path]:
+def _files(folder: Path, sensor: Sensor, camera: str, cameras: int) -> list[Path]:
     """Return the image files of one camera, in order."""
     given = (sensor.images or {}).get(camera)
     if isinstance(given, list):

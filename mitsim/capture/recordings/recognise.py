@@ -25,7 +25,7 @@ from mitsim.capture.recordings.pose_file import read_pose
 from mitsim.capture.recordings.recording_files import MCAP_MAGIC, frame_of, plain_name
 from mitsim.capture.recordings.robi import is_robi, read_robi
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
-from mitsim.sensor.recorded_rig import load_recorded_rig, rig_named
+from mitsim.sensor.preset import load_sensor, named_sensor
 
 AXES: tuple[Axes, ...] = ("opencv", "opengl")
 
@@ -74,7 +74,7 @@ class ReadOptions:
     @property
     def named(self) -> str | None:
         """Return the name of the sensor, if one is given."""
-        return None if self.sensor is None else rig_named(self.sensor)[0]
+        return None if self.sensor is None else named_sensor(self.sensor)[0]
 
     @property
     def cameras(self) -> str | None:
@@ -114,7 +114,7 @@ def _read_images(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, b
             "the rig that took them: --sensor my.toml",
             "for a plain stereo pair --calibration suffices",
         )
-    rig = load_recorded_rig(options.sensor, size_of_images(path))
+    rig = load_sensor(options.sensor, "decoding", size_of_images(path))
     if options.images:
         rig = replace(rig, images={**(rig.images or {}), **options.images})
     capture = read_image_folder(path, rig, channel_of(options.channel))
@@ -310,7 +310,7 @@ def _kind_of_folder(path: Path, options: ReadOptions) -> str:
     if options.calibration is not None:
         return "stereo-pair"
     if options.sensor is not None:
-        return "images" if rig_named(options.sensor)[1] == "structured_light" else "stereo-pair"
+        return "images" if named_sensor(options.sensor)[1] == "structured_light" else "stereo-pair"
     if any(name == "capture.json" for name in top):
         raise InputError(path, "", "a capture folder", "a recording of another program", "it needs no import")
     alone = next((file.name for file in _down_to(path, 1) if file.suffix.lower() in _RECORDED_ALONE), None)

@@ -35,7 +35,7 @@ from mitsim.capture.simulated.surface_speckle import draw_speckle
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.plain_scene import single_plane
-from mitsim.scene.light_transport.projector_light import Light, ModulatedLight, ProjectedPatterns
+from mitsim.scene.light_transport.projector_light import ModulatedLight, ProjectedLight, ProjectedPatterns
 from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
 from mitsim.scene.light_transport.transport import trace
 from mitsim.scene.load import Scene
@@ -77,6 +77,7 @@ class SimulatedSensor:
     """
 
     def __init__(self, sensor: Sensor) -> None:
+        sensor.require("simulation")
         self.sensor = sensor
         cameras = sensor.true_rig.cameras
         self.rays = {name: _camera_rays(sensor, camera) for name, camera in cameras.items()}
@@ -347,7 +348,7 @@ def _camera_rays(sensor: Sensor, camera: Camera) -> CameraRays:
     return CameraRays(camera, sensor.pupil_mm(camera), sensor.focus_mm)
 
 
-def _light(sensor: Sensor) -> Light:
+def _light(sensor: Sensor) -> ProjectedLight:
     """Return the light whose code depends on the projector coordinate, or on time for time of flight."""
     if isinstance(sensor.pattern, AmplitudeModulation):
         return ModulatedLight(sensor.projector, *sensor.pattern.images())

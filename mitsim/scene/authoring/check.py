@@ -32,8 +32,9 @@ from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.mesh_facts import MeshFacts
 from mitsim.scene.surface.processes import PROCESSES
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.rig_parameters import eyes
 from mitsim.sensor.transforms import Transform
-from mitsim.sensor.working_volume import depth, eyes_of, field_of_view, in_image, in_working_volume
+from mitsim.sensor.working_volume import depth, field_of_view, in_image, in_working_volume
 
 Severity = Literal["error", "warning", "note"]
 
@@ -62,7 +63,7 @@ _UNITS = {"inches": 25.4, "metres": 1000.0}
 
 
 @dataclass(frozen=True)
-class Finding:
+class SceneFinding:
     """One finding: its severity, the shape or feature it is about ("" for the scene), the problem and the advice."""
 
     severity: Severity
@@ -104,13 +105,22 @@ def findings(
     visible: VisibleSurfaces,
     posed: bool,
     task: TaskFeatures | None = None,
-) -> list[Finding]:
+) -> list[SceneFinding]:
     """Return all findings, the most severe first.
 
-    ``posed``: whether the author chose the pose; then shapes outside the working volume are reported.
+    Parameters
+    ----------
+    facts
+        About the scene.
+    sensor, pose, visible
+        The sensor, its pose, and what it sees from there.
+    posed
+        Whether the author chose the pose; then shapes outside the working volume are reported.
+    task
+        The features to measure, if any.
     """
     measured = set(task.features) if task else set()
-    found: list[Finding] = []
+    found: list[SceneFinding] = []
     borders = open_borders(facts)
     for number, shape in enumerate(facts.shapes):
         if shape.emitter:
@@ -128,9 +138,9 @@ def findings(
     return sorted(found, key=lambda one: order.index(one.severity))
 
 
-def _named(shape: ShapeFacts) -> Iterator[Finding]:
+def _named(shape: ShapeFacts) -> Iterator[SceneFinding]:
     if not shape.named:
-        yield Finding(
+        yield SceneFinding(
             "warning",
             shape.name,
             f"a {shape.kind} without an id; mitsim chose this name, and it may change",
@@ -138,19 +148,19 @@ def _named(shape: ShapeFacts) -> Iterator[Finding]:
         )
 
 
-def _material(shape: ShapeFacts, measured: bool) -> Iterator[Finding]:
+def _material(shape: ShapeFacts, measured: bool) -> Iterator[SceneFinding]:
     severity: Severity = "error" if measured else "warning"
     if shape.delta:
         what = f"a {shape.bsdf} only mirrors or refracts: black under a point-like projector"
-        yield Finding(severity, shape.name, what, "Use machined_metal, or a rough BSDF")
+        yield SceneFinding(severity, shape.name, what, "Use machined_metal, or a rough BSDF")
     elif shape.kind == "instance":
         what = "an instance has no finish of its own, so no performance map covers it"
         advice = "Write the shape itself if it is measured; as it is, it occludes, but has no predicted points"
-        yield Finding(severity, shape.name, what, advice)
+        yield SceneFinding(severity, shape.name, what, advice)
     elif shape.finish is None:
         what = f"the BSDF {shape.bsdf} has no finish, so no performance map covers it"
         advice = "Use machined_metal, gloss_paint, powder_coat or matt_white; as it is, it occludes but gives no points"
-        yield Finding(severity, shape.name, what, advice)
+        yield SceneFinding(severity, shape.name, what, advice)
     else:
         name, roughness = shape.finish.name.partition("/")[2], shape.finish.roughness
         process = PROCESSES.get(name)
@@ -159,23 +169,23 @@ def _material(shape: ShapeFacts, measured: bool) -> Iterator[Finding]:
                 f"{name.capitalize()} metal usually has {process.usual[0]:g} to {process.usual[1]:g} um: "
                 "check process and unit on the drawing"
             )
-            yield Finding("warning", shape.name, f"Ra {roughness:g} um is unusual for {name}", advice)
+            yield SceneFinding("warning", shape.name, f"Ra {roughness:g} um is unusual for {name}", advice)
     u, v = shape.alpha
     if abs(u - v) > 0.01 * (u + v) and shape.mesh is not None and not shape.mesh.texture:
         what = f"a lay (alpha {u:.3g} along u, {v:.3g} along v) on a mesh without u, v: its direction is arbitrary"
         advice = "Export the mesh with texture coordinates; mitsim part writes them for planes and cylinders"
-        yield Finding("warning", shape.name, what, advice)
+        yield SceneFinding("warning", shape.name, what, advice)
 
 
-def _mesh(shape: ShapeFacts, border: NDArray[np.float64]) -> Iterator[Finding]:
+def _mesh(shape: ShapeFacts, border: NDArray[np.float64]) -> Iterator[SceneFinding]:
     mesh = shape.mesh
     if mesh is None or shape.kind in _STOCK:
         return
     if mesh.duplicate or mesh.degenerate > _SLIVERS * len(mesh.triangles):
         what = f"{mesh.degenerate} triangles without area, {mesh.duplicate} duplicates"
-        yield Finding("warning", shape.name, what, "Clean the mesh: mitsim part leaves them out")
+        yield SceneFinding("warning", shape.name, what, "Clean the mesh: mitsim part leaves them out")
     if mesh.nonmanifold_edges:
-        yield Finding(
+        yield SceneFinding(
             "warning",
             shape.name,
             f"{mesh.nonmanifold_edges} edges belong to more than two triangles",
@@ -183,7 +193,7 @@ def _mesh(shape: ShapeFacts, border: NDArray[np.float64]) -> Iterator[Finding]:
         )
     holes = _holes(mesh, border)
     if holes:
-        yield Finding(
+        yield SceneFinding(
             "warning",
             shape.name,
             f"not watertight: {holes} open edges",
@@ -230,7 +240,7 @@ def _holes(mesh: MeshFacts, border: NDArray[np.float64]) -> int:
     return int((around[of_edge] < _HOLE * size).sum())
 
 
-def _facing(shape: ShapeFacts, number: int, visible: VisibleSurfaces) -> Iterator[Finding]:
+def _facing(shape: ShapeFacts, number: int, visible: VisibleSurfaces) -> Iterator[SceneFinding]:
     """Yield findings about faces whose black back side is visible."""
     if shape.two_sided:
         return
@@ -238,21 +248,21 @@ def _facing(shape: ShapeFacts, number: int, visible: VisibleSurfaces) -> Iterato
     mesh, mine = shape.mesh, visible.shape == number
     if mesh is not None and mesh.closed and mesh.volume < 0:
         what = f"inward normals: a closed mesh of {mesh.volume:.4g} mm^3, black from outside"
-        yield Finding("error", shape.name, what, turn)
+        yield SceneFinding("error", shape.name, what, turn)
     elif shape.front_hits + shape.back_hits == 0:
         what = "visible from nowhere: it lies inside the part, or is very small"
-        yield Finding("note", shape.name, what, "Leave it out if it is not needed")
+        yield SceneFinding("note", shape.name, what, "Leave it out if it is not needed")
     elif shape.front_hits < 0.02 * shape.back_hits:
         what = "inward normals: only its black back is visible, from all directions"
-        yield Finding("error", shape.name, what, turn)
+        yield SceneFinding("error", shape.name, what, turn)
     elif mine.sum() > _CRACK_PX and not visible.front[mine].any():
         what = "shows only its black back in this view"
-        yield Finding("warning", shape.name, what, f"{turn}; or look from the other side")
+        yield SceneFinding("warning", shape.name, what, f"{turn}; or look from the other side")
 
 
 def _placed(
     shape: ShapeFacts, number: int, sensor: Sensor, pose: Transform, visible: VisibleSurfaces
-) -> Iterator[Finding]:
+) -> Iterator[SceneFinding]:
     """Yield findings about shapes that the chosen pose cannot measure."""
     mine = visible.shape == number
     if not len(shape.points) or (mine.any() and not visible.front[mine].any()):
@@ -261,21 +271,21 @@ def _placed(
     facing = np.einsum("ij,ij->i", normals, sensor.rig.reference.centre - points) > 0
     if not (facing.any() or shape.two_sided):
         what = "faces away from the sensor in this pose"
-        yield Finding("note", shape.name, what, "Look from another side if it is measured")
+        yield SceneFinding("note", shape.name, what, "Look from another side if it is measured")
         return
     shown = points if shape.two_sided else points[facing]
     share = float(in_working_volume(sensor, shown).mean())
     if share == 0:
         what = f"outside the working volume in this pose: {_why_outside(sensor, shown)}"
-        yield Finding("warning", shape.name, what, "Move the sensor")
+        yield SceneFinding("warning", shape.name, what, "Move the sensor")
         return
     if share < 0.99:
         what = f"{100 * share:.0f} % of the facing area lies in the working volume: {_why_outside(sensor, shown)}"
-        yield Finding("note", shape.name, what, "Move the sensor if the rest is measured")
+        yield SceneFinding("note", shape.name, what, "Move the sensor if the rest is measured")
     if not (mine & visible.seen_by_all).any():
         why = "another camera or the projector does not see it" if mine.any() else "other faces occlude it"
         what = f"cameras and projector see no point in common: {why}"
-        yield Finding("warning", shape.name, what, "Look from another side if it is measured")
+        yield SceneFinding("warning", shape.name, what, "Look from another side if it is measured")
 
 
 def _why_outside(sensor: Sensor, points: np.ndarray) -> str:
@@ -286,13 +296,13 @@ def _why_outside(sensor: Sensor, points: np.ndarray) -> str:
         reasons.append(f"{along.min():.0f} to {along.max():.0f} mm deep, the sensor works from {near:g} to {far:g} mm")
     reasons += [
         f"not {'wholly ' if in_image(eye, points).any() else ''}in the image of the {name}"
-        for name, eye in eyes_of(sensor).items()
+        for name, eye in eyes(sensor.rig).items()
         if not in_image(eye, points).all()
     ]
     return "; ".join(reasons)
 
 
-def _whole(facts: SceneFacts, sensor: Sensor, open_edges: int) -> Iterator[Finding]:
+def _whole(facts: SceneFacts, sensor: Sensor, open_edges: int) -> Iterator[SceneFinding]:
     """Yield findings about size, units, gaps and light of the whole scene."""
     yield from _size(sorted((facts.bounds[1] - facts.bounds[0]).tolist(), reverse=True), sensor)
     parts = [shape for shape in facts.shapes if not shape.emitter]
@@ -301,7 +311,7 @@ def _whole(facts: SceneFacts, sensor: Sensor, open_edges: int) -> Iterator[Findi
     if facts.merged_mesh is not None and cut and open_edges and not each_closed:
         what = f"all meshes together are not closed ({open_edges} open edges)"
         advice = "Correct if only one side of the part is modelled: light passes through the openings"
-        yield Finding("note", "", what, advice)
+        yield SceneFinding("note", "", what, advice)
     if facts.emitters:
         known = [flux for _, flux in facts.emitters if np.isfinite(flux)]
         kinds = ", ".join(sorted({kind for kind, _ in facts.emitters}))
@@ -309,10 +319,10 @@ def _whole(facts: SceneFacts, sensor: Sensor, open_edges: int) -> Iterator[Findi
         rest = f", {len(facts.emitters) - len(known)} without a flux" if len(known) < len(facts.emitters) else ""
         what = f"ambient light, {len(facts.emitters)} emitter{'s'[: len(facts.emitters) > 1]} ({kinds}{total}{rest})"
         advice = f"It is added to every image; the projector emits {sensor.projector.flux:g} W"
-        yield Finding("note", "", what, advice)
+        yield SceneFinding("note", "", what, advice)
 
 
-def _size(sizes: list[float], sensor: Sensor) -> Iterator[Finding]:
+def _size(sizes: list[float], sensor: Sensor) -> Iterator[SceneFinding]:
     """Yield findings about a part in the wrong unit or larger than the view; ``sizes`` [mm], the largest first."""
     near, far = sensor.working_range_mm
     middle = (near + far) / 2
@@ -325,31 +335,31 @@ def _size(sizes: list[float], sensor: Sensor) -> Iterator[Finding]:
             if SMALL_PX * pixel <= factor * sizes[0] <= largest
         ]
         what = f"the part is {sizes[0]:.4g} mm across, {sizes[0] / pixel:.0f} px at {middle:g} mm"
-        yield Finding("warning", "", what, f"Lengths are mm; {'; '.join(guesses) or 'check the unit of the file'}")
+        yield SceneFinding("warning", "", what, f"Lengths are mm; {'; '.join(guesses) or 'check the unit of the file'}")
     view = sorted(field_of_view(sensor, near), reverse=True)
     if sizes[0] > view[0] or sizes[1] > view[1]:
         part = " x ".join(f"{size:.0f}" for size in sizes)
         what = f"the part is {part} mm, the common view at {near:g} mm is {view[0]:.0f} x {view[1]:.0f} mm"
         unit = "; or its unit is not mm" if sizes[0] > 10 * view[0] else ""
-        yield Finding("warning", "", what, f"Increase the distance, or plan several views{unit}")
+        yield SceneFinding("warning", "", what, f"Increase the distance, or plan several views{unit}")
 
 
-def _task(facts: SceneFacts, task: TaskFeatures) -> Iterator[Finding]:
+def _task(facts: SceneFacts, task: TaskFeatures) -> Iterator[SceneFinding]:
     names = [shape.name for shape in facts.shapes]
     if not task.measurements:
-        yield Finding("note", "task", "it has no measurements yet", "Add a [measurements.NAME] before a study")
+        yield SceneFinding("note", "task", "it has no measurements yet", "Add a [measurements.NAME] before a study")
     for name, feature in task.features.items():
         if not feature.shaped:
             continue  # it is derived from others
         if name not in names:
             hint = nearest(name, names)
             advice = f"D{hint[1:]}" if hint else f"The shapes are: {', '.join(names)}"
-            yield Finding("error", name, "a feature of the task without a shape in the scene", advice)
+            yield SceneFinding("error", name, "a feature of the task without a shape in the scene", advice)
         else:
             yield from _nominal(facts.shapes[names.index(name)], feature)
 
 
-def _nominal(shape: ShapeFacts, feature: Feature) -> Iterator[Finding]:
+def _nominal(shape: ShapeFacts, feature: Feature) -> Iterator[SceneFinding]:
     """Yield a finding if the nominal geometry of a task does not lie on the shape of that name."""
     surface = feature.nominal()
     corners = shape.points if shape.mesh is None else shape.mesh.vertices
@@ -358,11 +368,11 @@ def _nominal(shape: ShapeFacts, feature: Feature) -> Iterator[Finding]:
         severity: Severity = "error" if worst > MISTAKE_MM else "warning"
         what = f"the shape is up to {worst:.3g} mm off the nominal {feature.kind} of the task"
         advice = "All errors would be measured from there: correct point_mm, direction or radius_mm"
-        yield Finding(severity, shape.name, what, advice)
+        yield SceneFinding(severity, shape.name, what, advice)
     elif shape.mesh is not None:
         middles = shape.mesh.vertices[shape.mesh.triangles].mean(axis=1)
         sag = float(np.abs(surface_distance(surface, middles)).max(initial=0.0))
         if sag > NOMINAL_MM:
             what = f"facets deviate by up to {sag:.2g} mm from the nominal {feature.kind}"
             advice = "Mesh the part more finely: this is an error of the part, not of the sensor"
-            yield Finding("warning", shape.name, what, advice)
+            yield SceneFinding("warning", shape.name, what, advice)

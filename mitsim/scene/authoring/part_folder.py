@@ -93,7 +93,16 @@ class Part:
 def read_part(
     path: str | Path, units: str | None = None, angle_deg: float = 20.0, fineness: Fineness | None = None
 ) -> Part:
-    """Read a STEP file, meshed as finely as asked, or a mesh, and name its faces.
+    """Read a STEP file or a mesh, and name its faces.
+
+    Parameters
+    ----------
+    path, units
+        The file, and its unit of length if it states none.
+    angle_deg
+        Of a mesh: neighbouring triangles with a smaller angle between them belong to one face.
+    fineness
+        Of the mesh of a STEP file.
 
     Raises
     ------
@@ -105,7 +114,7 @@ def read_part(
     check_part_file(path, units)
     if path.suffix.lower() not in STEP:
         mesh = read_mesh(path, units)
-        made = segment_mesh(mesh.vertices, mesh.triangles, angle_deg, None, str(path))
+        made = segment_mesh(mesh.vertices, mesh.triangles, angle_deg, str(path))
         return Part(with_names(made.faces), [*mesh.remarks, *made.remarks])
     drawn = read_step(path, fineness or Fineness(), units)
     check_size(path, np.concatenate([face.vertices for face in drawn.faces]))
@@ -123,6 +132,15 @@ def write_part(
     fineness: Fineness | None = None,
 ) -> Part:
     """Read a part, write its scene folder atomically, and return the part.
+
+    Parameters
+    ----------
+    path, units, angle_deg, fineness
+        As for :func:`read_part`.
+    folder
+        To be made.
+    finishing
+        Finish of all faces; ground aluminium by default.
 
     Raises
     ------

@@ -16,27 +16,13 @@ from mitsim.scene.authoring.drawn_characteristics import Dimension, GeometricTol
 from mitsim.scene.authoring.part21 import Entity, Enumeration, Reference, StepText, Typed
 from mitsim.scene.authoring.units import unit_size
 
+_KINDS = (
+    "flatness straightness roundness cylindricity parallelism perpendicularity angularity position coaxiality "
+    "concentricity symmetry circular_runout total_runout line_profile surface_profile"
+)
+
 #: geometric tolerances by the type of their entity
-TOLERANCES = {
-    f"{name.upper()}_TOLERANCE": name.replace("_", " ")
-    for name in (
-        "flatness",
-        "straightness",
-        "roundness",
-        "cylindricity",
-        "parallelism",
-        "perpendicularity",
-        "angularity",
-        "position",
-        "coaxiality",
-        "concentricity",
-        "symmetry",
-        "circular_runout",
-        "total_runout",
-        "line_profile",
-        "surface_profile",
-    )
-}
+TOLERANCES = {f"{name.upper()}_TOLERANCE": name.replace("_", " ") for name in _KINDS.split()}
 _SIZES = ("DIMENSIONAL_SIZE", "ANGULAR_SIZE", "DIMENSIONAL_SIZE_WITH_PATH", "DIMENSIONAL_SIZE_WITH_DATUM_FEATURE")
 _LOCATIONS = (
     "DIMENSIONAL_LOCATION",

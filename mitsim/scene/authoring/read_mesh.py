@@ -13,7 +13,8 @@ import trimesh
 
 from characterisation.files.errors import InputError, nearest
 from mitsim.scene.authoring.face import Floats, Ints
-from mitsim.scene.authoring.units import UNITS, WORDS, commented_unit, unit_words
+from mitsim.scene.authoring.units import UNITS, commented_unit, unit_words
+from mitsim.sensor.calibration_qualifiers import UNITS_MM
 
 STEP = (".step", ".stp", ".p21")
 _MESHES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".3mf")
@@ -104,9 +105,9 @@ def _stated_unit(path: Path, scene: Any) -> float | None:
         return UNITS["m"]
     if kind == ".3mf":
         word = str(scene.metadata.get("units", "millimeter")).strip().lower()
-        if word not in WORDS:
+        if word not in UNITS_MM:
             raise InputError(path, "unit", repr(word[:40]), "micron, millimeter, centimeter, inch, foot or meter")
-        return WORDS[word]
+        return UNITS_MM[word]
     with path.open("rb") as file:
         return commented_unit(kind, file.read(4096))
 

@@ -38,6 +38,7 @@ from mitsim.scene.authoring.face import (
     surface_distance,
 )
 from mitsim.scene.authoring.part21 import StepText, read_step_text
+from mitsim.scene.authoring.segment_mesh import components
 from mitsim.scene.authoring.units import UNITS, step_units, unit_words
 
 #: default mesh of STEP without a sensor: distance from the true surface [mm], and angle between facets [rad]. The angle
@@ -301,22 +302,10 @@ def _joined(faces: list[Face]) -> list[Face]:
     for number, face in enumerate(faces):
         for edge in face.edges:
             owners[face.part, face.body, edge].append(number)
-    root = list(range(len(faces)))
-
-    def top(number: int) -> int:
-        while root[number] != number:
-            number = root[number]
-        return number
-
-    for shared in owners.values():
-        for other in shared[1:]:
-            first, second = top(shared[0]), top(other)
-            if first != second and same_surface(faces[shared[0]], faces[other], ONE_SURFACE_MM):
-                root[max(first, second)] = min(first, second)
-    groups = defaultdict(list)
-    for number in range(len(faces)):
-        groups[top(number)].append(faces[number])
-    return [_as_one(members) for members in groups.values()]
+    neighbours = {(shared[0], other) for shared in owners.values() for other in shared[1:]}
+    same = [pair for pair in neighbours if same_surface(faces[pair[0]], faces[pair[1]], ONE_SURFACE_MM)]
+    groups = components(np.array(same, int).reshape(-1, 2), np.arange(len(faces)))
+    return [_as_one([faces[number] for number in group]) for group in groups]
 
 
 def _as_one(members: list[Face]) -> Face:

@@ -1,14 +1,13 @@
 """Segment a mesh of a part into its faces, and recognise planes, cylinders and spheres.
 
 Signal chain: triangles [mm] -> vertices merged, degenerate triangles removed -> neighbours joined if the angle between
-them is small (or if the CAD file states one face) -> the surface of each piece
-(:mod:`mitsim.scene.authoring.recognise`) -> neighbours on one surface joined (CAD divides a cylinder in two) -> names
-by kind and area.
+them is small -> the surface of each piece (:mod:`mitsim.scene.authoring.recognise`) -> neighbours on one surface joined
+(CAD divides a cylinder in two).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import trimesh
@@ -42,10 +41,8 @@ class SegmentedMesh:
     remarks: list[str]
 
 
-def segment_mesh(
-    vertices: Floats, triangles: Ints, angle_deg: float = 20.0, drawn: Ints | None = None, where: str = "mesh"
-) -> SegmentedMesh:
-    """Segment a mesh into faces.
+def segment_mesh(vertices: Floats, triangles: Ints, angle_deg: float = 20.0, where: str = "mesh") -> SegmentedMesh:
+    """Segment a mesh into faces, which have no names yet.
 
     Parameters
     ----------
@@ -53,8 +50,6 @@ def segment_mesh(
         (n, 3) [mm] and (m, 3).
     angle_deg
         Neighbouring triangles with a smaller angle between them belong to one face.
-    drawn
-        (m,) CAD face of each triangle, if known; it takes precedence over the angle.
     where
         Name of the mesh in messages.
 
@@ -70,21 +65,16 @@ def segment_mesh(
     if not kept.any():
         raise InputError(where, "", "only triangles without area", "a mesh of the part's surface")
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces[kept], process=False)
-    drawn = None if drawn is None else np.asarray(drawn)[kept]
     mesh, turned = _outside_out(mesh)
     remarks += turned
 
     pairs, bend = mesh.face_adjacency, np.degrees(mesh.face_adjacency_angles)
-    joined = bend < angle_deg if drawn is None else drawn[pairs[:, 0]] == drawn[pairs[:, 1]]
-    pieces = _components(pairs[joined], np.arange(len(mesh.faces)))
+    pieces = components(pairs[bend < angle_deg], np.arange(len(mesh.faces)))
     if len(pieces) > LARGEST_COUNT:
         hint = f"raise --angle from {angle_deg:g} deg if round surfaces were meshed coarsely; scans are not supported"
         raise InputError(where, "", f"{len(pieces)} faces", f"at most {LARGEST_COUNT}", hint)
-    if drawn is None:
-        pieces = [part for piece in pieces for part in _without_flats(mesh, piece, pairs, bend, angle_deg)]
-    faces = [recognised(mesh, piece) for piece in pieces]
-    pieces, faces = _joined(mesh, pieces, faces, pairs)
-    return SegmentedMesh(_named(faces), remarks)
+    pieces = [part for piece in pieces for part in _without_flats(mesh, piece, pairs, bend, angle_deg)]
+    return SegmentedMesh(_joined(mesh, pieces, pairs), remarks)
 
 
 def _outside_out(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, list[str]]:
@@ -94,7 +84,7 @@ def _outside_out(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, list[str]]:
         trimesh.repair.fix_winding(mesh)  # type: ignore[no-untyped-call]
         triangles = mesh.faces.copy()
         remarks.append("triangles of mixed winding made consistent")
-    bodies = _components(mesh.face_adjacency, np.arange(len(triangles)))
+    bodies = components(mesh.face_adjacency, np.arange(len(triangles)))
     open_bodies, inward = 0, 0
     for body in bodies:
         one = trimesh.Trimesh(mesh.vertices, triangles[body], process=False)
@@ -123,8 +113,8 @@ def _inside_another(mesh: trimesh.Trimesh, body: Ints, bodies: list[Ints]) -> bo
     return False
 
 
-def _components(pairs: NDArray[np.integer], members: Ints) -> list[Ints]:
-    """Return connected sets of triangles (numbers in ``members``), where ``pairs`` (k, 2) are neighbours."""
+def components(pairs: NDArray[np.integer], members: Ints) -> list[Ints]:
+    """Return connected sets of ``members`` (n,) numbers, of which ``pairs`` (k, 2) are neighbours."""
     place = np.full(int(members.max(initial=-1)) + 1, -1)
     place[members] = np.arange(len(members))
     inside = pairs[(pairs < len(place)).all(axis=1)]
@@ -143,41 +133,24 @@ def _without_flats(
     if recognised(mesh, piece).surface is not None:
         return [piece]
     area = mesh.area_faces
-    patches = _components(pairs[bend < _FLAT_DEG], piece)
+    patches = components(pairs[bend < _FLAT_DEG], piece)
     flats = [patch for patch in patches if area[patch].sum() > _FLAT_SHARE * area[piece].sum()]
     if not flats:
         return [piece]
     rest = np.setdiff1d(piece, np.concatenate(flats))
-    return [*flats, *_components(pairs[bend < angle_deg], rest)]
+    return [*flats, *components(pairs[bend < angle_deg], rest)]
 
 
-def _joined(
-    mesh: trimesh.Trimesh, pieces: list[Ints], faces: list[Face], pairs: NDArray[np.integer]
-) -> tuple[list[Ints], list[Face]]:
-    """Join neighbours that lie on one surface."""
+def _joined(mesh: trimesh.Trimesh, pieces: list[Ints], pairs: NDArray[np.integer]) -> list[Face]:
+    """Return pieces as faces; neighbours that lie on one surface are joined."""
+    faces = [recognised(mesh, piece) for piece in pieces]
     owner = np.empty(len(mesh.faces), int)
     for number, piece in enumerate(pieces):
         owner[piece] = number
     neighbours = np.unique(np.sort(owner[pairs], axis=1), axis=0)
     same = [(a, b) for a, b in neighbours.tolist() if a != b and same_surface(faces[a], faces[b])]
-    if not same:
-        return pieces, faces
-    groups = _components(np.array(same), np.arange(len(pieces)))
-    merged = [np.concatenate([pieces[number] for number in group]) for group in groups]
-    again = [
-        faces[group[0]] if len(group) == 1 else recognised(mesh, piece)
-        for group, piece in zip(groups, merged, strict=True)
+    groups = components(np.array(same, int).reshape(-1, 2), np.arange(len(pieces)))
+    return [
+        faces[group[0]] if len(group) == 1 else recognised(mesh, np.concatenate([pieces[number] for number in group]))
+        for group in groups
     ]
-    return merged, again
-
-
-def _named(faces: list[Face]) -> list[Face]:
-    """Name faces by kind, the largest first: plane_1, plane_2, cylinder_1."""
-    out, count = [], {"plane": 0, "cylinder": 0, "sphere": 0, "face": 0}
-    kinds = list(count)
-    for face in sorted(
-        faces, key=lambda one: (kinds.index(one.kind), -round(one.area, 6), one.vertices.mean(0).tolist())
-    ):
-        count[face.kind] += 1
-        out.append(replace(face, name=f"{face.kind}_{count[face.kind]}"))
-    return out

@@ -203,8 +203,15 @@ def faces_of(shape: Any) -> list[Any]:
 def mesh_together(faces: list[Any], chord: float, bend: float, delabella: bool = True) -> None:
     """Mesh faces; those among them that have a mesh as fine keep it, and their neighbours take its points on an edge.
 
-    OpenCASCADE has two ways to connect the same points. Delabella takes a seventeenth of the time for 146,000 triangles
-    of a torus.
+    Parameters
+    ----------
+    faces
+        To be meshed.
+    chord, bend
+        Largest distance from the surface [mm], and angle between facets [rad].
+    delabella
+        Which of OpenCASCADE's two ways connects the same points. Delabella takes a seventeenth of the time for 146,000
+        triangles of a torus.
     """
     from OCP.BRep import BRep_Builder
     from OCP.BRepMesh import BRepMesh_IncrementalMesh
@@ -236,10 +243,18 @@ def chords(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the chord (n,) of each face, and about how many triangles (n,) it will have.
 
-    ``kinds`` (n,) of surfaces had ``counts`` (n,) triangles at the chord ``coarse``. The number is inversely
-    proportional to the chord, and to its square root for planes and cylinders, whose triangles are long. Faces that a
-    task can measure get ``chord``, others ``others``. If all would have over ``most``, the chords of the faces with the
-    most triangles are doubled: of measured faces up to ``others``, then of all.
+    The number is inversely proportional to the chord, and to its square root for planes and cylinders, whose triangles
+    are long. If all faces would have over ``most``, the chords of the faces with the most triangles are doubled: of
+    measured faces up to ``others``, then of all.
+
+    Parameters
+    ----------
+    kinds, counts, coarse
+        Kinds (n,) of the surfaces, and their triangles (n,) at the chord ``coarse``.
+    chord, others
+        Of faces that a task can measure, and of other faces.
+    most
+        Triangles of all faces.
     """
     straight = np.array([kind in ("plane", "cylinder") for kind in kinds])
     measured = np.array([kind in MEASURED for kind in kinds])
@@ -261,6 +276,13 @@ def mesh(shapes: list[Any], chord: float, bend: float, others: float, most: int)
     """Mesh all faces of shapes, finest first; return the largest chord of a measured face.
 
     If Delabella leaves a face without triangles, the other way meshes it again.
+
+    Parameters
+    ----------
+    shapes, bend
+        To be meshed, with this angle between facets [rad].
+    chord, others, most
+        As for :func:`chords`; 0 triangles is no limit.
     """
     faces = [face for shape in shapes for face in faces_of(shape)]
     if not faces:
@@ -333,7 +355,17 @@ def convert(
     others_mm: float | None = None,
     most: float = 0,
 ) -> None:
-    """Write the faces of a STEP file as an NPZ of arrays and a JSON text ``faces``, lengths times ``unit_mm``."""
+    """Write the faces of a STEP file as an NPZ of arrays and a JSON text ``faces``.
+
+    Parameters
+    ----------
+    path, out
+        The STEP file, and the NPZ.
+    chord_mm, bend, others_mm, most
+        As for :func:`mesh`.
+    unit_mm
+        Factor on all lengths.
+    """
     from OCP.IFSelect import IFSelect_RetDone
     from OCP.STEPCAFControl import STEPCAFControl_Reader
     from OCP.TCollection import TCollection_ExtendedString

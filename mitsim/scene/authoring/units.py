@@ -13,23 +13,10 @@ import re
 from typing import Any
 
 from mitsim.scene.authoring.part21 import Entity, Enumeration, Reference, StepText, Typed
+from mitsim.sensor.calibration_qualifiers import UNITS_MM
 
 #: units of length that an option may name [mm]
 UNITS = {"mm": 1.0, "m": 1000.0, "inch": 25.4}
-
-#: units of length by the words of files [mm]
-WORDS = {
-    word: size
-    for size, words in {
-        1e-3: "um micron microns micrometer micrometers micrometre micrometres",
-        1.0: "mm millimeter millimeters millimetre millimetres",
-        10.0: "cm centimeter centimeters centimetre centimetres",
-        1000.0: "m meter meters metre metres",
-        25.4: "in inch inches",
-        304.8: "ft foot feet",
-    }.items()
-    for word in words.split()
-}
 
 #: head of a file in which a comment may state the unit [bytes]
 _HEAD = 4096
@@ -74,7 +61,7 @@ def commented_unit(suffix: str, data: bytes) -> float | None:
     for line in lines:
         if re.match(mark, line.strip()):
             for found in _STATEMENT.finditer(line.decode("ascii", "replace").lower()):
-                size = WORDS.get(found.group(1) or found.group(2))
+                size = UNITS_MM.get(found.group(1) or found.group(2))
                 if size is not None:
                     return size
     return None

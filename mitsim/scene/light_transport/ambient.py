@@ -22,7 +22,19 @@ def has_emitters(scene: Scene) -> bool:
 
 
 def sampled_emitter_light(scene: Scene, surface: Any, bsdf: Any, random: Any, active: Any) -> Any:
-    """Return the reflected radiance of one emitter, chosen at random [W / (mm^2 sr)]."""
+    """Return the reflected radiance of one emitter, chosen at random [W / (mm^2 sr)].
+
+    Parameters
+    ----------
+    scene, surface, bsdf
+        The scene, the surface that reflects, and its BSDF.
+    random, active
+        Generator of random numbers, and mask of the lanes.
+
+    See Also
+    --------
+    hit_emitter_light : the other estimate of the same light
+    """
     point = mi.Point2f(random.next_float32(), random.next_float32())
     sample, weight = scene.mitsuba.sample_emitter_direction(surface, point, True, active)
     usable = active & (sample.pdf != 0.0)
@@ -33,10 +45,20 @@ def sampled_emitter_light(scene: Scene, surface: Any, bsdf: Any, random: Any, ac
 
 
 def hit_emitter_light(scene: Scene, surface: Any, origin: Any, pdf: Any, first: Any) -> Any:
-    """Return the weighted radiance of an emitter that the ray meets [W / (mm^2 sr)].
+    """Return the weighted radiance of an emitter that a ray meets [W / (mm^2 sr)].
 
-    ``pdf`` is the density of the direction in which the ray left ``origin`` [1/sr]. Rays from the camera (``first``)
-    have no such density and the weight 1.
+    Parameters
+    ----------
+    scene, surface
+        The scene, and the surface that the ray meets.
+    origin, pdf
+        Point that the ray left, and density of its direction there [1/sr].
+    first
+        Whether the ray comes from the camera; it has no such density, and the weight 1.
+
+    See Also
+    --------
+    sampled_emitter_light : the other estimate of the same light
     """
     emitter = surface.emitter(scene.mitsuba)
     emitted = emitter.eval(surface)[0]

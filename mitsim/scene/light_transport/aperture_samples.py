@@ -35,11 +35,23 @@ Floats = NDArray[np.float64]
 #: radii (c, p) of the two blurs [px] for which the order is optimised
 _BLURS = ((0.15, 0.1), (0.45, 0.45), (0.45, -0.45), (0.0, 0.45), (0.9, 0.9))
 
-#: lines of the cost: number of directions, positions along a line [px]; number of points of the target distribution
-_DIRECTIONS, _LINE, _POINTS = 8, np.linspace(-2.5, 2.5, 101), 1 << 13
+#: directions of the lines of the cost
+_DIRECTIONS = 8
 
-#: number of orders drawn, of exchanges tried in each, and of orders kept
-_ORDERS, _EXCHANGES, _KEPT = 1024, 800, 32
+#: positions along a line [px]
+_LINE = np.linspace(-2.5, 2.5, 101)
+
+#: points of the target distribution
+_POINTS = 1 << 13
+
+#: orders drawn
+_ORDERS = 1024
+
+#: exchanges tried in each order
+_EXCHANGES = 800
+
+#: orders kept
+_KEPT = 32
 
 #: up to this number of positions in half of a pixel (9 samples), all orders are compared
 _ALL_TRIED = 4

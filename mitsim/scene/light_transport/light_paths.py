@@ -14,23 +14,14 @@ PHOTONS_PER_SAMPLE = 0.25
 class LightPaths:
     """The light paths that :func:`trace` follows.
 
-    Attributes
-    ----------
-    samples
-        Number per pixel, rounded up to a square number, because they form a raster.
-    seed
-        Seed of the directions of later bounces, and of the jitter; use another for each camera and pose.
-    depth
-        Largest number of surfaces on a path: 1 is direct light, 3 adds two interreflections.
-    jitter
-        Whether the positions are random within their cells and lenses, instead of fixed.
-    photons
-        Number of photons for light of two and more surfaces, rounded up to a square number. By default it is
-        proportional to the samples of the *whole* image, whatever the region. 0 leaves all light to camera paths.
-    indirect_only
-        Render only light that has met two surfaces or more, on the same paths.
-    with_ambient
-        Add a last image: the light of the scene's own emitters alone, with the projector off.
+    - ``samples`` per pixel, rounded up to a square number, because they form a raster.
+    - ``seed`` of the directions of later bounces, and of the jitter; use another for each camera and pose.
+    - ``depth``: largest number of surfaces on a path: 1 is direct light, 3 adds two interreflections.
+    - ``jitter``: whether the positions are random within their cells and lenses, instead of fixed.
+    - ``photons`` for light of two and more surfaces, rounded up to a square number. By default their number is
+      proportional to the samples of the *whole* image, whatever the region. 0 leaves all light to camera paths.
+    - ``indirect_only``: render only light that has met two surfaces or more, on the same paths.
+    - ``with_ambient``: add a last image, the light of the scene's own emitters alone, with the projector off.
     """
 
     samples: int

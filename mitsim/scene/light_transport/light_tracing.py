@@ -44,7 +44,7 @@ from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import opaque, opaque_index
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
 from mitsim.scene.light_transport.plain_scene import SceneBsdfs
-from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
+from mitsim.scene.light_transport.projector_light import ProjectedLight, ProjectorLight
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays, pixel_area
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
@@ -64,16 +64,10 @@ _FIRST_STREAM = 1 << 40
 class Photons:
     """The photons that a projector emits.
 
-    Attributes
-    ----------
-    count
-        Number of photons, a square number.
-    depth
-        Largest number of surfaces that a photon meets.
-    seed
-        Seed of their directions.
-    samples
-        Camera samples per pixel, with which the photons share the light; None if there are only photons.
+    - ``count``: a square number.
+    - ``depth``: largest number of surfaces that a photon meets.
+    - ``seed`` of their directions.
+    - ``samples`` of the camera per pixel, with which the photons share the light; None if there are only photons.
     """
 
     count: int
@@ -86,7 +80,7 @@ def add_photons(
     images: NDArray[np.float32],
     scene: Scene,
     rays: CameraRays,
-    light: Light,
+    light: ProjectedLight,
     poses: Sequence[Transform],
     photons: Photons,
     roi: Roi,
@@ -131,7 +125,7 @@ def add_photons(
 def _launch(
     scene: Scene,
     rays: CameraRays,
-    light: Light,
+    light: ProjectedLight,
     poses: Sequence[Transform],
     photons: Photons,
     batch: range,
@@ -267,33 +261,15 @@ def _launch(
 
 @dataclass
 class _PhotonState:
-    """State of the photons of one launch, one lane each, in Dr.Jit's loop.
+    """State of the photons of one launch, one lane each, in Dr.Jit's loop."""
 
-    Attributes
-    ----------
-    active
-        Whether the photon continues.
-    bounce
-        Number of surfaces met before.
-    origin, direction
-        The next ray.
-    weight
-        Light of the photon.
-    ratio
-        n_C p_C / (n_L p_L) so far.
-    length
-        Optical length so far [mm].
-    random
-        Generator of random numbers.
-    """
-
-    active: Any
-    bounce: Any
+    active: Any  # whether the photon continues
+    bounce: Any  # number of surfaces met before
     origin: Any
     direction: Any
-    weight: Any
-    ratio: Any
-    length: Any
+    weight: Any  # light of the photon
+    ratio: Any  # n_C p_C / (n_L p_L) so far
+    length: Any  # optical length so far [mm]
     random: Any
 
 

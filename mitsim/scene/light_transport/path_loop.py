@@ -29,7 +29,7 @@ from mitsim.scene.light_transport.aperture_samples import aperture_samples
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.low_discrepancy import r3_point, z_order
 from mitsim.scene.light_transport.plain_scene import SceneBsdfs, intersect_plane, single_bsdf, single_plane
-from mitsim.scene.light_transport.projector_light import Light, ProjectorLight
+from mitsim.scene.light_transport.projector_light import ProjectedLight, ProjectorLight
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays, bilinear, pixel_area
 from mitsim.scene.ray_casting.eye import Eye
@@ -42,13 +42,22 @@ _LARGEST_RATIO = 1e30
 def launch(
     scene: Scene,
     rays: CameraRays,
-    light: Light,
+    light: ProjectedLight,
     poses: Sequence[Transform],
     paths: LightPaths,
     roi: Roi,
     shift: NDArray[np.floating] | None,
 ) -> list[Any]:
-    """Return all images of a region, and the ambient one, as arrays on the device, pose after pose; one kernel."""
+    """Return all images of a region, and the ambient one, as arrays on the device, pose after pose; one kernel.
+
+    Parameters
+    ----------
+    scene, rays, light, poses, paths
+        The scene, the camera's rays, the projector's light, the poses of the sensor, and the light paths.
+    roi, shift
+        The region, and the displacement (2, height, width) [rad] of its codes, as for
+        :func:`~mitsim.scene.light_transport.transport.trace`.
+    """
     side, depth, seed, jitter = paths.side, paths.depth, paths.seed, paths.jitter
     photons = paths.photon_count(rays.camera.width * rays.camera.height)
     count = len(poses) * roi.width * roi.height
@@ -114,7 +123,7 @@ def launch(
         local = mi.Vector3f(bilinear(x, a, b), bilinear(y, a, b), 1.0)
         start = camera.position
         if has_aperture:
-            in_lens = pupils.camera(sample, random) * aperture
+            in_lens = pupils.position(0, sample, random) * aperture
             start = start + camera.axes[0] * in_lens.x + camera.axes[1] * in_lens.y
             local -= mi.Vector3f(in_lens.x, in_lens.y, 0.0) * inverse_focus
         origin = dr.select(at_first, start, origin)
@@ -133,7 +142,7 @@ def launch(
         bsdf: Any = shared_bsdf if bsdfs is None else bsdfs.at(surface)
         contributes = hit & ~at_first if paths.indirect_only else hit
 
-        lens = pupils.projector(sample, random) if projector.has_aperture else None
+        lens = pupils.position(1, sample, random) if projector.has_aperture else None
         shift_mm = None if displacement is None else displacement * dr.select(at_first, surface.t, 0.0)
         toward, irradiance, uv, distance = projector.light(occluders, surface, direction, lens, shift_mm, contributes)
         reflected = bsdf.eval(context, surface, surface.to_local(toward), contributes & (irradiance > 0))[0]
@@ -198,40 +207,18 @@ def launch(
 
 @dataclass
 class _PathState:
-    """State of the light paths of one launch, one lane per pixel, in Dr.Jit's loop.
+    """State of the light paths of one launch, one lane per pixel, in Dr.Jit's loop."""
 
-    Attributes
-    ----------
-    sample
-        Index of the sample in its pixel.
-    bounce
-        Number of surfaces met before.
-    origin, direction
-        The next ray.
-    weight
-        Weight of its light.
-    pdf
-        Density of its direction [1/sr].
-    length
-        Optical length so far [mm].
-    ratio
-        n_L p_L / (n_C p_C) so far, of photons over camera paths.
-    random
-        Generator of random numbers.
-    sums
-        Light of each code, and of the emitters as the last.
-    """
-
-    sample: Any
-    bounce: Any
+    sample: Any  # index of the sample in its pixel
+    bounce: Any  # number of surfaces met before
     origin: Any
     direction: Any
-    weight: Any
-    pdf: Any
-    length: Any
-    ratio: Any
+    weight: Any  # of the light of the next ray
+    pdf: Any  # density of its direction [1/sr]
+    length: Any  # optical length so far [mm]
+    ratio: Any  # n_L p_L / (n_C p_C) so far, of photons over camera paths
     random: Any
-    sums: Any
+    sums: Any  # light of each code, and of the emitters as the last
 
 
 def _density_to_camera(bsdf: Any, surface: Any, toward_projector: Any, active: Any) -> Any:
@@ -255,15 +242,8 @@ class _Pupils:
         padded = (np.pad(positions, ((0, 0), (0, 1))) for positions in aperture_samples(count))
         self.tables = [mi.Point2f(to_device(x), to_device(y)) for x, y in padded]
 
-    def camera(self, sample: Any, random: Any) -> Any:
-        """Return the position in the camera's lens."""
-        return self._position(0, sample, random)
-
-    def projector(self, sample: Any, random: Any) -> Any:
-        """Return the position in the projector's lens."""
-        return self._position(1, sample, random)
-
-    def _position(self, lens: int, sample: Any, random: Any) -> Any:
+    def position(self, lens: int, sample: Any, random: Any) -> Any:
+        """Return the position in the lens of the camera, 0, or the projector, 1."""
         if self.jitter:
             return mi.warp.square_to_uniform_disk_concentric(mi.Point2f(random.next_float32(), random.next_float32()))
         return dr.gather(mi.Point2f, self.tables[lens], sample)

@@ -42,7 +42,7 @@ _VALUES_AT_ONCE = 1 << 22
 _MARGIN = 2e-3
 
 
-class Light(Protocol):
+class ProjectedLight(Protocol):
     """A projector and the codes of all images of a capture.
 
     ``count`` images are weighted sums of ``codes`` codes, which are as many or fewer.

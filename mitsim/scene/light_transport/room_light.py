@@ -30,7 +30,12 @@ def room_radiance(
 ) -> NDArray[np.float32]:
     """Return the radiance (H, W) [1/sr] per unit of irradiance on a surface with a free view; 0 outside the part.
 
-    ``albedos`` are those of the scene's shapes, from :func:`directional_albedos`.
+    Parameters
+    ----------
+    scene, rays, world_from_sensor
+        The scene, the rays of the pixels, and the pose of the sensor.
+    albedos
+        Of the scene's shapes, from :func:`directional_albedos`.
     """
     surfaces = cast(scene, rays, world_from_sensor, np.empty((0, 3)))
     out = np.zeros(surfaces.shape.shape, np.float32)

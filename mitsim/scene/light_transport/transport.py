@@ -26,7 +26,7 @@ from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.light_tracing import PHOTONS_AT_ONCE, Photons, add_photons
 from mitsim.scene.light_transport.path_loop import launch
 from mitsim.scene.light_transport.plain_scene import single_plane
-from mitsim.scene.light_transport.projector_light import Light
+from mitsim.scene.light_transport.projector_light import ProjectedLight
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.transforms import Transform
@@ -39,7 +39,7 @@ LARGEST_LAUNCH = 1 << 24
 def trace(
     scene: Scene,
     rays: CameraRays,
-    light: Light,
+    light: ProjectedLight,
     world_from_sensor: Transform,
     paths: LightPaths,
     roi: Roi | None = None,
@@ -72,11 +72,22 @@ def trace(
 
 
 def trace_poses(
-    scene: Scene, rays: CameraRays, light: Light, poses: Sequence[Transform], paths: LightPaths
+    scene: Scene, rays: CameraRays, light: ProjectedLight, poses: Sequence[Transform], paths: LightPaths
 ) -> NDArray[np.float32]:
     """Return the radiance of :func:`trace` for whole images at several poses: (poses, P, height, width).
 
     Poses that fit into one launch share it. Recording a kernel takes about as long as rendering 20 000 pixels.
+
+    Parameters
+    ----------
+    scene, rays, light, paths
+        As for :func:`trace`.
+    poses
+        ``world_from_sensor`` of each.
+
+    See Also
+    --------
+    trace : one pose, and a region of the image
     """
     pixels = rays.camera.width * rays.camera.height
     together = max(
@@ -92,7 +103,7 @@ def trace_poses(
 def _traced(
     scene: Scene,
     rays: CameraRays,
-    light: Light,
+    light: ProjectedLight,
     poses: Sequence[Transform],
     paths: LightPaths,
     roi: Roi,

@@ -37,18 +37,9 @@ _GRID_PX = 8
 class CameraRays:
     """The rays of a camera, in a table on the device.
 
-    Attributes
-    ----------
-    camera
-        The camera.
-    distortion
-        Its forward model, from direction to pixel.
-    aperture_mm
-        Diameter of the entrance pupil [mm], 0 for a pinhole.
-    focus_mm
-        Depth of the plane of sharp focus [mm].
-    x, y
-        Ideal image coordinates x/z and y/z at the pixel corners, row by row, (H + 1)(W + 1) each.
+    - ``distortion``: its forward model, from direction to pixel.
+    - ``aperture_mm``: diameter of the entrance pupil, 0 for a pinhole; ``focus_mm``: depth of the plane of sharp focus.
+    - ``x``, ``y``: ideal image coordinates x/z and y/z at the pixel corners, row by row, (H + 1)(W + 1) each.
 
     Raises
     ------

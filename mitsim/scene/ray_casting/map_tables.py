@@ -60,7 +60,18 @@ class MapTables:
     def look_up(self, number: Any, distance: Any, normal: Any, active: Any) -> tuple[Any, Any]:
         """Return F [1] and sigma [mm] of surfaces by number; NaN if unknown.
 
-        ``distance`` is |V| [mm], ``normal`` N in the view frame.
+        Parameters
+        ----------
+        number
+            Of the surface.
+        distance, normal
+            |V| [mm], and N in the view frame.
+        active
+            Mask of the lanes.
+
+        See Also
+        --------
+        look_up_lay : in the direction of the marks of surfaces with a lay
         """
         scale = dr.sqrt(2 / (1 + normal.z)) / self.step
         column, row = normal.x * scale - self.origin, normal.y * scale - self.origin
@@ -92,7 +103,12 @@ class MapTables:
     def look_up_lay(self, number: Any, distance: Any, normal: Any, along: Any, active: Any) -> tuple[Any, Any]:
         """Return F [1] and sigma [mm], for surfaces with a lay in its direction (:mod:`characterisation.maps.lay`).
 
-        ``along`` is the derivative of the point by u, in the view frame; its length does not matter.
+        Parameters
+        ----------
+        number, distance, normal, active
+            As for :meth:`look_up`.
+        along
+            Derivative of the point by u, in the view frame; its length does not matter.
         """
         mean = self.look_up(number, distance, normal, active)
         directed = active & dr.gather(mi.Bool, self.has_lay, number, active)

@@ -35,20 +35,11 @@ from mitsim.sensor.transforms import Transform
 class MappedView:
     """Images (h, w) of the pixels of ``roi``; no pixel outside it shows the scene.
 
-    Attributes
-    ----------
-    roi
-        The region.
-    status
-        VALID if all cameras and the projector see the point; else the reason.
-    shape
-        Index into the names of the scene; -1 without a surface.
-    distance
-        |V| [mm]; NaN without a surface.
-    normal
-        (3, h, w) in the view frame, if requested.
-    fraction, sigma
-        F [1] and sigma [mm]; NaN if the status is not VALID or the map has no value.
+    - ``status``: VALID if all cameras and the projector see the point; else the reason.
+    - ``shape``: index into the names of the scene; -1 without a surface.
+    - ``distance``: |V| [mm]; NaN without a surface.
+    - ``normal`` (3, h, w) in the view frame, if requested.
+    - ``fraction``, ``sigma``: F [1] and sigma [mm]; NaN if the status is not VALID or the map has no value.
     """
 
     roi: Roi
@@ -171,7 +162,14 @@ class MappedScene:
     def cast(self, view: ViewRays, world_from_sensor: Transform, margin: int = 0, normals: bool = False) -> MappedView:
         """Return the visible surfaces of a view from a pose, with F and sigma of the map.
 
-        ``margin`` pixels are added around the region that can show the scene. ``normals`` requests the normals too.
+        Parameters
+        ----------
+        view, world_from_sensor
+            The rays, and the pose of the sensor.
+        margin
+            Pixels that are added around the region that can show the scene.
+        normals
+            Whether to return the normals, too.
         """
         roi = view.roi(self.scene.bounds, world_from_sensor, margin)
         size = (roi.height, roi.width)

@@ -28,18 +28,12 @@ from mitsim.sensor.transforms import Transform
 class Surfaces:
     """Surfaces that the rays meet, in the sensor frame.
 
-    Attributes
-    ----------
-    distance
-        (H, W) |V| [mm]. NaN without a surface, or where only the back of a one-sided face is seen, which renders black.
-    normal
-        (H, W, 3) unit normal, toward the sensor.
-    shape
-        (H, W) index into the names of the scene; -1 where the distance is NaN.
-    seen
-        (E, H, W) whether each of the given eyes is on the front side and has a free line of sight to the point.
-    along
-        (H, W, 3) derivative of the point by the surface parameter u; None in a scene without a lay.
+    - ``distance`` (H, W): |V| [mm]. NaN without a surface, or where only the back of a one-sided face is seen, which
+      renders black.
+    - ``normal`` (H, W, 3) toward the sensor.
+    - ``shape`` (H, W): index into the names of the scene; -1 where the distance is NaN.
+    - ``seen`` (E, H, W): whether each eye is on the front side and has a free line of sight to the point.
+    - ``along`` (H, W, 3): derivative of the point by the surface parameter u; None in a scene without a lay.
     """
 
     distance: NDArray[np.float32]
@@ -110,8 +104,8 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
     return Surfaces(
         distance=np.array(distance, np.float32).reshape(size),
         normal=vectors_to_host(normal).reshape(*size, 3),
-        shape=_indices(scene, shape).reshape(size),
-        seen=_stack(seen, size),
+        shape=shape_indices(scene, shape).reshape(size),
+        seen=np.array([np.array(mask, bool) for mask in seen], bool).reshape(len(seen), *size),
         along=None if along is None else vectors_to_host(along).reshape(*size, 3),
     )
 
@@ -124,10 +118,10 @@ def shapes_met(scene: Scene, rays: PixelRays, world_from_sensor: Transform) -> N
     frame = rays.frame(world_from_sensor)
     ray = mi.Ray3f(frame.position, frame.to_world(rays.directions))
     met = scene.mitsuba.ray_intersect_preliminary(ray, active=rays.active)
-    return _indices(scene, dr.reinterpret_array(mi.UInt32, met.shape)).reshape(rays.size)
+    return shape_indices(scene, dr.reinterpret_array(mi.UInt32, met.shape)).reshape(rays.size)
 
 
-def _indices(scene: Scene, numbers: Any) -> NDArray[np.int16]:
+def shape_indices(scene: Scene, numbers: Any) -> NDArray[np.int16]:
     """Return the indices (n,) into the names of the scene of Mitsuba's shape numbers."""
     ids = np.array(numbers)
     lookup = np.full(int(ids.max(initial=0)) + 1, -1, np.int16)
@@ -142,12 +136,6 @@ def _indices(scene: Scene, numbers: Any) -> NDArray[np.int16]:
 def shape_number(shape: Any) -> int:
     """Return Mitsuba's number of a shape, which is 1 or more."""
     return int(np.ravel(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))))[0])
-
-
-def _stack(masks: list[Any], size: tuple[int, int]) -> NDArray[np.bool_]:
-    if not masks:
-        return np.empty((0, *size), bool)
-    return np.stack([np.array(mask, bool).reshape(size) for mask in masks])
 
 
 def cloud_points(surfaces: Surfaces, grid: ViewGrid) -> NDArray[np.float64]:

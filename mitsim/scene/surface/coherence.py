@@ -32,18 +32,16 @@ EVEN_FROM = float(np.cos(np.radians(45)))
 #: incidence [rad] up to which A holds and energy is conserved
 LARGEST_INCIDENCE = float(np.radians(75))
 
-_ANGLES, _COUNTS = 12, (96, 48, 4)
+#: angles of incidence at which energy is conserved
+_ANGLES = 12
+
+#: facets of the quadrature at each angle, as of :func:`~mitsim.scene.surface.energy.facets`
+_COUNTS = (96, 48, 4)
 
 
 def coherent_weight(phase_variance: float, mean_cosine: ArrayLike) -> NDArray[np.float64]:
     """Return A [1] of pairs of directions; ``mean_cosine`` is the mean of their cosines to the normal, any shape."""
     return np.asarray(np.exp(-phase_variance * np.square(mean_cosine)))
-
-
-def lobe_factor(numbers: tuple[float, float, float], mean_cosine: ArrayLike) -> NDArray[np.float64]:
-    """Return h [1] of pairs of directions; ``mean_cosine`` is the mean of their cosines to the normal, any shape."""
-    u = np.maximum(1 - np.asarray(mean_cosine, float) / EVEN_FROM, 0.0)
-    return np.asarray(np.maximum(1 + u**2 * (numbers[0] + u * (numbers[1] + u * numbers[2])), 0.0))
 
 
 @lru_cache(maxsize=1024)
@@ -52,8 +50,12 @@ def lobe_numbers(
 ) -> tuple[float, float, float]:
     """Return the coefficients c_0, c_1 and c_2 [1] of h.
 
-    The parameters of the lobe are those of :class:`~mitsim.scene.surface.scatter.Scatter`. For an elongated lobe the
-    energy is averaged over the azimuth of the light.
+    For an elongated lobe the energy is averaged over the azimuth of the light.
+
+    Parameters
+    ----------
+    phase_variance, alpha_u, alpha_v, beckmann, energy_factor
+        Of the lobe, as in :class:`~mitsim.scene.surface.scatter.Scatter`.
     """
     returned, missing = [], []
     lobes: tuple[tuple[float, float, Distribution], ...] = (

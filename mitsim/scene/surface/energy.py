@@ -22,7 +22,8 @@ from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, Distribution, fres
 #: incidence at which the compensation is exact [rad]
 NOMINAL_INCIDENCE = float(np.radians(30))
 
-_RADII, _AZIMUTHS, _VIEWS = 300, 96, 12
+#: facets of the quadrature: radii and azimuths of their slopes, and azimuths of the light for an elongated lobe
+_COUNTS = (300, 96, 12)
 
 
 @lru_cache(maxsize=4096)
@@ -33,12 +34,20 @@ def directional_albedo(
     distribution: Distribution,
     index: tuple[float, float] | None = None,
 ) -> float:
-    """Return the share [1] of light at ``incidence`` [rad] that a lobe returns, averaged over the light's azimuth.
+    """Return the share [1] of light that a lobe returns, averaged over the light's azimuth.
 
-    ``index`` (n, k) of the material; None for a perfect mirror. The quadrature uses midpoints in the cumulative
-    distribution of the slopes, so it covers the whole tail.
+    The quadrature uses midpoints in the cumulative distribution of the slopes, so it covers the whole tail.
+
+    Parameters
+    ----------
+    incidence
+        Of the light [rad].
+    alpha_u, alpha_v, distribution
+        Of the lobe.
+    index
+        n and k of the material [1]; None for a perfect mirror.
     """
-    weights, _ = facets(incidence, alpha_u, alpha_v, distribution, (_RADII, _AZIMUTHS, _VIEWS), index)
+    weights, _ = facets(incidence, alpha_u, alpha_v, distribution, _COUNTS, index)
     return float(weights.sum())
 
 
@@ -50,10 +59,16 @@ def facets(
     counts: tuple[int, int, int],
     index: tuple[float, float] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return each facet's share [1] of light at ``incidence`` [rad], and the cosine of its exit angle; (n,) each.
+    """Return each facet's share [1] of the light, and the cosine of its exit angle; (n,) each.
 
-    ``counts``: numbers of the facets' radii and azimuths, and of azimuths of the light for an elongated lobe. The sum
-    of the shares is the directional albedo.
+    The sum of the shares is the :func:`directional_albedo`.
+
+    Parameters
+    ----------
+    incidence, alpha_u, alpha_v, distribution, index
+        As for :func:`directional_albedo`.
+    counts
+        Numbers of the facets' radii and azimuths, and of azimuths of the light for an elongated lobe.
     """
     radii, azimuths, several = counts
     # an isotropic lobe needs one azimuth, and half of the facets, as the others are their mirror images; an elongated
@@ -111,9 +126,14 @@ def _facets_from(
 
 
 def compensation(alpha_u: float, alpha_v: float, distribution: Distribution, reflectance: float) -> float:
-    """Return the factor [1] that restores a lobe's lost energy; ``reflectance`` F0 at normal incidence [1].
+    """Return the factor [1] that restores a lobe's lost energy: 1 / E for a perfect mirror, 1 for a black surface.
 
-    For a perfect mirror it is 1 / E at the nominal incidence, for a black surface 1.
+    Parameters
+    ----------
+    alpha_u, alpha_v, distribution
+        Of the lobe.
+    reflectance
+        F0 at normal incidence [1].
     """
     kept = directional_albedo(NOMINAL_INCIDENCE, alpha_u, alpha_v, distribution)
     return 1 + reflectance * (1 - kept) / kept

@@ -31,7 +31,21 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(96)
 
 
 def lobe_gloss(alpha: float, index: tuple[float, float], distribution: Distribution, angle_deg: int = 60) -> float:
-    """Return the gloss [GU] of a lobe alone; ``index`` (n, k) of the surface, ``alpha`` in its distribution's sense."""
+    """Return the gloss [GU] of a lobe alone.
+
+    Parameters
+    ----------
+    alpha, distribution
+        Width [1], in the sense of the distribution.
+    index
+        n and k of the surface [1].
+    angle_deg
+        Of the gloss meter: 20, 60 or 85 deg.
+
+    See Also
+    --------
+    base_gloss : of the body under it
+    """
     theta = np.radians(angle_deg)
     incoming = np.array([np.sin(theta), 0.0, np.cos(theta)])
     within, within_weight = _crowded(np.radians(APERTURES_DEG[angle_deg][0]) / 2, alpha)

@@ -15,9 +15,9 @@ from typing import Literal
 from mitsim.scene.surface.processes import PROCESSES
 from mitsim.scene.surface.scatter import Scatter
 
-#: ``round``: the process leaves marks, their direction is not given, and prediction and virtual measurements treat the
-#: face as round. ``averaged``, in runs of older versions only: the prediction has the mean over directions
-LayLeftOut = Literal["averaged", "round"]
+#: the process leaves marks, their direction is not given, and prediction and virtual measurements treat the face as
+#: round
+LayLeftOut = Literal["round"]
 
 
 def lay_left_out(finish: str, scatter: Scatter | None) -> LayLeftOut | None:

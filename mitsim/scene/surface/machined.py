@@ -55,7 +55,7 @@ NOSE_RADIUS_MM = 0.8
 
 
 @dataclass(frozen=True)
-class Face:
+class MachinedFace:
     """Known properties of a machined face; None if not given.
 
     - ``Ra``, ``Rq``, ``RSm`` [um]; ``Rdq`` [1].
@@ -113,11 +113,18 @@ class _Lobe:
 
 
 def machined(
-    face: Face, wavelength_nm: float, where: str = "a machined face", deviation: Deviation = NOMINAL
+    face: MachinedFace, wavelength_nm: float, where: str = "a machined face", deviation: Deviation = NOMINAL
 ) -> Scatter:
-    """Return how a face scatters at one wavelength [nm]; ``where`` names it in messages.
+    """Return how a face scatters.
 
-    ``deviation`` moves the result away from the best estimate.
+    Parameters
+    ----------
+    face, wavelength_nm
+        Its properties, and the wavelength of the light [nm].
+    where
+        Name of the face in messages.
+    deviation
+        From the best estimate.
 
     Raises
     ------
@@ -161,7 +168,7 @@ def machined(
     )
 
 
-def check(face: Face, where: str) -> None:
+def check(face: MachinedFace, where: str) -> None:
     """Reject properties that contradict one another, do not suffice, or would be unused.
 
     Raises
@@ -220,12 +227,12 @@ def check(face: Face, where: str) -> None:
         raise InputError(where, "nose_radius_mm", f"nose_radius_mm beside {said[0]}", "one of them")
 
 
-def _said(face: Face) -> bool:
+def _said(face: MachinedFace) -> bool:
     """Return whether the lobe's width has a source other than Ra and process."""
     return any(getattr(face, name) is not None for name in INPUTS)
 
 
-def _height(face: Face, process: Process) -> float:
+def _height(face: MachinedFace, process: Process) -> float:
     if process.feed_marks:
         return rms_height(micro_roughness(face.roughness))
     if face.height_map is not None:
@@ -235,12 +242,12 @@ def _height(face: Face, process: Process) -> float:
     return face.Rq if face.Rq is not None else rms_height(face.roughness)
 
 
-def _feed_slope(face: Face) -> float:
+def _feed_slope(face: MachinedFace) -> float:
     radius = face.nose_radius if face.nose_radius is not None else NOSE_RADIUS_MM
     return feed_slope(feed(face.roughness, radius), radius)
 
 
-def _lobe(face: Face, process: Process, sigma: float, wavelength_nm: float, where: str) -> _Lobe:
+def _lobe(face: MachinedFace, process: Process, sigma: float, wavelength_nm: float, where: str) -> _Lobe:
     ratio = process.lay_ratio
     if face.alpha is not None:
         return _Lobe(face.alpha, face.alpha, f"alpha {face.alpha:g} as given", FACTORS["alpha"])
@@ -293,7 +300,7 @@ def _from_heights(rho: Autocorrelation, sigma: float, wavelength_nm: float, wher
         raise InputError(where, key, str(error), "a trace or map of roughness, without form and noise") from None
 
 
-def _of_gloss(face: Face, process: Process, sigma: float, wavelength_nm: float, where: str) -> _Lobe:
+def _of_gloss(face: MachinedFace, process: Process, sigma: float, wavelength_nm: float, where: str) -> _Lobe:
     """Compute alpha at 555 nm from a gloss reading, then the lateral scale, then alpha at the sensor's wavelength."""
     index = refractive_index(face.metal, GLOSS_WAVELENGTH_NM)
     bright = normal_reflectance(face.metal, GLOSS_WAVELENGTH_NM)
@@ -336,7 +343,7 @@ def _length_of_alpha(alpha: float, sigma: float, nu: float) -> float | None:
     return float(np.exp(brentq(excess, *ends, xtol=1e-7)))
 
 
-def _directions(lay: Lay, across: float, along: float, face: Face) -> tuple[float, float]:
+def _directions(lay: Lay, across: float, along: float, face: MachinedFace) -> tuple[float, float]:
     if face.alpha_u is not None and face.alpha_v is not None:
         return face.alpha_u, face.alpha_v
     if lay == "none":
@@ -350,7 +357,7 @@ def _mirror_directions(lay: Lay, mirror: float) -> tuple[float, float]:
     return (ALPHA_FORM, mirror) if lay == "u" else (mirror, ALPHA_FORM)
 
 
-def _prior_in_words(face: Face, process: Process) -> tuple[str, float]:
+def _prior_in_words(face: MachinedFace, process: Process) -> tuple[str, float]:
     name = face.process_or_default
     marks = f", feed marks {face.feed_marks or 'blurred'}" if process.feed_marks else ""
     if face.process is None:
@@ -358,7 +365,7 @@ def _prior_in_words(face: Face, process: Process) -> tuple[str, float]:
     return f"prior of {name.replace('_', '-')} metal for Ra {face.roughness:g} um{marks}", FACTORS["process"]
 
 
-def _in_words(face: Face, process: Process, provenance: str) -> str:
+def _in_words(face: MachinedFace, process: Process, provenance: str) -> str:
     words = provenance
     if face.alpha is None and face.alpha_u is None and process.lay_ratio < 1 and face.lay in (None, "none"):
         words = f"{provenance}; lay not given: round, as wide as across the lay"

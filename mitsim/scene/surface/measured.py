@@ -25,7 +25,12 @@ from characterisation.files.checked_files import read_bounded, read_text_bounded
 from characterisation.files.errors import InputError
 from mitsim.scene.surface.diffraction import Autocorrelation, sampled
 
-_FEWEST_POINTS, _SMALLEST_MAP, _LARGEST_MAP = 200, 64, 4096
+#: fewest points of a trace
+_FEWEST_POINTS = 200
+
+#: least and most heights of a map along each side
+_SMALLEST_MAP, _LARGEST_MAP = 64, 4096
+
 #: largest text table [bytes]
 _LARGEST_TABLE = 128 * 1024**2
 
@@ -193,6 +198,17 @@ def height_map(heights_um: ArrayLike, spacing_um: float, name: str = "height map
 
 def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "", key: str = "height_map") -> HeightMap:
     """Read an areal map [um]: a two-dimensional .npy, or a CSV of numbers without a header, row by row.
+
+    Parameters
+    ----------
+    path, spacing_um
+        The file, and the spacing of its heights [um].
+    where, key
+        Place that refers to the file, for messages.
+
+    See Also
+    --------
+    read_profile : a trace
 
     Raises
     ------

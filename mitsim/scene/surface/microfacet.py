@@ -73,14 +73,3 @@ def half_width(alpha: float, distribution: Distribution) -> float:
         return float(slope_density((np.tan(angle) / alpha) ** 2, distribution) / np.cos(angle) ** 4 - 0.5)
 
     return float(brentq(excess, 0.0, angles[below[0]], xtol=1e-12))
-
-
-def alpha_of_half_width(width: float, distribution: Distribution) -> float:
-    """Return alpha [1] of the lobe whose D(m) falls to half at ``width`` [rad]; the inverse of :func:`half_width`.
-
-    D(width) = D(0) / 2 in closed form: with h = cos^-4(width), tan^2 = alpha^2 (sqrt(2 h) - 1) for GGX and
-    alpha^2 ln(2 h) for Beckmann.
-    """
-    h = np.cos(width) ** -4.0
-    q = np.sqrt(2 * h) - 1 if distribution == "ggx" else np.log(2 * h)
-    return float(np.tan(width) / np.sqrt(q))

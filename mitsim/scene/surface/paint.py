@@ -51,8 +51,16 @@ def paint(
 ) -> Scatter:
     """Return how ``gloss_paint`` (a Beckmann lobe) or ``powder_coat`` (a GGX lobe) scatters.
 
-    ``reflectance`` of the base [1]. ``gloss`` [GU at 60 deg] or ``alpha`` [1] in Beckmann's sense; without either, the
-    default gloss of the coat. ``deviation`` moves alpha within the range of the coat; its wide-angle share follows.
+    Parameters
+    ----------
+    kind, reflectance
+        Of the coat, and of its base [1].
+    gloss, alpha
+        [GU at 60 deg], or [1] in Beckmann's sense; without either, the default gloss of the coat.
+    where
+        Name of the surface in messages.
+    deviation
+        Of alpha, within the range of the coat; its wide-angle share follows.
 
     Raises
     ------

@@ -57,9 +57,18 @@ def matern(lag: ArrayLike, nu: float) -> NDArray[np.float64]:
 
 
 def band_limited_slope(sigma_um: float, correlation_um: float, nu: float, cutoff_um: float = STYLUS_CUTOFF_UM) -> float:
-    """Return Sdq [1] of a Matern surface from spatial wavelengths above ``cutoff_um`` only.
+    """Return Sdq [1] of a Matern surface from its longer spatial wavelengths only.
 
-    Its two-dimensional spectrum is S(f) = sigma^2 nu B^2 / pi (1 + B^2 f^2)^-(nu + 1), B = 2 pi l. The slope is the
+    Parameters
+    ----------
+    sigma_um, correlation_um, nu
+        Rq [um], lateral scale l [um], and smoothness [1].
+    cutoff_um
+        Shortest wavelength that counts [um].
+
+    Notes
+    -----
+    The two-dimensional spectrum is S(f) = sigma^2 nu B^2 / pi (1 + B^2 f^2)^-(nu + 1), B = 2 pi l. The slope is the
     root of the integral of (2 pi f)^2 S over the disc f < 1 / cutoff.
     """
     x = (2 * np.pi * correlation_um / cutoff_um) ** 2
@@ -69,11 +78,6 @@ def band_limited_slope(sigma_um: float, correlation_um: float, nu: float, cutoff
         return float(power + (1 + t) ** -nu / nu)
 
     return float(sigma_um / correlation_um * np.sqrt(nu * (antiderivative(x) - antiderivative(0.0))))
-
-
-def short_wave_height(sigma_um: float, correlation_um: float, nu: float, longest_um: float) -> float:
-    """Return Rq [um] of a Matern surface from spatial wavelengths below ``longest_um`` only; same spectrum."""
-    return float(sigma_um * (1 + (2 * np.pi * correlation_um / longest_um) ** 2) ** (-nu / 2))
 
 
 @lru_cache(maxsize=1024)

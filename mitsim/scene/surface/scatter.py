@@ -34,33 +34,20 @@ class Scatter:
     narrow lobe and the remainder in a lobe of alpha_u, alpha_v, whose share ``beckmann`` is Beckmann and the rest GGX.
     A grows with the angle of incidence (:meth:`coherent_at`).
 
-    Parameters
-    ----------
-    phase_variance
-        Variance g of the phase at normal incidence [rad^2] in A = exp(-g); infinite if A is 0 at every angle.
-    alpha_u, alpha_v
-        Width of the incoherent lobe along u and v in Beckmann's sense: sqrt(2) times the rms slope. NaN if there is
-        no such lobe.
-    beckmann
-        Share of Beckmann in the incoherent lobe.
-    height_um
-        Rq that determines coherence and speckle [um]; NaN if light is scattered in the volume.
-    wide_angle, wide_angle_range
-        Share of all reflected light at wide angles; and its one-sigma range, low and high.
-    alpha_factor
-        One-sigma factor of alpha: it lies between alpha / factor and alpha x factor.
-    provenance
-        Source of alpha, in words.
-    lay
-        Direction of the marks.
-    energy_factor
-        Factors on the GGX and the Beckmann lobe that compensate the energy lost by single scattering.
-    coherent_alpha
-        Width of the coherent part along u and v.
-    correlation_um
-        Lateral scale l of the heights [um]; NaN if not needed.
-    depolarising
-        Whether the wide-angle light was scattered inside the material (paint, white) and is therefore depolarised.
+    - ``phase_variance``: variance g of the phase at normal incidence [rad^2] in A = exp(-g); infinite if A is 0 at
+      every angle.
+    - ``alpha_u``, ``alpha_v``: width of the incoherent lobe along u and v in Beckmann's sense: sqrt(2) times the rms
+      slope. NaN if there is no such lobe.
+    - ``beckmann``: share of Beckmann in the incoherent lobe.
+    - ``height_um``: Rq that determines coherence and speckle [um]; NaN if light is scattered in the volume.
+    - ``wide_angle``: share of all reflected light at wide angles; ``wide_angle_range``: its one-sigma range.
+    - ``alpha_factor``: one-sigma factor of alpha, which lies between alpha / factor and alpha x factor;
+      ``provenance``: source of alpha, in words.
+    - ``lay``: direction of the marks.
+    - ``energy_factor``: factors on the GGX and the Beckmann lobe that compensate the energy lost by single scattering.
+    - ``coherent_alpha``: width of the coherent part along u and v.
+    - ``correlation_um``: lateral scale l of the heights [um]; NaN if not needed.
+    - ``depolarising``: whether the wide-angle light was scattered inside the material (paint, white).
     """
 
     phase_variance: float

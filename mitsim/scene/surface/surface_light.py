@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from characterisation.files.errors import InputError
 from characterisation.maps.light import Light, same_light
-from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.scene.surface.metals import CONSTANTS, normal_reflectance
 from mitsim.scene.surface.paint import matt_white, paint
 from mitsim.scene.surface.processes import PROCESSES
@@ -50,7 +50,7 @@ def nominal_light(finish: str, roughness_um: float, wavelength_nm: float) -> Lig
     if metal not in CONSTANTS or process not in PROCESSES or not roughness_um > 0:
         return None
     try:
-        scatter = machined(Face(metal, process, roughness_um), wavelength_nm)
+        scatter = machined(MachinedFace(metal, process, roughness_um), wavelength_nm)
         reflectance = normal_reflectance(metal, wavelength_nm)
     except (InputError, ValueError):
         return None
@@ -60,6 +60,14 @@ def nominal_light(finish: str, roughness_um: float, wavelength_nm: float) -> Lig
 def surface_light(
     kind: str, reflectance: float, scatter: Scatter, finish: str, roughness_um: float, wavelength_nm: float
 ) -> Light:
-    """Return the light of a surface, and whether its finish and Ra alone would give the same."""
+    """Return the light of a surface, and whether its finish and Ra alone would give the same.
+
+    Parameters
+    ----------
+    kind, reflectance, scatter
+        As for :func:`light_of_scatter`.
+    finish, roughness_um, wavelength_nm
+        As for :func:`nominal_light`.
+    """
     light, usual = light_of_scatter(kind, reflectance, scatter), nominal_light(finish, roughness_um, wavelength_nm)
     return replace(light, as_made=usual is not None and same_light(light, usual))

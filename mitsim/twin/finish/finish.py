@@ -24,7 +24,7 @@ from characterisation.files.errors import InputError
 from mitsim.scene.materials import Finish
 from mitsim.scene.surface.diffraction import phase_variance
 from mitsim.scene.surface.energy import energy_factors
-from mitsim.scene.surface.machined import Face, machined
+from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.scene.surface.metals import CONSTANTS, normal_reflectance, refractive_index
 from mitsim.scene.surface.processes import PROCESSES
 from mitsim.scene.surface.roughness import ALPHA_LARGEST
@@ -123,7 +123,7 @@ def _family(metal: str, process: str, wavelength_nm: float) -> MetalFinish:
     """Return the finishes of a metal and process at all alphas, from a table over the usual Ra of the process."""
     low, high = PROCESSES[process].usual
     heights = np.geomspace(low, high, _PLACES)
-    faces = [machined(Face(metal=metal, process=process, Ra=float(ra)), wavelength_nm) for ra in heights]
+    faces = [machined(MachinedFace(metal=metal, process=process, Ra=float(ra)), wavelength_nm) for ra in heights]
     widths = np.array([face.alpha_u for face in faces])
     last = int(np.argmax(widths >= ALPHA_LARGEST)) if (widths >= ALPHA_LARGEST).any() else len(widths)
     # the part of the table above the last Ra at which alpha decreases with Ra
