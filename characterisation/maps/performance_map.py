@@ -43,7 +43,7 @@ __all__ = [
     "lambert_projection",
 ]
 
-#: version of the files: 2 interpolates F and ln sigma, and its errors allow for captures and gaps; 1 is read as well
+#: version of the files
 SCHEMA_VERSION = 2
 
 #: bits of the mantissa that a compact file keeps: relative errors of at most 2^-11 and 2^-6
@@ -233,14 +233,14 @@ class PerformanceMap:
         Raises
         ------
         InputError
-            If the file is missing, damaged, not a performance map, or has a newer schema.
+            If the file is missing, damaged, not a performance map, or has another schema.
         """
         path = Path(path)
         data = read_dataset(path, _SCHEMA)
-        version = data.attrs.get("schema_version", 1)
-        if not (isinstance(version, (int, np.integer)) and 1 <= version <= SCHEMA_VERSION):
-            hint = "read it with the version of mitsim that wrote it, or a later one"
-            raise InputError(path, "schema_version", repr(version), f"1 to {SCHEMA_VERSION}", hint)
+        version = data.attrs.get("schema_version")
+        if np.ndim(version) or version != SCHEMA_VERSION:
+            hint = "read it with the version of mitsim that wrote it"
+            raise InputError(path, "schema_version", repr(version), str(SCHEMA_VERSION), hint)
         _check_axes(path, data)
         return PerformanceMap(data)
 

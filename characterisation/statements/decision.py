@@ -39,8 +39,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import gamma, norm, t
 
-from characterisation.statements.coverage import BLOCKS, coverage_interval, standard_errors
-from characterisation.statements.judgement import share
+from characterisation.statements.coverage import BLOCKS, coverage_interval, share, standard_errors
 from characterisation.statements.one_sided import OneSidedErrors, stated_errors, without_bias
 from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.task_file import Task
@@ -235,11 +234,6 @@ def expanded(errors: Errors) -> float:
     """
     low, high = coverage_interval(stated_errors(errors))
     return max(abs(low), abs(high))
-
-
-def conformance_probability(reading: float, errors: Floats, tolerance: Tolerance) -> float:
-    """Return the probability that a part with this reading conforms, without other knowledge of it (JCGM 106, 7)."""
-    return float(_within(reading - errors, (tolerance.lower, tolerance.upper)).mean())
 
 
 def demand(errors: Errors, tolerance: Tolerance) -> float:

@@ -56,22 +56,6 @@ class Standing:
     chance: Floats
 
 
-def standing(
-    errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike, margin: float = 0.1, seed: int = 0
-) -> Standing:
-    """Estimate the risks of the views of a race from their trials.
-
-    Parameters
-    ----------
-    errors
-        (v, n) by view and world; NaN for a trial without a value, infinite where the view had no trial in that world.
-    prior_risk, prior_chance
-        (v,) the map's u, and its probability that the measurement is possible.
-    """
-    mean, covariance = posterior(errors, prior_risk, prior_chance)
-    return judge(sampled(mean, covariance, seed), margin)
-
-
 def judge(samples: Floats, margin: float = 0.1) -> Standing:
     """Return the standing from samples (s, v) of the logarithms of the risks."""
     centre = np.median(samples, axis=0)
@@ -89,7 +73,15 @@ def sampled(mean: Floats, covariance: Floats, seed: int = 0) -> Floats:
 
 
 def posterior(errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike) -> tuple[Floats, Floats]:
-    """Return the mean (v,) and covariance (v, v) of the logarithms of the risks; arguments of :func:`standing`."""
+    """Return the mean (v,) and covariance (v, v) of the logarithms of the risks of views, from their trials.
+
+    Parameters
+    ----------
+    errors
+        (v, n) by view and world; NaN for a trial without a value, infinite where the view had no trial in that world.
+    prior_risk, prior_chance
+        (v,) the map's u, and its probability that the measurement is possible.
+    """
     every = np.asarray(errors, float)
     tried, valued = ~np.isinf(every), np.isfinite(every)
     u = np.log(np.asarray(prior_risk, float))

@@ -7,8 +7,13 @@ from scipy.stats import binom, norm
 from characterisation.statements.budget import budget
 from characterisation.statements.coverage import coverage_interval
 from characterisation.statements.decision import plus_minus
-from characterisation.statements.selection import posterior, standing
+from characterisation.statements.selection import Standing, judge, posterior, sampled
 from characterisation.statements.statement import numerical_tolerance, statement
+
+
+def standing(errors, prior_risk, prior_chance) -> Standing:
+    """Return the standing of a race of views from their trials and what the map predicts."""
+    return judge(sampled(*posterior(errors, prior_risk, prior_chance)))
 
 
 @pytest.mark.parametrize("draw", ["normal", "lognormal", "uniform"])

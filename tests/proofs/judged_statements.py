@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.scores.screening import LEAST_MEASURABLE
-from characterisation.statements.judgement import Regret, Share, falsely_accepted, pooled_share, regret, share, within
+from characterisation.statements.coverage import Share, share
 from mitsim.study.virtual.world import FINISH_DAYS
 from mitsim.views.view_scores import screening_risk
+from tests.proofs.judgement import Regret, falsely_accepted, pooled_share, regret, within
+from tests.proofs.screening_figures import LEAST_MEASURABLE
 from tests.proofs.statement_run import JudgedCase, StatedView
 
 Floats = NDArray[np.float64]

@@ -15,7 +15,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from characterisation.scores.screening import (
+from mitsim.report.style import BLUE, INK, MUTED, VERMILION, drawing, write_png
+from tests.proofs.part_cases import PartCase
+from tests.proofs.screening_figures import (
     Screened,
     attainable_recall,
     ceiling,
@@ -25,8 +27,6 @@ from characterisation.scores.screening import (
     recall,
     reliability,
 )
-from mitsim.report.style import BLUE, INK, MUTED, VERMILION, drawing, write_png
-from tests.proofs.part_cases import PartCase
 from tests.proofs.screening_run import ALONE, COSINE, POINTS, PREDICTED, TALK, JudgedScreening
 from tests.proofs.tables import markdown, number, write_csv
 

@@ -32,7 +32,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import Status
-from characterisation.scores.screening import Screened
 from characterisation.statements.selection import chance_after, posterior
 from mitsim.decode.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
@@ -44,6 +43,7 @@ from mitsim.study.virtual.screening import screen
 from mitsim.views.view_scores import RAYS, screening_risk
 from tests.proofs.case_trials import days, keep_trials, measured_truth, trials_by_kind
 from tests.proofs.part_cases import PartCase
+from tests.proofs.screening_figures import Screened
 
 Floats = NDArray[np.float64]
 
