@@ -98,6 +98,42 @@ def available_memory() -> int:
     return min(found)
 
 
+def finished_orders(
+    waiting: deque[Item],
+    running: dict[Future[Result], Item],
+    submit: Callable[[Item], Future[Result]],
+    room: Callable[[], int],
+    idle: Callable[[], None] = lambda: None,
+    idle_s: float | None = None,
+) -> Iterator[tuple[Item, Result]]:
+    """Submit waiting items while there is room, and yield each with its result as it is finished.
+
+    Parameters
+    ----------
+    waiting, running
+        Items that wait, and those in work by their futures; both are changed. After an error, ``running`` has the items
+        without a result. Their futures are cancelled.
+    submit, room
+        Start the work on an item; return how many items may be in work.
+    idle, idle_s
+        Called when no item was finished for ``idle_s`` [s].
+    """
+    try:
+        while waiting or running:
+            while waiting and len(running) < room():
+                running[submit(waiting[0])] = waiting[0]
+                waiting.popleft()
+            done = wait(running, idle_s, FIRST_COMPLETED).done
+            if not done:
+                idle()
+            for future in done:
+                result = future.result()
+                yield running.pop(future), result
+    finally:
+        for future in running:
+            future.cancel()
+
+
 class Pool:
     """Processes on this machine, each with its share of the cores."""
 
@@ -118,21 +154,21 @@ class Pool:
             If processes die repeatedly.
         """
         waiting, deaths = deque(items), 0
-        while waiting:
-            running: dict[Future[Result], Item] = {}
+        running: dict[Future[Result], Item] = {}
+        while waiting or running:
             try:
-                pool = self._ready()
-                while waiting or running:
-                    while waiting and len(running) < AHEAD * self.processes:
-                        running[pool.submit(work, order(waiting[0]))] = waiting[0]
-                        waiting.popleft()
-                    for future in wait(running, return_when=FIRST_COMPLETED).done:
-                        result = future.result()
-                        deaths = 0
-                        yield running.pop(future), result
+                for finished in finished_orders(
+                    waiting,
+                    running,
+                    lambda item: self._ready().submit(work, order(item)),
+                    lambda: AHEAD * self.processes,
+                ):
+                    deaths = 0
+                    yield finished
             except BrokenProcessPool:
                 self._pool = None
                 waiting.extendleft(reversed(running.values()))
+                running.clear()
                 deaths += 1
                 if deaths > DEATHS:
                     raise MissingEnvironmentError(
@@ -140,9 +176,6 @@ class Pool:
                         "finished work is kept: use fewer, and run the same command again"
                     ) from None
                 say("a worker process died; its work is repeated")
-            finally:
-                for future in running:
-                    future.cancel()
 
     def close(self) -> None:
         """End the processes after their current orders."""
