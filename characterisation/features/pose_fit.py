@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from characterisation.features.fitted import FitQuality
 from characterisation.features.robust_fit import FitError, covariance_of, rays_from, robust_fit
 from characterisation.features.surfaces import Surface
 
@@ -55,16 +56,8 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class PoseFit(Pose):
-    """Fitted pose; ``about`` is the centroid of the used points.
-
-    ``covariance`` (6, 6) of the six parameters; ``residual_std`` [mm] with ``count - 6`` degrees of freedom; ``count``,
-    the number of points used.
-    """
-
-    covariance: Array
-    residual_std: float
-    count: int
+class PoseFit(FitQuality, Pose):
+    """Fitted pose; ``about`` is the centroid of the used points."""
 
 
 def pose_jacobian(surface: Surface, points: Array, rays: Array | None, about: ArrayLike = (0.0, 0.0, 0.0)) -> Array:

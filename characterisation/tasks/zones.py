@@ -101,11 +101,7 @@ def parallelism(feature: Plane | Axis, datum: Plane | Axis, *, outline: Array) -
     - Datum axis, plane: two planes parallel to the axis, at the angle about it with the least width.
     - Datum axis, axis: a cylinder along the datum axis.
     """
-    places, along = feet_on(feature, outline), direction(datum)
-    if isinstance(datum, Plane):
-        return float(np.ptp(places @ along))
-    across = places - np.outer(places @ along, along)
-    return least_width(across, along) if isinstance(feature, Plane) else largest_distance(across)
+    return _along(feature, datum, outline) if isinstance(datum, Plane) else _across(feature, datum, outline)
 
 
 def perpendicularity(feature: Plane | Axis, datum: Plane | Axis, *, outline: Array) -> float:
@@ -117,9 +113,17 @@ def perpendicularity(feature: Plane | Axis, datum: Plane | Axis, *, outline: Arr
     - Datum plane, plane: two planes perpendicular to the datum, at the angle with the least width.
     - Datum plane, axis: a cylinder perpendicular to the datum.
     """
+    return _across(feature, datum, outline) if isinstance(datum, Plane) else _along(feature, datum, outline)
+
+
+def _along(feature: Plane | Axis, datum: Datum, outline: Array) -> float:
+    """Return the range of a feature along the direction of a datum."""
+    return float(np.ptp(feet_on(feature, outline) @ direction(datum)))
+
+
+def _across(feature: Plane | Axis, datum: Datum, outline: Array) -> float:
+    """Return the extent of a feature across the direction of a datum."""
     places, along = feet_on(feature, outline), direction(datum)
-    if not isinstance(datum, Plane):
-        return float(np.ptp(places @ along))
     across = places - np.outer(places @ along, along)
     return least_width(across, along) if isinstance(feature, Plane) else largest_distance(across)
 

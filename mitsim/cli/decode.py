@@ -42,7 +42,7 @@ def decode(
 
     Example: mitsim decode captures/real -o cloud.ply
     """
-    from characterisation.cloud_files import write_ply
+    from characterisation.cloud_files import write_cloud
     from mitsim.capture.folder import read_capture
     from mitsim.capture.workspace import written_frame
     from mitsim.decode.checks.sanity import capture_findings, cloud_warnings, pair_row_error, row_error_in_words
@@ -81,6 +81,6 @@ def decode(
         whose = sensor or (read.sensor if read.sensor in presets() else None)
         say(range_warning(f"{capture}: a surface", beyond.depths, settings, whose, known))
     check_file(output)
-    write_ply(cloud, output, written)
+    write_cloud(cloud, output, written)
     for reason, count in cloud.reasons().items():
         print(f"{reason}\t{count}")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 
-from characterisation import interface as cloud_files
+from characterisation import cloud_files
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture import folder

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from characterisation.cloud_files import read_ply
+from characterisation import cloud_files
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
@@ -74,7 +74,7 @@ def read_cloud(path: Path, sensor: str | None = None) -> InputCloud:
         If the path does not exist, or its content cannot be read or decoded.
     """
     if path.is_file() and _is_mitsim_ply(path):
-        return InputCloud(path, read_ply(path), None)
+        return InputCloud(path, cloud_files.read_cloud(path), None)
     if (path / "capture.json").exists():
         capture = read_capture(path)
     elif path.exists():

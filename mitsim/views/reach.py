@@ -30,6 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.coupon.view_frame import view_frame
 from characterisation.stage.angles import TOLERANCE, about_one, about_two, turned
+from characterisation.stage.turning_axes import rotation_about
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.views.table import PartStage
@@ -112,24 +113,28 @@ def reach_rotations(stage: PartStage, rotations: Floats) -> Reach:
     third = np.broadcast_to(units[2], (len(wanted), 3))
 
     def error(angles: Floats) -> Floats:
-        shown = _turns(units[0], angles[:, 0]) @ _turns(units[1], angles[:, 1]) @ _turns(units[2], angles[:, 2])
+        shown = (
+            rotation_about(units[0], angles[:, 0])
+            @ rotation_about(units[1], angles[:, 1])
+            @ rotation_about(units[2], angles[:, 2])
+        )
         return np.asarray(np.abs(shown - wanted).max(axis=(1, 2)))
 
     def finished(first: Floats, second: Floats) -> Floats:
-        rest = _turns(units[1], -second) @ _turns(units[0], -first) @ wanted
+        rest = rotation_about(units[1], -second) @ rotation_about(units[0], -first) @ wanted
         return np.stack([first, second, _angle(rest, units[2])], axis=1)
 
     def candidates() -> Iterator[Floats]:
         for pair in about_two(third, wanted @ units[2], units[0], units[1]):
             yield finished(pair[:, 0], pair[:, 1])
         for first in _fixed(stage, 0, len(wanted)):
-            left = _turns(units[0], -first) @ wanted
+            left = rotation_about(units[0], -first) @ wanted
             yield finished(first, about_one(third, left @ units[2], units[1]))
         for last in _fixed(stage, 2, len(wanted)):
-            left = wanted @ _turns(units[2], -last)  # R_1 R_2; the axis a_1 is invariant under R_1
+            left = wanted @ rotation_about(units[2], -last)  # R_1 R_2; the axis a_1 is invariant under R_1
             across = np.broadcast_to(units[0], third.shape)
             second = -about_one(across, np.einsum("nji,j->ni", left, units[0]), units[1])
-            yield np.stack([_angle(left @ _turns(units[1], -second), units[0]), second, last], axis=1)
+            yield np.stack([_angle(left @ rotation_about(units[1], -second), units[0]), second, last], axis=1)
 
     return _best(stage, candidates(), error, len(wanted))
 
@@ -139,11 +144,6 @@ def _fixed(stage: PartStage, number: int, count: int) -> Iterator[Floats]:
     low, high = np.radians(stage.axes[number].limits_deg)
     for angle in dict.fromkeys((min(max(0.0, low), high), low, high)):
         yield np.full(count, angle)
-
-
-def _turns(axis: Floats, angles: Floats) -> Floats:
-    """Return rotations (n, 3, 3) about a unit axis."""
-    return np.asarray(Rotation.from_rotvec(np.nan_to_num(angles)[:, None] * axis).as_matrix())
 
 
 def _angle(rotations: Floats, axis: Floats) -> Floats:

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 import xarray as xr
 
-from characterisation.cloud_files import write_ply
+from characterisation.cloud_files import write_cloud
 from characterisation.coupon.patch_table import patch_table
 from characterisation.files.atomic_io import write_netcdf
 from characterisation.maps.performance_map import PerformanceMap
@@ -141,8 +141,8 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
     K = np.array([[40.0, 0, 15.5], [0, 40.0, 11.5], [0, 0, 1]])
     camera = Camera(K, np.zeros(0), WIDTH, HEIGHT)
     for view in checked:
-        write_ply(cloud("predicted", view), folder / "clouds" / f"predicted_{view:04d}.ply")
-        write_ply(cloud("simulated", 100 + view), folder / "clouds" / f"rendered_{view:04d}.ply")
+        write_cloud(cloud("predicted", view), folder / "clouds" / f"predicted_{view:04d}.ply")
+        write_cloud(cloud("simulated", 100 + view), folder / "clouds" / f"rendered_{view:04d}.ply")
         images = {name: rng.integers(0, 60, (1, HEIGHT, WIDTH)).astype(np.uint8) for name in ("left", "right")}
         rig = Rig({"left": camera, "right": camera})
         capture = Capture("test-sensor", "active_stereo", "simulated", rig, images)
