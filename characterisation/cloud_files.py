@@ -24,15 +24,7 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
 _VERTEX = np.dtype(
-    [
-        ("x", "<f4"),
-        ("y", "<f4"),
-        ("z", "<f4"),
-        ("sigma", "<f4"),
-        ("row", "<u2"),
-        ("col", "<u2"),
-        ("feature", "<i2"),
-    ]
+    [*((name, "<f4") for name in ("x", "y", "z", "sigma")), ("row", "<u2"), ("col", "<u2"), ("feature", "<i2")]
 )
 _PIXEL = np.dtype([("status", "u1")])
 _BENT_PIXEL = np.dtype([("status", "u1"), ("ray_x", "<f4"), ("ray_y", "<f4")])
@@ -98,12 +90,7 @@ def write_cloud(cloud: PointCloud, path: str | Path, frame: WrittenFrame | None 
         "baseline": cloud.baseline.tolist(),
         "labelled": cloud.feature is not None,
         "grid": {
-            "fx": grid.fx,
-            "fy": grid.fy,
-            "cx": grid.cx,
-            "cy": grid.cy,
-            "width": grid.width,
-            "height": grid.height,
+            **{name: getattr(grid, name) for name in ("fx", "fy", "cx", "cy", "width", "height")},
             "rotation": grid.rotation.tolist(),
             "origin": grid.origin.tolist(),
             "bent": grid.normalised is not None,
@@ -206,15 +193,5 @@ def read_cloud(path: str | Path) -> PointCloud:
         read = ((read - moved[:3, 3]) @ moved[:3, :3]).astype(np.float32)
     points[rows, columns] = read
     feature[rows, columns], sigma[rows, columns] = vertices["feature"], vertices["sigma"]
-    has_sigma = bool(np.isfinite(sigma).any())
-    return PointCloud(
-        points,
-        status,
-        grid,
-        sensor,
-        source,
-        baseline,
-        feature if labelled else None,
-        names,
-        sigma if has_sigma else None,
-    )
+    known_sigma = sigma if np.isfinite(sigma).any() else None
+    return PointCloud(points, status, grid, sensor, source, baseline, feature if labelled else None, names, known_sigma)

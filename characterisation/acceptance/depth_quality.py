@@ -157,8 +157,7 @@ def mean_depth_error(
         If there is no cloud, or a region does not match one.
     """
     where = "mean_depth_error"
-    if not clouds:
-        raise InputError(where, "clouds", "none", "one cloud or more", "Luxonis takes 10")
+    _check_clouds(where, clouds, 1, "Luxonis takes 10", alike=False)
     medians = []
     for cloud in clouds:
         points = cloud.points[_region(where, cloud, region) & cloud.valid].astype(float) - cloud.grid.origin
@@ -182,12 +181,7 @@ def temporal_noise(clouds: Sequence[PointCloud]) -> Floats:
     InputError
         If there are fewer than two clouds, or their grids differ in size.
     """
-    where = "temporal_noise"
-    if len(clouds) < 2:
-        raise InputError(where, "clouds", len(clouds), "two or more", "rs-depth-quality takes 40")
-    shapes = {cloud.points.shape for cloud in clouds}
-    if len(shapes) > 1:
-        raise InputError(where, "clouds", "grids of different sizes", "captures of one sensor with one setting")
+    _check_clouds("temporal_noise", clouds, 2, "rs-depth-quality takes 40")
     distance = np.stack([np.linalg.norm(cloud.points - cloud.grid.origin, axis=-1) for cloud in clouds])
     seen = np.isfinite(distance)
     count = seen.sum(0)
@@ -245,14 +239,18 @@ def global_planarity_trueness(
         If there is no cloud, their grids differ in size, or the region does not match.
     """
     where = "global_planarity_trueness"
-    if not clouds:
-        raise InputError(where, "clouds", "none", "one cloud or more")
-    if len({cloud.points.shape for cloud in clouds}) > 1:
-        raise InputError(where, "clouds", "grids of different sizes", "captures of one sensor with one setting")
+    _check_clouds(where, clouds, 1, "several reduce the noise")
     region = _region(where, clouds[0], region)
     points = sum((cloud.points[region].astype(float) for cloud in clouds), np.zeros(3)) / len(clouds)
     points = points[np.isfinite(points).all(axis=-1)]
     return float(np.percentile(np.abs(plane_distances(points)), percentile)) if len(points) >= 4 else float("nan")
+
+
+def _check_clouds(where: str, clouds: Sequence[PointCloud], least: int, hint: str, alike: bool = True) -> None:
+    if len(clouds) < least:
+        raise InputError(where, "clouds", len(clouds), f"{least} or more", hint)
+    if alike and len({cloud.points.shape for cloud in clouds}) > 1:
+        raise InputError(where, "clouds", "grids of different sizes", "captures of one sensor with one setting")
 
 
 def _region(where: str, cloud: PointCloud, region: NDArray[np.bool_] | None) -> NDArray[np.bool_]:

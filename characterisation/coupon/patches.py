@@ -152,8 +152,7 @@ def measure_patches(
     _check(cloud, radius_px, step_px, angular_pitch, reference)
     centres = patch_centres(cloud.grid, coupon, radius_px, margin_px, step_px or 2 * radius_px)
     offsets = disc_offsets(radius_px)
-    row_and_column = np.array([cloud.grid.width, 1])
-    pixels = (centres @ row_and_column)[:, None] + offsets @ row_and_column
+    pixels = _pixels(cloud, centres, radius_px)
     points, true = _points_of(cloud, coupon, pixels)
     false = np.isfinite(points[..., 2]).sum(-1) - true.sum(-1)
     noise = ray_noise_std(np.where(true[..., None], points, np.nan))
@@ -218,9 +217,7 @@ def patch_residuals(cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, m
 
     The array is flat and excludes outliers.
     """
-    centres = patch_centres(cloud.grid, coupon, radius_px, margin_px, 2 * radius_px)
-    row_and_column = np.array([cloud.grid.width, 1])
-    pixels = (centres @ row_and_column)[:, None] + disc_offsets(radius_px) @ row_and_column
+    pixels = _pixels(cloud, patch_centres(cloud.grid, coupon, radius_px, margin_px, 2 * radius_px), radius_px)
     points, true = _points_of(cloud, coupon, pixels)
     residual = ray_noise_std(np.where(true[..., None], points, np.nan)).inlier_residual
     return np.asarray(residual[np.isfinite(residual)])
@@ -243,18 +240,18 @@ def _check(
     if reference is None:
         return
     if angular_pitch is not None:
-        raise InputError(
-            where,
-            "reference",
-            "angular_pitch and reference",
-            "only one of them",
-            "each gives the number of possible points",
-        )
+        hint = "each gives the number of possible points"
+        raise InputError(where, "reference", "angular_pitch and reference", "only one of them", hint)
     if reference.points.shape != cloud.points.shape:
         found, allowed = (f"{s[1]} x {s[0]} px" for s in (reference.points.shape, cloud.points.shape))
-        raise InputError(
-            where, "reference", found, allowed, "capture the reference with the same settings of the sensor"
-        )
+        hint = "capture the reference with the same settings of the sensor"
+        raise InputError(where, "reference", found, allowed, hint)
+
+
+def _pixels(cloud: PointCloud, centres: NDArray[np.int64], radius_px: float) -> NDArray[np.int64]:
+    """Return the flat pixel numbers (p, n) of discs about pixels (p, 2)."""
+    row_and_column = np.array([cloud.grid.width, 1])
+    return np.asarray((centres @ row_and_column)[:, None] + disc_offsets(radius_px) @ row_and_column)
 
 
 def _points_of(cloud: PointCloud, coupon: Coupon, pixels: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
@@ -279,9 +276,8 @@ def _ellipses(
     Both follow from the step of the surface, and of the rays, per pixel.
     """
     reach = int(radius_px)
-    rays = grid.rays_at(
-        columns + reach * np.array([[1], [-1], [0], [0]]), rows + reach * np.array([[0], [0], [1], [-1]])
-    )
+    aside, down = reach * np.array([[1], [-1], [0], [0]]), reach * np.array([[0], [0], [1], [-1]])
+    rays = grid.rays_at(columns + aside, rows + down)
     surface = rays * ((coupon.centre - grid.origin) @ coupon.normal / (rays @ coupon.normal))[..., None]
 
     def semi_axes(projected: Floats) -> tuple[Floats, Floats]:
