@@ -59,10 +59,8 @@ def difference_along_rays(cloud: PointCloud, reference: PointCloud) -> Floats:
         If the grids are not the same.
     """
     if not same_grid(cloud.grid, reference.grid):
-        allowed, hint = (
-            f"the grid of the reference: {_described(reference.grid)}",
-            "or use the difference to the surface",
-        )
+        allowed = f"the grid of the reference: {_described(reference.grid)}"
+        hint = "or use the difference to the surface"
         raise InputError("difference along rays", "grid", _described(cloud.grid), allowed, hint)
     one, other = (
         np.linalg.norm(each.points.astype(np.float64) - each.grid.origin, axis=-1) for each in (cloud, reference)

@@ -30,9 +30,9 @@ from characterisation.features.fits import fit_plane, fit_sphere
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.rendering import Rendering
-from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.decode.cloud import capture_cloud
 from mitsim.maps.campaign.acquire import coupon_cloud
+from mitsim.maps.campaign.orders import prepared_sensor
 from mitsim.maps.campaign.plan import coupon_pose
 from mitsim.running.executor import Executor, results_of
 from mitsim.running.progress import track
@@ -162,22 +162,13 @@ def measure_sensor(sensor: Sensor, seed: int = 1, workers: Executor | None = Non
     asked += [("residuals", (mid,))]
     pieces = [Piece(sensor, seed + number, *one) for number, one in enumerate(asked)]
     done = results_of(pieces, measure_piece, workers, sensor.name)
-    _prepared.clear()
     planes, noise, metal = done[:2], done[3 : 3 + DISTANCES], done[3 + DISTANCES : -1]
     return DataSheet(sensor, mid, planes, radius, done[2], noise, metal, done[-1])
 
 
-_prepared: dict[str, _SimulatedTargets] = {}
-
-
 def measure_piece(piece: Piece) -> Any:
     """Take and measure one capture of a data sheet; workers call this function."""
-    key = repr(piece.sensor)
-    if key not in _prepared:
-        _prepared.clear()
-        _prepared[key] = _SimulatedTargets(piece.sensor, piece.seed)
-    targets = _prepared[key]
-    targets.seed = piece.seed
+    targets = _SimulatedTargets(piece.sensor, piece.seed)
     return getattr(targets, piece.method)(*piece.arguments)
 
 
@@ -201,8 +192,9 @@ class _SimulatedTargets:
     """A simulated sensor, and the test targets in front of it."""
 
     def __init__(self, sensor: Sensor, seed: int) -> None:
+        prepared = prepared_sensor(sensor)
         self.sensor, self.seed = sensor, seed
-        self.simulated, self.geometry = SimulatedSensor(sensor), sensor_geometry(sensor)
+        self.simulated, self.geometry = prepared.simulated, prepared.geometry
         self.axis = sensor.rig.reference.sensor_from_camera.rotation[:, 2]
         # distances count from the camera in which clouds are given, not from the origin of the sensor frame
         self.eye = sensor.rig.reference.sensor_from_camera.translation
@@ -275,8 +267,7 @@ class _SimulatedTargets:
         size = PLATE_SHARE * distance
         tilt, azimuth = math.radians(tilt_deg), math.radians(AZIMUTH_DEG)
         normal = np.array([math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)])
-        pose = coupon_pose(normal, distance, self.axis)
-        pose = Transform(pose.rotation, pose.translation + self.eye)
+        pose = coupon_pose(normal, distance, self.axis, self.eye)
         axes = pose.rotation
         coupon = Coupon(pose.translation, axes[:, 2], axes[:, 0], size, size)
         scene = plate(size, finish, self.sensor.wavelength_nm)

@@ -107,13 +107,8 @@ def predict(
     """
     map_sensor = str(performance_map.data.attrs.get("sensor"))
     if map_sensor != sensor.name:
-        raise InputError(
-            "predict",
-            "performance_map",
-            map_sensor,
-            sensor.name,
-            "a map predicts only the sensor that it was measured with",
-        )
+        hint = "a map predicts only the sensor that it was measured with"
+        raise InputError("predict", "performance_map", map_sensor, sensor.name, hint)
     world_from_sensor = as_pose(pose, "predict")
     eye = (world_from_sensor @ sensor.rig.reference.sensor_from_camera).translation
     predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor))

@@ -58,6 +58,9 @@ MATT_WHITE = Finish("matt_white", float("nan"))
 #: approximate number of rays per view; with fewer, expectations over a feature change by one per cent
 RAYS = 40_000
 
+#: statistics of V_m in :class:`_ViewScore`, in the order of :func:`view_statistics`
+_STATISTICS = ("n", "sigma", "n_white", "sigma_white", "n_only")
+
 #: R_f below which a lack of points is attributed to occlusion
 OCCLUDED = 0.75
 
@@ -147,49 +150,34 @@ def score_candidates(
 
     # the rays of the next view are cast while this view is evaluated
     scored = [one for _, one in track(one_ahead(views, cast, score), "score views", len(views))]
-    columns = {
-        key: np.array([getattr(one, key) for one in scored])
-        for key in ("n", "sigma", "n_white", "sigma_white", "n_only")
-    }
-    statistics = view_statistics(
-        names, columns["n"], columns["sigma"], columns["n_white"], columns["sigma_white"], columns["n_only"]
-    )
+    columns = (np.array([getattr(one, key) for one in scored]) for key in _STATISTICS)
+    statistics = view_statistics(names, *columns)
     scores = score_views(statistics, task, minimum_points)
-    scores["mean_sigma"] = statistics["mean_sigma"]
-    for name in ("n_white", "mean_sigma_white", "n_only_white"):
+    for name in ("mean_sigma", "n_white", "mean_sigma_white", "n_only_white"):
         scores[name] = statistics[name]
-    uncertainty = np.array([[one.measurements[m].uncertainty for one in scored] for m in range(len(task.measurements))])
-    chance = np.array([[one.measurements[m].chance for one in scored] for m in range(len(task.measurements))])
+    uncertainty, chance = (
+        np.array([[getattr(one.measurements[m], name) for one in scored] for m in range(len(task.measurements))])
+        for name in ("uncertainty", "chance")
+    )
     possible = np.isfinite(uncertainty) & (chance >= LEAST_CHANCE)
+
+    def add(name: str, dims: tuple[str, ...], values: Any, long_name: str, units: str = "1") -> None:
+        scores[name] = (dims, values, {"long_name": long_name, "units": units})
+
     by = ("measurement", "view")
-    scores["predicted_uncertainty"] = (
-        by,
-        uncertainty,
-        {"long_name": "predicted standard uncertainty", "units": "mm or deg"},
-    )
-    scores["chance"] = (by, chance, {"long_name": "chance that there are enough points", "units": "1"})
-    scores["uncertainty_possible"] = (
-        by,
-        possible,
-        {"long_name": "whether the measurement is possible, by uncertainty and chance", "units": "1"},
-    )
+    add("predicted_uncertainty", by, uncertainty, "predicted standard uncertainty", "mm or deg")
+    add("chance", by, chance, "chance that there are enough points")
+    long_name = "whether the measurement is possible, by uncertainty and chance"
+    add("uncertainty_possible", by, possible, long_name)
     risk = screening_risk(scores)
-    scores["uncertainty_rank"] = (
-        by,
-        rank_views(-risk, possible),
-        {"long_name": "rank by predicted risk, uncertainty over the square root of chance; 1 is best", "units": "1"},
-    )
-    scores["overall_rank"] = (
-        "view",
-        rank_views(-risk.mean(axis=0), np.asarray(possible.all(axis=0))),
-        {
-            "long_name": "rank by the mean logarithm of the predicted risk over all measurements, 1 is best",
-            "units": "1",
-        },
-    )
+    long_name = "rank by predicted risk, uncertainty over the square root of chance; 1 is best"
+    add("uncertainty_rank", by, rank_views(-risk, possible), long_name)
+    overall = rank_views(-risk.mean(axis=0), np.asarray(possible.all(axis=0)))
+    long_name = "rank by the mean logarithm of the predicted risk over all measurements, 1 is best"
+    add("overall_rank", ("view",), overall, long_name)
     limit, feature = _limits(task, scored, scores, possible)
-    scores["limit"] = (by, limit, {"long_name": "limiting factor of the view, against the best view", "units": "1"})
-    scores["limiting_feature"] = (by, feature, {"long_name": "the feature that contributes most", "units": "1"})
+    add("limit", by, limit, "limiting factor of the view, against the best view")
+    add("limiting_feature", by, feature, "the feature that contributes most")
     measurements = task.measurements.values()
     scores["nominal"] = ("measurement", [m.nominal for m in measurements], {"units": "mm or deg"})
     tolerances = [math.nan if m.tolerance_size is None else m.tolerance_size for m in measurements]

@@ -231,27 +231,17 @@ def _found_shot(place: Path, campaign: Campaign) -> Shot:
     label = shown.get("sample") if isinstance(shown, dict) else None
     labels = [sample.label() for sample in campaign.samples]
     if label not in labels:
-        raise InputError(
-            place / "settings.json",
-            "coupon.sample",
-            repr(label),
-            ", ".join(labels),
-            "the label of a sample of the campaign",
-        )
+        hint = "the label of a sample of the campaign"
+        raise InputError(place / "settings.json", "coupon.sample", repr(label), ", ".join(labels), hint)
     if world_from_sensor is None:
         raise InputError(place / "pose.json", "world_from_sensor", "null", "the pose, in the coupon's frame")
     pose = world_from_sensor.inverse()
     distance = float(np.linalg.norm(pose.translation - campaign.sensor.rig.reference.sensor_from_camera.translation))
     nominal = min(campaign.distances, key=lambda planned: abs(np.log(distance / planned)))
     if abs(distance / nominal - 1) > DISTANCE_SLACK:
-        known = ", ".join(f"{planned:g}" for planned in campaign.distances)
-        raise InputError(
-            place / "pose.json",
-            "distance",
-            f"{distance:.1f} mm",
-            f"within 5 % of {known} mm",
-            "add this distance to distances_mm",
-        )
+        allowed = f"within 5 % of {', '.join(f'{planned:g}' for planned in campaign.distances)} mm"
+        hint = "add this distance to distances_mm"
+        raise InputError(place / "pose.json", "distance", f"{distance:.1f} mm", allowed, hint)
     series = next(
         s for s in campaign.series if s.variant is None and s.distance == nominal and s.sample.label() == label
     )

@@ -82,13 +82,8 @@ def map_with_finishes(
     source = str(performance_map.data.attrs.get("source", ""))
     if source not in ("", "simulated"):
         name, finish = next(iter(missing.items()))
-        raise _unknown_finish_error(
-            performance_map,
-            needed,
-            name,
-            finish,
-            "the map comes from a device: characterise a coupon of this finish with that device",
-        )
+        hint = "the map comes from a device: characterise a coupon of this finish with that device"
+        raise _unknown_finish_error(performance_map, needed, name, finish, hint)
     distances = distances_about(performance_map, needed.between)
     largest = largest_incidence_deg(performance_map)
     ones = {name: OneFinish(finish, needed.sensor, largest) for name, finish in missing.items()}
@@ -100,13 +95,8 @@ def map_with_finishes(
         lacking = ", ".join(_in_words(ones[name].finish) for name in names)
         question = f"{needed.sensor.name}: its map lacks {lacking}; characterise now (about {_minutes(seconds)})?"
         if ask is None or not ask(question):
-            raise _unknown_finish_error(
-                performance_map,
-                needed,
-                names[0],
-                missing[names[0]],
-                f"add --yes to characterise it now, in about {_minutes(seconds)}; the result is kept",
-            )
+            hint = f"add --yes to characterise it now, in about {_minutes(seconds)}; the result is kept"
+            raise _unknown_finish_error(performance_map, needed, names[0], missing[names[0]], hint)
         say(f"{needed.sensor.name}: characterising {lacking} in about {_minutes(seconds)}; kept in {cache_folder()}")
         kept |= _characterise(ones, to_make, needed.sensor)
     found = [one for one in kept.values() if one is not None]

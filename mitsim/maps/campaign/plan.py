@@ -210,13 +210,8 @@ def plan_campaign(
     ``places`` is for captures with the file's ``device``: its live stage, as calibrated at each distance.
     """
     if file.device is not None and places is None:
-        raise InputError(
-            path,
-            "device",
-            f"a live {file.device.kind}",
-            "no device: these captures are simulated",
-            "only campaigns and validations of maps take captures with a device",
-        )
+        hint = "only campaigns and validations of maps take captures with a device"
+        raise InputError(path, "device", f"a live {file.device.kind}", "no device: these captures are simulated", hint)
     stages: tuple[Stage, ...] = () if file.stage is None else (file.stage,)
     if places is None:
         check_exposure(sensor)
@@ -233,13 +228,8 @@ def plan_campaign(
     campaign = Campaign(file, sensor, distances, tuple(series), stages)
     labels = [sample.label() for sample in campaign.samples]
     if twice := next((label for label in labels if labels.count(label) > 1), None):
-        raise InputError(
-            path,
-            "samples",
-            f"{twice}, more than once",
-            "one coupon of each finish and Ra",
-            "a map identifies a sample by its finish and Ra",
-        )
+        hint = "a map identifies a sample by its finish and Ra"
+        raise InputError(path, "samples", f"{twice}, more than once", "one coupon of each finish and Ra", hint)
     return campaign
 
 
@@ -266,14 +256,9 @@ def check_exposure(sensor: Sensor) -> None:
         With the sensor and its rule.
     """
     if sensor.exposure.base_s is None:
-        raise InputError(
-            f"sensor {sensor.name}",
-            "exposure.rule",
-            sensor.exposure.rule,
-            "fixed, matt_white",
-            "a map holds for one exposure: with an automatic one, F depends on the rest of the view, "
-            "not only on distance, normal and finish",
-        )
+        hint = "a map holds for one exposure: with an automatic one, F depends on the rest of the view, "
+        hint += "not only on distance, normal and finish"
+        raise InputError(f"sensor {sensor.name}", "exposure.rule", sensor.exposure.rule, "fixed, matt_white", hint)
 
 
 def coupon_pose(

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 
@@ -166,7 +166,7 @@ class InterreflectionEffect:
         nothing = Perturbation.none(len(rho))
         if isinstance(self.sensor.settings, MatcherSettings):
             noisier = 1 + rho / (1 + rho / (NOISIEST - 1))
-            return Perturbation(found_share(rho, losses().matched), noisier, *_unbiased(nothing))
+            return replace(nothing, kept=found_share(rho, losses().matched), noisier=noisier)
         kept, displaced, scattered = found_share(rho, losses().coded), nothing.displaced, nothing.scattered
         if isinstance(self.sensor.pattern, AmplitudeModulation):
             kept = 1.0 - found.rejected
@@ -199,19 +199,9 @@ class InterreflectionEffect:
         """Render the interreflections in several views at once; each image is the one that :meth:`render` returns."""
         given = scene, self.rays, self.light, poses
         direct = trace_poses(*given, LightPaths(samples=self.samples, seed=seed))
-        indirect = [
-            trace_poses(
-                *given,
-                LightPaths(
-                    samples=self.samples,
-                    seed=2 * seed + half,
-                    depth=self.depth,
-                    photons=self.photons,
-                    indirect_only=True,
-                ),
-            )
-            for half in range(1 if self.fringe is None else 2)
-        ]
+        paths = LightPaths(self.samples, 2 * seed, self.depth, photons=self.photons, indirect_only=True)
+        halves = range(1 if self.fringe is None else 2)
+        indirect = [trace_poses(*given, replace(paths, seed=2 * seed + half)) for half in halves]
         return [
             self._image(shapes_met(scene, self.middles, pose), direct[k], [one[k] for one in indirect])
             for k, pose in enumerate(poses)
@@ -222,9 +212,8 @@ class InterreflectionEffect:
     ) -> InterreflectionImage:
         """Return the interreflections of one view from its direct light and one or two renders of the other light."""
         code = self.sensor.pattern
-        own = (
-            1 if not isinstance(code, AmplitudeModulation) else code.steps
-        )  # number of images whose mean is the total light
+        # number of images whose mean is the total light
+        own = code.steps if isinstance(code, AmplitudeModulation) else 1
         white = np.stack([direct[:own].mean(axis=0), np.mean([one[:own].mean(axis=0) for one in indirect], axis=0)])
         first, other = smoothed(white, shape, SMOOTHED_PX / self.step).astype(float)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -267,10 +256,6 @@ def _light(sensor: Sensor) -> ProjectedPatterns | ModulatedLight:
     optics = sensor.projector.optics
     white = np.ones((1, optics.height, optics.width), np.float32)
     return ProjectedPatterns(np.concatenate([white, fringes(sensor)]), sensor.projector)
-
-
-def _unbiased(nothing: Perturbation) -> tuple[Floats, Floats, Floats]:
-    return nothing.displaced, nothing.scattered, nothing.shared
 
 
 def found_share(rho: Floats, loss: Loss) -> Floats:
