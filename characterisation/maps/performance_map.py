@@ -252,12 +252,8 @@ def _check_axes(path: Path, data: xr.Dataset) -> None:
         raise InputError(path, "distance", "distances that do not increase", "increasing distances [mm]")
     step = np.diff(a)
     if len(a) != len(b) or not np.allclose(a, b, atol=1e-6) or not (step > 0).all() or np.ptp(step) > 1e-3 * step[0]:
-        raise InputError(
-            path,
-            "a",
-            "nodes that are unequally spaced or differ from those of b",
-            "equally spaced nodes, the same for a and b",
-        )
+        allowed = "equally spaced nodes, the same for a and b"
+        raise InputError(path, "a", "nodes that are unequally spaced or differ from those of b", allowed)
     if "lay" in data.dims:
         lays = data["lay"].values.astype(float) if "lay" in data.variables else np.full(1, np.nan)
         if not np.allclose(lays, np.arange(len(lays)) * 180.0 / len(lays), atol=1e-6):

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError
 from characterisation.scores.joining import (
     JoinedView,
-    fitted_covariance,
     invariant,
+    joined_covariance,
     joint_information,
-    merged_covariance,
     rigid_derivatives,
 )
 from characterisation.scores.view_sets import Feature, ViewSet, fewest_views
@@ -98,8 +97,7 @@ def choose_set(
 
     def joined(chosen: Floats) -> Floats:
         some = [view for view, taken in zip(views, chosen, strict=True) if taken]
-        covariance_of = fitted_covariance if joining.best_fit else merged_covariance
-        covariance = covariance_of(some, whole.rigid, joining.known)
+        covariance = joined_covariance(some, whole.rigid, joining.known, joining.best_fit)
         return np.asarray(np.sqrt(np.maximum(np.einsum("mij,ji->m", whole.quadratic, covariance), 0.0)))
 
     return fewest_views(features, np.array(list(limits.values())), seconds, joined)

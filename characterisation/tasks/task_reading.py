@@ -62,13 +62,9 @@ def check_features(task: Task, task_path: str | Path, shape_ids: Iterable[str]) 
     known = list(shape_ids)
     for name in task.shapes:
         if name not in known:
-            raise InputError(
-                task_path,
-                f"features.{name}",
-                repr(name),
-                f"ids of the scene's shapes: {', '.join(known) or 'there are none'}",
-                nearest(name, known),
-            )
+            allowed = f"ids of the scene's shapes: {', '.join(known) or 'there are none'}"
+            hint = nearest(name, known)
+            raise InputError(task_path, f"features.{name}", repr(name), allowed, hint)
 
 
 def _check_feature(path: str | Path, task: Task, name: str) -> None:

@@ -146,12 +146,12 @@ def live_source(live: LiveCampaign, mount: Mount) -> Iterator[CaptureSource]:
                 stage = opened.enter_context(open_stage(live.connection))  # opened last, so stopped first
                 stage.home()
                 hardware.append((camera, stage))
-            return live_capture(live, shot, *hardware[0])
+            return _live_capture(live, shot, *hardware[0])
 
         yield take
 
 
-def live_capture(live: LiveCampaign, shot: Shot, camera: LiveDevice, stage: LiveStage) -> Capture:
+def _live_capture(live: LiveCampaign, shot: Shot, camera: LiveDevice, stage: LiveStage) -> Capture:
     """Rotate the stage to a shot's normal, and take a capture with the pose at the angles that are read back."""
     distance = shot.series.distance
     calibration = live.calibrations[distance]

@@ -297,12 +297,9 @@ def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sens
     except InputError as error:
         if error.field != "half_size":
             raise
-        raise InputError(
-            *where,
-            entry.scene,
-            "a scene with a parameter half_size [mm], as coupon_px needs",
-            "give the scene <default name='half_size' value='60'/>, or leave out coupon_px",
-        ) from None
+        found = "a scene with a parameter half_size [mm], as coupon_px needs"
+        allowed = "give the scene <default name='half_size' value='60'/>, or leave out coupon_px"
+        raise InputError(*where, entry.scene, found, allowed) from None
     shown: list[tuple[Variant | None, Sample]] = [(None, sample)]
     if entry.spread:
         shown += [(name, load_sample(recipe.moved(deviation), where)) for name, deviation in VARIANTS.items()]

@@ -10,8 +10,7 @@ map.
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import astuple
 from pathlib import Path
 
@@ -36,9 +35,6 @@ KEPT = "coupons"
 
 #: number of damaged captures that are named one by one
 NAMED = 10
-
-#: number of captures after which the total time is estimated
-_TIMED = 4
 
 
 def run_campaign(campaign: Campaign, source: Source, folder: str | Path) -> PerformanceMap:
@@ -115,22 +111,9 @@ def _take_missing(
         if len(damaged) > NAMED:
             say(f"mitsim: and {len(damaged) - NAMED} more")
         raise damaged[0]
-    for shot, finished in track(_with_time(source(list(missing.values())), len(missing)), label, len(missing)):
+    for shot, finished in track(source(list(missing.values())), label, len(missing)):
         write_shot(captures, shot, finished)
         done[shot.series.name, shot.name] = Finished(finished.patches, finished.source)
-
-
-def _with_time(taken: Iterable[tuple[Shot, Finished]], count: int) -> Iterator[tuple[Shot, Finished]]:
-    """Pass captures on, and report the expected total time after a few; the first includes compilation."""
-    start = 0.0
-    for number, one in enumerate(taken, 1):
-        if number == 1:
-            start = time.monotonic()
-        elif number == _TIMED and count > 2 * _TIMED:
-            left = (time.monotonic() - start) / (_TIMED - 1) * (count - number)
-            duration = f"{left / 60:.0f} min" if left > 90 else f"{left:.0f} s"
-            say(f"{count} captures: about {duration} from here; a refinement adds to them")
-        yield one
 
 
 def _refined(
