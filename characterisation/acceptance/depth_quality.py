@@ -151,6 +151,17 @@ def mean_depth_error(
     board is perpendicular to the axis, and the error is that of its depth. Here each point is compared with the true
     plane along its own ray, which is the same for such a board.
 
+    Parameters
+    ----------
+    clouds
+        Captures of one target.
+    ground_truth
+        True pose of the target.
+    region
+        (H, W) mask of the target; the whole grid if None.
+    trimmed_share
+        Share of the points excluded at either end of the errors.
+
     Raises
     ------
     InputError

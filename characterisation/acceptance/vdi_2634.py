@@ -108,7 +108,14 @@ def sphere_spacing_error(
 ) -> float:
     """Return the sphere-spacing error SD of VDI/VDE 2634-2 [mm]: measured minus calibrated distance of the centres.
 
-    ``first`` and ``second`` are (n, 3) points [mm] of the two spheres of a ball bar.
+    Parameters
+    ----------
+    first, second
+        (n, 3) points [mm] of the two spheres of a ball bar.
+    calibrated_distance
+        [mm].
+    rejected_share
+        As in :func:`probing_error`.
 
     Raises
     ------

@@ -266,6 +266,15 @@ def reference_fraction(
     intervals of both (Donner and Zou, Stat. Methods Med. Res. 21 (2012) 347-359, *recalled*; the tests check its
     coverage).
 
+    Parameters
+    ----------
+    count, reference_count
+        Points of the coupon, and of the matt-white one.
+    possible
+        Pixels of the patch.
+    confidence
+        Of the interval.
+
     Returns
     -------
     F, low, high, excess

@@ -70,6 +70,15 @@ def patch_centres(
     """Return pixels (p, 2) as (row, column) about which a disc lies on the coupon, ``margin_px`` from its edge.
 
     The centres form a hexagonal lattice with ``step_px`` between neighbours, anchored at the centre of the coupon.
+
+    Parameters
+    ----------
+    grid
+        Pixels of the cloud.
+    radius_px, margin_px
+        Radius of the discs, and their least distance from the edge of the coupon.
+    step_px
+        Distance between neighbouring centres.
     """
     corners = grid.project(coupon.corners())
     middle = grid.project(coupon.centre)
@@ -216,6 +225,11 @@ def patch_residuals(cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, m
     """Return the residuals [mm] along V of the points of all patches from the planes of their patches.
 
     The array is flat and excludes outliers.
+
+    Parameters
+    ----------
+    cloud, coupon, radius_px, margin_px
+        As in :func:`measure_patches`.
     """
     pixels = _pixels(cloud, patch_centres(cloud.grid, coupon, radius_px, margin_px, 2 * radius_px), radius_px)
     points, true = _points_of(cloud, coupon, pixels)

@@ -182,7 +182,19 @@ def _choose(
 
 
 def counted_as_one(place: Floats, residual: Floats, thinning: float, rng: np.random.Generator) -> float:
-    """Return the number a of points whose residuals (n,), at places (n, 3), are as good as one; at least 1."""
+    """Return the number a of points whose residuals (n,), at places (n, 3), are as good as one; at least 1.
+
+    Parameters
+    ----------
+    place
+        (n, 3) [mm].
+    residual
+        (n,) [mm].
+    thinning
+        Number of measured points that each of these stands for.
+    rng
+        Chooses the points about which correlation is summed.
+    """
     middles = rng.choice(len(place), min(_MIDDLES, len(place)), replace=False)
     apart = cdist(place[middles], place)
     product = residual[middles, None] * residual

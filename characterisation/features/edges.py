@@ -110,12 +110,19 @@ def fit_edge_point(
 ) -> EdgePointFit:
     """Fit the point where a line in a plane crosses the edge of the face.
 
-    The edge is assumed straight within ``reach`` [mm] of the nominal point, along the line and across it, and searched
-    there. Other arguments and errors are those of :func:`fit_circle`.
-
     The sampling error of an edge along a row of pixels is the same in all crossings. The variance is therefore at least
     d^2 / (12 k^2), regardless of their number. Here d is the spacing of the pixels along the line, and k the number of
     rows or columns that the edge crosses.
+
+    Parameters
+    ----------
+    cloud, plane, near
+        As in :func:`fit_circle`.
+    nominal
+        Nominal point, sensor frame.
+    reach
+        Distance [mm] from the nominal point, along the line and across it, within which the edge is searched and
+        assumed straight.
     """
     nominal = nominal.seen_from(cloud.grid.origin).on_moved_plane(plane)
     found = _crossings(cloud, plane, nominal, near, reach)

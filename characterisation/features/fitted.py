@@ -77,6 +77,15 @@ def with_covariance(
 ) -> Fit:
     """Return a shape, fitted or nominal, with the covariance (p, p) of its parameters, for predicted uncertainties.
 
+    Parameters
+    ----------
+    covariance
+        (p, p) of the parameters of a small change.
+    residual_std
+        [mm].
+    count
+        Number of points used.
+
     Raises
     ------
     ValueError

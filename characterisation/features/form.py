@@ -176,10 +176,20 @@ def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None, deg
 def fit_form(
     points: ArrayLike, surface: Plane | Cylinder, viewpoint: ArrayLike | None = None, degree: int = DEGREE
 ) -> Form:
-    """Fit the low-order form of a surface to its points (n, 3) [mm], seen from ``viewpoint`` (3,) [mm] if given.
+    """Fit the low-order form of a surface.
 
-    ``surface`` is the least-squares surface of the same points (:func:`~characterisation.features.fits.fit_surface`).
     Points at grazing incidence, and outliers about the form, are excluded.
+
+    Parameters
+    ----------
+    points
+        (n, 3) [mm] of the surface.
+    surface
+        Least-squares surface of the same points (:func:`~characterisation.features.fits.fit_surface`).
+    viewpoint
+        (3,) [mm]; without it, residuals are orthogonal.
+    degree
+        As in :func:`form_modes`.
 
     Raises
     ------

@@ -64,7 +64,14 @@ def pose_jacobian(surface: Surface, points: Array, rays: Array | None, about: Ar
     """Return the derivatives (n, 6) of the residuals of points (n, 3) by a small motion of the surface.
 
     The motion is a rotation vector [rad] about the point ``about`` (3,) [mm] and a translation [mm], in the frame of
-    all arguments. Without rays, residuals are orthogonal distances.
+    all arguments.
+
+    Parameters
+    ----------
+    points, rays
+        (n, 3) [mm], and unit (n, 3); without rays, residuals are orthogonal distances.
+    about
+        (3,) [mm] centre of the rotation.
     """
     at = surface.meet(points, rays)
     turning = np.cross(at.foot - np.asarray(about, float), at.normal)

@@ -127,7 +127,14 @@ def fewest_views(
 ) -> ViewSet:
     """Return the fewest views that keep all limits.
 
-    If ``seconds`` do not suffice for a proof, the greedy set is returned, marked as not exact.
+    Parameters
+    ----------
+    limits
+        l_m (measurements,) in their units.
+    seconds
+        Time limit of the proof; after it, the greedy set is returned, marked as not exact.
+    joined
+        Returns the actual uncertainty of a set; by default :func:`set_uncertainty`.
     """
     began = time.monotonic()
     uncertainty_of = joined or (lambda chosen: set_uncertainty(features, chosen))

@@ -156,6 +156,13 @@ def about_two(start: Floats, wanted: Floats, first: Floats, second: Floats) -> l
 
     The intermediate vector c = R(second, t2) start has unit length. It has the component of start along ``second``, and
     that of wanted along ``first``, so c = alpha first + beta second +- gamma (first x second).
+
+    Parameters
+    ----------
+    start, wanted
+        Unit vectors (n, 3).
+    first, second
+        Unit axes (3,).
     """
     cos = float(first @ second)
     if abs(cos) > 1 - 1e-12:  # two parallel axes act as one

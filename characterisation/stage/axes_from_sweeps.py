@@ -72,7 +72,14 @@ def axes_from_normals(
 ) -> tuple[TurningAxes, Floats, float]:
     """Return the axes, and the normal (3,) and distance [mm] at zero, from planes N x = d at angles (n, k) [rad].
 
-    ``tilt_std`` [rad] is the standard deviation of the normals, which their rotation must exceed.
+    Parameters
+    ----------
+    angles
+        (n, k) [rad].
+    normals, distances
+        Planes N x = d, (n, 3) and (n,) [mm].
+    tilt_std
+        Standard deviation of the normals [rad], which their rotation must exceed.
 
     Raises
     ------

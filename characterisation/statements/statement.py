@@ -140,7 +140,18 @@ def statement(
 ) -> Statement:
     """State a measurement from the errors (n,) of independent trials, NaN for trials without a value.
 
-    ``repeats`` (m,) are errors of a second capture on the day of the first m trials, for the same part.
+    Parameters
+    ----------
+    measurement, unit
+        Name of the measurement; mm or deg.
+    errors
+        (n,) of independent trials, NaN for trials without a value.
+    tolerance
+        None for a measurement without one.
+    budget
+        Variance by group of unknowns.
+    repeats
+        (m,) errors of a second capture on the day of the first m trials, for the same part.
     """
     part: Part = ANY_PART
     if isinstance(errors, OneSidedErrors):

@@ -89,7 +89,14 @@ def fold_of(asked: Measurement) -> float | None:
 def deviations(asked: Measurement, outline: Array, nominal: Sequence[Any], point: Array) -> Deviations:
     """Return the deviations of a measurement that folds (:func:`fold_of`).
 
-    ``outline`` (k, 3) and the ``nominal`` features are in the part frame; ``point`` (3,) is that of a pose.
+    Parameters
+    ----------
+    outline
+        (k, 3) [mm], part frame.
+    nominal
+        Nominal features, part frame.
+    point
+        (3,) [mm] of a pose.
     """
     kind = asked.kind
     if DEFINITIONS[kind].of == "form":

@@ -84,7 +84,13 @@ class Repeatability:
 
 
 def failed(name: str, unit: str, reason: str, points: int = 0, points_given: int = 0) -> Result:
-    """Return the result of a measurement that was not possible, with its reason."""
+    """Return the result of a measurement that was not possible, with its reason.
+
+    Parameters
+    ----------
+    name, unit, reason, points, points_given
+        As in :class:`Result`.
+    """
     return Result(name, unit, math.nan, points=points, points_given=points_given, reason=reason)
 
 

@@ -213,7 +213,19 @@ def _end_with_parent(parent: int) -> None:
 def results_of(
     orders: Sequence[Plain], work: Callable[[Plain], Result], workers: Executor | None, label: str
 ) -> list[Result]:
-    """Return the results of orders, in their sequence, from workers or this process; progress goes to stderr."""
+    """Return the results of orders, in their sequence, from workers or this process.
+
+    Parameters
+    ----------
+    orders
+        Plain values.
+    work
+        Module-level function of an order.
+    workers
+        None for this process.
+    label
+        Of the progress on stderr.
+    """
     if workers is None:
         return [work(one) for one in track(orders, label)]
     made = workers.distribute(range(len(orders)), orders.__getitem__, work)

@@ -142,7 +142,19 @@ def _solids(triangles: Floats) -> Solids:
 
 
 def is_near(part: Obstacle, box: Box, part_from_sensor: Transform, clearance: float) -> bool:
-    """Return whether any triangle of a part is nearer to a box than ``clearance`` [mm], or meets it."""
+    """Return whether any triangle of a part is nearer to a box than ``clearance`` [mm], or meets it.
+
+    Parameters
+    ----------
+    part
+        From :func:`obstacle`.
+    box
+        In the sensor frame.
+    part_from_sensor
+        Pose of the sensor.
+    clearance
+        [mm].
+    """
     centre = part_from_sensor.points(box.centre)
     reach = float(np.linalg.norm(box.half)) + clearance
     found = [members[tree.query_ball_point(centre, reach + radius)] for tree, members, radius in part.trees]

@@ -111,7 +111,16 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
     """Decode a capture of a coupon and measure its patches.
 
     Pose and calibration are those of the capture, if it has them: a stage stops near its requested position and is read
-    back, and a device has its own calibration. ``geometry`` is that of the sensor's rig.
+    back, and a device has its own calibration.
+
+    Parameters
+    ----------
+    geometry
+        That of the rig of ``sensor``.
+    sensor
+        Sensor of the campaign; pose and calibration are those of the capture, if it has them.
+    keep_images
+        Whether the result contains the capture.
     """
     coupon = shot.series.sample.at(coupon_place(capture, shot))
     if own_sensor(capture, sensor) is not sensor:
@@ -142,7 +151,17 @@ def own_sensor(capture: Capture, sensor: Sensor) -> Sensor:
 
 
 def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: Sensor) -> PointCloud:
-    """Decode the part of a capture that shows the coupon."""
+    """Decode the part of a capture that shows the coupon.
+
+    Parameters
+    ----------
+    coupon
+        At its pose in the sensor frame.
+    geometry
+        That of the capture.
+    sensor
+        Gives decoder and imager.
+    """
     grid = geometry.grid
     corners = grid.project(coupon.corners())
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])

@@ -100,7 +100,14 @@ def held_out_live(
 ) -> LiveCampaign:
     """Return a campaign with a device for comparison with a map, at the stage positions within the map's distances.
 
-    The map may be that of a simulated sensor, which compares the simulation with the device.
+    Parameters
+    ----------
+    path, file
+        The campaign file, and its content.
+    sensor
+        Preset or file, as in :func:`~mitsim.maps.campaign.live.plan_live`.
+    performance_map
+        To be compared; it may be that of a simulated sensor, which compares the simulation with the device.
 
     Raises
     ------
@@ -153,7 +160,15 @@ def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
 def compare(
     campaign: Campaign, performance_map: PerformanceMap, shots: list[Shot], take: CaptureSource, repeats: int = 1
 ) -> Iterator[Pair]:
-    """Take and predict each shot in this process; see :func:`compared`."""
+    """Take and predict each shot in this process.
+
+    Parameters
+    ----------
+    take
+        Takes a shot.
+    repeats
+        Captures of each shot, as in :func:`compared`.
+    """
     prepared = PreparedSensor(campaign.sensor)
     for shot in shots:
         yield compared(shot, prepared, performance_map, take, repeats)
@@ -167,6 +182,15 @@ def compared(
     With few points sigma is uncertain in both. The shot is then repeated up to :data:`MOST_REPEATS` times as often,
     until the standard error of sigma is :data:`LARGEST_SIGMA_ERROR` of it. Pose and calibration are those of the first
     capture, since a stage is read back and a device has its own calibration.
+
+    Parameters
+    ----------
+    prepared
+        The sensor, prepared once.
+    take
+        Takes a shot.
+    repeats
+        Number of captures with fresh noise.
     """
     sensor = prepared.sensor
     repeated = _repeated(shot, MOST_REPEATS * repeats)
@@ -220,7 +244,15 @@ class HeldOutOrder:
 
 
 def held_out_orders(campaign: Campaign, shots: list[Shot], map_path: Path, repeats: int) -> list[HeldOutOrder]:
-    """Return an order for each shot."""
+    """Return an order for each shot.
+
+    Parameters
+    ----------
+    map_path
+        Path of the map, the same on every machine.
+    repeats
+        Captures of each shot.
+    """
     path = str(map_path.absolute())
     return [HeldOutOrder(order_of(shot, campaign), path, _digest(path), repeats) for shot in shots]
 

@@ -150,7 +150,17 @@ def plan_of(largest_deg: float, seed: int = 1) -> CampaignFile:
 
 
 def one_finish_campaign(one: OneFinish, distance: float, file: CampaignFile, lay_deg: float = 0.0) -> Campaign:
-    """Return the campaign of a finish at a distance [mm], with its u at a lay angle if it has a lay."""
+    """Return the campaign of a finish at a distance [mm], with its u at a lay angle if it has a lay.
+
+    Parameters
+    ----------
+    distance
+        [mm].
+    file
+        The plan, from :func:`plan_of`.
+    lay_deg
+        Angle of u [deg], if the finish has a lay.
+    """
     half = half_size(one.sensor, distance, COUPON_PX if file.coupon_px is None else file.coupon_px)
     recipe = CouponRecipe(one.finish.name, (), one.sensor.wavelength_nm)
     scene = flat_coupon(one.finish, half)
@@ -163,6 +173,15 @@ def one_finish_campaign(one: OneFinish, distance: float, file: CampaignFile, lay
 
 def characterise_finish(one: OneFinish, simulated: SimulatedSensor, distance: float, folder: Path) -> PerformanceMap:
     """Run the campaign of a finish at a distance [mm] in its own folder.
+
+    Parameters
+    ----------
+    simulated
+        The sensor on the device.
+    distance
+        [mm].
+    folder
+        Empty folder for the captures.
 
     Raises
     ------

@@ -207,7 +207,14 @@ def plan_campaign(
 ) -> Campaign:
     """Plan a campaign file that has been read from ``path``.
 
-    ``places`` is for captures with the file's ``device``: its live stage, as calibrated at each distance.
+    Parameters
+    ----------
+    path, file
+        The campaign file, and its content.
+    distances_mm
+        Distances if the file has none.
+    places
+        Live stage as calibrated at each distance, for captures with the file's ``device``.
     """
     if file.device is not None and places is None:
         hint = "only campaigns and validations of maps take captures with a device"
@@ -269,9 +276,16 @@ def coupon_pose(
 ) -> Transform:
     """Return ``sensor_from_coupon`` with the coupon's centre on the view axis.
 
-    ``normal`` (3,) is in the view frame (z toward the sensor, x toward the second eye). ``distance`` is |V| [mm].
-    ``axis`` (3,) is the unit view direction in the sensor frame. ``eye`` (3,) is the position of the camera; default
-    the origin.
+    Parameters
+    ----------
+    normal
+        (3,) in the view frame (z toward the sensor, x toward the second eye).
+    distance
+        |V| [mm].
+    axis
+        (3,) unit view direction in the sensor frame.
+    eye
+        (3,) position of the camera [mm]; default the origin.
     """
     z = view_axes(axis) @ normal
     x = np.cross([0.0, 1.0, 0.0], z)

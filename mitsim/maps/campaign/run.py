@@ -71,7 +71,17 @@ def run_campaign(campaign: Campaign, source: Source, folder: str | Path) -> Perf
 
 
 def measure_captures(campaign: Campaign, shots: Sequence[Shot], source: Source, folder: str | Path) -> PerformanceMap:
-    """Measure existing captures, see :func:`~mitsim.maps.campaign.acquire.found_shots`, and make their map."""
+    """Measure existing captures and make their map.
+
+    Parameters
+    ----------
+    shots
+        From :func:`~mitsim.maps.campaign.acquire.found_shots`.
+    source
+        Returns their results.
+    folder
+        For the map and the measured shots.
+    """
     captures = Path(folder) / KEPT
     captures.mkdir(parents=True, exist_ok=True)
     remove_partial(captures)

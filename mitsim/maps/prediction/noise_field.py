@@ -72,7 +72,14 @@ def correlated_noise(
 ) -> Singles:
     """Return the errors (h, w) of the points of a view in units of the map's sigma; 0 where the map has none.
 
-    ``mapped`` includes normals.
+    Parameters
+    ----------
+    performance_map
+        Gives noise areas and persistent noise.
+    mapped
+        The view, with normals.
+    rng
+        Random generator.
     """
     assert mapped.normal is not None
     predicted = np.isfinite(mapped.sigma)
