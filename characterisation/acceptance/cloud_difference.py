@@ -117,10 +117,7 @@ def same_grid(one: ViewGrid, other: ViewGrid) -> bool:
 
 
 def _to_surface(points: Floats, surface: Floats, tree: cKDTree, viewpoint: Floats) -> Floats:
-    """Return signed distances (n,) of points (n, 3) from a surface (m, 3).
-
-    The surface at a point is the plane through its nearest points.
-    """
+    """Return signed distances (n,) of points (n, 3) from planes through their nearest points of a surface (m, 3)."""
     away = points - viewpoint
     length = np.linalg.norm(away, axis=1)
     distance, index = tree.query(points, NEIGHBOURS)

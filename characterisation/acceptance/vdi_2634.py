@@ -175,9 +175,6 @@ def _usable(where: str, given: ArrayLike, least: int, rejected_share: float) -> 
 
 
 def _nearest(deviation: Floats, rejected_share: float) -> NDArray[np.intp]:
-    """Return the indices of the points that are kept.
-
-    Of the points, ``rejected_share``, rounded down, with the largest deviations are rejected.
-    """
+    """Return the indices of the points without ``rejected_share``, rounded down, of the largest deviations."""
     stay = len(deviation) - int(rejected_share * len(deviation))
     return np.asarray(np.argsort(np.abs(deviation), kind="stable")[:stay])

@@ -41,8 +41,11 @@ from characterisation.coupon.discs import disc_offsets
 
 Floats = NDArray[np.float64]
 
-#: distances of neighbours that touch, and of those apart, in diameters of a patch: (from, to)
-TOUCHING, APART = (0.9, 1.25), (2.0, 4.0)
+#: distances (from, to) of neighbours that touch, in diameters of a patch
+TOUCHING = (0.9, 1.25)
+
+#: distances (from, to) of neighbours apart, in diameters of a patch: errors of block matching are not correlated there
+APART = (2.0, 4.0)
 
 #: smallest share of its pixels with which a patch has an offset
 LEAST_SHARE = 0.3

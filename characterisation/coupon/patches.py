@@ -285,10 +285,7 @@ def _points_of(cloud: PointCloud, coupon: Coupon, pixels: NDArray[np.int64]) -> 
 def _ellipses(
     grid: ViewGrid, coupon: Coupon, rows: NDArray[np.int64], columns: NDArray[np.int64], radius_px: float
 ) -> dict[str, Floats]:
-    """Return the ellipses on the coupon and the included angles of discs about pixels (p,).
-
-    Both follow from the step of the surface, and of the rays, per pixel.
-    """
+    """Return ellipses on the coupon, and included angles, from the steps of surface and rays about pixels (p,)."""
     reach = int(radius_px)
     aside, down = reach * np.array([[1], [-1], [0], [0]]), reach * np.array([[0], [0], [1], [-1]])
     rays = grid.rays_at(columns + aside, rows + down)

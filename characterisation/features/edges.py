@@ -40,9 +40,12 @@ from characterisation.point_cloud import PointCloud
 
 Array = NDArray[np.float64]
 
-#: largest distance behind the plane at which a point lies on it: in standard deviations of the plane's points, and at
-#: least in mm. In front it is twice that, because walls of holes and adjoining faces lie behind; *assumed*
-NEAR_STD, NEAR_MM = 2.0, 0.02
+#: largest distance behind the plane at which a point lies on it, in standard deviations of the plane's points. In front
+#: it is twice that, because walls of holes and adjoining faces lie behind; *assumed*
+NEAR_STD = 2.0
+
+#: the same in mm, if that is more; *assumed*
+NEAR_MM = 0.02
 
 #: least number of crossings for a figure; *assumed*
 LEAST_CROSSINGS = 12
@@ -274,9 +277,6 @@ def _window(cloud: PointCloud, figure: Circle | EdgePoint, reach: float) -> tupl
 
 
 def _pitch(cloud: PointCloud, edge: EdgePoint) -> float:
-    """Return the length [mm] of one pixel along the line at the edge.
-
-    The pixel is that of a row or a column, whichever is closer to the direction of the line.
-    """
+    """Return the length [mm] along the line of a pixel of its row or column, whichever is closer to the line."""
     here, there = cloud.grid.project(np.stack([edge.point, edge.point + edge.direction]))
     return float(1.0 / np.abs(there - here).max())

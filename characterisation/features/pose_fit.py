@@ -166,10 +166,7 @@ def _check_determined(jacobian: Array, pose: Pose, points: Array) -> None:
 
 
 def _in_words(motions: Array, size: float, pose: Pose) -> list[str]:
-    """Describe free motions (k, 6) in words, in the part frame: shifts, then rotations.
-
-    The rotation vector w in ``motions`` is multiplied by ``size``.
-    """
+    """Describe free motions (k, 6) [size w, t] in words, in the part frame: shifts, then rotations."""
     turn, start = pose.sensor_from_part[:3, :3], pose.sensor_from_part[:3, 3]
     about = (pose.about - start) @ turn
     # combinations of the motions without rotation are shifts; the others are described without these

@@ -28,8 +28,11 @@ class Document(BaseModel):
 
 Model = TypeVar("Model", bound=Document)
 
-#: largest TOML file [bytes], and its deepest nesting
-LARGEST_TOML, DEEPEST = 4 * 1024**2, 32
+#: largest TOML file [bytes]
+LARGEST_TOML = 4 * 1024**2
+
+#: deepest nesting of a TOML file
+DEEPEST = 32
 
 _BRACKETS = re.compile(r"[][{}]")
 _PART = r"(?<![A-Za-z0-9_-])(?:[A-Za-z0-9_-]++|[\"'][^\"'\n]*+[\"'])[ \t]*+\.[ \t]*+"
@@ -229,13 +232,7 @@ def _joined(*sentences: str) -> str:
 
 
 def _keys_at(model: type[Document], location: tuple[Any, ...]) -> list[str]:
-    """Return the keys that a model allows in the table at a pydantic location.
-
-    Parameters
-    ----------
-    location
-        Keys, indices, and between them the names of validators and of the table variants that pydantic chose.
-    """
+    """Return the keys of the table at a pydantic location, which also names validators and table variants."""
     here: list[Any] = [model]
     for part in location:
         here = [each for option in here for each in _options(option)]

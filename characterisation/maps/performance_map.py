@@ -46,8 +46,11 @@ __all__ = [
 #: version of the files
 SCHEMA_VERSION = 2
 
-#: bits of the mantissa that a compact file keeps: relative errors of at most 2^-11 and 2^-6
-VALUE_BITS, ERROR_BITS = 10, 5
+#: bits of the mantissa of values that a compact file keeps: relative errors of at most 2^-11
+VALUE_BITS = 10
+
+#: bits of the mantissa of errors that a compact file keeps: relative errors of at most 2^-6
+ERROR_BITS = 5
 
 _NODES = ("sample", "distance", "b", "a")
 
@@ -238,7 +241,7 @@ class PerformanceMap:
         path = Path(path)
         data = read_dataset(path, _SCHEMA)
         version = data.attrs.get("schema_version")
-        if np.ndim(version) or version != SCHEMA_VERSION:
+        if str(version) != str(SCHEMA_VERSION):
             hint = "read it with the version of mitsim that wrote it"
             raise InputError(path, "schema_version", repr(version), str(SCHEMA_VERSION), hint)
         _check_axes(path, data)

@@ -105,10 +105,7 @@ class Samples:
         return alike
 
     def _check_between(self, finish: str, roughness: float, light: Light, members: list[int]) -> None:
-        """Reject a surface whose optical properties do not lie between those of its neighbours by Ra.
-
-        This happens if the laws of the renderer have changed since the campaign.
-        """
+        """Reject a surface outside its neighbours by Ra, as after a change of the laws of the renderer."""
         upper = min(int(np.searchsorted(self.roughness[members], roughness * (1 - 1e-6))), len(members) - 1)
         low, high = self.lights[members[max(upper - 1, 0)]], self.lights[members[upper]]
         if low is not None and high is not None and not lies_between(light, low, high):

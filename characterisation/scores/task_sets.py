@@ -23,7 +23,7 @@ from characterisation.scores.joining import (
     joint_information,
     rigid_derivatives,
 )
-from characterisation.scores.view_sets import Feature, ViewSet, fewest_views
+from characterisation.scores.view_sets import FeatureInformation, ViewSet, fewest_views
 from characterisation.tasks.evaluation import InputQuantity, measurement_model
 from characterisation.tasks.prediction import ExpectedInput, joint_quadratic_form
 from characterisation.tasks.task_file import Task
@@ -93,7 +93,7 @@ def choose_set(
     whole = _JoinedSet(task, needed_inputs, best, joining)
     views = [whole.view(one, least_chance) for one in inputs]
     information = np.array([joint_information(view, whole.rigid, joining.known) for view in views])
-    features = [Feature(information, whole.quadratic)]
+    features = [FeatureInformation(information, whole.quadratic)]
 
     def joined(chosen: Floats) -> Floats:
         some = [view for view, taken in zip(views, chosen, strict=True) if taken]

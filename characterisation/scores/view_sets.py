@@ -50,7 +50,7 @@ _HALVINGS = 40
 
 
 @dataclass(frozen=True)
-class Feature:
+class FeatureInformation:
     """Information on one feature, and its use.
 
     ``information`` (views, p, p) is P_v; ``quadratic`` (measurements, p, p) is G_m, 0 where not needed.
@@ -75,12 +75,12 @@ class ViewSet:
     exact: bool
 
 
-def set_uncertainty(features: Sequence[Feature], chosen: Floats) -> Floats:
+def set_uncertainty(features: Sequence[FeatureInformation], chosen: Floats) -> Floats:
     """Return u_m (measurements,) of views chosen by shares x (views,), 0 or 1; very large for an unseen feature."""
     return np.asarray(np.sqrt(_total(features, [_covariance(feature, chosen) for feature in features])))
 
 
-def greedy_views(features: Sequence[Feature], limits: Floats, joined: Joined | None = None) -> ViewSet:
+def greedy_views(features: Sequence[FeatureInformation], limits: Floats, joined: Joined | None = None) -> ViewSet:
     """Add views until all limits are met, or none helps; each lowers the sum of ln(u_m / l_m) over unmet limits most.
 
     ``limits`` l_m (measurements,) [units of the measurement]; ``joined`` returns the actual uncertainty of a set, by
@@ -123,7 +123,7 @@ def _grown(uncertainty_of: Joined, count: int, limits: Floats, wanted: NDArray[n
 
 
 def fewest_views(
-    features: Sequence[Feature], limits: Floats, seconds: float = 60.0, joined: Joined | None = None
+    features: Sequence[FeatureInformation], limits: Floats, seconds: float = 60.0, joined: Joined | None = None
 ) -> ViewSet:
     """Return the fewest views that keep all limits.
 
@@ -171,7 +171,7 @@ def fewest_views(
 
 
 def _cut(
-    features: Sequence[Feature],
+    features: Sequence[FeatureInformation],
     at: Floats,
     limits: Floats,
     wanted: NDArray[np.bool_],
@@ -203,11 +203,11 @@ def _excess(at: Floats, limits: Floats, wanted: NDArray[np.bool_]) -> float:
     return float(np.maximum(np.log(at / limits), 0)[wanted].sum())
 
 
-def _met(features: Sequence[Feature], chosen: Floats, limits: Floats) -> NDArray[np.bool_]:
+def _met(features: Sequence[FeatureInformation], chosen: Floats, limits: Floats) -> NDArray[np.bool_]:
     return np.asarray(set_uncertainty(features, chosen) <= limits)
 
 
-def _covariance(feature: Feature, chosen: Floats) -> Floats:
+def _covariance(feature: FeatureInformation, chosen: Floats) -> Floats:
     total = np.tensordot(chosen, feature.information, 1)
     scale = np.sqrt(np.einsum("vii->vi", feature.information).max(0))
     scale[scale == 0] = 1.0
@@ -215,7 +215,7 @@ def _covariance(feature: Feature, chosen: Floats) -> Floats:
     return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))
 
 
-def _total(features: Sequence[Feature], covariances: Sequence[Floats]) -> Floats:
+def _total(features: Sequence[FeatureInformation], covariances: Sequence[Floats]) -> Floats:
     """Return u_m^2 (measurements,)."""
     parts = [np.einsum("mij,ji->m", f.quadratic, c) for f, c in zip(features, covariances, strict=True)]
     return np.asarray(np.sum(parts, axis=0))

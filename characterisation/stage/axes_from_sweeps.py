@@ -32,9 +32,11 @@ SAME = float(np.radians(0.5))
 #: least rotation between two captures that is used to locate an axis [rad]
 LEAST_TURN = float(np.radians(2.0))
 
-#: normals turn about an axis if their differences spread in two directions by this many times their noise; rounding
-#: counts as noise of SMALLEST_TILT [rad]
-LEAST_SPREAD, SMALLEST_TILT = 3.0, 1e-7
+#: normals turn about an axis if their differences spread in two directions by this many times their noise
+LEAST_SPREAD = 3.0
+
+#: rounding counts as noise of this size [rad]
+SMALLEST_TILT = 1e-7
 
 
 def axes_from_rotations(angles: Floats, rotations: Floats, translations: Floats) -> tuple[TurningAxes, Floats]:
@@ -113,10 +115,7 @@ def axes_from_normals(
 
 
 def _pairs(angles: Floats, index: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
-    """Return pairs of captures between which, of this axis and those after it, only this one turns; and its angle.
-
-    The rotations of the axes before it are removed, so these may differ.
-    """
+    """Return pairs of captures between which, of this axis and those after it, only this one turns; and its angle."""
     apart = np.abs(angles[:, None, index + 1 :] - angles[None, :, index + 1 :])
     still = (apart < SAME).all(axis=2)
     turn = angles[:, None, index] - angles[None, :, index]

@@ -56,9 +56,11 @@ WORDS = {
     "simple_acceptance": "simple acceptance, JCGM 106, 8.2",
 }
 
-#: defaults for the largest share of the tolerance for the guard band, and for the least test uncertainty ratio: the 4 :
-#: 1 of ANSI/NCSL Z540.3
-GUARD_SHARE, UNCERTAINTY_RATIO = 0.25, 4.0
+#: default for the largest share of the tolerance for the guard band: the 4 : 1 of ANSI/NCSL Z540.3
+GUARD_SHARE = 0.25
+
+#: default for the least test uncertainty ratio: the same 4 : 1
+UNCERTAINTY_RATIO = 4.0
 
 Verdict = Literal["fits", "does not fit", "undecidable", "not decided", "no tolerance"]
 
@@ -309,10 +311,7 @@ def _one_sided_risks(errors: OneSidedErrors, tolerance: Tolerance, limit: float)
 
 
 def _least_guard(errors: Errors, tolerance: Tolerance) -> float:
-    """Return the least guard band for which the consumer's risk is at most the stated one.
-
-    It is at most the whole tolerance.
-    """
+    """Return the least guard band, up to the whole tolerance, with at most the stated consumer's risk."""
     most = tolerance.rule.consumer_risk
     assert most is not None
 
@@ -334,10 +333,7 @@ def _within(readings: Floats, limits: tuple[float, float] | None) -> Floats:
 
 
 def _demand_interval(errors: Errors, tolerance: Tolerance, asked: float) -> tuple[float, float]:
-    """Return the 95 % interval of the demand, symmetric in its logarithm.
-
-    Few trials determine only the order of magnitude of a scale.
-    """
+    """Return the 95 % interval of the demand, symmetric in its logarithm, as few trials give only its order."""
     if not asked > 0:
         return 0.0, 0.0
     if isinstance(errors, OneSidedErrors):

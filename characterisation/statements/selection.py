@@ -23,11 +23,17 @@ from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 
-#: standard uncertainty of the logarithm of the map's u: common to all views, and of each view
-PRIOR_COMMON, PRIOR_OWN = 1.0, 0.7
+#: standard uncertainty of the logarithm of the map's u, common to all views
+PRIOR_COMMON = 1.0
 
-#: kurtosis of errors: at least that of a uniform distribution, and that of a normal one where it is unknown
-_LEAST_KURTOSIS, _USUAL_KURTOSIS = 1.8, 3.0
+#: standard uncertainty of the logarithm of the map's u, of each view
+PRIOR_OWN = 0.7
+
+#: least kurtosis of errors: that of a uniform distribution
+_LEAST_KURTOSIS = 1.8
+
+#: kurtosis of errors where it is unknown: that of a normal distribution
+_USUAL_KURTOSIS = 3.0
 
 #: number of common trials at which the correlation of two views has the same weight as the mean over all pairs
 _SHRINKAGE = 20.0

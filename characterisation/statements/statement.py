@@ -206,14 +206,11 @@ def statement(
     )
 
 
-def numerical_tolerance(uncertainty: float, digits: int = 1) -> float:
-    """Return the numerical tolerance delta of an uncertainty (JCGM 101, 7.9.2).
-
-    It is half of the last of its significant digits.
-    """
+def numerical_tolerance(uncertainty: float) -> float:
+    """Return the numerical tolerance delta of an uncertainty of one significant digit: half of it (JCGM 101, 7.9.2)."""
     if not uncertainty > 0:
         return 0.0
-    power = math.floor(math.log10(uncertainty)) - (digits - 1)
-    if round(uncertainty / 10.0**power) >= 10**digits:  # 0.0996 is 0.1
+    power = math.floor(math.log10(uncertainty))
+    if round(uncertainty / 10.0**power) >= 10:  # 0.0996 is 0.1
         power += 1
     return float(0.5 * 10.0**power)

@@ -30,8 +30,11 @@ PARENTS: dict[str, tuple[tuple[tuple[str, ...], ...], str]] = {
     "mid_plane": ((("plane", "plane"),), "[plane, plane]"),
 }
 
-#: largest distance of nominal geometry from its plane or axis [mm], and largest tilt of a direction out of its face
-MISPLACED_MM, LEANING = 0.05, 1e-3
+#: largest distance of nominal geometry from its plane or axis [mm]
+MISPLACED_MM = 0.05
+
+#: largest tilt of a direction out of its face
+LEANING = 1e-3
 
 
 def read_task(path: str | Path) -> Task:

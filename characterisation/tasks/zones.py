@@ -19,9 +19,12 @@ from characterisation.tasks.places import PARALLEL, Axis, Geometry, PointLike, d
 Array = NDArray[np.float64]
 Datum = Plane | Axis
 
-#: sine of the angle within which normals and axes count as parallel, and least distance of two datum axes [mm]. The
-#: angle applies to an axis perpendicular to a datum plane, and to two planes about a middle plane
-ASKEW, APART_MM = 0.1, 1.0
+#: sine of the angle within which normals and axes count as parallel. It applies to an axis perpendicular to a datum
+#: plane, and to two planes about a middle plane
+ASKEW = 0.1
+
+#: least distance of two datum axes [mm]
+APART_MM = 1.0
 
 
 def position(feature: Plane | Axis | PointLike, *datums: Datum, nominal: Sequence[Geometry], outline: Array) -> float:

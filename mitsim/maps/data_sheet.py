@@ -44,12 +44,23 @@ from mitsim.sensor.transforms import Transform, look_at
 
 Floats = NDArray[np.float64]
 
-#: side of a plate and radius of a ball, each over its distance from the sensor
-PLATE_SHARE, BALL_SHARE = 0.25, 0.1
+#: side of a plate, over its distance from the sensor
+PLATE_SHARE = 0.25
 
-#: number of distances over the working range, tilts of metal, of the second plane of the floor, and of noise plates
-#: [deg]
-DISTANCES, TILTS_DEG, FLOOR_TILT_DEG, NOISE_TILT_DEG = 5, (0.0, 20.0, 40.0), 20.0, 5.0
+#: radius of a ball, over its distance from the sensor
+BALL_SHARE = 0.1
+
+#: number of distances over the working range
+DISTANCES = 5
+
+#: tilts of metal
+TILTS_DEG = (0.0, 20.0, 40.0)
+
+#: tilt of the second plane of the floor
+FLOOR_TILT_DEG = 20.0
+
+#: tilt of noise plates: a depth that is quantised in steps would show no noise on a square one
+NOISE_TILT_DEG = 5.0
 
 METALS = [finish for finish in FINISHES if finish != "matt white"]
 
@@ -307,10 +318,7 @@ def _seen(cloud: PointCloud) -> tuple[Floats, Floats]:
 
 
 def _inside(cloud: PointCloud, coupon: Coupon, margin: float = 0.1) -> NDArray[np.bool_]:
-    """Return which valid points lie on the coupon, by their rays, and near it.
-
-    ``margin`` is the excluded border as a fraction of the size.
-    """
+    """Return which valid points lie near the coupon, by their rays, without a border of ``margin`` of its size."""
     points, view = _seen(cloud)
     centre = coupon.centre - cloud.grid.origin
     reach = _to_plane(centre, coupon.normal, view)

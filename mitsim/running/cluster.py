@@ -188,7 +188,7 @@ class _Watch:
     def __init__(self, client: Any, address: str) -> None:
         self.client, self.address = client, address
         self.alone_since: float | None = None
-        self.reported = -REPORT_EVERY_S
+        self.reported = -float(REPORT_EVERY_S)
 
     def check(self) -> None:
         if self.client.ncores():

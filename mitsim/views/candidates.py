@@ -25,7 +25,7 @@ from mitsim.running.progress import track_if_long
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.sensor.working_volume import in_image
-from mitsim.views.collision import Box, Obstacle, is_inside, is_near, obstacle, sensor_box
+from mitsim.views.collision import BodyBox, Obstacle, is_inside, is_near, obstacle, sensor_box
 from mitsim.views.reach import reach_directions, reach_rotations, stage_from_part, stage_from_sensor
 from mitsim.views.table import PartStage, ViewsTable
 
@@ -266,12 +266,9 @@ def _depth(sensor: Sensor, target: Floats, distance: float, range_mm: tuple[floa
 
 
 def _first_free(
-    part: Obstacle, box: Box, clearance: float, sensor: Sensor, nearest: Transform, distances: Floats
+    part: Obstacle, box: BodyBox, clearance: float, sensor: Sensor, nearest: Transform, distances: Floats
 ) -> float:
-    """Return the first of ascending distances [mm] at which the sensor's body is clear of the part, NaN if none.
-
-    ``nearest`` is ``world_from_sensor`` at the first distance.
-    """
+    """Return the first of ascending distances [mm] with a free body, NaN if none; ``nearest`` is the first pose."""
     outward = -(nearest @ sensor.rig.reference.sensor_from_camera).rotation[:, 2]
     inside: bool | None = None  # None: unknown. Between two free steps the body does not cross the surface
     for distance in distances.tolist():

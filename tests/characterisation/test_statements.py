@@ -45,11 +45,6 @@ def test_numerical_tolerance_as_in_the_examples_of_jcgm_101(uncertainty, delta):
     assert numerical_tolerance(uncertainty) == pytest.approx(delta)
 
 
-def test_two_digits_of_numerical_tolerance():
-    # JCGM 101, 7.9.2.1, example 1: u = 0.35 g with two digits is 35 x 10^-2 g, delta 0.005 g
-    assert numerical_tolerance(0.35, digits=2) == pytest.approx(0.005)
-
-
 def test_bias_spread_and_their_errors():
     rng = np.random.default_rng(7)
     found = [statement("length", "mm", rng.normal(0.4, 0.1, 200)) for _ in range(300)]

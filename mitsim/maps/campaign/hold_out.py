@@ -40,8 +40,11 @@ PATCH_REACH = 0.015
 #: relative margin of a live stage from the ends of a map's distances, for the extent of a tilted coupon
 LIVE_MARGIN = 0.03
 
-#: relative standard error of sigma above which a pose is repeated, and the largest factor on the repeats
-LARGEST_SIGMA_ERROR, MOST_REPEATS = 0.03, 4
+#: relative standard error of sigma above which a pose is repeated
+LARGEST_SIGMA_ERROR = 0.03
+
+#: largest factor on the repeats
+MOST_REPEATS = 4
 
 #: [rad]
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
@@ -299,10 +302,7 @@ def _repeated(shot: Shot, count: int) -> list[Shot]:
 
 
 def _known(patches: xr.Dataset, sample: Sample, performance_map: PerformanceMap) -> NDArray[np.bool_]:
-    """Return the patches for which the map has a value over their whole extent.
-
-    A tilted coupon may extend beyond the distances of the map.
-    """
+    """Return the patches for which the map has a value over their whole extent, which a tilted coupon may exceed."""
     across = np.stack([patches["normal_x"].values, patches["normal_y"].values], axis=-1)
     normals = np.column_stack([across, np.sqrt(np.maximum(1 - (across**2).sum(axis=1), 0))])
     known = np.ones(len(normals), bool)

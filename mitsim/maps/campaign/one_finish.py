@@ -53,7 +53,11 @@ TURNS_DEG = (0.0, 45.0, 90.0, 135.0)
 #: mirror-like and glossy lobes are 5 to 20 deg wide; a matt finish varies only with cos
 BANDS = ((20.0, 3), (80.0, 2))
 REFINED = Refinement(fraction=0.3, sigma=0.7, sigma_error=0.08, subdivisions=4)
-COUPON_PX, SAMPLES_PER_PIXEL = 150.0, 16
+
+#: side of the coupon seen face on
+COUPON_PX = 150.0
+
+SAMPLES_PER_PIXEL = 16
 
 
 @dataclass(frozen=True)

@@ -129,10 +129,7 @@ def _take_missing(
 def _refined(
     campaign: Campaign, wanted: dict[Series, list[NDArray[np.float64]]], done: dict[tuple[str, str], Finished]
 ) -> tuple[dict[Series, list[NDArray[np.float64]]], int]:
-    """Add normals where a sample needs them, and the same normals for its variants.
-
-    Returns the new normals, and the number of edges that remain rough.
-    """
+    """Add normals where a sample needs them, also to its variants; return them and the number of rough edges."""
     assert campaign.file.refine is not None
     fresh: dict[Series, list[NDArray[np.float64]]] = {}
     unresolved = 0

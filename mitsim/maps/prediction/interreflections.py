@@ -54,13 +54,17 @@ from mitsim.sensor.vignetting import camera_illumination
 
 Floats = NDArray[np.float64]
 
-#: number of pixels of the coarse camera, and number of its pixels that a fringe covers at least
-PIXELS, PIXELS_OF_FRINGE = 20_000, 6
+#: number of pixels of the coarse camera
+PIXELS = 20_000
 
-#: camera paths and photons per render of interreflections. A phase code has two renders, which
-#: distinguish their noise from a bias. With large pixels photons are efficient: 300 000 remove two thirds of the noise
-#: of 80 000 camera paths
-PATHS, PHOTONS = 180_000, 400_000
+#: least number of its pixels that a fringe covers
+PIXELS_OF_FRINGE = 6
+
+#: camera paths per render of interreflections. A phase code has two renders, which distinguish their noise from a bias
+PATHS = 180_000
+
+#: photons per render. With large pixels 300 000 of them remove two thirds of the noise of 80 000 camera paths
+PHOTONS = 400_000
 
 #: number of views that are rendered at once: recording a kernel takes about as long as rendering one of them
 TOGETHER = 16
@@ -72,7 +76,7 @@ SMOOTHED_PX = 3.0
 NOISIEST = 4.0
 
 
-class Loss(Document):
+class LossCurve(Document):
     """Constants r, ``half``, and k, ``steepness``, of g(rho), each with its 95 % interval."""
 
     half: float
@@ -86,8 +90,8 @@ class Losses(Document):
 
     command: str
     cases: list[str]
-    matched: Loss
-    coded: Loss
+    matched: LossCurve
+    coded: LossCurve
 
 
 @cache
@@ -258,7 +262,7 @@ def _light(sensor: Sensor) -> ProjectedPatterns | ModulatedLight:
     return ProjectedPatterns(np.concatenate([white, fringes(sensor)]), sensor.projector)
 
 
-def found_share(rho: Floats, loss: Loss) -> Floats:
+def found_share(rho: Floats, loss: LossCurve) -> Floats:
     """Return g(rho), the share of points that are found at the right place."""
     with np.errstate(over="ignore"):
         return np.asarray(1 / (1 + (rho / loss.half) ** loss.steepness))
