@@ -64,6 +64,10 @@ def flatness_error(points: ArrayLike, rejected_share: float = REJECTED_SHARE) ->
     rejected_share
         Share of the points that may be rejected, 0..0.1; the plane is fitted again without them.
 
+    See Also
+    --------
+    characterisation.acceptance.range_uncertainty.flatness_uncertainty
+
     Raises
     ------
     InputError
@@ -87,6 +91,10 @@ def probing_error(
         [mm].
     rejected_share
         Share of the points that may be rejected, 0..0.1; the sphere is fitted again without them.
+
+    See Also
+    --------
+    characterisation.acceptance.range_uncertainty.form_error_uncertainty
 
     Raises
     ------

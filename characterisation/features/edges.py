@@ -91,6 +91,10 @@ def fit_circle(cloud: PointCloud, plane: PlaneFit, nominal: Circle, near: float 
         distance. By default :data:`NEAR_STD` times the standard deviation of the plane's points, at least
         :data:`NEAR_MM`.
 
+    See Also
+    --------
+    fit_edge_point
+
     Raises
     ------
     FitError

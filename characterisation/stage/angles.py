@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
+from characterisation.features.surfaces import unit
 from characterisation.files.documents import Document, Name
 
 Floats = NDArray[np.float64]
@@ -62,7 +63,7 @@ class StageAxis(Document):
 
     def unit(self) -> Floats:
         """Return the unit direction (3,)."""
-        return _unit(self.direction)
+        return unit(self.direction)
 
     def nearest(self, angles: ArrayLike) -> Floats:
         """Return the same angles (n,) [rad] plus whole turns, within the limits and as small as possible.
@@ -90,7 +91,7 @@ class Stage(Document):
     def normals(self, angles: ArrayLike) -> Floats:
         """Return the normals (n, 3) of the coupon at angles (n, axes) [rad]."""
         angles = np.atleast_2d(np.asarray(angles, float))
-        out = np.broadcast_to(_unit(self.normal), (len(angles), 3))
+        out = np.broadcast_to(unit(self.normal), (len(angles), 3))
         for axis, turn in reversed(list(zip(self.axes, angles.T, strict=True))):
             out = turned(out, axis.unit(), turn)
         return np.asarray(out)
@@ -106,7 +107,7 @@ class Stage(Document):
 
     def _candidates(self, wanted: Floats) -> list[Floats]:
         """Return angles (n, axes) that may show the wanted normals, NaN where there is no solution."""
-        start = np.broadcast_to(_unit(self.normal), wanted.shape)
+        start = np.broadcast_to(unit(self.normal), wanted.shape)
         units = [axis.unit() for axis in self.axes]
         if len(units) == 1:
             return [about_one(start, wanted, units[0])[:, None]]
@@ -186,11 +187,6 @@ def turned(vectors: Floats, axis: Floats, angle: Floats) -> Floats:
     cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
     along = (vectors @ axis)[:, None] * axis
     return np.asarray(along + cos * (vectors - along) + sin * np.cross(axis, vectors))
-
-
-def _unit(vector: ArrayLike) -> Floats:
-    vector = np.asarray(vector, float)
-    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def about_one(start: Floats, wanted: Floats, axis: Floats) -> Floats:

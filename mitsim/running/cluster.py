@@ -69,15 +69,13 @@ class Cluster:
     def distribute(
         self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
     ) -> Iterator[tuple[Item, Result]]:
-        """Yield items with the results of their orders, as they are finished; orders and results are plain values.
+        """Yield items with their results, see :meth:`~mitsim.running.executor.Executor.distribute`.
 
         Raises
         ------
-        InputError
-            If a worker raises it.
         MissingEnvironmentError
-            If there are no workers for :data:`NO_WORKER_S`, a worker has another build of mitsim, or any other error
-            occurs there.
+            Also if there are no workers for :data:`NO_WORKER_S`, a worker has another build of mitsim, or any other
+            error occurs there.
         """
         if not items:
             return

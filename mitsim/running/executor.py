@@ -144,15 +144,7 @@ class Pool:
     def distribute(
         self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
     ) -> Iterator[tuple[Item, Result]]:
-        """Yield items with the results of ``work`` on their orders, as they are finished.
-
-        Raises
-        ------
-        InputError
-            If a worker raises it.
-        MissingEnvironmentError
-            If processes die repeatedly.
-        """
+        """Yield items with their results, see :meth:`Executor.distribute`; dead processes are replaced."""
         waiting, deaths = deque(items), 0
         running: dict[Future[Result], Item] = {}
         while waiting or running:

@@ -221,13 +221,11 @@ def joined(tables: Sequence[xr.Dataset]) -> xr.Dataset:
 def _all_patches(tables: list[SampleTable]) -> xr.Dataset:
     """Join the tables; each patch keeps the number of its sample, whose finish and Ra are coordinates."""
     samples = list(dict.fromkeys((table.finish, str(table.roughness)) for table in tables))
-    columns: dict[str, list[NDArray[np.generic]]] = {}
-    for table in tables:
-        number = samples.index((table.finish, str(table.roughness)))
-        for name, values in table.patches.data_vars.items():
-            columns.setdefault(str(name), []).append(values.values)
-        columns.setdefault("sample_number", []).append(np.full(table.patches.sizes["patch"], number, np.int16))
-    whole = patch_table(**{name: np.concatenate(parts) for name, parts in columns.items()})
+    numbers = [samples.index((table.finish, str(table.roughness))) for table in tables]
+    sizes = [table.patches.sizes["patch"] for table in tables]
+    patches = [table.patches.variables for table in tables]
+    columns = {str(name): np.concatenate([one[name].values for one in patches]) for name in tables[0].patches.data_vars}
+    whole = patch_table(**columns, sample_number=np.repeat(np.array(numbers, np.int16), sizes))
     return whole.assign_coords(
         finish=("sample", [finish for finish, _ in samples]),
         roughness=("sample", [float(ra) for _, ra in samples], {"units": "um", "long_name": "roughness average Ra"}),
