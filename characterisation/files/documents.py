@@ -268,14 +268,13 @@ def _tags(model: type[BaseModel]) -> set[str]:
 def shown(value: Any, where: str | Path = "") -> str:
     """Return a value as its file has it, shortened: in JSON for a ``.json`` file, otherwise in TOML."""
     try:
-        text = _in_json(value) if str(where).lower().endswith(".json") else _in_toml(value)
+        if str(where).lower().endswith(".json") and not isinstance(value, str):
+            text = json.dumps(value, ensure_ascii=False, default=str)
+        else:
+            text = _in_toml(value)
     except (ValueError, TypeError, RecursionError):  # an integer of thousands of digits, or nesting as deep
         text = f"a {type(value).__name__} too long to show"
     return text if len(text) <= 80 else text[:77] + "..."
-
-
-def _in_json(value: Any) -> str:
-    return repr(value) if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
 
 
 def _in_toml(value: Any) -> str:

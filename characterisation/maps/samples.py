@@ -68,7 +68,9 @@ class Samples:
         rough = self.roughness[members]
         if math.isnan(rough[0]):
             return members[:1], math.nan
-        self._check_roughness(finish, float(roughness), rough)
+        if not rough[0] * (1 - 1e-6) <= roughness <= rough[-1] * (1 + 1e-6):
+            allowed = f"{rough[0]:g} to {rough[-1]:g} um, the characterised range of {finish}"
+            raise InputError(self.where, "Ra", f"{roughness:g} um", allowed, "characterise a sample outside this range")
         if light is not None:
             self._check_between(finish, float(roughness), light, members)
         return members, float(roughness)
@@ -112,8 +114,3 @@ class Samples:
             found = f"{finish} Ra {roughness:g} um ({light})"
             allowed = f"optical properties between those of its neighbours: {low}, and {high}"
             raise InputError(self.where, "finish", found, allowed, "characterise this finish")
-
-    def _check_roughness(self, finish: str, roughness: float, known: Floats) -> None:
-        if not known[0] * (1 - 1e-6) <= roughness <= known[-1] * (1 + 1e-6):
-            allowed = f"{known[0]:g} to {known[-1]:g} um, the characterised range of {finish}"
-            raise InputError(self.where, "Ra", f"{roughness:g} um", allowed, "characterise a sample outside this range")

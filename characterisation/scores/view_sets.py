@@ -143,7 +143,8 @@ def fewest_views(
     if not greedy.feasible.any() or (complete and len(greedy.views) <= 1):
         return ViewSet(greedy.views, greedy.uncertainty, greedy.feasible, exact=True)
     count = len(features[0].information)
-    best, rows, bounds = _indicator(greedy.views, count), list[Floats](), list[float]()
+    best = np.isin(np.arange(count), greedy.views).astype(float)
+    rows, bounds = list[Floats](), list[float]()
     size = best.sum() if complete else count + 1
     _cut(features, np.zeros(count), limits, greedy.feasible, rows, bounds)
     while (left := seconds - (time.monotonic() - began)) > 0:
@@ -219,12 +220,6 @@ def _total(features: Sequence[FeatureInformation], covariances: Sequence[Floats]
     """Return u_m^2 (measurements,)."""
     parts = [np.einsum("mij,ji->m", f.quadratic, c) for f, c in zip(features, covariances, strict=True)]
     return np.asarray(np.sum(parts, axis=0))
-
-
-def _indicator(views: Sequence[int], count: int) -> Floats:
-    chosen = np.zeros(count)
-    chosen[list(views)] = 1
-    return chosen
 
 
 def _answer(uncertainty_of: Joined, chosen: Floats, feasible: NDArray[np.bool_], exact: bool) -> ViewSet:

@@ -190,6 +190,7 @@ def decide(errors: Errors, tolerance: Tolerance) -> Decided:
     edges = [edge for edge in (tolerance.lower, tolerance.upper) if math.isfinite(edge)]
     through = [share(_within(edge + stated_errors(taken), limits)) for edge in edges]
     worst = max(through, key=lambda one: one.value)
+    middle = taken.at(abs(taken.fold - tolerance.middle)) if isinstance(taken, OneSidedErrors) else taken
     risks = None if rule.rule != "jcgm_106" else global_risks(taken, tolerance, limits)
     return Decided(
         WORDS[rule.rule],
@@ -202,14 +203,9 @@ def decide(errors: Errors, tolerance: Tolerance) -> Decided:
         worst.value,
         (worst.low, worst.high),
         1 - min(one.value for one in through),
-        1 - float(_within(tolerance.middle + _in_the_middle(taken, tolerance), limits).mean()),
+        1 - float(_within(tolerance.middle + middle, limits).mean()),
         *(risks or (None, None)),
     )
-
-
-def _in_the_middle(errors: Errors, tolerance: Tolerance) -> Floats:
-    """Return the errors (n,) of a part in the middle of the tolerance."""
-    return errors.at(abs(errors.fold - tolerance.middle)) if isinstance(errors, OneSidedErrors) else errors
 
 
 def acceptance(errors: Errors, tolerance: Tolerance) -> tuple[float, float] | None:

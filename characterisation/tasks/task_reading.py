@@ -140,14 +140,10 @@ def _check_measurement(path: str | Path, task: Task, name: str) -> None:
         hint = f"{place} is a zone over the extent of the feature"
         raise InputError(path, f"features.{measurement.features[0]}.outline_mm", "nothing", allowed, hint)
     if definition.datums and len(kinds) > len(definition.kinds):
-        _check_datums(path, f"{place}.features", measurement.features[len(definition.kinds) :], task)
-
-
-def _check_datums(path: str | Path, place: str, names: tuple[str, ...], task: Task) -> None:
-    """Check that three datums define a frame."""
-    datums = [one for one in map(task.nominal, names) if isinstance(one, Plane | Cylinder | Cone)]
-    if fault := frame_fault(datums):
-        raise InputError(path, place, ", ".join(names), fault)
+        names = measurement.features[len(definition.kinds) :]
+        datums = [one for one in map(task.nominal, names) if isinstance(one, Plane | Cylinder | Cone)]
+        if fault := frame_fault(datums):
+            raise InputError(path, f"{place}.features", ", ".join(names), fault)
 
 
 def _check_names(path: str | Path, place: str, names: tuple[str, ...], task: Task) -> None:

@@ -27,7 +27,7 @@ from scipy import stats
 
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.features.fits import fit_plane, fit_sphere
-from characterisation.point_cloud import PointCloud
+from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.decode.cloud import capture_cloud
@@ -69,6 +69,9 @@ AZIMUTH_DEG = 45.0
 
 #: largest angle between normal and view ray on a ball; points beyond it belong to the limb and bias the radius
 _EDGE_DEG = 60.0
+
+#: excluded border of a plate, as a fraction of its size
+_BORDER = 0.1
 
 SAMPLES_PER_PIXEL = 16
 
@@ -212,9 +215,7 @@ class _SimulatedTargets:
 
     def plane_floor(self, distance: float, tilt_deg: float) -> PlaneFloor:
         cloud, coupon = self._plate("matt white", distance, tilt_deg, Noise.none())
-        points, view = _seen(cloud)
-        inner = _inside(cloud, coupon)
-        points, view = points[inner], view[inner]
+        points, view, _ = _on_plate(cloud, coupon)
         off = np.linalg.norm(points, axis=1) - _to_plane(coupon.centre - cloud.grid.origin, coupon.normal, view)
         patches = measure_patches(cloud, coupon)
         return PlaneFloor(
@@ -245,9 +246,8 @@ class _SimulatedTargets:
         patches = measure_patches(cloud, coupon)
         sigma = patches.ray_noise_inliers.values
         known = sigma[np.isfinite(sigma)]
-        points, view = _seen(cloud)
-        inner = _inside(cloud, coupon)
-        spread = float(_about_plane(points[inner], view[inner]).std()) if inner.sum() > 100 else math.nan
+        points, view, _ = _on_plate(cloud, coupon)
+        spread = float(_about_plane(points, view).std()) if len(points) > 100 else math.nan
         return Recovery(
             finish,
             float(distance),
@@ -259,12 +259,10 @@ class _SimulatedTargets:
 
     def residuals(self, distance: float) -> Residuals:
         cloud, coupon = self._plate("matt white", distance, NOISE_TILT_DEG, Noise())
-        points, view = _seen(cloud)
-        inner = _inside(cloud, coupon)
-        values = _about_plane(points[inner], view[inner])
+        points, view, inner = _on_plate(cloud, coupon)
+        values = _about_plane(points, view)
         image = np.full(cloud.status.shape, np.nan)
-        rows, columns = np.nonzero(cloud.valid)
-        image[rows[inner], columns[inner]] = values
+        image.flat[np.flatnonzero(cloud.valid)[inner]] = values
         length = correlation_length(image)
         step = max(1, math.ceil(2 * length))
         apart = image[::step, ::step]
@@ -317,16 +315,17 @@ def _seen(cloud: PointCloud) -> tuple[Floats, Floats]:
     return points, points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
-def _inside(cloud: PointCloud, coupon: Coupon, margin: float = 0.1) -> NDArray[np.bool_]:
-    """Return which valid points lie near the coupon, by their rays, without a border of ``margin`` of its size."""
+def _on_plate(cloud: PointCloud, coupon: Coupon) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Return points near the coupon and off its border, by their rays, these rays, and which valid points they are."""
     points, view = _seen(cloud)
     centre = coupon.centre - cloud.grid.origin
     reach = _to_plane(centre, coupon.normal, view)
     foot = view * reach[:, None] - centre
     along = np.cross(coupon.normal, coupon.across)
-    half_width, half_height = (0.5 - margin) * coupon.width, (0.5 - margin) * coupon.height
-    true = np.abs(np.linalg.norm(points, axis=1) / reach - 1) < 0.01
-    return np.asarray(true & (np.abs(foot @ coupon.across) < half_width) & (np.abs(foot @ along) < half_height))
+    half_width, half_height = (0.5 - _BORDER) * coupon.width, (0.5 - _BORDER) * coupon.height
+    true = np.abs(np.linalg.norm(points, axis=1) / reach - 1) < FALSE_SHARE_OF_DISTANCE
+    inner = true & (np.abs(foot @ coupon.across) < half_width) & (np.abs(foot @ along) < half_height)
+    return points[inner], view[inner], inner
 
 
 def _to_plane(centre: Floats, normal: Floats, view: Floats) -> Floats:

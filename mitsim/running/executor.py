@@ -12,6 +12,7 @@ repeated, at most :data:`DEATHS` times in a row.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import multiprocessing
 import os
 import signal
@@ -184,22 +185,15 @@ class Pool:
 
 
 def _start_worker(threads: int, parent: int) -> None:
-    """Set up a worker process: limit its threads, and ignore Ctrl-C, which the parent handles."""
+    """Set up a worker process: limit its threads, end with its parent (Linux), and leave Ctrl-C to the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _end_with_parent(parent)
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = str(threads)
-
-
-def _end_with_parent(parent: int) -> None:
-    """End this process if the parent is killed (Linux)."""
     if sys.platform == "linux":
-        import ctypes
-
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
     if os.getppid() != parent:
         raise SystemExit(0)
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = str(threads)
 
 
 def results_of(

@@ -196,7 +196,8 @@ def compared(
         Number of captures with fresh noise.
     """
     sensor = prepared.sensor
-    repeated = _repeated(shot, MOST_REPEATS * repeats)
+    seeds = (shot.series.seed + 2**32 * number for number in range(MOST_REPEATS * repeats))
+    repeated = [replace(shot, series=replace(shot.series, seed=seed)) for seed in seeds]
     first = take(repeated[0])
     sample, pose = shot.series.sample, coupon_place(first, shot)
     own = own_sensor(first, sensor)
@@ -293,12 +294,6 @@ def _measure(cloud: PointCloud, coupon: Coupon) -> _Measured:
 
 def _pooled(measurements: list[_Measured], known: NDArray[np.int64]) -> Overall:
     return overall(xr.concat([patches.isel(patch=known) for patches, _ in measurements], "patch"))
-
-
-def _repeated(shot: Shot, count: int) -> list[Shot]:
-    """Return shots of the same coupon at the same pose, each with its own seed."""
-    seeds = [shot.series.seed + 2**32 * number for number in range(count)]
-    return [replace(shot, series=replace(shot.series, seed=seed)) for seed in seeds]
 
 
 def _known(patches: xr.Dataset, sample: Sample, performance_map: PerformanceMap) -> NDArray[np.bool_]:
