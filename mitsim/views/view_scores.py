@@ -80,18 +80,6 @@ class _Cast:
 
 
 @dataclass(frozen=True)
-class _Scoring:
-    """Scene, task, map and predictor of a scoring; the ``predictor`` casts every ``step``-th ray of every such row."""
-
-    scene: Scene
-    task: Task
-    performance_map: PerformanceMap
-    minimum_points: float
-    predictor: Predictor
-    step: int
-
-
-@dataclass(frozen=True)
 class _ViewScore:
     """Results of one view: a row of each statistic of V_m by feature, and the expected inputs and measurements."""
 
@@ -132,8 +120,7 @@ def score_candidates(
     list of dict
         For every view, the input quantities of its measurements, from which sets of views are chosen.
     """
-    looking, step = predictor.thinned_to(RAYS)
-    scoring = _Scoring(scene, task, performance_map, minimum_points, looking, step)
+    looking = predictor.thinned_to(RAYS)
     names = list(task.shapes)
     alone = [CharacterisedScene(scene.only(name), performance_map, MATT_WHITE) for name in names]
 
@@ -146,7 +133,7 @@ def score_candidates(
         return _Cast(ideal, labels, n_only, together((effect(view_of) for effect in effects), len(ideal.pixel)))
 
     def score(cast: _Cast, view: View) -> _ViewScore:
-        return _score_view(scoring, cast, view)
+        return _score_view(cast, view, scene, task, performance_map, minimum_points, looking)
 
     # the rays of the next view are cast while this view is evaluated
     scored = [one for _, one in track(one_ahead(views, cast, score), "score views", len(views))]
@@ -198,14 +185,21 @@ def screening_risk(scores: xr.Dataset) -> Floats:
     return np.where(able, np.log(np.where(able, u, 1.0)) - 0.5 * np.log(np.where(able, chance, 1.0)), np.inf)
 
 
-def _score_view(scoring: _Scoring, cast: _Cast, view: View) -> _ViewScore:
-    """Return the results of a view from its rays: every ``step``-th ray of every ``step``-th row."""
-    scene, task, performance_map = scoring.scene, scoring.task, scoring.performance_map
+def _score_view(
+    cast: _Cast,
+    view: View,
+    scene: Scene,
+    task: Task,
+    performance_map: PerformanceMap,
+    minimum_points: float,
+    predictor: Predictor,
+) -> _ViewScore:
+    """Return the results of a view from the rays that a thinned predictor has cast."""
     names, ideal, labels = list(task.shapes), cast.ideal, cast.labels
     shapes = [scene.names.index(name) for name in names]
     white = performance(ideal, scene, performance_map, MATT_WHITE)
     n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
-    thinning, pitch = scoring.step**2, scoring.predictor.grid.angular_pitch / scoring.step
+    thinning, pitch = predictor.step**2, predictor.grid.angular_pitch / predictor.step
     points_of_view = ViewPoints(ideal, labels, view.world_from_sensor, thinning, pitch)
 
     def expected(perturbation: Perturbation | None) -> dict[str, ExpectedPoints]:
@@ -215,7 +209,7 @@ def _score_view(scoring: _Scoring, cast: _Cast, view: View) -> _ViewScore:
         }
 
     as_mapped, points = expected(None), expected(cast.perturbation)
-    inputs = expected_inputs(task, points, scoring.minimum_points)
+    inputs = expected_inputs(task, points, minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _ViewScore(
         np.array([one.count for one in as_mapped.values()]),

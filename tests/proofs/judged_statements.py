@@ -1,7 +1,7 @@
 """Judge the statements and chosen views of cases: coverage of the intervals, false accepts, regrets.
 
 Signal chain: judged cases (:mod:`tests.proofs.statement_run`) -> shares of errors inside the stated intervals,
-shares of worlds that falsely accept a part, and regrets of chosen views (:mod:`characterisation.statements.judgement`).
+shares of worlds that falsely accept a part, and regrets of chosen views (:mod:`tests.proofs.judgement`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Write the page on how well screening orders views: recall, rank correlation and probability of a value, in Markdown.
 
 Signal chain: judged cases (:mod:`tests.proofs.screening_run`) -> values of every measurement and score
-(:mod:`characterisation.scores.screening`) -> ``scores.csv``, ``reliability.png``, ``order.png`` -> ``scores.md``.
+(:mod:`tests.proofs.screening_figures`) -> ``scores.csv``, ``reliability.png``, ``order.png`` -> ``scores.md``.
 """
 
 from __future__ import annotations

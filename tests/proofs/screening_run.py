@@ -172,7 +172,8 @@ def measured_cost(cost: Floats, u: Floats, chance: Floats, once: Floats, count: 
 
 def seen_by_all(study: Study, predictor: Predictor) -> Floats:
     """Return the sum of cos(theta) / |V|^2 [1/mm^2] over the points that all eyes see, (view, feature)."""
-    looking, step = predictor.thinned_to(RAYS)
+    looking = predictor.thinned_to(RAYS)
+    step = looking.step
     scene = study.scene
     shapes = [scene.names.index(name) for name in study.task.shapes]
     sums = np.zeros((len(study.views), len(shapes)))

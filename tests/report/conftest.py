@@ -14,7 +14,7 @@ import xarray as xr
 from characterisation.cloud_files import write_cloud
 from characterisation.coupon.patch_table import patch_table
 from characterisation.files.atomic_io import write_netcdf
-from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.performance_map import SCHEMA_VERSION, PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.scores.view_score import score_views, view_statistics
 from characterisation.tasks.evaluation import Feature, Measurement, Task
@@ -53,7 +53,7 @@ def make_map() -> PerformanceMap:
                 "finish": ("sample", ["matt_white", "steel/ground"]),
                 "roughness": ("sample", [np.nan, 0.4]),
             },
-            {"source": "simulated", "name": "test map"},
+            {"source": "simulated", "name": "test map", "schema_version": SCHEMA_VERSION},
         )
     )
 

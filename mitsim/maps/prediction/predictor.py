@@ -110,10 +110,10 @@ class Predictor:
         assert self.step == 1, "thinned already"
         return Predictor(self.rig, self.grid, self.seen, self.sensor, self.edge_margin_px, step)
 
-    def thinned_to(self, rays: int) -> tuple[Predictor, int]:
-        """Return a predictor that casts about ``rays`` rays, and its step, as in :meth:`thinned`."""
+    def thinned_to(self, rays: int) -> Predictor:
+        """Return a predictor that casts about ``rays`` rays, as :meth:`thinned`."""
         step = max(1, math.floor(math.sqrt(self.grid.width * self.grid.height / rays)))
-        return (self.thinned(step) if step > 1 else self), step
+        return self.thinned(step) if step > 1 else self
 
     def surfaces(self, scene: Scene, world_from_sensor: Transform) -> Surfaces:
         """Return the ray-cast surfaces of a view, in the sensor frame."""
