@@ -33,11 +33,12 @@ _NAMES = {
     "measure_coupon": "characterisation.coupon_cloud",
     "overall": "characterisation.coupon.patch_table",
     "patch_metrics": "characterisation.coupon_cloud",
-    "read_cloud": "characterisation.interface",
-    "write_cloud": "characterisation.interface",
+    "read_cloud": "characterisation.cloud_files",
+    "write_cloud": "characterisation.cloud_files",
 }
 
 if TYPE_CHECKING:
+    from characterisation.cloud_files import read_cloud, write_cloud
     from characterisation.coupon.patch_table import Overall, overall
     from characterisation.coupon.patches import Coupon
     from characterisation.coupon_cloud import measure_coupon, patch_metrics
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
     from characterisation.features.robust_fit import FitError
     from characterisation.features.surfaces import Cylinder
     from characterisation.files.errors import InputError, MissingEnvironmentError
-    from characterisation.interface import read_cloud, write_cloud
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.point_cloud import PointCloud, Status, ViewGrid
 

@@ -24,15 +24,7 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
 _VERTEX = np.dtype(
-    [
-        ("x", "<f4"),
-        ("y", "<f4"),
-        ("z", "<f4"),
-        ("sigma", "<f4"),
-        ("row", "<u2"),
-        ("col", "<u2"),
-        ("feature", "<i2"),
-    ]
+    [*((name, "<f4") for name in ("x", "y", "z", "sigma")), ("row", "<u2"), ("col", "<u2"), ("feature", "<i2")]
 )
 _PIXEL = np.dtype([("status", "u1")])
 _BENT_PIXEL = np.dtype([("status", "u1"), ("ray_x", "<f4"), ("ray_y", "<f4")])
@@ -54,8 +46,32 @@ class WrittenFrame:
     from_sensor: NDArray[np.float64]
 
 
-def write_ply(cloud: PointCloud, path: str | Path, frame: WrittenFrame | None = None) -> None:
-    """Write a cloud atomically as binary little-endian PLY, in the sensor frame or in ``frame``."""
+def write_cloud(cloud: PointCloud, path: str | Path, frame: WrittenFrame | None = None) -> None:
+    """Write an organised cloud as binary PLY.
+
+    The file holds the pixel grid, the status of every pixel, and each point with its row, column, feature and sigma.
+    Writing is atomic: an existing file is replaced only when the new one is complete.
+
+    Parameters
+    ----------
+    cloud
+        Points (H, W, 3) [mm] in the sensor frame.
+    path
+        Path of the file. Its folder must exist.
+    frame
+        Frame in which the points are written; by default, the sensor frame.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> import characterisation
+    >>> cloud = characterisation.read_cloud("cloud.ply")
+    >>> characterisation.write_cloud(cloud, "copy.ply")
+    """
     rows, columns = np.nonzero(cloud.valid)
     vertices = np.zeros(len(rows), _VERTEX)
     points = cloud.points[rows, columns].astype(np.float64)
@@ -74,12 +90,7 @@ def write_ply(cloud: PointCloud, path: str | Path, frame: WrittenFrame | None = 
         "baseline": cloud.baseline.tolist(),
         "labelled": cloud.feature is not None,
         "grid": {
-            "fx": grid.fx,
-            "fy": grid.fy,
-            "cx": grid.cx,
-            "cy": grid.cy,
-            "width": grid.width,
-            "height": grid.height,
+            **{name: getattr(grid, name) for name in ("fx", "fy", "cx", "cy", "width", "height")},
             "rotation": grid.rotation.tolist(),
             "origin": grid.origin.tolist(),
             "bent": grid.normalised is not None,
@@ -106,13 +117,31 @@ def write_ply(cloud: PointCloud, path: str | Path, frame: WrittenFrame | None = 
         file.write_bytes("\n".join(header).encode() + vertices.tobytes() + pixels.tobytes())
 
 
-def read_ply(path: str | Path) -> PointCloud:
-    """Read a cloud written by :func:`write_ply`; return its points in the sensor frame.
+def read_cloud(path: str | Path) -> PointCloud:
+    """Read an organised cloud from a PLY file written by :func:`write_cloud` or ``mitsim decode``.
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Returns
+    -------
+    PointCloud
+        Points (H, W, 3) [mm] in the sensor frame, NaN where missing.
 
     Raises
     ------
     InputError
-        If the file is missing, truncated, or a PLY without a grid.
+        If the file is missing or truncated, or is a PLY without a pixel grid. ``mitsim import`` reads the clouds of
+        other programs.
+
+    Examples
+    --------
+    >>> import characterisation
+    >>> cloud = characterisation.read_cloud("cloud.ply")
+    >>> cloud.points.shape
+    (240, 320, 3)
     """
     path = Path(path)
     data = read_bounded(path, "a PLY file", largest=_LARGEST_CLOUD)
@@ -164,15 +193,5 @@ def read_ply(path: str | Path) -> PointCloud:
         read = ((read - moved[:3, 3]) @ moved[:3, :3]).astype(np.float32)
     points[rows, columns] = read
     feature[rows, columns], sigma[rows, columns] = vertices["feature"], vertices["sigma"]
-    has_sigma = bool(np.isfinite(sigma).any())
-    return PointCloud(
-        points,
-        status,
-        grid,
-        sensor,
-        source,
-        baseline,
-        feature if labelled else None,
-        names,
-        sigma if has_sigma else None,
-    )
+    known_sigma = sigma if np.isfinite(sigma).any() else None
+    return PointCloud(points, status, grid, sensor, source, baseline, feature if labelled else None, names, known_sigma)

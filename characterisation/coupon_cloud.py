@@ -22,6 +22,7 @@ from characterisation.features.robust_fit import FitError
 from characterisation.files.errors import InputError
 from characterisation.pinhole_grid import PINHOLE_RMS_PX, pinhole_of
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from characterisation.region_of_interest import Roi
 
 Floats = NDArray[np.float64]
 
@@ -141,21 +142,15 @@ def measure_coupon(
     (True, True)
     """
     cloud = points if isinstance(points, PointCloud) else _cloud_of(points, viewpoint, grid)
-    left, top, width, height = _checked_window(window, cloud.grid)
-    part = _cropped(cloud, left, top, width, height)
-    if coupon is None:
-        known, margin = _coupon_seen(part), 0.0 if margin_px is None else margin_px
-    else:
-        known, margin = coupon, 5.0 if margin_px is None else margin_px
-    patches = measure_patches(part, known, radius_px, margin)
+    roi = _checked_window(window, cloud.grid)
+    part = _cropped(cloud, roi)
+    if margin_px is None:
+        margin_px = 0.0 if coupon is None else 5.0
+    patches = measure_patches(part, coupon or _coupon_seen(part), radius_px, margin_px)
     if not patches.sizes["patch"]:
-        raise InputError(
-            "patch_metrics",
-            "window",
-            f"{width} x {height} px, with no disc in it",
-            f"a part of the coupon that holds discs of radius {radius_px:g} px",
-        )
-    patches = patches.assign(row=patches["row"] + top, column=patches["column"] + left)
+        allowed = f"a part of the coupon that holds discs of radius {radius_px:g} px"
+        raise InputError("patch_metrics", "window", f"{roi.width} x {roi.height} px, with no disc in it", allowed)
+    patches = patches.assign(row=patches["row"] + roi.top, column=patches["column"] + roi.left)
     return patches if coupon is not None else patches.drop_vars(_OF_A_KNOWN_POSE)
 
 
@@ -164,13 +159,8 @@ def _cloud_of(points: ArrayLike, viewpoint: ArrayLike, grid: ViewGrid | None) ->
     array, eye = np.asarray(points, float), np.asarray(viewpoint, float)
     where = "patch_metrics"
     if array.ndim != 3 or array.shape[2] != 3:
-        raise InputError(
-            where,
-            "points",
-            f"an array {array.shape}",
-            "(H, W, 3): one point per sensor pixel",
-            "F is the share of pixels that have a point",
-        )
+        hint = "F is the share of pixels that have a point"
+        raise InputError(where, "points", f"an array {array.shape}", "(H, W, 3): one point per sensor pixel", hint)
     if eye.shape != (3,) or not np.isfinite(eye).all():
         raise InputError(where, "viewpoint", eye.tolist(), "three numbers [mm]")
     known = np.isfinite(array).all(axis=-1)
@@ -198,26 +188,23 @@ def _cloud_of(points: ArrayLike, viewpoint: ArrayLike, grid: ViewGrid | None) ->
         raise InputError(where, "grid", str(error), "a grid of the same size as the points") from None
 
 
-def _checked_window(window: tuple[int, int, int, int] | None, grid: ViewGrid) -> tuple[int, int, int, int]:
+def _checked_window(window: tuple[int, int, int, int] | None, grid: ViewGrid) -> Roi:
     """Return the checked window, or the whole grid without one."""
     if window is None:
-        return 0, 0, grid.width, grid.height
-    left, top, width, height = (int(number) for number in window)
-    if left < 0 or top < 0 or width < 1 or height < 1 or left + width > grid.width or top + height > grid.height:
-        raise InputError(
-            "patch_metrics",
-            "window",
-            tuple(window),
-            f"(column, row, width, height) within {grid.width} x {grid.height} px",
-        )
-    return left, top, width, height
+        return Roi.whole(grid.width, grid.height)
+    roi = Roi(*(int(number) for number in window))
+    if not roi.fits(grid.width, grid.height):
+        allowed = f"(column, row, width, height) within {grid.width} x {grid.height} px"
+        raise InputError("patch_metrics", "window", tuple(window), allowed)
+    return roi
 
 
-def _cropped(cloud: PointCloud, left: int, top: int, width: int, height: int) -> PointCloud:
+def _cropped(cloud: PointCloud, window: Roi) -> PointCloud:
     """Crop a cloud and its grid to a window."""
-    grid, inside = cloud.grid, (slice(top, top + height), slice(left, left + width))
+    grid, inside = cloud.grid, window.slices
     bent = None if grid.normalised is None else grid.normalised[inside]
-    part = replace(grid, cx=grid.cx - left, cy=grid.cy - top, width=width, height=height, normalised=bent)
+    moved = replace(grid, cx=grid.cx - window.left, cy=grid.cy - window.top, width=window.width, height=window.height)
+    part = replace(moved, normalised=bent)
     return PointCloud(cloud.points[inside], cloud.status[inside], part, cloud.sensor, cloud.source, cloud.baseline)
 
 
@@ -236,12 +223,8 @@ def _coupon_seen(cloud: PointCloud) -> Coupon:
     reach = (plane.point - grid.origin) @ plane.normal
     facing = rays @ plane.normal
     if not (facing * reach > 0).all():
-        raise InputError(
-            "patch_metrics",
-            "window",
-            "pixels whose rays miss the plane of the points",
-            "a window that the coupon fills",
-        )
+        found = "pixels whose rays miss the plane of the points"
+        raise InputError("patch_metrics", "window", found, "a window that the coupon fills")
     met = grid.origin + rays * (reach / facing)[:, None]
     axis = grid.rotation[:, 2]
     across = np.cross(plane.normal, axis)

@@ -8,7 +8,7 @@ missing point has a :class:`Status` that says why.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol
@@ -85,17 +85,13 @@ class ViewGrid:
         """Return the grid of every ``step``-th pixel and row, starting at ``step // 2``."""
         first = step // 2
         rows, columns = range(first, self.height, step), range(first, self.width, step)
-        bent = None if self.normalised is None else self.normalised[first::step, first::step]
-        return ViewGrid(
-            self.fx / step,
-            self.fy / step,
-            (self.cx - first) / step,
-            (self.cy - first) / step,
-            len(columns),
-            len(rows),
-            self.rotation,
-            self.origin,
-            bent,
+        return replace(
+            self,
+            **{name: getattr(self, name) / step for name in ("fx", "fy")},
+            **{name: (getattr(self, name) - first) / step for name in ("cx", "cy")},
+            width=len(columns),
+            height=len(rows),
+            normalised=None if self.normalised is None else self.normalised[first::step, first::step],
         )
 
     def rays(self) -> NDArray[np.float64]:

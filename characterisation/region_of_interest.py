@@ -32,7 +32,15 @@ class Roi:
 
     @classmethod
     def between(cls, left: float, top: float, right: float, bottom: float) -> Roi:
-        """From its edges, whole numbers; ``right`` and ``bottom`` are the first column and row after it."""
+        """From its edges, whole numbers.
+
+        Parameters
+        ----------
+        left, top
+            First column and row, whole numbers.
+        right, bottom
+            First column and row after the region.
+        """
         return cls(int(left), int(top), int(right) - int(left), int(bottom) - int(top))
 
     @classmethod
@@ -74,6 +82,15 @@ class Roi:
 
 def checked_roi(roi: Roi | None, width: int, height: int, where: str) -> Roi:
     """Return the region, or all of an image of this size if there is none.
+
+    Parameters
+    ----------
+    roi
+        Region; all of the image if None.
+    width, height
+        Of the image [px].
+    where
+        Name of the file or argument, for the error.
 
     Raises
     ------

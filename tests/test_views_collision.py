@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mitsim.sensor.transforms import Transform
-from mitsim.views.collision import Box, box_distance, is_inside, is_near, obstacle, sensor_box
+from mitsim.views.collision import BodyBox, box_distance, is_inside, is_near, obstacle, sensor_box
 from mitsim.views.table import MARGIN_MM, SensorBody
 
 HALF = np.array([40.0, 15.0, 20.0])
@@ -64,7 +64,7 @@ def test_a_corner_pointing_at_an_edge_is_as_far_as_it_is():
 def test_the_trees_miss_no_triangle_whatever_its_size(rng):
     """Small and large triangles together, against the distances of all of them."""
     triangles = np.concatenate([triangles_about(rng, 400, 300, 8), triangles_about(rng, 12, 300, 400)])
-    part, box = obstacle(triangles), Box(np.array([30.0, -5, -10]), HALF)
+    part, box = obstacle(triangles), BodyBox(np.array([30.0, -5, -10]), HALF)
     near = 0
     for turn, place in zip(Rotation.random(60, rng=rng), rng.normal(0, 250, (60, 3)), strict=True):
         pose = Transform(turn.as_matrix(), place)
@@ -78,7 +78,7 @@ def test_the_trees_miss_no_triangle_whatever_its_size(rng):
 
 def test_nothing_is_in_the_way_of_a_part_without_triangles():
     part = obstacle(np.empty((0, 3, 3)))
-    assert not is_near(part, Box(np.zeros(3), HALF), Transform.identity(), 100.0)
+    assert not is_near(part, BodyBox(np.zeros(3), HALF), Transform.identity(), 100.0)
     assert not is_inside(part, np.zeros(3))
 
 

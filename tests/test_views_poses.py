@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.documents import validate
-from mitsim.views import ViewsTable, candidate_views, write_poses, write_views
+from mitsim.views import ViewsTable, candidate_views, write_views
 
 STAGE = {
     "axes": [
@@ -47,7 +47,7 @@ def pose_of(row, prefix=""):
 
 def test_a_pose_is_the_same_in_every_file(n10, tmp_path):
     found, table = views(n10, rolls_deg=[0, 200], flange_from_sensor=FLANGE)
-    write_poses(tmp_path / "poses", found, table, n10.name)
+    write_views(tmp_path / "poses", found, table, n10.name)
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["poses", "poses.csv", "poses.json"]
     told = json.loads((tmp_path / "poses/poses.json").read_text(encoding="utf-8"))
     assert told["schema_version"] == 1 and told["units"] == {"length": "mm", "angle": "deg"}
@@ -87,7 +87,7 @@ def test_the_angles_of_a_stage_give_the_pose_that_is_written(n10, tmp_path):
     """Only by the words of poses.json: turn the part about each axis, and look at it from the z axis."""
     found, table = views(n10, stage=STAGE)
     folder = tmp_path / "poses"
-    write_poses(folder, found, table, n10.name)
+    write_views(folder, found, table, n10.name)
     told = json.loads((folder / "poses.json").read_text(encoding="utf-8"))
     assert "anticlockwise" in told["frames"]["stage"]
     angles = rows(folder / "stage.csv")

@@ -69,13 +69,9 @@ def difference_along_rays(cloud: PointCloud, reference: PointCloud, window: Wind
         If the grids are not the same.
     """
     if not same_grid(cloud.grid, reference.grid):
-        raise InputError(
-            "difference along rays",
-            "grid",
-            _described(cloud.grid),
-            f"the grid of the reference: {_described(reference.grid)}",
-            "or use the difference to the surface",
-        )
+        allowed = f"the grid of the reference: {_described(reference.grid)}"
+        hint = "or use the difference to the surface"
+        raise InputError("difference along rays", "grid", _described(cloud.grid), allowed, hint)
     one, other = (
         np.linalg.norm(each.points[window].astype(np.float64) - each.grid.origin, axis=-1)
         for each in (cloud, reference)

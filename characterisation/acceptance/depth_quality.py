@@ -51,6 +51,12 @@ TRIMMED_SHARE = 0.005
 #: percentile of |distance from the plane| used as planarity trueness; *assumed*
 TRUENESS_PERCENTILE = 95.0
 
+#: the same in the published accuracy tables of Luxonis
+PUBLISHED_TRIMMED_SHARE = 0.05
+
+#: side of the patches whose noise is the local planarity precision [px]; *assumed*
+PATCH_PX = 9
+
 
 @dataclass(frozen=True)
 class PlaneQuality:
@@ -140,10 +146,7 @@ def plane_quality(
 
 
 def mean_depth_error(
-    clouds: Sequence[PointCloud],
-    ground_truth: Coupon,
-    region: NDArray[np.bool_] | None = None,
-    trimmed_share: float = 0.05,
+    clouds: Sequence[PointCloud], ground_truth: Coupon, region: NDArray[np.bool_] | None = None
 ) -> float:
     """Return Luxonis' published depth error [% of the true depth]: medians of z - z_true, averaged over captures.
 
@@ -151,20 +154,28 @@ def mean_depth_error(
     board is perpendicular to the axis, and the error is that of its depth. Here each point is compared with the true
     plane along its own ray, which is the same for such a board.
 
+    Parameters
+    ----------
+    clouds
+        Captures of one target.
+    ground_truth
+        True pose of the target.
+    region
+        (H, W) mask of the target; the whole grid if None.
+
     Raises
     ------
     InputError
         If there is no cloud, or a region does not match one.
     """
     where = "mean_depth_error"
-    if not clouds:
-        raise InputError(where, "clouds", "none", "one cloud or more", "Luxonis takes 10")
+    _check_clouds(where, clouds, 1, "Luxonis takes 10", alike=False)
     medians = []
     for cloud in clouds:
         points = cloud.points[_region(where, cloud, region) & cloud.valid].astype(float) - cloud.grid.origin
         reach = float((ground_truth.centre - cloud.grid.origin) @ ground_truth.normal)
         error = np.sort(100.0 * (points @ ground_truth.normal / reach - 1.0))
-        cut = int(trimmed_share * len(error))
+        cut = int(PUBLISHED_TRIMMED_SHARE * len(error))
         medians.append(float(np.median(error[cut : len(error) - cut])) if len(error) > 2 * cut else np.nan)
     return float(np.mean(medians))
 
@@ -182,12 +193,7 @@ def temporal_noise(clouds: Sequence[PointCloud]) -> Floats:
     InputError
         If there are fewer than two clouds, or their grids differ in size.
     """
-    where = "temporal_noise"
-    if len(clouds) < 2:
-        raise InputError(where, "clouds", len(clouds), "two or more", "rs-depth-quality takes 40")
-    shapes = {cloud.points.shape for cloud in clouds}
-    if len(shapes) > 1:
-        raise InputError(where, "clouds", "grids of different sizes", "captures of one sensor with one setting")
+    _check_clouds("temporal_noise", clouds, 2, "rs-depth-quality takes 40")
     distance = np.stack([np.linalg.norm(cloud.points - cloud.grid.origin, axis=-1) for cloud in clouds])
     seen = np.isfinite(distance)
     count = seen.sum(0)
@@ -197,28 +203,26 @@ def temporal_noise(clouds: Sequence[PointCloud]) -> Floats:
         return np.where(count > 1, np.sqrt(total.sum(0) / (count - 1)), np.nan)
 
 
-def local_planarity_precision(cloud: PointCloud, region: NDArray[np.bool_] | None = None, patch_px: int = 9) -> float:
+def local_planarity_precision(cloud: PointCloud, region: NDArray[np.bool_] | None = None) -> float:
     """Return Zivid's local planarity precision [mm]: the median noise about planes fitted to small patches.
 
-    Patches are squares of ``patch_px`` side that lie in the region and have all points. The noise of a patch is the
+    Patches are squares of :data:`PATCH_PX` side that lie in the region and have all points. The noise of a patch is the
     standard deviation of orthogonal distances with n - 3 degrees of freedom. Size, statistic and median are *assumed*.
     The result is NaN if no patch has all points.
 
     Raises
     ------
     InputError
-        If the region has another shape than the grid or is empty, or the patch is smaller than 2 px.
+        If the region has another shape than the grid or is empty.
     """
-    if patch_px < 2:
-        raise InputError("local_planarity_precision", "patch_px", patch_px, "2 or more")
     region = _region("local_planarity_precision", cloud, region)
-    rows, columns = (side // patch_px for side in region.shape)
-    cut = cloud.points[: rows * patch_px, : columns * patch_px].astype(float)
-    used = (region & cloud.valid)[: rows * patch_px, : columns * patch_px]
+    rows, columns = (side // PATCH_PX for side in region.shape)
+    cut = cloud.points[: rows * PATCH_PX, : columns * PATCH_PX].astype(float)
+    used = (region & cloud.valid)[: rows * PATCH_PX, : columns * PATCH_PX]
 
     def tiles(array: NDArray[np.generic], *tail: int) -> NDArray[np.generic]:
-        split = array.reshape(rows, patch_px, columns, patch_px, *tail).swapaxes(1, 2)
-        return split.reshape(rows * columns, patch_px**2, *tail)
+        split = array.reshape(rows, PATCH_PX, columns, PATCH_PX, *tail).swapaxes(1, 2)
+        return split.reshape(rows * columns, PATCH_PX**2, *tail)
 
     patches = np.asarray(tiles(cut, 3), float)[np.asarray(tiles(used), bool).all(axis=1)]
     if not len(patches):
@@ -226,18 +230,16 @@ def local_planarity_precision(cloud: PointCloud, region: NDArray[np.bool_] | Non
     centred = patches - patches.mean(axis=1, keepdims=True)
     # the smallest eigenvalue of the scatter matrix is the sum of squares about the orthogonal plane
     smallest = np.linalg.eigvalsh(centred.swapaxes(1, 2) @ centred)[:, 0]
-    return float(np.median(np.sqrt(np.maximum(smallest, 0.0) / max(patch_px**2 - 3, 1))))
+    return float(np.median(np.sqrt(np.maximum(smallest, 0.0) / (PATCH_PX**2 - 3))))
 
 
-def global_planarity_trueness(
-    clouds: Sequence[PointCloud], region: NDArray[np.bool_] | None = None, percentile: float = TRUENESS_PERCENTILE
-) -> float:
+def global_planarity_trueness(clouds: Sequence[PointCloud], region: NDArray[np.bool_] | None = None) -> float:
     """Return Zivid's global planarity trueness error [mm]: the systematic deviation of a flat target from a plane.
 
     The clouds of several captures are averaged pixel by pixel, which reduces noise by the square root of their number.
-    The result is a percentile of the absolute distance from the plane through all points. Statistic and percentile are
-    *assumed*. The remaining noise is included, so use enough captures. A pixel without a point in some capture is
-    excluded. The result is NaN with fewer than 4 points.
+    The result is the :data:`TRUENESS_PERCENTILE` of the absolute distance from the plane through all points. Statistic
+    and percentile are *assumed*. The remaining noise is included, so use enough captures. A pixel without a point in
+    some capture is excluded. The result is NaN with fewer than 4 points.
 
     Raises
     ------
@@ -245,14 +247,20 @@ def global_planarity_trueness(
         If there is no cloud, their grids differ in size, or the region does not match.
     """
     where = "global_planarity_trueness"
-    if not clouds:
-        raise InputError(where, "clouds", "none", "one cloud or more")
-    if len({cloud.points.shape for cloud in clouds}) > 1:
-        raise InputError(where, "clouds", "grids of different sizes", "captures of one sensor with one setting")
+    _check_clouds(where, clouds, 1, "several reduce the noise")
     region = _region(where, clouds[0], region)
     points = sum((cloud.points[region].astype(float) for cloud in clouds), np.zeros(3)) / len(clouds)
     points = points[np.isfinite(points).all(axis=-1)]
-    return float(np.percentile(np.abs(plane_distances(points)), percentile)) if len(points) >= 4 else float("nan")
+    return (
+        float(np.percentile(np.abs(plane_distances(points)), TRUENESS_PERCENTILE)) if len(points) >= 4 else float("nan")
+    )
+
+
+def _check_clouds(where: str, clouds: Sequence[PointCloud], least: int, hint: str, alike: bool = True) -> None:
+    if len(clouds) < least:
+        raise InputError(where, "clouds", len(clouds), f"{least} or more", hint)
+    if alike and len({cloud.points.shape for cloud in clouds}) > 1:
+        raise InputError(where, "clouds", "grids of different sizes", "captures of one sensor with one setting")
 
 
 def _region(where: str, cloud: PointCloud, region: NDArray[np.bool_] | None) -> NDArray[np.bool_]:

@@ -64,6 +64,10 @@ def flatness_error(points: ArrayLike, rejected_share: float = REJECTED_SHARE) ->
     rejected_share
         Share of the points that may be rejected, 0..0.1; the plane is fitted again without them.
 
+    See Also
+    --------
+    characterisation.acceptance.range_uncertainty.flatness_uncertainty
+
     Raises
     ------
     InputError
@@ -88,6 +92,10 @@ def probing_error(
     rejected_share
         Share of the points that may be rejected, 0..0.1; the sphere is fitted again without them.
 
+    See Also
+    --------
+    characterisation.acceptance.range_uncertainty.form_error_uncertainty
+
     Raises
     ------
     InputError
@@ -108,7 +116,14 @@ def sphere_spacing_error(
 ) -> float:
     """Return the sphere-spacing error SD of VDI/VDE 2634-2 [mm]: measured minus calibrated distance of the centres.
 
-    ``first`` and ``second`` are (n, 3) points [mm] of the two spheres of a ball bar.
+    Parameters
+    ----------
+    first, second
+        (n, 3) points [mm] of the two spheres of a ball bar.
+    calibrated_distance
+        [mm].
+    rejected_share
+        As in :func:`probing_error`.
 
     Raises
     ------
@@ -168,9 +183,6 @@ def _usable(where: str, given: ArrayLike, least: int, rejected_share: float) -> 
 
 
 def _nearest(deviation: Floats, rejected_share: float) -> NDArray[np.intp]:
-    """Return the indices of the points that are kept.
-
-    Of the points, ``rejected_share``, rounded down, with the largest deviations are rejected.
-    """
+    """Return the indices of the points without ``rejected_share``, rounded down, of the largest deviations."""
     stay = len(deviation) - int(rejected_share * len(deviation))
     return np.asarray(np.argsort(np.abs(deviation), kind="stable")[:stay])

@@ -1,7 +1,6 @@
 """Compute how much discs of pixels overlap, and how many of them are independent.
 
-Signal chain: centres and radius [px] -> shared area of each pair of discs -> correlation of their means -> effective
-number of independent discs, and the weight of each.
+Signal chain: centres and radius [px] -> shared area of each pair of discs -> weight of each disc.
 
 Two discs that share pixels share noise. Consider a quantity with independent values in each pixel, and its means over
 two discs of radius r at distance d. The two means correlate by the share of their area that the discs have in common.
@@ -11,8 +10,7 @@ The common area is a lens:
 
 This is the autocorrelation of a disc. In optics it is the transfer function of a round aperture (Goodman, "Introduction
 to Fourier Optics", 6.3). The same holds for sample variances, because their terms are squares of the same pixels. The
-plane fit changes this by a term of order 3 / n. If neighbouring pixels correlate by rho(h) = exp(-h^2 / L^2), the lens
-is smoothed with rho.
+plane fit changes this by a term of order 3 / n.
 
 The mean of n values of equal variance s^2 and correlation matrix C has the variance s^2 / n_eff, where
 
@@ -30,9 +28,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 Floats = NDArray[np.float64]
-
-#: nodes of the Gauss-Hermite rule along each axis; the lens is smooth except at its edge; 12 are accurate to 1e-3
-_NODES = 12
 
 
 def disc_offsets(radius_px: float) -> NDArray[np.int64]:
@@ -52,49 +47,6 @@ def lens_share(distance: ArrayLike, radius: float) -> Floats:
     return np.asarray(2.0 / np.pi * (np.arccos(x) - x * np.sqrt(1.0 - x**2)))
 
 
-def overlap_correlation(distance: ArrayLike, radius: float, correlation_length: float = 0.0) -> Floats:
-    """Return the correlation of the means over two discs, ``distance`` [px] apart (any shape); 1 at distance 0.
-
-    Parameters
-    ----------
-    correlation_length
-        Length L [px] at which the correlation of single pixels has fallen to 1/e, assuming a Gaussian; 0 for
-        independent pixels. For means of *squares*, such as sample variances, give L / sqrt(2), because squares of
-        Gaussian values correlate by rho^2.
-    """
-    distance = np.asarray(distance, float)
-    if correlation_length <= 0:
-        return lens_share(distance, radius)
-    node, weight = np.polynomial.hermite.hermgauss(_NODES)
-    weights = np.outer(weight, weight).ravel() / np.pi
-    x, y = correlation_length * np.stack(np.meshgrid(node, node, indexing="ij")).reshape(2, -1)
-
-    def smoothed(separation: Floats) -> Floats:
-        return np.asarray(lens_share(np.hypot(separation[..., None] + x, y), radius) @ weights)
-
-    table = np.linspace(0.0, 2.0 * radius + 6.0 * correlation_length, 257)
-    return np.asarray(np.interp(distance, table, smoothed(table) / smoothed(np.zeros(1)), right=0.0))
-
-
-def correlation_matrix(centres: ArrayLike, radius: float, correlation_length: float = 0.0) -> Floats:
-    """Return the correlation (p, p) of the means over discs about ``centres`` (p, 2) [px].
-
-    See :func:`overlap_correlation`.
-    """
-    centres = np.asarray(centres, float)
-    separation = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
-    return overlap_correlation(separation, radius, correlation_length)
-
-
-def effective_number(correlation: ArrayLike) -> float:
-    """Return the number of independent values whose mean has the same variance as that of n correlated values.
-
-    ``correlation`` is the correlation matrix (n, n) of the values.
-    """
-    correlation = np.asarray(correlation, float)
-    return float(len(correlation) ** 2 / correlation.sum()) if len(correlation) else 0.0
-
-
 def independent_share(centres: ArrayLike, radius: float) -> Floats:
     """Return weights (p,) of discs about ``centres`` (p, 2) [px]: 1 for an isolated disc, less for overlapping ones.
 
@@ -102,8 +54,7 @@ def independent_share(centres: ArrayLike, radius: float) -> Floats:
     any overlaps. The weight w of a disc is 1 / (sum of its row of C). In every connected group of discs, the weights
     are then scaled by (sum of w) / (w^T C w), which makes the variance exact.
 
-    Pixels are assumed to be independent. Where they correlate over more than the gap between discs, use
-    :func:`effective_number` with a correlation length.
+    Pixels are assumed to be independent.
     """
     centres = np.asarray(centres, float).reshape(-1, 2)
     count = len(centres)

@@ -152,10 +152,7 @@ def _fit_and_spread(
 
 
 def _frame(axis: Floats) -> Floats:
-    """Return right-handed frames (p, 3, 3) with the unit vectors ``axis`` (p, 3) as last row.
-
-    The method needs no square root or branch: Duff et al., J. Comput. Graph. Tech. 6 (2017) 1-8.
-    """
+    """Return right-handed frames (p, 3, 3), last row ``axis`` (Duff et al., J. Comput. Graph. Tech. 6 (2017) 1)."""
     x, y, z = axis.T
     sign = np.copysign(1.0, z)
     a = -1.0 / (sign + z)
@@ -265,6 +262,15 @@ def reference_fraction(
     Both counts are random, each out of ``possible`` pixels. The interval of their ratio comes from the Clopper-Pearson
     intervals of both (Donner and Zou, Stat. Methods Med. Res. 21 (2012) 347-359, *recalled*; the tests check its
     coverage).
+
+    Parameters
+    ----------
+    count, reference_count
+        Points of the coupon, and of the matt-white one.
+    possible
+        Pixels of the patch.
+    confidence
+        Of the interval.
 
     Returns
     -------

@@ -41,8 +41,11 @@ from characterisation.coupon.discs import disc_offsets
 
 Floats = NDArray[np.float64]
 
-#: distances of neighbours that touch, and of those apart, in diameters of a patch: (from, to)
-TOUCHING, APART = (0.9, 1.25), (2.0, 4.0)
+#: distances (from, to) of neighbours that touch, in diameters of a patch
+TOUCHING = (0.9, 1.25)
+
+#: distances (from, to) of neighbours apart, in diameters of a patch: errors of block matching are not correlated there
+APART = (2.0, 4.0)
 
 #: smallest share of its pixels with which a patch has an offset
 LEAST_SHARE = 0.3
@@ -51,8 +54,14 @@ LEAST_SHARE = 0.3
 def known_offset(points: Floats, inlier: NDArray[np.bool_], normal: Floats, reach: float) -> Floats:
     """Return the mean distance o [mm] (p,) of patches from the known plane, along the rays; NaN with too few inliers.
 
-    ``points`` (p, n, 3) [mm] are relative to the optical centre of the sensor; ``inlier`` is (p, n). The plane is q .
-    normal = reach.
+    Parameters
+    ----------
+    points
+        (p, n, 3) [mm] relative to the optical centre of the sensor.
+    inlier
+        (p, n) mask of the points used.
+    normal, reach
+        The plane q . normal = reach, normal (3,) and reach [mm].
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         beyond = np.linalg.norm(points, axis=-1) * (1.0 - reach / (points @ normal))
@@ -89,7 +98,12 @@ def neighbour_products(offset: Floats, centres: NDArray[np.integer], radius_px: 
 def noise_area(k_0: Floats, k_1: Floats, k_2: Floats, radius_px: float) -> tuple[Floats, Floats]:
     """Return the noise area A [px^2], at least 1, and p^2 in units of sigma^2.
 
-    ``k_0``, ``k_1`` and ``k_2`` are K_0, K_1 and K_2 in units of sigma^2.
+    Parameters
+    ----------
+    k_0, k_1, k_2
+        K_0, K_1 and K_2 in units of sigma^2.
+    radius_px
+        Radius of the discs.
     """
     persistent = np.maximum(k_2, 0.0)
     cell = np.sqrt(3) / 2 * (2 * radius_px) ** 2

@@ -22,8 +22,11 @@ from characterisation.files.documents import Document
 # an icosahedron on the unit sphere has 10 * 4^k + 2 vertices after k subdivisions:
 # k = 1: 42, 2: 162, 3: 642, 4: 2562, with neighbours about 34, 17, 8.6, 4.3 deg apart
 
-#: limits in units of the tolerance: of the deviation from a straight line, and of the difference along an edge
-BENT, STEEP = 0.5, 3.0
+#: limit of the deviation from a straight line, in units of the tolerance
+BENT = 0.5
+
+#: limit of the difference along an edge, in units of the tolerance
+STEEP = 3.0
 
 #: F below which a better sigma is of no use
 WORTH = 0.02
@@ -169,10 +172,7 @@ def _bent(
     middle: NDArray[np.int64],
     tolerance: float,
 ) -> NDArray[np.bool_]:
-    """Return which edges (e, 2) are bent, by more than a tolerance and by more than chance.
-
-    A bent edge has a value in the middle (e,) that differs from the mean of its ends.
-    """
+    """Return which edges (e, 2) differ in the middle (e,) from the mean of their ends, by more than both limits."""
     off = np.abs(values[middle] - values[ends].mean(axis=1))
     chance = 2 * np.sqrt(errors[middle] ** 2 + (errors[ends] ** 2).sum(axis=1) / 4)
     with np.errstate(invalid="ignore"):

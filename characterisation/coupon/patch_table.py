@@ -66,29 +66,16 @@ def overall(patches: xr.Dataset) -> Overall:
     return Overall(fraction, fraction_error, math.sqrt(pooled), error)
 
 
-_UNITS = {
-    "ray_noise_std": "mm",
-    "standard_error": "mm",
-    "ray_noise_robust": "mm",
-    "ray_noise_inliers": "mm",
-    "ray_noise_corrected": "mm",
-    "sigma_low": "mm",
-    "sigma_high": "mm",
-    "distance": "mm",
-    "semi_major": "mm",
-    "semi_minor": "mm",
-    "incidence": "rad",
-    "off_axis": "rad",
-    "included_angle": "rad",
-    "correlation_length": "px",
-    "correlation_length_pooled": "px",
-    "correlation_area_pooled": "px2",
-    "ray_offset": "mm",
-    "offset_product_touching": "mm2",
-    "offset_product_apart": "mm2",
-    "row": "px",
-    "column": "px",
+_COLUMNS_BY_UNIT = {
+    "mm": "ray_noise_std standard_error ray_noise_robust ray_noise_inliers ray_noise_corrected sigma_low sigma_high "
+    "distance semi_major semi_minor ray_offset",
+    "mm2": "offset_product_touching offset_product_apart",
+    "rad": "incidence off_axis included_angle",
+    "px": "correlation_length correlation_length_pooled row column",
+    "px2": "correlation_area_pooled",
 }
+
+_UNITS = {name: unit for unit, names in _COLUMNS_BY_UNIT.items() for name in names.split()}
 
 _PATCH = ("patch",)
 
@@ -99,11 +86,9 @@ PATCHES = Schema(
         **{name: Variable(_PATCH, "number", 0, 1) for name in ("recovered_fraction", "false_fraction")},
         **{name: Variable(_PATCH, "number", 0, 1e9) for name in ("points", "points_possible")},
         **{name: Variable(_PATCH, "number", 0, 1e6, gaps=True) for name in ("ray_noise_std", "ray_noise_inliers")},
-        **{name: Variable(_PATCH, "number", -1e6, 1e6, gaps=True) for name in ("ray_offset",)},
-        **{
-            name: Variable(_PATCH, "number", -1e12, 1e12, gaps=True)
-            for name in ("offset_product_touching", "offset_product_apart")
-        },
+        "ray_offset": Variable(_PATCH, "number", -1e6, 1e6, gaps=True),
+        "offset_product_touching": Variable(_PATCH, "number", -1e12, 1e12, gaps=True),
+        "offset_product_apart": Variable(_PATCH, "number", -1e12, 1e12, gaps=True),
         **{name: Variable(_PATCH, "number", -1, 1) for name in ("normal_x", "normal_y")},
         "distance": Variable(_PATCH, "number", 1, 1e6),
         "independent_share": Variable(_PATCH, "number", 0, 1),

@@ -70,6 +70,15 @@ def patch_centres(
     """Return pixels (p, 2) as (row, column) about which a disc lies on the coupon, ``margin_px`` from its edge.
 
     The centres form a hexagonal lattice with ``step_px`` between neighbours, anchored at the centre of the coupon.
+
+    Parameters
+    ----------
+    grid
+        Pixels of the cloud.
+    radius_px, margin_px
+        Radius of the discs, and their least distance from the edge of the coupon.
+    step_px
+        Distance between neighbouring centres.
     """
     corners = grid.project(coupon.corners())
     middle = grid.project(coupon.centre)
@@ -152,8 +161,7 @@ def measure_patches(
     _check(cloud, radius_px, step_px, angular_pitch, reference)
     centres = patch_centres(cloud.grid, coupon, radius_px, margin_px, step_px or 2 * radius_px)
     offsets = disc_offsets(radius_px)
-    row_and_column = np.array([cloud.grid.width, 1])
-    pixels = (centres @ row_and_column)[:, None] + offsets @ row_and_column
+    pixels = _pixels(cloud, centres, radius_px)
     points, true = _points_of(cloud, coupon, pixels)
     false = np.isfinite(points[..., 2]).sum(-1) - true.sum(-1)
     noise = ray_noise_std(np.where(true[..., None], points, np.nan))
@@ -217,10 +225,13 @@ def patch_residuals(cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, m
     """Return the residuals [mm] along V of the points of all patches from the planes of their patches.
 
     The array is flat and excludes outliers.
+
+    Parameters
+    ----------
+    cloud, coupon, radius_px, margin_px
+        As in :func:`measure_patches`.
     """
-    centres = patch_centres(cloud.grid, coupon, radius_px, margin_px, 2 * radius_px)
-    row_and_column = np.array([cloud.grid.width, 1])
-    pixels = (centres @ row_and_column)[:, None] + disc_offsets(radius_px) @ row_and_column
+    pixels = _pixels(cloud, patch_centres(cloud.grid, coupon, radius_px, margin_px, 2 * radius_px), radius_px)
     points, true = _points_of(cloud, coupon, pixels)
     residual = ray_noise_std(np.where(true[..., None], points, np.nan)).inlier_residual
     return np.asarray(residual[np.isfinite(residual)])
@@ -243,18 +254,18 @@ def _check(
     if reference is None:
         return
     if angular_pitch is not None:
-        raise InputError(
-            where,
-            "reference",
-            "angular_pitch and reference",
-            "only one of them",
-            "each gives the number of possible points",
-        )
+        hint = "each gives the number of possible points"
+        raise InputError(where, "reference", "angular_pitch and reference", "only one of them", hint)
     if reference.points.shape != cloud.points.shape:
         found, allowed = (f"{s[1]} x {s[0]} px" for s in (reference.points.shape, cloud.points.shape))
-        raise InputError(
-            where, "reference", found, allowed, "capture the reference with the same settings of the sensor"
-        )
+        hint = "capture the reference with the same settings of the sensor"
+        raise InputError(where, "reference", found, allowed, hint)
+
+
+def _pixels(cloud: PointCloud, centres: NDArray[np.int64], radius_px: float) -> NDArray[np.int64]:
+    """Return the flat pixel numbers (p, n) of discs about pixels (p, 2)."""
+    row_and_column = np.array([cloud.grid.width, 1])
+    return np.asarray((centres @ row_and_column)[:, None] + disc_offsets(radius_px) @ row_and_column)
 
 
 def _points_of(cloud: PointCloud, coupon: Coupon, pixels: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
@@ -274,14 +285,10 @@ def _points_of(cloud: PointCloud, coupon: Coupon, pixels: NDArray[np.int64]) -> 
 def _ellipses(
     grid: ViewGrid, coupon: Coupon, rows: NDArray[np.int64], columns: NDArray[np.int64], radius_px: float
 ) -> dict[str, Floats]:
-    """Return the ellipses on the coupon and the included angles of discs about pixels (p,).
-
-    Both follow from the step of the surface, and of the rays, per pixel.
-    """
+    """Return ellipses on the coupon, and included angles, from the steps of surface and rays about pixels (p,)."""
     reach = int(radius_px)
-    rays = grid.rays_at(
-        columns + reach * np.array([[1], [-1], [0], [0]]), rows + reach * np.array([[0], [0], [1], [-1]])
-    )
+    aside, down = reach * np.array([[1], [-1], [0], [0]]), reach * np.array([[0], [0], [1], [-1]])
+    rays = grid.rays_at(columns + aside, rows + down)
     surface = rays * ((coupon.centre - grid.origin) @ coupon.normal / (rays @ coupon.normal))[..., None]
 
     def semi_axes(projected: Floats) -> tuple[Floats, Floats]:

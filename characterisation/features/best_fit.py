@@ -35,8 +35,14 @@ from characterisation.features.surfaces import Surface
 
 Floats = NDArray[np.float64]
 
-#: points of a shape from one view that are used; steps at most, and the first of them, which choose points and weights
-POINTS, STEPS, CHOICES = 2000, 40, 5
+#: points of a shape from one view that are used
+POINTS = 2000
+
+#: steps at most
+STEPS = 40
+
+#: first steps, which choose points and weights
+CHOICES = 5
 
 #: a step of the poses [mm, at the farthest point] that is their end
 REST_MM = 1e-4
@@ -44,9 +50,11 @@ REST_MM = 1e-4
 #: fewest points of a shape from one view
 LEAST = 50
 
-#: points about which the correlation of residuals is summed, in so many rings, until it vanishes; the rings are as wide
-#: as the distance to the fourth neighbour
-_MIDDLES, _RINGS = 200, 60
+#: points about which the correlation of residuals is summed
+_MIDDLES = 200
+
+#: rings about each, as wide as the distance to the fourth neighbour, in which it is summed until it vanishes
+_RINGS = 60
 
 
 @dataclass(frozen=True)
@@ -182,7 +190,19 @@ def _choose(
 
 
 def counted_as_one(place: Floats, residual: Floats, thinning: float, rng: np.random.Generator) -> float:
-    """Return the number a of points whose residuals (n,), at places (n, 3), are as good as one; at least 1."""
+    """Return the number a of points whose residuals (n,), at places (n, 3), are as good as one; at least 1.
+
+    Parameters
+    ----------
+    place
+        (n, 3) [mm].
+    residual
+        (n,) [mm].
+    thinning
+        Number of measured points that each of these stands for.
+    rng
+        Chooses the points about which correlation is summed.
+    """
     middles = rng.choice(len(place), min(_MIDDLES, len(place)), replace=False)
     apart = cdist(place[middles], place)
     product = residual[middles, None] * residual

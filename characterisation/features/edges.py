@@ -40,9 +40,12 @@ from characterisation.point_cloud import PointCloud
 
 Array = NDArray[np.float64]
 
-#: largest distance behind the plane at which a point lies on it: in standard deviations of the plane's points, and at
-#: least in mm. In front it is twice that, because walls of holes and adjoining faces lie behind; *assumed*
-NEAR_STD, NEAR_MM = 2.0, 0.02
+#: largest distance behind the plane at which a point lies on it, in standard deviations of the plane's points. In front
+#: it is twice that, because walls of holes and adjoining faces lie behind; *assumed*
+NEAR_STD = 2.0
+
+#: the same in mm, if that is more; *assumed*
+NEAR_MM = 0.02
 
 #: least number of crossings for a figure; *assumed*
 LEAST_CROSSINGS = 12
@@ -88,6 +91,10 @@ def fit_circle(cloud: PointCloud, plane: PlaneFit, nominal: Circle, near: float 
         distance. By default :data:`NEAR_STD` times the standard deviation of the plane's points, at least
         :data:`NEAR_MM`.
 
+    See Also
+    --------
+    fit_edge_point
+
     Raises
     ------
     FitError
@@ -110,12 +117,19 @@ def fit_edge_point(
 ) -> EdgePointFit:
     """Fit the point where a line in a plane crosses the edge of the face.
 
-    The edge is assumed straight within ``reach`` [mm] of the nominal point, along the line and across it, and searched
-    there. Other arguments and errors are those of :func:`fit_circle`.
-
     The sampling error of an edge along a row of pixels is the same in all crossings. The variance is therefore at least
     d^2 / (12 k^2), regardless of their number. Here d is the spacing of the pixels along the line, and k the number of
     rows or columns that the edge crosses.
+
+    Parameters
+    ----------
+    cloud, plane, near
+        As in :func:`fit_circle`.
+    nominal
+        Nominal point, sensor frame.
+    reach
+        Distance [mm] from the nominal point, along the line and across it, within which the edge is searched and
+        assumed straight.
     """
     nominal = nominal.seen_from(cloud.grid.origin).on_moved_plane(plane)
     found = _crossings(cloud, plane, nominal, near, reach)
@@ -267,9 +281,6 @@ def _window(cloud: PointCloud, figure: Circle | EdgePoint, reach: float) -> tupl
 
 
 def _pitch(cloud: PointCloud, edge: EdgePoint) -> float:
-    """Return the length [mm] of one pixel along the line at the edge.
-
-    The pixel is that of a row or a column, whichever is closer to the direction of the line.
-    """
+    """Return the length [mm] along the line of a pixel of its row or column, whichever is closer to the line."""
     here, there = cloud.grid.project(np.stack([edge.point, edge.point + edge.direction]))
     return float(1.0 / np.abs(there - here).max())

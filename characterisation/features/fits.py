@@ -30,8 +30,11 @@ from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 
 Array = NDArray[np.float64]
 
-#: largest distance of a point from its nominal surface, in standard deviations, or in mm if that is more
-GATE, LEAST_GATE_MM = 6.0, 1.0
+#: largest distance of a point from its nominal surface, in standard deviations
+GATE = 6.0
+
+#: the same in mm, if that is more: parts lie that far from nominal
+LEAST_GATE_MM = 1.0
 
 #: least share of a surface's points that belong to it. With fewer, the nearest quarter, which gives the scatter, is
 #: false, and a fit would use a few points that lie near the surface by chance

@@ -13,25 +13,13 @@ from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, Su
 
 Array = NDArray[np.float64]
 
-# All fits have the same three fields. `covariance` (p, p) is that of the parameters of a small change of their shape.
-# `residual_std` [mm] has `count - p` degrees of freedom, and is along the rays if a viewpoint was given. `count` is the
-# number of points used.
-
 
 @dataclass(frozen=True)
-class PlaneFit(Plane):
-    """Fitted plane; ``point`` is the foot of the used points' centroid, ``normal`` faces the viewpoint."""
+class FitQuality:
+    """Quality of a fit, after the fields of its shape.
 
-    covariance: Array
-    residual_std: float
-    count: int
-
-
-@dataclass(frozen=True)
-class CylinderFit(Cylinder):
-    """Fitted cylinder.
-
-    ``point`` is the axis' point nearest the used points' centroid; ``axis`` has the sense of the initial axis.
+    ``covariance`` (p, p) is that of the parameters of a small change of the shape. ``residual_std`` [mm] has ``count -
+    p`` degrees of freedom, and is along the rays if a viewpoint was given. ``count`` is the number of points used.
     """
 
     covariance: Array
@@ -40,39 +28,36 @@ class CylinderFit(Cylinder):
 
 
 @dataclass(frozen=True)
-class SphereFit(Sphere):
+class PlaneFit(FitQuality, Plane):
+    """Fitted plane; ``point`` is the foot of the used points' centroid, ``normal`` faces the viewpoint."""
+
+
+@dataclass(frozen=True)
+class CylinderFit(FitQuality, Cylinder):
+    """Fitted cylinder.
+
+    ``point`` is the axis' point nearest the used points' centroid; ``axis`` has the sense of the initial axis.
+    """
+
+
+@dataclass(frozen=True)
+class SphereFit(FitQuality, Sphere):
     """Fitted sphere."""
 
-    covariance: Array
-    residual_std: float
-    count: int
-
 
 @dataclass(frozen=True)
-class ConeFit(Cone):
+class ConeFit(FitQuality, Cone):
     """Fitted cone; ``point`` is the axis' point nearest the used points' centroid."""
 
-    covariance: Array
-    residual_std: float
-    count: int
-
 
 @dataclass(frozen=True)
-class CircleFit(Circle):
+class CircleFit(FitQuality, Circle):
     """Fitted circle; its covariance is that of the edge alone, since its plane has its own."""
 
-    covariance: Array
-    residual_std: float
-    count: int
-
 
 @dataclass(frozen=True)
-class EdgePointFit(EdgePoint):
+class EdgePointFit(FitQuality, EdgePoint):
     """Fitted point of an edge; its covariance is that of the edge alone, since its plane has its own."""
-
-    covariance: Array
-    residual_std: float
-    count: int
 
 
 Fit = PlaneFit | CylinderFit | SphereFit | ConeFit | CircleFit | EdgePointFit
@@ -91,6 +76,15 @@ def with_covariance(
     shape: Surface | Circle | EdgePoint, covariance: ArrayLike, residual_std: float = np.nan, count: int = 0
 ) -> Fit:
     """Return a shape, fitted or nominal, with the covariance (p, p) of its parameters, for predicted uncertainties.
+
+    Parameters
+    ----------
+    covariance
+        (p, p) of the parameters of a small change.
+    residual_std
+        [mm].
+    count
+        Number of points used.
 
     Raises
     ------

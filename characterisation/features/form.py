@@ -130,8 +130,11 @@ def node_modes(kind: str) -> Array:
     return modes
 
 
-def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None, degree: int = DEGREE) -> Array:
+def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None) -> Array:
     """Return the smooth deviations along the rays that no small change of a surface can produce.
+
+    They are polynomials of total degree :data:`DEGREE` in the two coordinates of the surface, both scaled to -1..1 over
+    the points: along the tangents of a plane, or round a cylinder and along its axis.
 
     Parameters
     ----------
@@ -139,9 +142,6 @@ def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None, deg
         On which the points (n, 3) [mm] lie, except for their noise.
     rays
         (n, 3), or None for orthogonal deviations.
-    degree
-        Of the polynomial in the two coordinates of the surface, both scaled to -1..1 over the points. They are along
-        the tangents of a plane, or round a cylinder and along its axis.
 
     Returns
     -------
@@ -157,8 +157,8 @@ def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None, deg
     _, jacobian, _ = surface.linearised(np.zeros(surface.parameter_count), points, rays)
     at = surface.meet(points, rays)
     u, v = (_scaled(coordinate) for coordinate in _coordinates(surface, at.foot))
-    products = legvander(u, degree)[:, :, None] * legvander(v, degree)[:, None, :]
-    first, second = np.nonzero(np.add.outer(np.arange(degree + 1), np.arange(degree + 1)) <= degree)
+    products = legvander(u, DEGREE)[:, :, None] * legvander(v, DEGREE)[:, None, :]
+    first, second = np.nonzero(np.add.outer(np.arange(DEGREE + 1), np.arange(DEGREE + 1)) <= DEGREE)
     smooth = products[:, first, second] / at.slope[:, None]
     if len(points) <= jacobian.shape[1] + smooth.shape[1]:
         needed = jacobian.shape[1] + smooth.shape[1] + 1
@@ -173,13 +173,19 @@ def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None, deg
     return modes
 
 
-def fit_form(
-    points: ArrayLike, surface: Plane | Cylinder, viewpoint: ArrayLike | None = None, degree: int = DEGREE
-) -> Form:
-    """Fit the low-order form of a surface to its points (n, 3) [mm], seen from ``viewpoint`` (3,) [mm] if given.
+def fit_form(points: ArrayLike, surface: Plane | Cylinder, viewpoint: ArrayLike | None = None) -> Form:
+    """Fit the low-order form of a surface.
 
-    ``surface`` is the least-squares surface of the same points (:func:`~characterisation.features.fits.fit_surface`).
     Points at grazing incidence, and outliers about the form, are excluded.
+
+    Parameters
+    ----------
+    points
+        (n, 3) [mm] of the surface.
+    surface
+        Least-squares surface of the same points (:func:`~characterisation.features.fits.fit_surface`).
+    viewpoint
+        (3,) [mm]; without it, residuals are orthogonal.
 
     Raises
     ------
@@ -193,7 +199,7 @@ def fit_form(
     kept, deviation = facing, at.residual
     for _ in range(CHOICES):
         chosen = np.flatnonzero(kept)
-        modes = form_modes(surface, points[chosen], None if rays is None else rays[chosen], degree)
+        modes = form_modes(surface, points[chosen], None if rays is None else rays[chosen])
         coefficients = modes.T @ at.residual[chosen]
         deviation = at.residual[chosen] - modes @ coefficients
         limit = CLIP * robust_std(deviation)

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from characterisation.features.fitted import FitQuality
 from characterisation.features.robust_fit import FitError, covariance_of, rays_from, robust_fit
 from characterisation.features.surfaces import Surface
 
@@ -55,23 +56,22 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class PoseFit(Pose):
-    """Fitted pose; ``about`` is the centroid of the used points.
-
-    ``covariance`` (6, 6) of the six parameters; ``residual_std`` [mm] with ``count - 6`` degrees of freedom; ``count``,
-    the number of points used.
-    """
-
-    covariance: Array
-    residual_std: float
-    count: int
+class PoseFit(FitQuality, Pose):
+    """Fitted pose; ``about`` is the centroid of the used points."""
 
 
 def pose_jacobian(surface: Surface, points: Array, rays: Array | None, about: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
     """Return the derivatives (n, 6) of the residuals of points (n, 3) by a small motion of the surface.
 
     The motion is a rotation vector [rad] about the point ``about`` (3,) [mm] and a translation [mm], in the frame of
-    all arguments. Without rays, residuals are orthogonal distances.
+    all arguments.
+
+    Parameters
+    ----------
+    points, rays
+        (n, 3) [mm], and unit (n, 3); without rays, residuals are orthogonal distances.
+    about
+        (3,) [mm] centre of the rotation.
     """
     at = surface.meet(points, rays)
     turning = np.cross(at.foot - np.asarray(about, float), at.normal)
@@ -166,10 +166,7 @@ def _check_determined(jacobian: Array, pose: Pose, points: Array) -> None:
 
 
 def _in_words(motions: Array, size: float, pose: Pose) -> list[str]:
-    """Describe free motions (k, 6) in words, in the part frame: shifts, then rotations.
-
-    The rotation vector w in ``motions`` is multiplied by ``size``.
-    """
+    """Describe free motions (k, 6) [size w, t] in words, in the part frame: shifts, then rotations."""
     turn, start = pose.sensor_from_part[:3, :3], pose.sensor_from_part[:3, 3]
     about = (pose.about - start) @ turn
     # combinations of the motions without rotation are shifts; the others are described without these

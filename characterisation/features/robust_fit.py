@@ -70,8 +70,17 @@ def robust_fit(
 ) -> tuple[Shape, NDArray[np.bool_]]:
     """Return the robust least-squares shape through ``count`` points, and the mask (count,) of the points used.
 
-    ``least_scale`` [mm] is the smallest expected standard deviation of the residuals. Where their distribution has one
-    long tail, the median of their size is far below it.
+    Parameters
+    ----------
+    shape
+        Nominal geometry, from which the fit starts.
+    linearised
+        Residuals and derivatives of a changed shape.
+    count
+        Number of points.
+    least_scale
+        Smallest expected standard deviation [mm] of the residuals. Where their distribution has one long tail, the
+        median of their size is far below it.
 
     Raises
     ------

@@ -20,8 +20,14 @@ from characterisation.features.surfaces import Cylinder, tangents
 
 Array = NDArray[np.float64]
 
-#: number of points whose normals are estimated, and the smallest and largest number of neighbours of each
-_NORMALS, _LEAST_NEIGHBOURS, _MOST_NEIGHBOURS = 400, 20, 300
+#: number of points whose normals are estimated
+_NORMALS = 400
+
+#: smallest number of neighbours of each
+_LEAST_NEIGHBOURS = 20
+
+#: largest number of neighbours of each
+_MOST_NEIGHBOURS = 300
 
 #: neighbours of a point, as a share of all points
 _NEIGHBOUR_SHARE = 0.03

@@ -346,10 +346,7 @@ def _met_round(points: Array, rays: Array | None, radial: Array, across: Array |
 
 
 def _guarded(cosine: Array) -> Array:
-    """Keep N.V away from 0.
-
-    The limit is well below :data:`GRAZING_COSINE`, so that it affects hardly any point used.
-    """
+    """Keep N.V away from 0, by a limit well below :data:`GRAZING_COSINE`, which affects hardly any point used."""
     return np.copysign(np.maximum(np.abs(cosine), GRAZING_COSINE / 4), cosine)
 
 

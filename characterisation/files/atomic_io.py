@@ -27,8 +27,11 @@ FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 #: this machine in the names of what is being written: the number of a process says nothing on another
 HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:6]
 
-#: what netCDF writes beside the values: of a file, and of each variable [bytes]; measured: 8 and 2.9 kB, deflated
-_NETCDF_FILE, _NETCDF_VARIABLE = 16 * 1024, 4 * 1024
+#: bytes that netCDF writes for a file beside the values; measured: 8 kB
+_NETCDF_FILE = 16 * 1024
+
+#: bytes that netCDF writes for each variable beside the values; measured: 2.9 kB, deflated
+_NETCDF_VARIABLE = 4 * 1024
 
 
 @contextmanager

@@ -60,6 +60,11 @@ def read_bounded(file: Path, absent: str | None = None, hint: str = "", largest:
 def read_text_bounded(file: Path, absent: str | None = None, hint: str = "", largest: int = LARGEST_FILE) -> str:
     """Read a plain file of at most ``largest`` bytes as UTF-8, with or without its mark.
 
+    Parameters
+    ----------
+    file, absent, hint, largest
+        As in :func:`read_bounded`.
+
     Raises
     ------
     InputError

@@ -44,8 +44,6 @@ with netCDF4.Dataset(sys.argv[1]) as file:
         variable[tuple(slice(0, 1) for _ in variable.dimensions)]
 """
 
-_SHIPPED = Path(__file__).resolve().parent / "maps"
-
 Kind = Literal["number", "whole", "truth", "text"]
 
 _IN_WORDS = {"number": "numbers", "whole": "whole numbers", "truth": "0 and 1", "text": "texts"}
@@ -107,9 +105,7 @@ def read_dataset(path: str | Path, schema: Schema) -> xr.Dataset:
     except MemoryError:
         raise InputError(path, "", "more than fits into memory", schema.made_by, schema.hint) from None
     except Exception as error:  # a damaged file may raise anything
-        cause = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        allowed = f"netCDF: {schema.made_by}"
-        raise InputError(path, "", f"a file that cannot be read ({cause})", allowed, schema.hint) from None
+        raise _unreadable(path, schema, f"({' '.join(f'{type(error).__name__}: {error}'.split())[:200]})") from None
     data = data.drop_encoding()
     written = data.attrs.pop(DIGEST, None)
     if written is not None and written != dataset_digest(data):
@@ -151,15 +147,7 @@ def _check_bytes(path: Path, schema: Schema) -> None:
     body, seal = data[: -len(SEAL) - 64], data[-len(SEAL) - 64 :]
     if seal.startswith(SEAL):
         if hashlib.sha256(body).hexdigest().encode() != seal[len(SEAL) :]:
-            raise InputError(
-                path,
-                "",
-                "a file that cannot be read: damaged since it was written",
-                f"netCDF: {schema.made_by}",
-                schema.hint,
-            )
-        return
-    if path.resolve().parent == _SHIPPED:
+            raise _unreadable(path, schema, ": damaged since it was written")
         return
     try:
         done = subprocess.run(
@@ -169,8 +157,12 @@ def _check_bytes(path: Path, schema: Schema) -> None:
     except subprocess.TimeoutExpired:
         found = f"its reader did not finish within {PATIENCE_S:g} s"
     if found:
-        cause = " ".join(found.split())
-        raise InputError(path, "", f"a file that cannot be read ({cause})", f"netCDF: {schema.made_by}", schema.hint)
+        raise _unreadable(path, schema, f"({' '.join(found.split())})")
+
+
+def _unreadable(path: Path, schema: Schema, cause: str) -> InputError:
+    found = f"a file that cannot be read {cause}".replace(" :", ":")
+    return InputError(path, "", found, f"netCDF: {schema.made_by}", schema.hint)
 
 
 def _check_form(path: Path, data: xr.Dataset, schema: Schema) -> None:
@@ -191,21 +183,12 @@ def _check_form(path: Path, data: xr.Dataset, schema: Schema) -> None:
             continue
         variable = data.variables[name]
         if variable.dims != one.dims:
-            raise InputError(
-                path,
-                name,
-                f"dimensions ({', '.join(map(str, variable.dims))})",
-                f"({', '.join(one.dims)})",
-                schema.hint,
-            )
+            found = f"dimensions ({', '.join(map(str, variable.dims))})"
+            raise InputError(path, name, found, f"({', '.join(one.dims)})", schema.hint)
         if packed := {"scale_factor", "add_offset"} & variable.encoding.keys():
             raise InputError(path, name, f"packed numbers ({', '.join(sorted(packed))})", "numbers as they are")
-        if not _is_kind(variable.dtype, one.kind):
+        if variable.dtype.kind not in {"number": "fiu", "whole": "iu", "truth": "biu", "text": "OUS"}[one.kind]:
             raise InputError(path, name, str(variable.dtype), _IN_WORDS[one.kind], schema.hint)
-
-
-def _is_kind(dtype: np.dtype[Any], kind: Kind) -> bool:
-    return dtype.kind in {"number": "fiu", "whole": "iu", "truth": "biu", "text": "OUS"}[kind]
 
 
 def _check_values(path: Path, name: str, values: NDArray[Any], one: Variable) -> None:

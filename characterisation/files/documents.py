@@ -32,8 +32,11 @@ class Document(BaseModel):
 
 Model = TypeVar("Model", bound=Document)
 
-#: largest TOML file [bytes], and its deepest nesting
-LARGEST_TOML, DEEPEST = 4 * 1024**2, 32
+#: largest TOML file [bytes]
+LARGEST_TOML = 4 * 1024**2
+
+#: deepest nesting of a TOML file
+DEEPEST = 32
 
 _BRACKETS = re.compile(r"[][{}]")
 _PART = r"(?<![A-Za-z0-9_-])(?:[A-Za-z0-9_-]++|[\"'][^\"'\n]*+[\"'])[ \t]*+\.[ \t]*+"
@@ -254,13 +257,7 @@ def _joined(*sentences: str) -> str:
 
 
 def _keys_at(model: type[Document], location: tuple[Any, ...]) -> list[str]:
-    """Return the keys that a model allows in the table at a pydantic location.
-
-    Parameters
-    ----------
-    location
-        Keys, indices, and between them the names of validators and of the table variants that pydantic chose.
-    """
+    """Return the keys of the table at a pydantic location, which also names validators and table variants."""
     here: list[Any] = [model]
     for part in location:
         here = [each for option in here for each in _options(option)]
@@ -312,14 +309,13 @@ def _tags(model: type) -> set[str]:
 def shown(value: Any, where: str | Path = "") -> str:
     """Return a value as its file has it, shortened: in JSON for a ``.json`` file, otherwise in TOML."""
     try:
-        text = _in_json(value) if str(where).lower().endswith(".json") else _in_toml(value)
+        if str(where).lower().endswith(".json") and not isinstance(value, str):
+            text = json.dumps(value, ensure_ascii=False, default=str)
+        else:
+            text = _in_toml(value)
     except (ValueError, TypeError, RecursionError):  # an integer of thousands of digits, or nesting as deep
         text = f"a {type(value).__name__} too long to show"
     return text if len(text) <= 80 else text[:77] + "..."
-
-
-def _in_json(value: Any) -> str:
-    return repr(value) if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
 
 
 def _in_toml(value: Any) -> str:

@@ -23,9 +23,12 @@ from numpy.typing import NDArray
 
 from characterisation.files.datasets import Variable
 
-#: two surfaces are optically equal if all numbers agree within this share or, near 0, within this difference [1].
-#: Assumed: a tenth of the uncertainty of the renderer's laws for a well-known finish
-SAME, SAME_NEAR_ZERO = 0.01, 0.002
+#: two surfaces are optically equal if all numbers agree within this share. Assumed: a tenth of the uncertainty of the
+#: renderer's laws for a well-known finish
+SAME = 0.01
+
+#: the same near 0, as a difference [1]
+SAME_NEAR_ZERO = 0.002
 
 
 @dataclass(frozen=True)

@@ -34,9 +34,14 @@ CELLS = ((0.1, 0.0), (0.2, 0.03), (0.4, 0.06), (np.inf, 0.12))
 #: square, so that the side also moves, by up to some percent, the estimates that few data determine
 TILE = 1.2
 
-#: Fisher scoring takes at most ``SCORING_STEPS`` steps of at most ``LARGEST_STEP`` in the logarithm. It ends when all
-#: steps are smaller than ``SMALL_STEP``; the remaining error is then the square of the step
-SCORING_STEPS, LARGEST_STEP, SMALL_STEP = 8, 1.5, 0.02
+#: largest number of steps of Fisher scoring
+SCORING_STEPS = 8
+
+#: largest step in the logarithm
+LARGEST_STEP = 1.5
+
+#: scoring ends when all steps are smaller; the remaining error is then the square of the step
+SMALL_STEP = 0.02
 
 
 @dataclass(frozen=True)

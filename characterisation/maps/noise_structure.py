@@ -42,6 +42,11 @@ def noise_structure(
     """Look up A, p / sigma and beta / sigma; arguments and errors are those of :meth:`PerformanceMap.query`.
 
     Outside the characterised normals or distances, the nearest ones are used: F and sigma are NaN there anyway.
+
+    Parameters
+    ----------
+    finish, roughness, distance, normals, light
+        As in :meth:`~characterisation.maps.performance_map.PerformanceMap.query`.
     """
     members, rough = performance_map.known.representing(finish, roughness, light)
     data = performance_map.data

@@ -47,11 +47,14 @@ __all__ = [
     "lambert_projection",
 ]
 
-#: version of the files: 2 interpolates F and ln sigma, and its errors allow for captures and gaps; 1 is read as well
+#: version of the files
 SCHEMA_VERSION = 2
 
-#: bits of the mantissa that a compact file keeps: relative errors of at most 2^-11 and 2^-6
-VALUE_BITS, ERROR_BITS = 10, 5
+#: bits of the mantissa of values that a compact file keeps: relative errors of at most 2^-11
+VALUE_BITS = 10
+
+#: bits of the mantissa of errors that a compact file keeps: relative errors of at most 2^-6
+ERROR_BITS = 5
 
 _NODES = ("sample", "distance", "b", "a")
 
@@ -309,14 +312,14 @@ class PerformanceMap:
         Raises
         ------
         InputError
-            If the file is missing, damaged, not a performance map, or has a newer schema.
+            If the file is missing, damaged, not a performance map, or has another schema.
         """
         path = Path(path)
         data = read_dataset(path, _SCHEMA)
-        version = data.attrs.get("schema_version", 1)
-        if not (isinstance(version, (int, np.integer)) and 1 <= version <= SCHEMA_VERSION):
-            hint = "read it with the version of mitsim that wrote it, or a later one"
-            raise InputError(path, "schema_version", repr(version), f"1 to {SCHEMA_VERSION}", hint)
+        version = data.attrs.get("schema_version")
+        if str(version) != str(SCHEMA_VERSION):
+            hint = "read it with the version of mitsim that wrote it"
+            raise InputError(path, "schema_version", repr(version), str(SCHEMA_VERSION), hint)
         _check_axes(path, data)
         return PerformanceMap(data)
 
@@ -328,12 +331,8 @@ def _check_axes(path: Path, data: xr.Dataset) -> None:
         raise InputError(path, "distance", "distances that do not increase", "increasing distances [mm]")
     step = np.diff(a)
     if len(a) != len(b) or not np.allclose(a, b, atol=1e-6) or not (step > 0).all() or np.ptp(step) > 1e-3 * step[0]:
-        raise InputError(
-            path,
-            "a",
-            "nodes that are unequally spaced or differ from those of b",
-            "equally spaced nodes, the same for a and b",
-        )
+        allowed = "equally spaced nodes, the same for a and b"
+        raise InputError(path, "a", "nodes that are unequally spaced or differ from those of b", allowed)
     if "lay" in data.dims:
         lays = data["lay"].values.astype(float) if "lay" in data.variables else np.full(1, np.nan)
         if not np.allclose(lays, np.arange(len(lays)) * 180.0 / len(lays), atol=1e-6):

@@ -56,14 +56,20 @@ LEAST_ROWS = 10
 #: smallest radius of the kernel in the equal-area plane, where 0.0175 is about 1 deg: patches are 1 to 2 deg wide
 SMALLEST_RADIUS = 0.045
 
-#: number of radii at every node, and number of captures about it in the largest
-RUNGS, CAPTURES = 4, 6
+#: number of radii at every node
+RUNGS = 4
+
+#: number of captures about a node in the largest radius
+CAPTURES = 6
 
 #: c^2 over S^2 where there are too few captures to estimate it; *assumed*
 COMMON_SHARE = 0.1
 
-#: least number of captures predicted from others for an estimate of c and kappa, and number used for a place
-LEAST_CAPTURES, NEIGHBOURS = 6, 20
+#: least number of captures predicted from others for an estimate of c and kappa
+LEAST_CAPTURES = 6
+
+#: number of such captures used for a place
+NEIGHBOURS = 20
 
 #: prior slopes per unit of the plane and of ln |V|: F level, within 5 and 1; variance as |V|^4, within 10 and 3; and
 #: bends of 0, within 10 and 3. One patch scatters by 0.1 in F and by a factor 1.3 in variance. *Assumed*; the priors
@@ -88,7 +94,7 @@ class Pooled:
     patches: Floats
 
 
-def pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Floats | float = 0.0) -> Pooled:
+def pool(patches: xr.Dataset, nominal: float, places: Floats) -> Pooled:
     """Estimate F and sigma at places of the equal-area plane, from the patches of one sample at one nominal distance.
 
     Parameters
@@ -99,20 +105,19 @@ def pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Floa
         nominal one.
     nominal
         |V| [mm] of the coupon's centre.
-    places, log_distance
-        (q, 2) in the plane; ln(|V| / nominal) there, (q,) or one.
+    places
+        (q, 2) in the plane.
     """
     with threadpool_limits(1, user_api="blas"):  # threads slow down thousands of small fits
-        return _pool(patches, nominal, places, log_distance)
+        return _pool(patches, nominal, places)
 
 
-def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Floats | float) -> Pooled:
-    unknown = np.full(len(places), np.nan)
+def _pool(patches: xr.Dataset, nominal: float, places: Floats) -> Pooled:
     rows = _rows(patches, nominal)
     inside, corner = _triangles(rows.place[:, :2], places)
     if not inside.any():
-        return Pooled(*(unknown.copy() for _ in range(6)))
-    at = np.column_stack([places, np.broadcast_to(log_distance, len(places))])[inside]
+        return Pooled(*np.full((6, len(places)), np.nan))
+    at = np.column_stack([places, np.zeros(len(places))])[inside]
     ladder = _ladder(rows, at[:, :2], corner[inside])
     gap = cKDTree(rows.place[:, :2]).query(at[:, :2])[0]
 
@@ -154,19 +159,9 @@ def _pool(patches: xr.Dataset, nominal: float, places: Floats, log_distance: Flo
             fraction > 1e-6, np.exp(log_variance / 2) / inverse_lambert_projection(at[:, :2])[:, 2], np.nan
         )
         sigma_error = sigma * error / 2
-    out = {
-        "fraction": fraction,
-        "sigma": sigma,
-        "fraction_error": fraction_error,
-        "sigma_error": sigma_error,
-        "false_fraction": false,
-        "patches": effective,
-    }
-    for name, values in out.items():
-        whole = unknown.copy()
-        whole[inside] = values
-        out[name] = whole
-    return Pooled(**out)
+    out = np.full((6, len(places)), np.nan)
+    out[:, inside] = fraction, sigma, fraction_error, sigma_error, false, effective
+    return Pooled(*out)
 
 
 def patch_normals(patches: xr.Dataset) -> Floats:

@@ -41,12 +41,8 @@ class Samples:
         out = []
         for name in self.finishes:
             rough = self.roughness[[i for i, one in enumerate(self.names) if one == name]]
-            ends = (
-                ""
-                if np.isnan(rough).any()
-                else f" Ra {rough.min():g}" + (f" to {rough.max():g}" if len(rough) > 1 else "") + " um"
-            )
-            out.append(name + ends)
+            ends = f"{rough.min():g}" + (f" to {rough.max():g}" if len(rough) > 1 else "")
+            out.append(name if np.isnan(rough).any() else f"{name} Ra {ends} um")
         return ", ".join(out)
 
     def representing(self, finish: str, roughness: float, light: Light | None = None) -> tuple[list[int], float]:
@@ -72,7 +68,9 @@ class Samples:
         rough = self.roughness[members]
         if math.isnan(rough[0]):
             return members[:1], math.nan
-        self._check_roughness(finish, float(roughness), rough)
+        if not rough[0] * (1 - 1e-6) <= roughness <= rough[-1] * (1 + 1e-6):
+            allowed = f"{rough[0]:g} to {rough[-1]:g} um, the characterised range of {finish}"
+            raise InputError(self.where, "Ra", f"{roughness:g} um", allowed, "characterise a sample outside this range")
         if light is not None:
             self._check_between(finish, float(roughness), light, members)
         return members, float(roughness)
@@ -104,32 +102,15 @@ class Samples:
         if not alike:
             asked = finish if math.isnan(roughness) else f"{finish} Ra {roughness:g} um"
             known = "; ".join(str(self.lights[i] or "of unknown optical properties") for i in self.members(finish))
-            raise InputError(
-                self.where,
-                "finish",
-                f"{asked} ({light})",
-                f"samples of {finish}: {known}",
-                "a map holds only characterised finishes: characterise this finish",
-            )
+            hint = "a map holds only characterised finishes: characterise this finish"
+            raise InputError(self.where, "finish", f"{asked} ({light})", f"samples of {finish}: {known}", hint)
         return alike
 
     def _check_between(self, finish: str, roughness: float, light: Light, members: list[int]) -> None:
-        """Reject a surface whose optical properties do not lie between those of its neighbours by Ra.
-
-        This happens if the laws of the renderer have changed since the campaign.
-        """
+        """Reject a surface outside its neighbours by Ra, as after a change of the laws of the renderer."""
         upper = min(int(np.searchsorted(self.roughness[members], roughness * (1 - 1e-6))), len(members) - 1)
         low, high = self.lights[members[max(upper - 1, 0)]], self.lights[members[upper]]
         if low is not None and high is not None and not lies_between(light, low, high):
-            raise InputError(
-                self.where,
-                "finish",
-                f"{finish} Ra {roughness:g} um ({light})",
-                f"optical properties between those of its neighbours: {low}, and {high}",
-                "characterise this finish",
-            )
-
-    def _check_roughness(self, finish: str, roughness: float, known: Floats) -> None:
-        if not known[0] * (1 - 1e-6) <= roughness <= known[-1] * (1 + 1e-6):
-            allowed = f"{known[0]:g} to {known[-1]:g} um, the characterised range of {finish}"
-            raise InputError(self.where, "Ra", f"{roughness:g} um", allowed, "characterise a sample outside this range")
+            found = f"{finish} Ra {roughness:g} um ({light})"
+            allowed = f"optical properties between those of its neighbours: {low}, and {high}"
+            raise InputError(self.where, "finish", found, allowed, "characterise this finish")

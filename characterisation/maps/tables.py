@@ -84,7 +84,7 @@ def between_samples(stacks: Mapping[str, Floats], known: Floats, roughness: floa
     t = float(np.clip((at - x[j]) / (x[j + 1] - x[j]), 0.0, 1.0))
     if t < AT_KNOT or t > 1 - AT_KNOT:
         return [value[j + round(t)] for value in values]
-    bends = [interpolation_error(x, values[k], values[k + 2], j) for k in (0, 1)]
+    bends = [_interpolation_error(x, values[k], values[k + 2], j) for k in (0, 1)]
     return _mixed([v[j] for v in values], [v[j + 1] for v in values], np.asarray(t), bends)
 
 
@@ -107,7 +107,7 @@ def _per_probit(z: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.asarray(density * z.dtype.type(1 / (np.sqrt(2 * np.pi) * (1 - 2 * PROBIT_MARGIN))))
 
 
-def interpolation_error(knots: Floats, values: Floats, errors: Floats, interval: int) -> Floats:
+def _interpolation_error(knots: Floats, values: Floats, errors: Floats, interval: int) -> Floats:
     """Return D of an interval between knots (k,), for values and errors (k, ...); NaN without a third knot."""
     found = np.full(values.shape[1:], np.nan)
     width = knots[interval + 1] - knots[interval]
@@ -167,7 +167,7 @@ class Surface:
         pairs = range(max(len(distances) - 1, 1))
         if len(distances) > 1:
             bends = [
-                np.stack([interpolation_error(self.knots, self.fields[k], self.fields[k + 2], j) for j in pairs])
+                np.stack([_interpolation_error(self.knots, self.fields[k], self.fields[k + 2], j) for j in pairs])
                 for k in (0, 1)
             ]
         else:

@@ -24,8 +24,11 @@ from characterisation.coupon.patch_table import Overall
 
 Floats = NDArray[np.float64]
 
-#: limits of the mean absolute residuals, per sample and distance: of F [1], and of sigma relative to it
-FRACTION_LIMIT, SIGMA_LIMIT = 0.05, 0.05
+#: limit of the mean absolute residual of F [1], per sample and distance
+FRACTION_LIMIT = 0.05
+
+#: limit of the mean absolute residual of sigma, relative to it, per sample and distance
+SIGMA_LIMIT = 0.05
 
 #: mean of |x| of a normal variable with a standard deviation of 1
 _MEAN_ABSOLUTE = math.sqrt(2 / math.pi)

@@ -128,33 +128,19 @@ def joint_information(view: JoinedView, rigid: Sequence[Floats], known: Floats) 
     return out
 
 
-def merged_covariance(views: Sequence[JoinedView], rigid: Sequence[Floats], known: Floats) -> Floats:
-    """Return the covariance (P, P) of all features fitted to the merged points of views; very large for unseen ones."""
-    own, weights = list[Floats](), list[list[Floats | None]]()
-    for f, motion in enumerate(rigid):
-        information = [None if (c := view.covariance[f]) is None else np.linalg.inv(c) for view in views]
-        total = np.sum([one for one in information if one is not None], axis=0)
-        if not np.ndim(total):
-            own.append(np.eye(len(motion)) / NOTHING)
-            weights.append([None] * len(views))
-            continue
-        mean = np.linalg.inv(total)
-        own.append(mean)
-        weights.append([None if one is None else mean @ one for one in information])
-    out = block_diag(*own)
-    common: Floats = np.zeros((len(out), 1))
-    for v, view in enumerate(views):
-        moved = _weighed([row[v] for row in weights], rigid)
-        out = out + moved @ known @ moved.T
-        if view.shared is not None:
-            common = common + _weighed([row[v] for row in weights], view.shared)
-    return np.asarray(out + common @ common.T)
+def joined_covariance(
+    views: Sequence[JoinedView], rigid: Sequence[Floats], known: Floats, best_fit: bool = False
+) -> Floats:
+    """Return the covariance (P, P) of all features fitted to the joined points of views; very large for unseen ones.
 
-
-def fitted_covariance(views: Sequence[JoinedView], rigid: Sequence[Floats], known: Floats) -> Floats:
-    """Return the covariance (P, P) of all features fitted to points joined by best fit; very large if no view sees one.
-
-    ``known`` K (6, 6) of each pose before the fit, not singular.
+    Parameters
+    ----------
+    rigid
+        J (p, 6) of each feature.
+    known
+        K (6, 6) of each pose, before the fit if there is one; then not singular.
+    best_fit
+        Whether the poses are estimated together with the features; otherwise the points are merged as they are.
     """
     ends = np.cumsum([len(one) for one in rigid])
     out = np.eye(ends[-1]) / NOTHING
@@ -163,50 +149,44 @@ def fitted_covariance(views: Sequence[JoinedView], rigid: Sequence[Floats], know
     if not seen:
         return out
     rows = np.concatenate([places[f] for f in seen])
-    parameters, poses = len(rows), 6 * len(views)
     at = {f: np.searchsorted(rows, places[f]) for f in seen}
-    normal = np.zeros((parameters + poses, parameters + poses))
-    normal[parameters:, parameters:] = block_diag(*[np.linalg.inv(known)] * len(views))
-    weights, moved, gains = list[Floats](), list[Floats](), list[Floats]()
+    count = len(rows)
+    weights, noises = np.zeros((2, len(views), count, count))
+    motions = np.zeros((len(views), count, 6))
     for v, view in enumerate(views):
-        weight, motion = np.zeros((parameters, parameters)), np.zeros((parameters, 6))
         for f in seen:
             if (covariance := view.covariance[f]) is not None:
-                weight[np.ix_(at[f], at[f])], motion[at[f]] = np.linalg.inv(covariance), rigid[f]
-        own = slice(parameters + 6 * v, parameters + 6 * v + 6)
-        design = np.zeros((parameters, parameters + poses))
-        design[:, :parameters], design[:, own] = np.eye(parameters), motion
-        normal += design.T @ weight @ design
-        weights.append(weight)
-        moved.append(motion)
-        gains.append(design.T @ weight)
-    scale = np.sqrt(np.diag(normal))
-    inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
-    mean = np.linalg.inv(np.sum(weights, axis=0))
-    carried = np.hstack([mean @ weight @ motion for weight, motion in zip(weights, moved, strict=True)])
-    total: Floats = np.zeros((parameters, parameters))
-    common: Floats = np.zeros((parameters, 1))
-    for view, weight, motion, gain in zip(views, weights, moved, gains, strict=True):
-        taken = mean @ weight - carried @ inverse[parameters:] @ gain
-        noise = np.zeros((parameters, parameters))
-        for f in seen:
-            if (covariance := view.covariance[f]) is not None:
-                noise[np.ix_(at[f], at[f])] = covariance
-        total += taken @ (noise + motion @ known @ motion.T) @ taken.T
+                block = np.ix_(at[f], at[f])
+                weights[v][block], noises[v][block] = np.linalg.inv(covariance), covariance
+                motions[v, at[f]] = rigid[f]
+    mean = np.linalg.inv(weights.sum(axis=0))
+    taken = mean @ weights
+    if best_fit:
+        taken = taken - _by_estimated_poses(weights, motions, known, mean)
+    common = np.zeros((count, 1))
+    total = np.zeros((count, count))
+    for v, view in enumerate(views):
+        total += taken[v] @ (noises[v] + motions[v] @ known @ motions[v].T) @ taken[v].T
         if view.shared is not None:
-            common = common + taken @ np.concatenate([view.shared[f] for f in seen])
+            common = common + taken[v] @ np.concatenate([view.shared[f] for f in seen])
     out[np.ix_(rows, rows)] = total + common @ common.T
     return out
 
 
-def _weighed(weights: Sequence[Floats | None], changes: Sequence[Floats]) -> Floats:
-    """Return the changes (P, k) of all features, each times its weight (p, p); 0 for unseen features."""
-    return np.concatenate(
-        [
-            np.zeros_like(change) if weight is None else weight @ change
-            for weight, change in zip(weights, changes, strict=True)
-        ]
-    )
+def _by_estimated_poses(weights: Floats, motions: Floats, known: Floats, mean: Floats) -> Floats:
+    """Return the change (views, P, P) of the features by the poses that a best fit estimates from each view."""
+    views, count, _ = motions.shape
+    designs = np.zeros((views, count, count + 6 * views))
+    designs[:, :, :count] = np.eye(count)
+    for v, motion in enumerate(motions):
+        designs[v, :, count + 6 * v : count + 6 * v + 6] = motion
+    gains = designs.swapaxes(1, 2) @ weights
+    normal = (gains @ designs).sum(axis=0)
+    normal[count:, count:] += block_diag(*[np.linalg.inv(known)] * views)
+    scale = np.sqrt(np.diag(normal))
+    inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
+    carried = np.hstack(list(mean @ weights @ motions))
+    return np.asarray(carried @ inverse[count:] @ gains)
 
 
 def invariant(form: Floats, rigid: Floats, variances: Floats) -> Floats:

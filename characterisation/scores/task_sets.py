@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError
 from characterisation.scores.joining import (
     JoinedView,
-    fitted_covariance,
     invariant,
+    joined_covariance,
     joint_information,
-    merged_covariance,
     rigid_derivatives,
 )
-from characterisation.scores.view_sets import Feature, ViewSet, fewest_views
+from characterisation.scores.view_sets import FeatureInformation, ViewSet, fewest_views
 from characterisation.tasks.evaluation import InputQuantity, measurement_model
 from characterisation.tasks.prediction import ExpectedInput, joint_quadratic_form
 from characterisation.tasks.task_file import Task
@@ -80,36 +79,25 @@ def choose_set(
     needed_inputs = {name: measurement_model(task, name).inputs for name in limits}
     for name, quantities in needed_inputs.items():
         for quantity in quantities:
+            found = allowed = hint = ""
             if quantity.kind == "form":
-                raise InputError(
-                    "limits", name, "a form", "a measurement of features or of the pose", "choose one view for it"
-                )
-            if quantity.kind == "pose" and joining.known.any():
-                raise InputError(
-                    "limits",
-                    name,
-                    "a pose, from joined views",
-                    "a measurement of features",
-                    'choose one view for it, or set.joining = "exact"',
-                )
-            if quantity not in best:
-                raise InputError(
-                    "limits",
-                    name,
-                    f"{', '.join(quantity.features)}, which no view sees well enough",
-                    "a feature that a view sees",
-                )
+                found, allowed, hint = "a form", "a measurement of features or of the pose", "choose one view for it"
+            elif quantity.kind == "pose" and joining.known.any():
+                found, allowed = "a pose, from joined views", "a measurement of features"
+                hint = 'choose one view for it, or set.joining = "exact"'
+            elif quantity not in best:
+                found = f"{', '.join(quantity.features)}, which no view sees well enough"
+                allowed = "a feature that a view sees"
+            if found:
+                raise InputError("limits", name, found, allowed, hint)
     whole = _JoinedSet(task, needed_inputs, best, joining)
     views = [whole.view(one, least_chance) for one in inputs]
     information = np.array([joint_information(view, whole.rigid, joining.known) for view in views])
-    features = [Feature(information, whole.quadratic)]
+    features = [FeatureInformation(information, whole.quadratic)]
 
     def joined(chosen: Floats) -> Floats:
         some = [view for view, taken in zip(views, chosen, strict=True) if taken]
-        if joining.best_fit:
-            covariance = fitted_covariance(some, whole.rigid, joining.known)
-        else:
-            covariance = merged_covariance(some, whole.rigid, joining.known)
+        covariance = joined_covariance(some, whole.rigid, joining.known, joining.best_fit)
         return np.asarray(np.sqrt(np.maximum(np.einsum("mij,ji->m", whole.quadratic, covariance), 0.0)))
 
     return fewest_views(features, np.array(list(limits.values())), seconds, joined)

@@ -45,8 +45,14 @@ def view_statistics(
 ) -> xr.Dataset:
     """Return the inputs of the score, arrays (views, features), as a dataset; see :data:`INPUTS`.
 
-    The sigmas are in mm, and NaN where a view has no point on a feature. Numbers of points may be fractional
-    expectations.
+    Parameters
+    ----------
+    features
+        Names.
+    n, n_white, n_only_white
+        Expected numbers of points, arrays (views, features); they may be fractional.
+    mean_sigma, mean_sigma_white
+        (views, features) [mm]; NaN where a view has no point on a feature.
 
     Raises
     ------
@@ -179,7 +185,15 @@ def score_table(
 def write_scores(
     path: str | Path, scores: xr.Dataset, extra: Mapping[str, ArrayLike] | None = None, order: str = "rank"
 ) -> None:
-    """Write :func:`score_table` as CSV, atomically."""
+    """Write :func:`score_table` as CSV, atomically.
+
+    Parameters
+    ----------
+    path
+        The file.
+    scores, extra, order
+        As in :func:`score_table`.
+    """
     rows = score_table(scores, extra, order)
     with atomic_write(path) as whole, whole.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else ["measurement", "view"])

@@ -50,7 +50,7 @@ _HALVINGS = 40
 
 
 @dataclass(frozen=True)
-class Feature:
+class FeatureInformation:
     """Information on one feature, and its use.
 
     ``information`` (views, p, p) is P_v; ``quadratic`` (measurements, p, p) is G_m, 0 where not needed.
@@ -75,12 +75,12 @@ class ViewSet:
     exact: bool
 
 
-def set_uncertainty(features: Sequence[Feature], chosen: Floats) -> Floats:
+def set_uncertainty(features: Sequence[FeatureInformation], chosen: Floats) -> Floats:
     """Return u_m (measurements,) of views chosen by shares x (views,), 0 or 1; very large for an unseen feature."""
     return np.asarray(np.sqrt(_total(features, [_covariance(feature, chosen) for feature in features])))
 
 
-def greedy_views(features: Sequence[Feature], limits: Floats, joined: Joined | None = None) -> ViewSet:
+def greedy_views(features: Sequence[FeatureInformation], limits: Floats, joined: Joined | None = None) -> ViewSet:
     """Add views until all limits are met, or none helps; each lowers the sum of ln(u_m / l_m) over unmet limits most.
 
     ``limits`` l_m (measurements,) [units of the measurement]; ``joined`` returns the actual uncertainty of a set, by
@@ -123,11 +123,18 @@ def _grown(uncertainty_of: Joined, count: int, limits: Floats, wanted: NDArray[n
 
 
 def fewest_views(
-    features: Sequence[Feature], limits: Floats, seconds: float = 60.0, joined: Joined | None = None
+    features: Sequence[FeatureInformation], limits: Floats, seconds: float = 60.0, joined: Joined | None = None
 ) -> ViewSet:
     """Return the fewest views that keep all limits.
 
-    If ``seconds`` do not suffice for a proof, the greedy set is returned, marked as not exact.
+    Parameters
+    ----------
+    limits
+        l_m (measurements,) in their units.
+    seconds
+        Time limit of the proof; after it, the greedy set is returned, marked as not exact.
+    joined
+        Returns the actual uncertainty of a set; by default :func:`set_uncertainty`.
     """
     began = time.monotonic()
     uncertainty_of = joined or (lambda chosen: set_uncertainty(features, chosen))
@@ -136,7 +143,8 @@ def fewest_views(
     if not greedy.feasible.any() or (complete and len(greedy.views) <= 1):
         return ViewSet(greedy.views, greedy.uncertainty, greedy.feasible, exact=True)
     count = len(features[0].information)
-    best, rows, bounds = _indicator(greedy.views, count), list[Floats](), list[float]()
+    best = np.isin(np.arange(count), greedy.views).astype(float)
+    rows, bounds = list[Floats](), list[float]()
     size = best.sum() if complete else count + 1
     _cut(features, np.zeros(count), limits, greedy.feasible, rows, bounds)
     while (left := seconds - (time.monotonic() - began)) > 0:
@@ -164,7 +172,7 @@ def fewest_views(
 
 
 def _cut(
-    features: Sequence[Feature],
+    features: Sequence[FeatureInformation],
     at: Floats,
     limits: Floats,
     wanted: NDArray[np.bool_],
@@ -196,11 +204,11 @@ def _excess(at: Floats, limits: Floats, wanted: NDArray[np.bool_]) -> float:
     return float(np.maximum(np.log(at / limits), 0)[wanted].sum())
 
 
-def _met(features: Sequence[Feature], chosen: Floats, limits: Floats) -> NDArray[np.bool_]:
+def _met(features: Sequence[FeatureInformation], chosen: Floats, limits: Floats) -> NDArray[np.bool_]:
     return np.asarray(set_uncertainty(features, chosen) <= limits)
 
 
-def _covariance(feature: Feature, chosen: Floats) -> Floats:
+def _covariance(feature: FeatureInformation, chosen: Floats) -> Floats:
     total = np.tensordot(chosen, feature.information, 1)
     scale = np.sqrt(np.einsum("vii->vi", feature.information).max(0))
     scale[scale == 0] = 1.0
@@ -208,16 +216,10 @@ def _covariance(feature: Feature, chosen: Floats) -> Floats:
     return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))
 
 
-def _total(features: Sequence[Feature], covariances: Sequence[Floats]) -> Floats:
+def _total(features: Sequence[FeatureInformation], covariances: Sequence[Floats]) -> Floats:
     """Return u_m^2 (measurements,)."""
     parts = [np.einsum("mij,ji->m", f.quadratic, c) for f, c in zip(features, covariances, strict=True)]
     return np.asarray(np.sum(parts, axis=0))
-
-
-def _indicator(views: Sequence[int], count: int) -> Floats:
-    chosen = np.zeros(count)
-    chosen[list(views)] = 1
-    return chosen
 
 
 def _answer(uncertainty_of: Joined, chosen: Floats, feasible: NDArray[np.bool_], exact: bool) -> ViewSet:

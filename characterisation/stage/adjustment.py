@@ -91,7 +91,17 @@ def adjusted(
 def whitened(
     residuals: Floats, jacobian: Floats, by_angles: Floats, variances: Floats, angle_std: ArrayLike
 ) -> tuple[Floats, Floats]:
-    """Return residuals (n, m) and derivatives (n, m, p) in units of their noise, uncorrelated."""
+    """Return residuals (n, m) and derivatives (n, m, p) in units of their noise, uncorrelated.
+
+    Parameters
+    ----------
+    residuals, jacobian, by_angles
+        (n, m), (n, m, p) and (n, m, k).
+    variances
+        (n, m, m) of the observations.
+    angle_std
+        [rad], one or (k,).
+    """
     spread = by_angles * np.broadcast_to(np.asarray(angle_std, float), by_angles.shape[2:])
     root = np.linalg.cholesky(variances + spread @ spread.swapaxes(1, 2))
     white = np.linalg.solve(root, np.concatenate([residuals[..., None], jacobian], axis=2))

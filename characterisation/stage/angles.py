@@ -13,12 +13,15 @@ motion is used.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
+from characterisation.features.surfaces import unit
 from characterisation.files.documents import Document, Name
 
 Floats = NDArray[np.float64]
@@ -30,6 +33,15 @@ TOLERANCE = 1e-6
 SEARCH_STEP = math.radians(1.0)
 
 _TURN = 2 * math.pi
+
+#: tolerance of a limit for rounding [rad]
+_SLACK = 1e-9
+
+#: solutions with a smaller error [rad] precede all others
+_EXACT = 1e-10
+
+#: increase of the motion of all others [rad^2]
+_ROUGH = 1e3
 
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 
@@ -51,7 +63,7 @@ class StageAxis(Document):
 
     def unit(self) -> Floats:
         """Return the unit direction (3,)."""
-        return _unit(self.direction)
+        return unit(self.direction)
 
     def nearest(self, angles: ArrayLike) -> Floats:
         """Return the same angles (n,) [rad] plus whole turns, within the limits and as small as possible.
@@ -66,11 +78,6 @@ class StageAxis(Document):
         nearer = np.where(above - high < low - below, above, below)
         return np.asarray(np.where(fewest <= most, within, nearer))
 
-    def within(self, angles: Floats) -> NDArray[np.bool_]:
-        """Return whether angles [rad] lie within the limits."""
-        low, high = np.radians(self.limits_deg)
-        return np.asarray((angles >= low - 1e-9) & (angles <= high + 1e-9))
-
 
 class Stage(Document):
     """The ``[stage]`` table: axes in the view frame (x along the baseline, z from the coupon toward the sensor).
@@ -84,7 +91,7 @@ class Stage(Document):
     def normals(self, angles: ArrayLike) -> Floats:
         """Return the normals (n, 3) of the coupon at angles (n, axes) [rad]."""
         angles = np.atleast_2d(np.asarray(angles, float))
-        out = np.broadcast_to(_unit(self.normal), (len(angles), 3))
+        out = np.broadcast_to(unit(self.normal), (len(angles), 3))
         for axis, turn in reversed(list(zip(self.axes, angles.T, strict=True))):
             out = turned(out, axis.unit(), turn)
         return np.asarray(out)
@@ -92,21 +99,15 @@ class Stage(Document):
     def angles(self, normals: ArrayLike) -> Floats:
         """Return the angles (n, axes) [rad] of least motion for each normal (n, 3); NaN where it is unreachable."""
         wanted = np.atleast_2d(np.asarray(normals, float))
-        best = np.full((len(wanted), len(self.axes)), np.nan)
-        least = np.full(len(wanted), np.inf)
-        for solved in self._candidates(wanted):
-            turns = [axis.nearest(turn) for axis, turn in zip(self.axes, solved.T, strict=True)]
-            candidate = np.stack(turns, axis=1)
-            reached = np.linalg.norm(self.normals(np.nan_to_num(candidate)) - wanted, axis=1) < TOLERANCE
-            allowed = [axis.within(turn) for axis, turn in zip(self.axes, candidate.T, strict=True)]
-            motion = np.where(reached & np.all(allowed, axis=0), (candidate**2).sum(axis=1), np.inf)
-            better = motion < least
-            best[better], least[better] = candidate[better], motion[better]
-        return best
+
+        def error(angles: Floats) -> Floats:
+            return np.asarray(np.linalg.norm(self.normals(angles) - wanted, axis=1))
+
+        return least_motion(self.axes, self._candidates(wanted), error, len(wanted)).angles
 
     def _candidates(self, wanted: Floats) -> list[Floats]:
         """Return angles (n, axes) that may show the wanted normals, NaN where there is no solution."""
-        start = np.broadcast_to(_unit(self.normal), wanted.shape)
+        start = np.broadcast_to(unit(self.normal), wanted.shape)
         units = [axis.unit() for axis in self.axes]
         if len(units) == 1:
             return [about_one(start, wanted, units[0])[:, None]]
@@ -132,16 +133,60 @@ class Stage(Document):
         return out
 
 
+@dataclass(frozen=True)
+class Reach:
+    """Reach of a stage for n views: ``angles`` (n, axes) [rad], NaN if impossible, and the reason, else ""."""
+
+    angles: Floats
+    reasons: list[str]
+
+
+def least_motion(
+    axes: Sequence[StageAxis], candidates: Iterable[Floats], error: Callable[[Floats], Floats], count: int
+) -> Reach:
+    """Return the angles of least motion within the limits.
+
+    Parameters
+    ----------
+    candidates
+        Angles (n, axes) [rad] that may be solutions, NaN where there is none.
+    error
+        Returns the error (n,) of angles (n, axes) [rad].
+    count
+        Number n of views.
+    """
+    best = np.full((count, len(axes)), np.nan)
+    least, beyond = np.full(count, np.inf), np.full(count, np.inf)
+    low, high = np.radians([axis.limits_deg for axis in axes]).T
+    for solved in candidates:
+        angles = np.stack([axis.nearest(turn) for axis, turn in zip(axes, solved.T, strict=True)], axis=1)
+        off = np.where(np.isfinite(angles).all(axis=1), error(np.nan_to_num(angles)), np.inf)
+        there = off < TOLERANCE
+        excess = np.where(there, np.maximum(low - angles, angles - high).max(axis=1), np.inf)
+        excess = np.where(excess < _SLACK, 0.0, excess)
+        motion = np.where(off < _EXACT, 0.0, _ROUGH) + (angles**2).sum(axis=1)
+        better = there & ((excess < beyond) | ((excess == beyond) & (motion < least)))
+        best[better], least[better], beyond[better] = angles[better], motion[better], excess[better]
+    reasons = [_reason(axes, angles) if over > 0 else "" for angles, over in zip(best, beyond, strict=True)]
+    return Reach(np.where(beyond[:, None] > 0, np.nan, best), reasons)
+
+
+def _reason(axes: Sequence[StageAxis], angles: Floats) -> str:
+    """Return the reason why angles (axes,) [rad] are out of reach; NaN stands for no solution."""
+    if not np.isfinite(angles).all():
+        return "stage: no angles of its axes show this view"
+    degrees = np.degrees(angles)
+    over = [max(axis.limits_deg[0] - turn, turn - axis.limits_deg[1]) for axis, turn in zip(axes, degrees, strict=True)]
+    worst = int(np.argmax(over))
+    low, high = axes[worst].limits_deg
+    return f"stage: {axes[worst].name} {degrees[worst]:.1f} deg beyond {low:g} to {high:g}"
+
+
 def turned(vectors: Floats, axis: Floats, angle: Floats) -> Floats:
     """Turn vectors (n, 3) about a unit axis (3,) by angles (n,) [rad], with Rodrigues' formula."""
     cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
     along = (vectors @ axis)[:, None] * axis
     return np.asarray(along + cos * (vectors - along) + sin * np.cross(axis, vectors))
-
-
-def _unit(vector: ArrayLike) -> Floats:
-    vector = np.asarray(vector, float)
-    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def about_one(start: Floats, wanted: Floats, axis: Floats) -> Floats:
@@ -156,6 +201,13 @@ def about_two(start: Floats, wanted: Floats, first: Floats, second: Floats) -> l
 
     The intermediate vector c = R(second, t2) start has unit length. It has the component of start along ``second``, and
     that of wanted along ``first``, so c = alpha first + beta second +- gamma (first x second).
+
+    Parameters
+    ----------
+    start, wanted
+        Unit vectors (n, 3).
+    first, second
+        Unit axes (3,).
     """
     cos = float(first @ second)
     if abs(cos) > 1 - 1e-12:  # two parallel axes act as one

@@ -32,9 +32,11 @@ SAME = float(np.radians(0.5))
 #: least rotation between two captures that is used to locate an axis [rad]
 LEAST_TURN = float(np.radians(2.0))
 
-#: normals turn about an axis if their differences spread in two directions by this many times their noise; rounding
-#: counts as noise of SMALLEST_TILT [rad]
-LEAST_SPREAD, SMALLEST_TILT = 3.0, 1e-7
+#: normals turn about an axis if their differences spread in two directions by this many times their noise
+LEAST_SPREAD = 3.0
+
+#: rounding counts as noise of this size [rad]
+SMALLEST_TILT = 1e-7
 
 
 def axes_from_rotations(angles: Floats, rotations: Floats, translations: Floats) -> tuple[TurningAxes, Floats]:
@@ -72,7 +74,14 @@ def axes_from_normals(
 ) -> tuple[TurningAxes, Floats, float]:
     """Return the axes, and the normal (3,) and distance [mm] at zero, from planes N x = d at angles (n, k) [rad].
 
-    ``tilt_std`` [rad] is the standard deviation of the normals, which their rotation must exceed.
+    Parameters
+    ----------
+    angles
+        (n, k) [rad].
+    normals, distances
+        Planes N x = d, (n, 3) and (n,) [mm].
+    tilt_std
+        Standard deviation of the normals [rad], which their rotation must exceed.
 
     Raises
     ------
@@ -106,10 +115,7 @@ def axes_from_normals(
 
 
 def _pairs(angles: Floats, index: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
-    """Return pairs of captures between which, of this axis and those after it, only this one turns; and its angle.
-
-    The rotations of the axes before it are removed, so these may differ.
-    """
+    """Return pairs of captures between which, of this axis and those after it, only this one turns; and its angle."""
     apart = np.abs(angles[:, None, index + 1 :] - angles[None, :, index + 1 :])
     still = (apart < SAME).all(axis=2)
     turn = angles[:, None, index] - angles[None, :, index]

@@ -16,8 +16,9 @@ on the same side, or a wrong calibration of the sensor.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,7 +29,7 @@ from characterisation.features.surfaces import Plane, tangents
 from characterisation.files.errors import InputError
 from characterisation.stage.adjustment import adjusted, whitened
 from characterisation.stage.axes_from_sweeps import axes_from_normals, axes_from_rotations
-from characterisation.stage.turning_axes import LINE_PARAMETERS, TurningAxes, axial_vector, cross_matrix
+from characterisation.stage.turning_axes import LINE_PARAMETERS, TurningAxes
 
 Floats = NDArray[np.float64]
 
@@ -37,6 +38,12 @@ SMALLEST_DEVIATIONS = (1e-8, 1e-5)
 
 #: largest number of rounds that estimate the noise; few are needed
 MOST_ROUNDS = 20
+
+#: steps of central differences: their error is a share of 1e-10 of the derivatives, and rounding is smaller
+RADIAN_STEP = 1e-5
+MM_STEP = 1e-2
+
+_LINE_STEPS = [RADIAN_STEP, RADIAN_STEP, MM_STEP, MM_STEP]
 
 _WHERE = "stage calibration"
 
@@ -68,7 +75,8 @@ class BoardCalibration:
 
     def pose_covariance(self, angles: ArrayLike) -> Floats:
         """Return the covariance (n, 6, 6) of the poses: rotation about the sensor's axes [rad], position [mm]."""
-        jacobian = _pose_derivatives(_Board(self.axes, self.zero_pose), np.atleast_2d(np.asarray(angles, float)))
+        angles = np.atleast_2d(np.asarray(angles, float))
+        _, jacobian, _ = _linearised(_board_residuals(self.poses(angles)), angles)(_Board(self.axes, self.zero_pose))
         return np.asarray(jacobian @ self.covariance @ jacobian.swapaxes(1, 2))
 
 
@@ -145,16 +153,16 @@ def calibrate_with_board(
     poses = np.asarray(poses, float)
     angles, kept = _usable(angles, poses.reshape(len(poses), -1), "poses")
     poses = poses[kept]
-    start = _board_start(angles, poses)
+    axes, zero = axes_from_rotations(angles, poses[:, :3, :3], poses[:, :3, 3])
+    start = _Board(axes.at_feet_of(zero[:3, 3]), zero)
+    residuals_of = _board_residuals(poses)
+    linearised = _linearised(residuals_of, angles)
     if covariance is None:
-        fitted, spread, chi2, freedom = _with_components(start, angles, poses, angle_std)
+        fitted, spread, chi2, freedom = _with_components(start, linearised, angle_std)
     else:
         variances = np.asarray(covariance, float)[kept]
-        fitted, spread, chi2, freedom = adjusted(
-            start, lambda model: _board_linearised(model, angles, poses), _Board.moved, variances, angle_std
-        )
-    residuals = _board_linearised(fitted, angles, poses)[0]
-    factor = chi2 / freedom
+        fitted, spread, chi2, freedom = adjusted(start, linearised, _Board.moved, variances, angle_std)
+    residuals, factor = residuals_of(fitted, angles), chi2 / freedom
     return BoardCalibration(fitted.axes, fitted.zero_pose, factor * spread, residuals, float(np.sqrt(factor)), freedom)
 
 
@@ -183,11 +191,11 @@ def calibrate_with_coupon(
     points, normals = values[kept, :3], values[kept, 3:]
     variances = np.array([plane.covariance for plane in planes])[kept]
     start = _coupon_start(angles, points, normals, float(np.sqrt(np.median(variances[:, [1, 2], [1, 2]]))))
+    residuals_of = _coupon_residuals(points, normals)
     fitted, spread, chi2, freedom = adjusted(
-        start, lambda model: _coupon_linearised(model, angles, points, normals), _Coupon.moved, variances, angle_std
+        start, _linearised(residuals_of, angles), _Coupon.moved, variances, angle_std
     )
-    residuals = _coupon_linearised(fitted, angles, points, normals)[0]
-    factor = chi2 / freedom
+    residuals, factor = residuals_of(fitted, angles), chi2 / freedom
     return CouponCalibration(
         fitted.axes, fitted.zero_plane, factor * spread, residuals, float(np.sqrt(factor)), freedom
     )
@@ -197,6 +205,11 @@ def calibrate_with_coupon(
 class _Board:
     axes: TurningAxes
     zero_pose: Floats
+
+    @property
+    def steps(self) -> Floats:
+        """Return the steps (p,) of finite differences by the parameters."""
+        return np.array([*_LINE_STEPS * self.axes.count, *[RADIAN_STEP] * 3, *[MM_STEP] * 3])
 
     def moved(self, parameters: Floats) -> _Board:
         axes = self.axes.moved(parameters[:-6])
@@ -211,13 +224,19 @@ class _Coupon:
     axes: TurningAxes
     zero_plane: Plane
 
+    @property
+    def steps(self) -> Floats:
+        """Return the steps (p,) of finite differences by the parameters."""
+        return np.array([*_LINE_STEPS * self.axes.count, MM_STEP, *[RADIAN_STEP] * 2])
+
     def moved(self, parameters: Floats) -> _Coupon:
         return _Coupon(self.axes.moved(parameters[:-3]), self.zero_plane.moved(parameters[-3:]))
 
 
-def _board_start(angles: Floats, poses: Floats) -> _Board:
-    axes, zero = axes_from_rotations(angles, poses[:, :3, :3], poses[:, :3, 3])
-    return _Board(axes.at_feet_of(zero[:3, 3]), zero)
+Model = TypeVar("Model", _Board, _Coupon)
+
+#: residuals (n, m), measured minus fitted, of a model at angles (n, k)
+Residuals = Callable[[Model, Floats], Floats]
 
 
 def _coupon_start(angles: Floats, points: Floats, normals: Floats, tilt_std: float) -> _Coupon:
@@ -228,85 +247,59 @@ def _coupon_start(angles: Floats, points: Floats, normals: Floats, tilt_std: flo
     return _Coupon(axes.at_feet_of(point), Plane(point, normal))
 
 
-def _pose_derivatives(model: _Board, angles: Floats) -> Floats:
-    """Return derivatives (n, 6, p) of the poses: rotation about the sensor's axes, position."""
-    motion = model.axes.motion(angles)
-    pose = motion @ model.zero_pose
-    by_axes = model.axes.by_parameters(angles) @ model.zero_pose
-    turned = np.einsum("npij,nkj->npik", by_axes[..., :3, :3], pose[:, :3, :3])
-    out = np.zeros((len(pose), 6, by_axes.shape[1] + 6))
-    out[:, :3, :-6] = axial_vector(turned).swapaxes(1, 2)
-    out[:, 3:, :-6] = by_axes[..., :3, 3].swapaxes(1, 2)
-    out[:, :3, -6:-3] = out[:, 3:, -3:] = motion[:, :3, :3]
-    return out
+def _linearised(residuals_of: Residuals[Model], angles: Floats) -> Callable[[Model], tuple[Floats, Floats, Floats]]:
+    """Return the function of a model that gives residuals (n, m), and derivatives by parameters and by angles."""
+
+    def derivatives(function: Callable[[Floats], Floats], steps: Floats) -> Floats:
+        ends = [(function(step), function(-step)) for step in np.diag(steps)]
+        return np.stack([(high - low) / (2 * size) for (high, low), size in zip(ends, steps, strict=True)], axis=-1)
+
+    def linearised(model: Model) -> tuple[Floats, Floats, Floats]:
+        by_parameters = derivatives(lambda change: residuals_of(model.moved(change), angles), model.steps)
+        turn = np.full(angles.shape[1], RADIAN_STEP)
+        by_angles = derivatives(lambda change: residuals_of(model, angles + change), turn)
+        return residuals_of(model, angles), by_parameters, by_angles
+
+    return linearised
 
 
-def _board_linearised(model: _Board, angles: Floats, poses: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return residuals (n, 6), measured minus fitted, and their derivatives (n, 6, .) by parameters and by angles."""
-    fitted = model.axes.motion(angles) @ model.zero_pose
-    rotation = Rotation.from_matrix(poses[:, :3, :3] @ fitted[:, :3, :3].swapaxes(1, 2)).as_rotvec()
-    residuals = np.concatenate([rotation, poses[:, :3, 3] - fitted[:, :3, 3]], axis=1)
-    by_angles = model.axes.by_angles(angles) @ model.zero_pose
-    turned = axial_vector(np.einsum("nkij,nlj->nkil", by_angles[..., :3, :3], fitted[:, :3, :3]))
-    by_angles = np.concatenate([turned, by_angles[..., :3, 3]], axis=2).swapaxes(1, 2)
-    # exp(r) exp(-d) = exp(r - J d), with J the inverse of the right Jacobian: 1 + [r]/2 + [r]^2/12 + ...
-    cross = np.array([cross_matrix(vector) for vector in rotation])
-    carried = np.broadcast_to(np.eye(6), (len(angles), 6, 6)).copy()
-    carried[:, :3, :3] += cross / 2 + cross @ cross / 12
-    return residuals, -carried @ _pose_derivatives(model, angles), -carried @ by_angles
+def _board_residuals(poses: Floats) -> Residuals[_Board]:
+    """Return residuals (n, 6): rotation vectors [rad] about the sensor's axes, positions [mm]."""
+
+    def residuals(model: _Board, angles: Floats) -> Floats:
+        fitted = model.axes.motion(angles) @ model.zero_pose
+        rotation = Rotation.from_matrix(poses[:, :3, :3] @ fitted[:, :3, :3].swapaxes(1, 2)).as_rotvec()
+        return np.concatenate([rotation, poses[:, :3, 3] - fitted[:, :3, 3]], axis=1)
+
+    return residuals
 
 
-def _coupon_linearised(
-    model: _Coupon, angles: Floats, points: Floats, normals: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Return residuals (n, 3), measured minus fitted, and their derivatives by the parameters and by the angles.
-
-    The residuals are the shift along the measured normal at the measured point, and two tilts.
-    """
+def _coupon_residuals(points: Floats, normals: Floats) -> Residuals[_Coupon]:
+    """Return residuals (n, 3): shift along the measured normal at the measured point [mm], and two tilts [rad]."""
     bases = np.array([tangents(normal) for normal in normals])
-    plane = model.zero_plane
-    motion = model.axes.motion(angles)
-    normal, point = motion[:, :3, :3] @ plane.normal, motion[:, :3, :3] @ plane.point + motion[:, :3, 3]
-    facing = (normals * normal).sum(axis=1)
-    shift = ((point - points) * normal).sum(axis=1) / facing
-    tilt = np.einsum("nij,nj->ni", bases, normal) / facing[:, None]
-    residuals = -np.column_stack([shift, tilt])
 
-    def derivatives(normals_by: Floats, points_by: Floats) -> Floats:
-        """Return those of the residuals (n, 3, p), from those of normal and point (n, p, 3)."""
-        turned = np.einsum("npj,nj->np", normals_by, normals)
-        shifted = np.einsum("npj,nj->np", points_by, normal) + np.einsum("npj,nj->np", normals_by, point - points)
-        tilted = np.einsum("nij,npj->nip", bases, normals_by)
-        top = (shifted - shift[:, None] * turned)[:, None]
-        return np.asarray(-np.concatenate([top, tilted - tilt[:, :, None] * turned[:, None]], axis=1))
+    def residuals(model: _Coupon, angles: Floats) -> Floats:
+        motion = model.axes.motion(angles)
+        normal = motion[:, :3, :3] @ model.zero_plane.normal
+        point = motion[:, :3, :3] @ model.zero_plane.point + motion[:, :3, 3]
+        facing = (normals * normal).sum(axis=1)
+        shift = ((point - points) * normal).sum(axis=1) / facing
+        return -np.column_stack([shift, np.einsum("nij,nj->ni", bases, normal) / facing[:, None]])
 
-    def of_motion(by: Floats) -> Floats:
-        return derivatives(by[..., :3, :3] @ plane.normal, by[..., :3, :3] @ plane.point + by[..., :3, 3])
-
-    still = np.zeros((len(angles), 1, 3))
-    first, second = (motion[:, :3, :3] @ edge for edge in tangents(plane.normal))
-    by_plane = derivatives(
-        np.concatenate([still, first[:, None], second[:, None]], axis=1),
-        np.concatenate([normal[:, None], still, still], axis=1),
-    )
-    by_parameters = np.concatenate([of_motion(model.axes.by_parameters(angles)), by_plane], axis=2)
-    return residuals, by_parameters, of_motion(model.axes.by_angles(angles))
+    return residuals
 
 
 def _with_components(
-    start: _Board, angles: Floats, poses: Floats, angle_std: ArrayLike
+    start: _Board, linearised: Callable[[_Board], tuple[Floats, Floats, Floats]], angle_std: ArrayLike
 ) -> tuple[_Board, Floats, float, int]:
     """Fit with one variance of rotations and one of positions, both estimated from the residuals."""
-    residuals = _board_linearised(start, angles, poses)[0]
+    residuals, _, _ = linearised(start)
     deviations = np.maximum([residuals[:, :3].std(), residuals[:, 3:].std()], SMALLEST_DEVIATIONS)
     model = start
     for _ in range(MOST_ROUNDS):
-        variances = np.broadcast_to(np.diag(np.repeat(deviations**2, 3)), (len(angles), 6, 6))
-        model, covariance, chi2, freedom = adjusted(
-            model, lambda model: _board_linearised(model, angles, poses), _Board.moved, variances, angle_std
-        )
-        residuals, jacobian, by_angles = _board_linearised(model, angles, poses)
-        white, jacobian = whitened(residuals, jacobian, by_angles, variances, angle_std)
+        variances = np.broadcast_to(np.diag(np.repeat(deviations**2, 3)), (len(residuals), 6, 6))
+        model, covariance, chi2, freedom = adjusted(model, linearised, _Board.moved, variances, angle_std)
+        white, jacobian = whitened(*linearised(model), variances, angle_std)
         leverage = np.einsum("nip,pq,niq->ni", jacobian, covariance, jacobian)
         parts = [(white[:, part] ** 2).sum() / (1 - leverage[:, part]).sum() for part in (slice(0, 3), slice(3, 6))]
         before, deviations = deviations, np.maximum(deviations * np.sqrt(parts), SMALLEST_DEVIATIONS)

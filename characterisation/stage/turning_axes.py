@@ -6,16 +6,17 @@ on the last axis.
 The first axis is fixed to the ground, the last carries the load. All lines are given in the frame of the sensor, with
 all angles at zero. The motion is the product of exponentials E_1(theta_1) ... E_k(theta_k), where E_i is a rotation by
 theta_i about line i (Murray, Li, Sastry, *A Mathematical Introduction to Robotic Manipulation*, 1994, section 3.2.2).
-With direction a and point p, R = I + sin [a] + (1 - cos) [a]^2 (Rodrigues) and t = (I - R) p.
+With direction a and point p, R = exp(theta [a]) and t = (I - R) p.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from characterisation.features.surfaces import tangents
 
@@ -68,68 +69,15 @@ class TurningAxes:
 
     def motion(self, angles: ArrayLike) -> Floats:
         """Return the motion (n, 4, 4) of the load from its place at zero, by angles (n, k) [rad]."""
-        return _product(list(self.turns(angles)))
-
-    def by_angles(self, angles: ArrayLike) -> Floats:
-        """Return the derivatives (n, k, 4, 4) of the motion by the angles [1/rad]."""
-        angles = np.atleast_2d(np.asarray(angles, float))
-        out = []
-        for i, (before, after) in enumerate(self._around(angles)):
-            cross, sin, cos = cross_matrix(self.directions[i]), np.sin(angles[:, i]), np.cos(angles[:, i])
-            turned = cos[:, None, None] * cross + sin[:, None, None] * (cross @ cross)
-            out.append(before @ _slope(turned, -turned @ self.points[i]) @ after)
-        return np.stack(out, axis=1)
-
-    def by_parameters(self, angles: ArrayLike) -> Floats:
-        """Return the derivatives (n, 4 k, 4, 4) of the motion by the parameters of :meth:`moved`, at zero."""
-        angles = np.atleast_2d(np.asarray(angles, float))
-        out = []
-        for i, (before, after) in enumerate(self._around(angles)):
-            sin, versine = np.sin(angles[:, i])[:, None, None], 1 - np.cos(angles[:, i])[:, None, None]
-            along, basis = cross_matrix(self.directions[i]), tangents(self.directions[i])
-            left = -sin * along - versine * (along @ along)  # I - R
-            for across in map(cross_matrix, basis):
-                turned = sin * across + versine * (across @ along + along @ across)
-                out.append(before @ _slope(turned, -turned @ self.points[i]) @ after)
-            out += [before @ _slope(np.zeros_like(left), left @ shift) @ after for shift in basis]
-        return np.stack(out, axis=1)
-
-    def _around(self, angles: Floats) -> list[tuple[Floats, Floats]]:
-        """Return for each axis the motions (n, 4, 4) of all before it, and of all after it."""
-        turns = self.turns(angles)
-        still = np.broadcast_to(np.eye(4), turns.shape[1:])
-        return [(_product([still, *turns[:i]]), _product([*turns[i + 1 :], still])) for i in range(self.count)]
+        return np.asarray(reduce(np.matmul, self.turns(angles)))
 
 
 def rotation_about(direction: Floats, angles: Floats) -> Floats:
-    """Return rotations (n, 3, 3) about a unit direction (3,) by angles (n,) [rad], by Rodrigues' formula."""
-    cross = cross_matrix(direction)
-    sin, versine = np.sin(angles)[:, None, None], 1 - np.cos(angles)[:, None, None]
-    return np.asarray(np.eye(3) + sin * cross + versine * (cross @ cross))
+    """Return rotations (n, 3, 3) about a unit direction (3,) by angles (n,) [rad]; the identity for NaN."""
+    return np.asarray(Rotation.from_rotvec(np.nan_to_num(angles)[:, None] * direction).as_matrix())
 
 
 def cross_matrix(vector: Floats) -> Floats:
     """Return [v] (3, 3) with [v] x = v cross x."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-def axial_vector(matrices: Floats) -> Floats:
-    """Return the vector (..., 3) of the skew part of matrices (..., 3, 3); for [v] it is v."""
-    m = matrices
-    skew = [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]]
-    return np.asarray(np.stack(skew, axis=-1) / 2)
-
-
-def _slope(turned: Floats, shifted: Floats) -> Floats:
-    """Return the derivative (n, 4, 4) of a motion, from those of its rotation (n, 3, 3) and translation (n, 3)."""
-    out = np.zeros((len(turned), 4, 4))
-    out[:, :3, :3], out[:, :3, 3] = turned, shifted
-    return out
-
-
-def _product(factors: Sequence[Floats]) -> Floats:
-    out = factors[0]
-    for factor in factors[1:]:
-        out = out @ factor
-    return np.asarray(out)

@@ -39,8 +39,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import gamma, norm, t
 
-from characterisation.statements.coverage import BLOCKS, coverage_interval, standard_errors
-from characterisation.statements.judgement import share
+from characterisation.statements.coverage import BLOCKS, coverage_interval, share, standard_errors
 from characterisation.statements.one_sided import OneSidedErrors, stated_errors, without_bias
 from characterisation.tasks.decision_table import Decision
 from characterisation.tasks.task_file import Task
@@ -57,9 +56,11 @@ WORDS = {
     "simple_acceptance": "simple acceptance, JCGM 106, 8.2",
 }
 
-#: defaults for the largest share of the tolerance for the guard band, and for the least test uncertainty ratio: the 4 :
-#: 1 of ANSI/NCSL Z540.3
-GUARD_SHARE, UNCERTAINTY_RATIO = 0.25, 4.0
+#: default for the largest share of the tolerance for the guard band: the 4 : 1 of ANSI/NCSL Z540.3
+GUARD_SHARE = 0.25
+
+#: default for the least test uncertainty ratio: the same 4 : 1
+UNCERTAINTY_RATIO = 4.0
 
 Verdict = Literal["fits", "does not fit", "undecidable", "not decided", "no tolerance"]
 
@@ -189,6 +190,7 @@ def decide(errors: Errors, tolerance: Tolerance) -> Decided:
     edges = [edge for edge in (tolerance.lower, tolerance.upper) if math.isfinite(edge)]
     through = [share(_within(edge + stated_errors(taken), limits)) for edge in edges]
     worst = max(through, key=lambda one: one.value)
+    middle = taken.at(abs(taken.fold - tolerance.middle)) if isinstance(taken, OneSidedErrors) else taken
     risks = None if rule.rule != "jcgm_106" else global_risks(taken, tolerance, limits)
     return Decided(
         WORDS[rule.rule],
@@ -201,14 +203,9 @@ def decide(errors: Errors, tolerance: Tolerance) -> Decided:
         worst.value,
         (worst.low, worst.high),
         1 - min(one.value for one in through),
-        1 - float(_within(tolerance.middle + _in_the_middle(taken, tolerance), limits).mean()),
+        1 - float(_within(tolerance.middle + middle, limits).mean()),
         *(risks or (None, None)),
     )
-
-
-def _in_the_middle(errors: Errors, tolerance: Tolerance) -> Floats:
-    """Return the errors (n,) of a part in the middle of the tolerance."""
-    return errors.at(abs(errors.fold - tolerance.middle)) if isinstance(errors, OneSidedErrors) else errors
 
 
 def acceptance(errors: Errors, tolerance: Tolerance) -> tuple[float, float] | None:
@@ -235,11 +232,6 @@ def expanded(errors: Errors) -> float:
     """
     low, high = coverage_interval(stated_errors(errors))
     return max(abs(low), abs(high))
-
-
-def conformance_probability(reading: float, errors: Floats, tolerance: Tolerance) -> float:
-    """Return the probability that a part with this reading conforms, without other knowledge of it (JCGM 106, 7)."""
-    return float(_within(reading - errors, (tolerance.lower, tolerance.upper)).mean())
 
 
 def demand(errors: Errors, tolerance: Tolerance) -> float:
@@ -315,10 +307,7 @@ def _one_sided_risks(errors: OneSidedErrors, tolerance: Tolerance, limit: float)
 
 
 def _least_guard(errors: Errors, tolerance: Tolerance) -> float:
-    """Return the least guard band for which the consumer's risk is at most the stated one.
-
-    It is at most the whole tolerance.
-    """
+    """Return the least guard band, up to the whole tolerance, with at most the stated consumer's risk."""
     most = tolerance.rule.consumer_risk
     assert most is not None
 
@@ -340,10 +329,7 @@ def _within(readings: Floats, limits: tuple[float, float] | None) -> Floats:
 
 
 def _demand_interval(errors: Errors, tolerance: Tolerance, asked: float) -> tuple[float, float]:
-    """Return the 95 % interval of the demand, symmetric in its logarithm.
-
-    Few trials determine only the order of magnitude of a scale.
-    """
+    """Return the 95 % interval of the demand, symmetric in its logarithm, as few trials give only its order."""
     if not asked > 0:
         return 0.0, 0.0
     if isinstance(errors, OneSidedErrors):

@@ -23,11 +23,17 @@ from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 
-#: standard uncertainty of the logarithm of the map's u: common to all views, and of each view
-PRIOR_COMMON, PRIOR_OWN = 1.0, 0.7
+#: standard uncertainty of the logarithm of the map's u, common to all views
+PRIOR_COMMON = 1.0
 
-#: kurtosis of errors: at least that of a uniform distribution, and that of a normal one where it is unknown
-_LEAST_KURTOSIS, _USUAL_KURTOSIS = 1.8, 3.0
+#: standard uncertainty of the logarithm of the map's u, of each view
+PRIOR_OWN = 0.7
+
+#: least kurtosis of errors: that of a uniform distribution
+_LEAST_KURTOSIS = 1.8
+
+#: kurtosis of errors where it is unknown: that of a normal distribution
+_USUAL_KURTOSIS = 3.0
 
 #: number of common trials at which the correlation of two views has the same weight as the mean over all pairs
 _SHRINKAGE = 20.0
@@ -56,22 +62,6 @@ class Standing:
     chance: Floats
 
 
-def standing(
-    errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike, margin: float = 0.1, seed: int = 0
-) -> Standing:
-    """Estimate the risks of the views of a race from their trials.
-
-    Parameters
-    ----------
-    errors
-        (v, n) by view and world; NaN for a trial without a value, infinite where the view had no trial in that world.
-    prior_risk, prior_chance
-        (v,) the map's u, and its probability that the measurement is possible.
-    """
-    mean, covariance = posterior(errors, prior_risk, prior_chance)
-    return judge(sampled(mean, covariance, seed), margin)
-
-
 def judge(samples: Floats, margin: float = 0.1) -> Standing:
     """Return the standing from samples (s, v) of the logarithms of the risks."""
     centre = np.median(samples, axis=0)
@@ -89,7 +79,15 @@ def sampled(mean: Floats, covariance: Floats, seed: int = 0) -> Floats:
 
 
 def posterior(errors: ArrayLike, prior_risk: ArrayLike, prior_chance: ArrayLike) -> tuple[Floats, Floats]:
-    """Return the mean (v,) and covariance (v, v) of the logarithms of the risks; arguments of :func:`standing`."""
+    """Return the mean (v,) and covariance (v, v) of the logarithms of the risks of views, from their trials.
+
+    Parameters
+    ----------
+    errors
+        (v, n) by view and world; NaN for a trial without a value, infinite where the view had no trial in that world.
+    prior_risk, prior_chance
+        (v,) the map's u, and its probability that the measurement is possible.
+    """
     every = np.asarray(errors, float)
     tried, valued = ~np.isinf(every), np.isfinite(every)
     u = np.log(np.asarray(prior_risk, float))

@@ -226,7 +226,18 @@ def statement(
 ) -> Statement:
     """State a measurement from the errors (n,) of independent trials, NaN for trials without a value.
 
-    ``repeats`` (m,) are errors of a second capture on the day of the first m trials, for the same part.
+    Parameters
+    ----------
+    measurement, unit
+        Name of the measurement; mm or deg.
+    errors
+        (n,) of independent trials, NaN for trials without a value.
+    tolerance
+        None for a measurement without one.
+    budget
+        Variance by group of unknowns.
+    repeats
+        (m,) errors of a second capture on the day of the first m trials, for the same part.
     """
     part: Part = ANY_PART
     if isinstance(errors, OneSidedErrors):
@@ -243,75 +254,49 @@ def statement(
     decided = None
     if tolerance is not None:
         decided = decide(errors.part(errors.known) if isinstance(errors, OneSidedErrors) else known, tolerance)
-    size = None if tolerance is None else tolerance.size
-    verdict: Verdict = "no tolerance" if decided is None else decided.verdict
-    if count < 2:
-        nan = math.nan
-        return Statement(
-            measurement,
-            unit,
-            len(every),
-            1 - count / max(len(every), 1),
-            nan,
-            nan,
-            nan,
-            (nan, nan),
-            (nan, nan),
-            (nan, nan, nan, nan),
-            nan,
-            False,
-            repeatability,
-            budget,
-            size,
-            None,
-            None,
-            decided,
-            verdict,
-            errors_of=part,
-        )
-    bias, spread = float(known.mean()), float(known.std(ddof=1))
-    low, high = coverage_interval(known)
-    moved = standard_errors(known, lambda part: np.array([part.mean(), part.std(ddof=1), *coverage_interval(part)]))
-    delta = numerical_tolerance(spread)
-    share = shares = None
-    if size is not None:
-        half = max(abs(low), abs(high))
-        share = half / size
-        # few trials determine only the order of magnitude of a scale, so the interval is one of its logarithm
-        factor = math.exp(float(t.ppf(0.975, BLOCKS - 1)) * max(moved[2:]) / half) if half > 0 else 1.0
-        shares = (share / factor, share * factor)
+    nan = math.nan
+    bias = spread = bias_uncertainty = delta = low = high = nan
+    moved, share, shares = np.full(4, nan), None, None
+    if count >= 2:
+        bias, spread = float(known.mean()), float(known.std(ddof=1))
+        bias_uncertainty, delta = spread / math.sqrt(count), numerical_tolerance(spread)
+        low, high = coverage_interval(known)
+        moved = standard_errors(known, lambda part: np.array([part.mean(), part.std(ddof=1), *coverage_interval(part)]))
+        if tolerance is not None:
+            half = max(abs(low), abs(high))
+            share = half / tolerance.size
+            # few trials determine only the order of magnitude of a scale, so the interval is one of its logarithm
+            factor = math.exp(float(t.ppf(0.975, BLOCKS - 1)) * max(moved[2:]) / half) if half > 0 else 1.0
+            shares = (share / factor, share * factor)
     return Statement(
-        measurement,
-        unit,
-        len(every),
-        1 - count / len(every),
-        bias,
-        spread / math.sqrt(count),
-        spread,
-        (low, high),
-        (low - bias, high - bias),
-        (float(moved[0]), float(moved[1]), float(moved[2]), float(moved[3])),
-        delta,
-        bool((2 * moved < delta).all()),
-        repeatability,
-        budget,
-        size,
-        share,
-        shares,
-        decided,
-        verdict,
+        measurement=measurement,
+        unit=unit,
+        trials=len(every),
+        without_value=1 - count / max(len(every), 1),
+        bias=bias,
+        bias_uncertainty=bias_uncertainty,
+        standard_uncertainty=spread,
+        interval=(low, high),
+        interval_corrected=(low - bias, high - bias),
+        moved=(float(moved[0]), float(moved[1]), float(moved[2]), float(moved[3])),
+        numerical_tolerance=delta,
+        settled=bool((2 * moved < delta).all()),
+        repeatability=repeatability,
+        budget=budget,
+        tolerance=None if tolerance is None else tolerance.size,
+        share_of_tolerance=share,
+        share_interval=shares,
+        decided=decided,
+        verdict="no tolerance" if decided is None else decided.verdict,
         errors_of=part,
     )
 
 
-def numerical_tolerance(uncertainty: float, digits: int = 1) -> float:
-    """Return the numerical tolerance delta of an uncertainty (JCGM 101, 7.9.2).
-
-    It is half of the last of its significant digits.
-    """
+def numerical_tolerance(uncertainty: float) -> float:
+    """Return the numerical tolerance delta of an uncertainty of one significant digit: half of it (JCGM 101, 7.9.2)."""
     if not uncertainty > 0:
         return 0.0
-    power = math.floor(math.log10(uncertainty)) - (digits - 1)
-    if round(uncertainty / 10.0**power) >= 10**digits:  # 0.0996 is 0.1
+    power = math.floor(math.log10(uncertainty))
+    if round(uncertainty / 10.0**power) >= 10:  # 0.0996 is 0.1
         power += 1
     return float(0.5 * 10.0**power)

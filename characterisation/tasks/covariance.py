@@ -52,12 +52,17 @@ from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 
 Floats = NDArray[np.float64]
 
-#: l [px] and t [rad] of the correlation of persistent noise; *assumed*
-PERSISTENT_REACH_PX, PERSISTENT_TURN = 60.0, math.radians(10.0)
+#: l [px] of the correlation of persistent noise; *assumed*
+PERSISTENT_REACH_PX = 60.0
 
-#: pixels of one cell share their persistent noise: side of a cell, a small part of the correlation length. The side is
-#: doubled for large faces with more cells than ``MOST_CELLS``
-CELL_PX, MOST_CELLS = 12, 500
+#: t [rad] of the correlation of persistent noise; *assumed*
+PERSISTENT_TURN = math.radians(10.0)
+
+#: side of a cell, whose pixels share their persistent noise: a small part of the correlation length
+CELL_PX = 12
+
+#: the side is doubled for large faces with more cells
+MOST_CELLS = 500
 
 #: with a shorter correlation length [pixels of the grid], pixels count as independent
 SHORTEST_REACH = 0.45
@@ -259,10 +264,7 @@ def solved(parts: Sequence[Sums], kind: str) -> ExpectedFit:
 def _averaging(
     g: Floats, weight: Floats, variance: Floats, area: float, pixel: NDArray[np.int64], thinning: float
 ) -> Floats:
-    """Return the first sum, for ``variance`` (n,) equal to F sigma^2 A.
-
-    The correlation length of all points follows from their mean noise ``area``.
-    """
+    """Return the first sum, for ``variance`` (n,) equal to F sigma^2 A, and the mean noise ``area`` of all points."""
     alone = (g * (weight * variance)[:, None]).T @ g
     reach = math.sqrt(float(own_area(np.array(area), DISC_RADIUS)) / (2 * math.pi * thinning))
     if reach < SHORTEST_REACH:
@@ -282,10 +284,7 @@ def _averaging(
 
 
 def _persistent(scaled: Floats, pixel: NDArray[np.int64], normal: Floats) -> Floats:
-    """Return the second sum, over cells.
-
-    ``scaled`` (n, p) is F p g times the number of sensor pixels of each element.
-    """
+    """Return the second sum, over cells; ``scaled`` (n, p) is F p g times the sensor pixels of each element."""
     cells, number = _cells(pixel, CELL_PX)
     if len(cells) > MOST_CELLS:
         cells, number = _cells(pixel, 2 * CELL_PX)

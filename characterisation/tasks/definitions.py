@@ -26,8 +26,8 @@ from numpy.typing import ArrayLike, NDArray
 from characterisation.features.figures import Circle
 from characterisation.features.form import zone
 from characterisation.features.pose_fit import Pose
-from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, cross, unit
-from characterisation.tasks.places import Axis, Geometry, PointLike, on_axis, place
+from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere, cross
+from characterisation.tasks.places import Axis, Geometry, PointLike, between_axes, between_planes, on_axis, place
 from characterisation.tasks.zones import (
     angularity,
     coaxiality,
@@ -49,15 +49,8 @@ def intersection_distance(plane: Plane, first: Axis, second: Axis) -> float:
 
 
 def axis_distance(first: Axis, second: Axis) -> float:
-    """Return the distance [mm] between two axes where they were measured.
-
-    It is evaluated in the plane perpendicular to the mean axis, through the middle of the two axis points (for fits,
-    the axis points nearest the measured points).
-    """
-    other = second.axis if first.axis @ second.axis >= 0 else -second.axis
-    mean = first.axis + other
-    plane = Plane((first.point + second.point) / 2, mean / np.linalg.norm(mean))
-    return intersection_distance(plane, first, second)
+    """Return the distance [mm] between two axes where they were measured (:func:`between_axes`)."""
+    return float(np.linalg.norm(between_axes(first, second)))
 
 
 def point_distance(first: PointLike, second: PointLike) -> float:
@@ -77,10 +70,7 @@ def plane_distance(first: Plane, second: Plane, *, nominal: Sequence[Geometry]) 
     view.
     """
     near, far = (one.point for one in nominal if isinstance(one, Plane))
-    other = second.normal if first.normal @ second.normal >= 0 else -second.normal
-    mean, middle = unit(first.normal + other), (near + far) / 2
-    heights = [(one.point - middle) @ one.normal / (mean @ one.normal) for one in (first, second)]
-    return abs(float(heights[0] - heights[1]))
+    return abs(between_planes(first, second, (near + far) / 2)[0])
 
 
 def plane_axis_angle(plane: Plane, axis: Axis) -> float:

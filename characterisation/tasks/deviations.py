@@ -39,7 +39,7 @@ from characterisation.features.form import NODE_SHARES, node_heights, node_modes
 from characterisation.features.pose_fit import Pose
 from characterisation.features.surfaces import Cone, Cylinder, Plane, unit
 from characterisation.tasks.definitions import DEFINITIONS
-from characterisation.tasks.places import direction, on_axis, place
+from characterisation.tasks.places import between_axes, between_planes, direction, on_axis, place
 from characterisation.tasks.task_file import Measurement
 from characterisation.tasks.zones import datum_motion, feet_on
 
@@ -89,7 +89,14 @@ def fold_of(asked: Measurement) -> float | None:
 def deviations(asked: Measurement, outline: Array, nominal: Sequence[Any], point: Array) -> Deviations:
     """Return the deviations of a measurement that folds (:func:`fold_of`).
 
-    ``outline`` (k, 3) and the ``nominal`` features are in the part frame; ``point`` (3,) is that of a pose.
+    Parameters
+    ----------
+    outline
+        (k, 3) [mm], part frame.
+    nominal
+        Nominal features, part frame.
+    point
+        (3,) [mm] of a pose.
     """
     kind = asked.kind
     if DEFINITIONS[kind].of == "form":
@@ -292,26 +299,15 @@ def _tilt(fits: Sequence[Any], ideal: Sequence[Any]) -> Array:
     return np.asarray(across * (np.arctan2(sine, first @ second) / sine if sine > 0 else 1.0))[None]
 
 
-def _between_axes(fits: Sequence[Any], ideal: Sequence[Any]) -> Array:
-    first, second = fits
-    other = second.axis if first.axis @ second.axis >= 0 else -second.axis
-    plane = Plane((first.point + second.point) / 2, unit(first.axis + other))
-    return np.asarray(on_axis(plane, first) - on_axis(plane, second))[None]
-
-
 def _between_planes(fits: Sequence[Any], ideal: Sequence[Any]) -> Array:
-    first, second = fits[0], fits[1]
-    near, far = ideal[0].point, ideal[1].point
-    other = second.normal if first.normal @ second.normal >= 0 else -second.normal
-    mean, middle = unit(first.normal + other), (near + far) / 2
-    low, high = ((one.point - middle) @ one.normal / (mean @ one.normal) for one in (first, second))
-    return np.array([[(low - high) * (1.0 if mean @ ideal[0].normal >= 0 else -1.0)]])
+    distance, mean = between_planes(fits[0], fits[1], (ideal[0].point + ideal[1].point) / 2)
+    return np.array([[distance * (1.0 if mean @ ideal[0].normal >= 0 else -1.0)]])
 
 
 #: deviations of measurements whose value is the length of one vector
 _POINTWISE: dict[str, Callable[[Sequence[Any], Sequence[Any]], Array]] = {
     "intersection_distance": lambda fits, _: (on_axis(fits[0], fits[1]) - on_axis(fits[0], fits[2]))[None],
-    "axis_distance": _between_axes,
+    "axis_distance": lambda fits, _: between_axes(*fits)[None],
     "point_distance": lambda fits, _: (place(fits[0]) - place(fits[1]))[None],
     "point_plane_distance": lambda fits, ideal: np.array(
         [[(place(fits[0]) - fits[1].point) @ _alike(fits[1], ideal[1]).normal]]

@@ -26,15 +26,26 @@ from characterisation.tasks.task_file import Task
 
 Array = NDArray[np.float64]
 
-#: numbers of streams of directions, apart from those of days
-_MOVE, _SHARE = 1 << 40, 1 << 41
+#: first seed of the stream of directions in which parts are moved, beyond every day of a trial
+_MOVE = 1 << 40
 
-#: number of draws of a share, and the size of a deviation far from nominal over the largest error
-_DRAWS, _FAR = 1000, 1e4
+#: first seed of the stream of directions that give :meth:`FoldedValue.far_share`
+_SHARE = 1 << 41
 
-#: step of the parameters of features [mm or rad] whose changes span the possible deviations; the least change, and the
+#: number of draws of a share
+_DRAWS = 1000
+
+#: size of a deviation far from nominal, over the largest error
+_FAR = 1e4
+
+#: step of the parameters of features [mm or rad] whose changes span the possible deviations
+STEP = 1e-4
+
+#: least change by a step, over the largest
+LEAST_CHANGE = 1e-6
+
 #: least singular value of a possible deviation, over the largest
-STEP, LEAST_CHANGE, LEAST_VALUE = 1e-4, 1e-6, 1e-4
+LEAST_VALUE = 1e-4
 
 
 @dataclass(frozen=True)

@@ -72,6 +72,28 @@ def on_axis(plane: Plane, axis: Axis) -> Array:
     return met
 
 
+def between_axes(first: Axis, second: Axis) -> Array:
+    """Return the vector (3,) [mm] from the second of two axes to the first, where they were measured.
+
+    It lies in the plane perpendicular to the mean axis, through the middle of the two axis points (for fits, the axis
+    points nearest the measured points).
+    """
+    other = second.axis if first.axis @ second.axis >= 0 else -second.axis
+    plane = Plane((first.point + second.point) / 2, unit(first.axis + other))
+    return np.asarray(on_axis(plane, first) - on_axis(plane, second))
+
+
+def between_planes(first: Plane, second: Plane, middle: Array) -> tuple[float, Array]:
+    """Return the signed distance [mm] from the second of two planes to the first, along their mean normal (3,).
+
+    It is that through the place ``middle`` (3,) [mm].
+    """
+    other = second.normal if first.normal @ second.normal >= 0 else -second.normal
+    mean = unit(first.normal + other)
+    high, low = ((one.point - middle) @ one.normal / (mean @ one.normal) for one in (first, second))
+    return float(high - low), mean
+
+
 def mid_plane(first: Plane, second: Plane) -> Plane:
     """Return the plane midway between two planes, with the normal in the sense of the first.
 

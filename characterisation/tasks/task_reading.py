@@ -30,8 +30,11 @@ PARENTS: dict[str, tuple[tuple[tuple[str, ...], ...], str]] = {
     "mid_plane": ((("plane", "plane"),), "[plane, plane]"),
 }
 
-#: largest distance of nominal geometry from its plane or axis [mm], and largest tilt of a direction out of its face
-MISPLACED_MM, LEANING = 0.05, 1e-3
+#: largest distance of nominal geometry from its plane or axis [mm]
+MISPLACED_MM = 0.05
+
+#: largest tilt of a direction out of its face
+LEANING = 1e-3
 
 
 def read_task(path: str | Path) -> Task:
@@ -62,13 +65,9 @@ def check_features(task: Task, task_path: str | Path, shape_ids: Iterable[str]) 
     known = list(shape_ids)
     for name in task.shapes:
         if name not in known:
-            raise InputError(
-                task_path,
-                f"features.{name}",
-                repr(name),
-                f"ids of the scene's shapes: {', '.join(known) or 'there are none'}",
-                nearest(name, known),
-            )
+            allowed = f"ids of the scene's shapes: {', '.join(known) or 'there are none'}"
+            hint = nearest(name, known)
+            raise InputError(task_path, f"features.{name}", repr(name), allowed, hint)
 
 
 def _check_feature(path: str | Path, task: Task, name: str) -> None:
@@ -141,14 +140,10 @@ def _check_measurement(path: str | Path, task: Task, name: str) -> None:
         hint = f"{place} is a zone over the extent of the feature"
         raise InputError(path, f"features.{measurement.features[0]}.outline_mm", "nothing", allowed, hint)
     if definition.datums and len(kinds) > len(definition.kinds):
-        _check_datums(path, f"{place}.features", measurement.features[len(definition.kinds) :], task)
-
-
-def _check_datums(path: str | Path, place: str, names: tuple[str, ...], task: Task) -> None:
-    """Check that three datums define a frame."""
-    datums = [one for one in map(task.nominal, names) if isinstance(one, Plane | Cylinder | Cone)]
-    if fault := frame_fault(datums):
-        raise InputError(path, place, ", ".join(names), fault)
+        names = measurement.features[len(definition.kinds) :]
+        datums = [one for one in map(task.nominal, names) if isinstance(one, Plane | Cylinder | Cone)]
+        if fault := frame_fault(datums):
+            raise InputError(path, f"{place}.features", ", ".join(names), fault)
 
 
 def _check_names(path: str | Path, place: str, names: tuple[str, ...], task: Task) -> None:

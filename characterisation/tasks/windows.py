@@ -153,6 +153,17 @@ _ALLOWED_SHAPES: dict[PairKind, str] = {
 }
 
 
+_PAIR_FUNCTIONS: dict[tuple[PairKind, Shape, Shape], Callable[..., Any]] = {
+    ("angle", "plane", "plane"): plane_angle,
+    ("angle", "plane", "cylinder"): plane_axis_angle,
+    ("angle", "cylinder", "cylinder"): axis_angle,
+    ("distance", "plane", "plane"): plane_distance,
+    ("distance", "cylinder", "cylinder"): axis_distance,
+    ("distance", "sphere", "sphere"): point_distance,
+    ("distance", "sphere", "plane"): point_plane_distance,
+}
+
+
 def _fit_shape(points: NDArray[np.float64], shape: Shape, viewpoint: NDArray[np.float64]) -> ShapeFit | FitError:
     """Return the fit of a shape to points (n, 3) [mm], or the error that says why there is none."""
     try:
@@ -238,17 +249,7 @@ def _pair_result(
 
 def _pair_function(kind: PairKind, first: Shape, second: Shape) -> tuple[Callable[..., Any], bool] | None:
     """Return the function that measures two shapes, and whether it takes them in reverse order; None without one."""
-    shapes_of_pair = (first, second)
-    table: dict[tuple[PairKind, Shape, Shape], Callable[..., Any]] = {
-        ("angle", "plane", "plane"): plane_angle,
-        ("angle", "plane", "cylinder"): plane_axis_angle,
-        ("angle", "cylinder", "cylinder"): axis_angle,
-        ("distance", "plane", "plane"): plane_distance,
-        ("distance", "cylinder", "cylinder"): axis_distance,
-        ("distance", "sphere", "sphere"): point_distance,
-        ("distance", "sphere", "plane"): point_plane_distance,
-    }
-    for ordered, swapped in ((shapes_of_pair, False), (shapes_of_pair[::-1], True)):
-        if (kind, *ordered) in table:
-            return table[(kind, *ordered)], swapped
+    for ordered, swapped in (((first, second), False), ((second, first), True)):
+        if (kind, *ordered) in _PAIR_FUNCTIONS:
+            return _PAIR_FUNCTIONS[(kind, *ordered)], swapped
     return None

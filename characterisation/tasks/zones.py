@@ -19,9 +19,12 @@ from characterisation.tasks.places import PARALLEL, Axis, Geometry, PointLike, d
 Array = NDArray[np.float64]
 Datum = Plane | Axis
 
-#: sine of the angle within which normals and axes count as parallel, and least distance of two datum axes [mm]. The
-#: angle applies to an axis perpendicular to a datum plane, and to two planes about a middle plane
-ASKEW, APART_MM = 0.1, 1.0
+#: sine of the angle within which normals and axes count as parallel. It applies to an axis perpendicular to a datum
+#: plane, and to two planes about a middle plane
+ASKEW = 0.1
+
+#: least distance of two datum axes [mm]
+APART_MM = 1.0
 
 
 def position(feature: Plane | Axis | PointLike, *datums: Datum, nominal: Sequence[Geometry], outline: Array) -> float:
@@ -101,11 +104,7 @@ def parallelism(feature: Plane | Axis, datum: Plane | Axis, *, outline: Array) -
     - Datum axis, plane: two planes parallel to the axis, at the angle about it with the least width.
     - Datum axis, axis: a cylinder along the datum axis.
     """
-    places, along = feet_on(feature, outline), direction(datum)
-    if isinstance(datum, Plane):
-        return float(np.ptp(places @ along))
-    across = places - np.outer(places @ along, along)
-    return least_width(across, along) if isinstance(feature, Plane) else largest_distance(across)
+    return _along(feature, datum, outline) if isinstance(datum, Plane) else _across(feature, datum, outline)
 
 
 def perpendicularity(feature: Plane | Axis, datum: Plane | Axis, *, outline: Array) -> float:
@@ -117,9 +116,17 @@ def perpendicularity(feature: Plane | Axis, datum: Plane | Axis, *, outline: Arr
     - Datum plane, plane: two planes perpendicular to the datum, at the angle with the least width.
     - Datum plane, axis: a cylinder perpendicular to the datum.
     """
+    return _across(feature, datum, outline) if isinstance(datum, Plane) else _along(feature, datum, outline)
+
+
+def _along(feature: Plane | Axis, datum: Datum, outline: Array) -> float:
+    """Return the range of a feature along the direction of a datum."""
+    return float(np.ptp(feet_on(feature, outline) @ direction(datum)))
+
+
+def _across(feature: Plane | Axis, datum: Datum, outline: Array) -> float:
+    """Return the extent of a feature across the direction of a datum."""
     places, along = feet_on(feature, outline), direction(datum)
-    if not isinstance(datum, Plane):
-        return float(np.ptp(places @ along))
     across = places - np.outer(places @ along, along)
     return least_width(across, along) if isinstance(feature, Plane) else largest_distance(across)
 
@@ -150,6 +157,13 @@ def angularity(feature: Plane, datum: Datum, *, nominal: Sequence[Geometry], out
 
     The zone is rotated about the direction of the datum to the least width. For small rotations from the fitted plane,
     the width is piecewise linear in the angle, and least where two of the places change order.
+
+    Parameters
+    ----------
+    nominal
+        Nominal feature and datum.
+    outline
+        (k, 3) [mm], places that span the feature.
     """
     target, nominal_datum = (direction(one) for one in nominal if isinstance(one, Plane | Cylinder | Cone))
     along = direction(datum) * (1.0 if direction(datum) @ nominal_datum >= 0 else -1.0)

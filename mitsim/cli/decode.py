@@ -42,7 +42,7 @@ def decode(
 
     Example: mitsim decode captures/real -o cloud.ply
     """
-    from characterisation.cloud_files import write_ply
+    from characterisation.cloud_files import write_cloud
     from mitsim.capture.folder import read_capture
     from mitsim.capture.workspace import written_frame
     from mitsim.decode.checks.checked_cloud import checked_cloud
@@ -60,5 +60,5 @@ def decode(
     for note in decoded.notes:
         say(note)
     check_file(output)
-    write_ply(decoded.cloud, output, written)
+    write_cloud(decoded.cloud, output, written)
     print_reasons(decoded.cloud)

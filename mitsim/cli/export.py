@@ -47,7 +47,7 @@ def cloud(
 
     Example: mitsim export cloud runs/two_pillars/clouds/predicted_0012.ply -o cloud.pcd
     """
-    from characterisation.cloud_files import read_ply
+    from characterisation.cloud_files import read_cloud
     from mitsim.report.export.cloud_points import cloud_points
     from mitsim.report.export.cloud_writers import write_cloud_pcd, write_cloud_ply
     from mitsim.report.export.e57 import write_e57
@@ -62,7 +62,7 @@ def cloud(
     known = None if pose is None else read_pose(pose)
     if frame == "part" and known is None:
         raise InputError("--in", "", "part, without --pose", "a JSON file with the sensor's pose", "give --pose FILE")
-    read = read_ply(cloud)
+    read = read_cloud(cloud)
     check_file(output)
     if suffix == ".e57":
         write_e57([(cloud.stem, cloud_points(read), known)], output)

@@ -9,7 +9,7 @@ from typing import Literal, overload
 
 from numpy.typing import ArrayLike
 
-from characterisation import interface as cloud_files
+from characterisation import cloud_files
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture import folder

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from characterisation.cloud_files import read_ply
+from characterisation import cloud_files
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
@@ -78,7 +78,7 @@ def read_cloud(path: Path, sensor: str | None = None, reference: bool = False) -
         If the path does not exist, or its content cannot be read or decoded.
     """
     if path.is_file() and _is_mitsim_ply(path):
-        return InputCloud(path, read_ply(path), None)
+        return InputCloud(path, cloud_files.read_cloud(path), None)
     if is_plain(path):
         return _plain(path)
     if (path / "capture.json").exists():

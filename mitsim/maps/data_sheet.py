@@ -27,12 +27,12 @@ from scipy import stats
 
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.features.fits import fit_plane, fit_sphere
-from characterisation.point_cloud import PointCloud
+from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.rendering import Rendering
-from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.decode.cloud import capture_cloud
 from mitsim.maps.campaign.acquire import coupon_cloud
+from mitsim.maps.campaign.orders import prepared_sensor
 from mitsim.maps.campaign.plan import coupon_pose
 from mitsim.running.executor import Executor, results_of
 from mitsim.running.progress import track
@@ -44,12 +44,23 @@ from mitsim.sensor.transforms import Transform, look_at
 
 Floats = NDArray[np.float64]
 
-#: side of a plate and radius of a ball, each over its distance from the sensor
-PLATE_SHARE, BALL_SHARE = 0.25, 0.1
+#: side of a plate, over its distance from the sensor
+PLATE_SHARE = 0.25
 
-#: number of distances over the working range, tilts of metal, of the second plane of the floor, and of noise plates
-#: [deg]
-DISTANCES, TILTS_DEG, FLOOR_TILT_DEG, NOISE_TILT_DEG = 5, (0.0, 20.0, 40.0), 20.0, 5.0
+#: radius of a ball, over its distance from the sensor
+BALL_SHARE = 0.1
+
+#: number of distances over the working range
+DISTANCES = 5
+
+#: tilts of metal
+TILTS_DEG = (0.0, 20.0, 40.0)
+
+#: tilt of the second plane of the floor
+FLOOR_TILT_DEG = 20.0
+
+#: tilt of noise plates: a depth that is quantised in steps would show no noise on a square one
+NOISE_TILT_DEG = 5.0
 
 METALS = [finish for finish in FINISHES if finish != "matt white"]
 
@@ -58,6 +69,9 @@ AZIMUTH_DEG = 45.0
 
 #: largest angle between normal and view ray on a ball; points beyond it belong to the limb and bias the radius
 _EDGE_DEG = 60.0
+
+#: excluded border of a plate, as a fraction of its size
+_BORDER = 0.1
 
 SAMPLES_PER_PIXEL = 16
 
@@ -162,22 +176,13 @@ def measure_sensor(sensor: Sensor, seed: int = 1, workers: Executor | None = Non
     asked += [("residuals", (mid,))]
     pieces = [Piece(sensor, seed + number, *one) for number, one in enumerate(asked)]
     done = results_of(pieces, measure_piece, workers, sensor.name)
-    _prepared.clear()
     planes, noise, metal = done[:2], done[3 : 3 + DISTANCES], done[3 + DISTANCES : -1]
     return DataSheet(sensor, mid, planes, radius, done[2], noise, metal, done[-1])
 
 
-_prepared: dict[str, _SimulatedTargets] = {}
-
-
 def measure_piece(piece: Piece) -> Any:
     """Take and measure one capture of a data sheet; workers call this function."""
-    key = repr(piece.sensor)
-    if key not in _prepared:
-        _prepared.clear()
-        _prepared[key] = _SimulatedTargets(piece.sensor, piece.seed)
-    targets = _prepared[key]
-    targets.seed = piece.seed
+    targets = _SimulatedTargets(piece.sensor, piece.seed)
     return getattr(targets, piece.method)(*piece.arguments)
 
 
@@ -201,17 +206,16 @@ class _SimulatedTargets:
     """A simulated sensor, and the test targets in front of it."""
 
     def __init__(self, sensor: Sensor, seed: int) -> None:
+        prepared = prepared_sensor(sensor)
         self.sensor, self.seed = sensor, seed
-        self.simulated, self.geometry = SimulatedSensor(sensor), sensor_geometry(sensor)
+        self.simulated, self.geometry = prepared.simulated, prepared.geometry
         self.axis = sensor.rig.reference.sensor_from_camera.rotation[:, 2]
         # distances count from the camera in which clouds are given, not from the origin of the sensor frame
         self.eye = sensor.rig.reference.sensor_from_camera.translation
 
     def plane_floor(self, distance: float, tilt_deg: float) -> PlaneFloor:
         cloud, coupon = self._plate("matt white", distance, tilt_deg, Noise.none())
-        points, view = _seen(cloud)
-        inner = _inside(cloud, coupon)
-        points, view = points[inner], view[inner]
+        points, view, _ = _on_plate(cloud, coupon)
         off = np.linalg.norm(points, axis=1) - _to_plane(coupon.centre - cloud.grid.origin, coupon.normal, view)
         patches = measure_patches(cloud, coupon)
         return PlaneFloor(
@@ -242,9 +246,8 @@ class _SimulatedTargets:
         patches = measure_patches(cloud, coupon)
         sigma = patches.ray_noise_inliers.values
         known = sigma[np.isfinite(sigma)]
-        points, view = _seen(cloud)
-        inner = _inside(cloud, coupon)
-        spread = float(_about_plane(points[inner], view[inner]).std()) if inner.sum() > 100 else math.nan
+        points, view, _ = _on_plate(cloud, coupon)
+        spread = float(_about_plane(points, view).std()) if len(points) > 100 else math.nan
         return Recovery(
             finish,
             float(distance),
@@ -256,12 +259,10 @@ class _SimulatedTargets:
 
     def residuals(self, distance: float) -> Residuals:
         cloud, coupon = self._plate("matt white", distance, NOISE_TILT_DEG, Noise())
-        points, view = _seen(cloud)
-        inner = _inside(cloud, coupon)
-        values = _about_plane(points[inner], view[inner])
+        points, view, inner = _on_plate(cloud, coupon)
+        values = _about_plane(points, view)
         image = np.full(cloud.status.shape, np.nan)
-        rows, columns = np.nonzero(cloud.valid)
-        image[rows[inner], columns[inner]] = values
+        image.flat[np.flatnonzero(cloud.valid)[inner]] = values
         length = correlation_length(image)
         step = max(1, math.ceil(2 * length))
         apart = image[::step, ::step]
@@ -275,8 +276,7 @@ class _SimulatedTargets:
         size = PLATE_SHARE * distance
         tilt, azimuth = math.radians(tilt_deg), math.radians(AZIMUTH_DEG)
         normal = np.array([math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)])
-        pose = coupon_pose(normal, distance, self.axis)
-        pose = Transform(pose.rotation, pose.translation + self.eye)
+        pose = coupon_pose(normal, distance, self.axis, self.eye)
         axes = pose.rotation
         coupon = Coupon(pose.translation, axes[:, 2], axes[:, 0], size, size)
         scene = plate(size, finish, self.sensor.wavelength_nm)
@@ -315,19 +315,17 @@ def _seen(cloud: PointCloud) -> tuple[Floats, Floats]:
     return points, points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
-def _inside(cloud: PointCloud, coupon: Coupon, margin: float = 0.1) -> NDArray[np.bool_]:
-    """Return which valid points lie on the coupon, by their rays, and near it.
-
-    ``margin`` is the excluded border as a fraction of the size.
-    """
+def _on_plate(cloud: PointCloud, coupon: Coupon) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Return points near the coupon and off its border, by their rays, these rays, and which valid points they are."""
     points, view = _seen(cloud)
     centre = coupon.centre - cloud.grid.origin
     reach = _to_plane(centre, coupon.normal, view)
     foot = view * reach[:, None] - centre
     along = np.cross(coupon.normal, coupon.across)
-    half_width, half_height = (0.5 - margin) * coupon.width, (0.5 - margin) * coupon.height
-    true = np.abs(np.linalg.norm(points, axis=1) / reach - 1) < 0.01
-    return np.asarray(true & (np.abs(foot @ coupon.across) < half_width) & (np.abs(foot @ along) < half_height))
+    half_width, half_height = (0.5 - _BORDER) * coupon.width, (0.5 - _BORDER) * coupon.height
+    true = np.abs(np.linalg.norm(points, axis=1) / reach - 1) < FALSE_SHARE_OF_DISTANCE
+    inner = true & (np.abs(foot @ coupon.across) < half_width) & (np.abs(foot @ along) < half_height)
+    return points[inner], view[inner], inner
 
 
 def _to_plane(centre: Floats, normal: Floats, view: Floats) -> Floats:

@@ -13,7 +13,7 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from characterisation.point_cloud import PointCloud
 from mitsim.decode.cloud import sensor_geometry
-from mitsim.maps.campaign.missing_finishes import NeededFinishes, map_with_finishes, seen_finishes, with_lights
+from mitsim.maps.campaign.missing_finishes import NeededFinishes, map_with_finishes, seen_finishes
 from mitsim.maps.prediction import CharacterisedScene, Predictor
 from mitsim.scene.load import Scene
 from mitsim.sensor.poses import as_pose
@@ -48,7 +48,7 @@ def performance_map(sensor_name_or_path: str | Path) -> PerformanceMap:
     >>> bool(facing.fraction[0] > 0.9)
     True
     """
-    return with_lights(PerformanceMap.load(map_path(sensor_name_or_path)))
+    return PerformanceMap.load(map_path(sensor_name_or_path))
 
 
 def predict(
@@ -107,13 +107,8 @@ def predict(
     """
     map_sensor = str(performance_map.data.attrs.get("sensor"))
     if map_sensor != sensor.name:
-        raise InputError(
-            "predict",
-            "performance_map",
-            map_sensor,
-            sensor.name,
-            "a map predicts only the sensor that it was measured with",
-        )
+        hint = "a map predicts only the sensor that it was measured with"
+        raise InputError("predict", "performance_map", map_sensor, sensor.name, hint)
     world_from_sensor = as_pose(pose, "predict")
     eye = (world_from_sensor @ sensor.rig.reference.sensor_from_camera).translation
     predictor = Predictor.of_sensor(sensor, sensor_geometry(sensor))

@@ -15,13 +15,14 @@ from __future__ import annotations
 import re
 import time
 import weakref
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from characterisation.files.checked_files import is_file
 from characterisation.files.errors import InputError, MissingEnvironmentError
 from mitsim.running.build import differences, own_build
+from mitsim.running.executor import finished_orders
 from mitsim.running.progress import say
 
 Item = TypeVar("Item")
@@ -43,8 +44,8 @@ NO_WORKER_S = 600
 #: time between messages about missing workers [s]
 REPORT_EVERY_S = 30
 
-#: time between checks for finished orders [s]
-_POLL_S = 0.02
+#: time between checks for workers while no order is finished [s]
+_POLL_S = 1.0
 
 _ADDRESS = re.compile(r"(?:(tcp|tls)://)?(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):([0-9]{1,5})")
 
@@ -68,47 +69,35 @@ class Cluster:
     def distribute(
         self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
     ) -> Iterator[tuple[Item, Result]]:
-        """Yield items with the results of their orders, as they are finished; orders and results are plain values.
+        """Yield items with their results, see :meth:`~mitsim.running.executor.Executor.distribute`.
 
         Raises
         ------
-        InputError
-            If a worker raises it.
         MissingEnvironmentError
-            If there are no workers for :data:`NO_WORKER_S`, a worker has another build of mitsim, or any other error
-            occurs there.
+            Also if there are no workers for :data:`NO_WORKER_S`, a worker has another build of mitsim, or any other
+            error occurs there.
         """
-        from distributed import as_completed
-
         if not items:
             return
         own = own_build()
         _compare_builds(self.client, self.address, own)
-        waiting = list(reversed(items))
-        running = as_completed(loop=self.client.loop)
-        of: dict[object, Item] = {}
-        watch = _Watch(self.client, self.address)
-
-        def send() -> None:
-            room = AHEAD * max(sum(self.client.ncores().values()), 1)
-            while waiting and len(of) < room:
-                item = waiting.pop()
-                future = self.client.submit(_of_same_build, own, work, order(item), pure=False, retries=DEATHS)
-                of[future.key] = item
-                running.add(future)
-
+        executor = self.client.get_executor(pure=False, retries=DEATHS)
         try:
-            send()
-            while of:
-                finished = running.next_batch(block=False)
-                if not finished:
-                    watch.check()
-                    time.sleep(_POLL_S)
-                for future in finished:
-                    yield of.pop(future.key), _result(future, self.address)
-                    send()
-        finally:
-            self.client.cancel(list(running.futures))
+            yield from finished_orders(
+                deque(items),
+                {},
+                lambda item: executor.submit(_of_same_build, self.address, own, work, order(item)),
+                lambda: AHEAD * max(sum(self.client.ncores().values()), 1),
+                _Watch(self.client, self.address).check,
+                _POLL_S,
+            )
+        except (InputError, MissingEnvironmentError):
+            raise
+        except Exception as error:  # any error of a worker or the network
+            raise MissingEnvironmentError(
+                f"--scheduler {self.address}: a capture failed there ({_in_a_line(error)}); finished "
+                "work is kept: repair the cluster, and run the same command again"
+            ) from None
 
 
 def connected(address: str) -> Any:
@@ -157,35 +146,12 @@ def _check_certificates(address: str, named: dict[str, Any]) -> None:
         )
 
 
-def _result(future: Any, address: str) -> Any:
-    try:
-        done = future.result()
-    except InputError:
-        raise
-    except Exception as error:  # any error of a worker or the network
-        raise MissingEnvironmentError(
-            f"--scheduler {address}: a capture failed there ({_in_a_line(error)}); finished "
-            "work is kept: repair the cluster, and run the same command again"
-        ) from None
-    if isinstance(done, OtherBuild):
-        raise _other_build(address, done.worker, done.differences)
-    return done
-
-
-@dataclass(frozen=True)
-class OtherBuild:
-    """Answer of a worker, in place of a result, if its build differs from that of the order."""
-
-    worker: str
-    differences: str
-
-
-def _of_same_build(build: dict[str, str], work: Callable[[Plain], Result], order: Plain) -> Result | OtherBuild:
+def _of_same_build(address: str, build: dict[str, str], work: Callable[[Plain], Result], order: Plain) -> Result:
     """Work on an order if this process has the build of the order; workers call this function."""
     from distributed import get_worker
 
-    if found := differences(build, own_build()):
-        return OtherBuild(str(get_worker().address), found)
+    if differing := differences(build, own_build()):
+        raise _other_build(address, str(get_worker().address), differing)
     return work(order)
 
 
@@ -194,7 +160,7 @@ def _compare_builds(client: Any, address: str, own: dict[str, str]) -> None:
     watch = _Watch(client, address)
     while not client.ncores():
         watch.check()
-        time.sleep(_POLL_S)
+        time.sleep(0.1)
     try:
         builds = client.run(own_build, on_error="return")
     except Exception as error:  # a worker without this function, or a network error
@@ -219,27 +185,24 @@ class _Watch:
 
     def __init__(self, client: Any, address: str) -> None:
         self.client, self.address = client, address
-        self.since = self.reported = self.checked = time.monotonic()
-        self.alone = False
+        self.alone_since: float | None = None
+        self.reported = -float(REPORT_EVERY_S)
 
     def check(self) -> None:
-        now = time.monotonic()
-        if now - self.checked < 1.0 and self.alone:
-            return
-        self.checked = now
         if self.client.ncores():
-            self.alone = False
+            self.alone_since = None
             return
-        if not self.alone:
-            self.alone, self.since, self.reported = True, now, now - REPORT_EVERY_S
-        if now - self.since > NO_WORKER_S:
+        now = time.monotonic()
+        self.alone_since = now if self.alone_since is None else self.alone_since
+        alone = now - self.alone_since
+        if alone > NO_WORKER_S:
             raise MissingEnvironmentError(
                 f"--scheduler {self.address}: no workers in {NO_WORKER_S:g} s; start some with: "
                 f"dask worker {self.address} --nthreads 1; finished work is kept"
             )
         if now - self.reported >= REPORT_EVERY_S:
             self.reported = now
-            say(f"{self.address}: no workers yet, waiting up to {NO_WORKER_S - (now - self.since):.0f} s")
+            say(f"{self.address}: no workers yet, waiting up to {NO_WORKER_S - alone:.0f} s")
 
 
 def _in_a_line(error: BaseException) -> str:

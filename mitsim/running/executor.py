@@ -12,6 +12,7 @@ repeated, at most :data:`DEATHS` times in a row.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import multiprocessing
 import os
 import signal
@@ -98,6 +99,42 @@ def available_memory() -> int:
     return min(found)
 
 
+def finished_orders(
+    waiting: deque[Item],
+    running: dict[Future[Result], Item],
+    submit: Callable[[Item], Future[Result]],
+    room: Callable[[], int],
+    idle: Callable[[], None] = lambda: None,
+    idle_s: float | None = None,
+) -> Iterator[tuple[Item, Result]]:
+    """Submit waiting items while there is room, and yield each with its result as it is finished.
+
+    Parameters
+    ----------
+    waiting, running
+        Items that wait, and those in work by their futures; both are changed. After an error, ``running`` has the items
+        without a result. Their futures are cancelled.
+    submit, room
+        Start the work on an item; return how many items may be in work.
+    idle, idle_s
+        Called when no item was finished for ``idle_s`` [s].
+    """
+    try:
+        while waiting or running:
+            while waiting and len(running) < room():
+                running[submit(waiting[0])] = waiting[0]
+                waiting.popleft()
+            done = wait(running, idle_s, FIRST_COMPLETED).done
+            if not done:
+                idle()
+            for future in done:
+                result = future.result()
+                yield running.pop(future), result
+    finally:
+        for future in running:
+            future.cancel()
+
+
 class Pool:
     """Processes on this machine, each with its share of the cores."""
 
@@ -108,31 +145,23 @@ class Pool:
     def distribute(
         self, items: Sequence[Item], order: Callable[[Item], Plain], work: Callable[[Plain], Result]
     ) -> Iterator[tuple[Item, Result]]:
-        """Yield items with the results of ``work`` on their orders, as they are finished.
-
-        Raises
-        ------
-        InputError
-            If a worker raises it.
-        MissingEnvironmentError
-            If processes die repeatedly.
-        """
+        """Yield items with their results, see :meth:`Executor.distribute`; dead processes are replaced."""
         waiting, deaths = deque(items), 0
-        while waiting:
-            running: dict[Future[Result], Item] = {}
+        running: dict[Future[Result], Item] = {}
+        while waiting or running:
             try:
-                pool = self._ready()
-                while waiting or running:
-                    while waiting and len(running) < AHEAD * self.processes:
-                        running[pool.submit(work, order(waiting[0]))] = waiting[0]
-                        waiting.popleft()
-                    for future in wait(running, return_when=FIRST_COMPLETED).done:
-                        result = future.result()
-                        deaths = 0
-                        yield running.pop(future), result
+                for finished in finished_orders(
+                    waiting,
+                    running,
+                    lambda item: self._ready().submit(work, order(item)),
+                    lambda: AHEAD * self.processes,
+                ):
+                    deaths = 0
+                    yield finished
             except BrokenProcessPool:
                 self._pool = None
                 waiting.extendleft(reversed(running.values()))
+                running.clear()
                 deaths += 1
                 if deaths > DEATHS:
                     raise MissingEnvironmentError(
@@ -140,9 +169,6 @@ class Pool:
                         "finished work is kept: use fewer, and run the same command again"
                     ) from None
                 say("a worker process died; its work is repeated")
-            finally:
-                for future in running:
-                    future.cancel()
 
     def close(self) -> None:
         """End the processes after their current orders."""
@@ -159,28 +185,33 @@ class Pool:
 
 
 def _start_worker(threads: int, parent: int) -> None:
-    """Set up a worker process: limit its threads, and ignore Ctrl-C, which the parent handles."""
+    """Set up a worker process: limit its threads, end with its parent (Linux), and leave Ctrl-C to the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _end_with_parent(parent)
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = str(threads)
-
-
-def _end_with_parent(parent: int) -> None:
-    """End this process if the parent is killed (Linux)."""
     if sys.platform == "linux":
-        import ctypes
-
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
     if os.getppid() != parent:
         raise SystemExit(0)
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = str(threads)
 
 
 def results_of(
     orders: Sequence[Plain], work: Callable[[Plain], Result], workers: Executor | None, label: str
 ) -> list[Result]:
-    """Return the results of orders, in their sequence, from workers or this process; progress goes to stderr."""
+    """Return the results of orders, in their sequence, from workers or this process.
+
+    Parameters
+    ----------
+    orders
+        Plain values.
+    work
+        Module-level function of an order.
+    workers
+        None for this process.
+    label
+        Of the progress on stderr.
+    """
     if workers is None:
         return [work(one) for one in track(orders, label)]
     made = workers.distribute(range(len(orders)), orders.__getitem__, work)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -35,13 +35,7 @@ def track(items: Iterable[Item], label: str, total: int | None = None) -> Iterat
 
 def track_if_long(items: Sequence[Item], label: str) -> Iterator[Item]:
     """Iterate over items that usually take no time, and show progress only after :data:`_LINE_EVERY_S`."""
-    start = last = time.monotonic()
-    for done, item in enumerate(items):
-        now = time.monotonic()
-        if now - last >= _LINE_EVERY_S:
-            say_progress(f"{label}: {done}/{len(items)}, {(now - start) / done * (len(items) - done):.0f} s left")
-            last = now
-        yield item
+    return _lines(items, label, len(items), say_progress)
 
 
 def say(text: str) -> None:
@@ -57,28 +51,14 @@ def say_progress(text: str) -> None:
 
 def _bar(items: Iterable[Item], label: str, total: int | None) -> Iterator[Item]:
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
-    columns = (
-        TextColumn("{task.description:<28}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), "left", TimeRemainingColumn())
+    with Progress("{task.description:<28}", *columns, console=Console(stderr=True)) as progress:
         yield from progress.track(items, total=total, description=label)
 
 
-def _lines(items: Iterable[Item], label: str, total: int | None) -> Iterator[Item]:
+def _lines(items: Iterable[Item], label: str, total: int | None, report: Callable[[str], None] = say) -> Iterator[Item]:
     start = last = time.monotonic()
     done = 0
     for item in items:
@@ -87,6 +67,7 @@ def _lines(items: Iterable[Item], label: str, total: int | None) -> Iterator[Ite
         now = time.monotonic()
         if now - last >= _LINE_EVERY_S and done != total:
             left = f", {(now - start) / done * (total - done):.0f} s left" if total else ""
-            say(f"{label}: {done}/{total or '?'}{left}")
+            report(f"{label}: {done}/{total or '?'}{left}")
             last = now
-    say(f"{label}: {done} done in {time.monotonic() - start:.1f} s")
+    if report is say:
+        say(f"{label}: {done} done in {time.monotonic() - start:.1f} s")

@@ -213,7 +213,7 @@ def in_turn(jobs: Sequence[Job], simulated: SimulatedSensor) -> Iterator[tuple[J
 
 def take_job(job: Job) -> dict[str, bytes]:
     """Take and pack one capture; workers call this function. Packing takes time, but reduces the size to a fifth."""
-    simulated, _ = prepared_sensor(repr(job.sensor), job.sensor)
+    simulated = prepared_sensor(job.sensor).simulated
     return _taken(job, simulated)
 
 

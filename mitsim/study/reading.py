@@ -27,7 +27,6 @@ from mitsim.maps.campaign.missing_finishes import (
     samples_of,
     seen_finishes,
     unknown_finishes,
-    with_lights,
 )
 from mitsim.maps.campaign.plan import Campaign, check_exposure, read_campaign, sensor_checksum
 from mitsim.running.progress import say
@@ -207,7 +206,7 @@ def read_map(name: str | Path, sensor: Sensor, folder: str | Path = ".") -> Perf
         If there is no map, or it belongs to another sensor.
     """
     file = map_path(name, folder)
-    performance_map = with_lights(PerformanceMap.load(file))
+    performance_map = PerformanceMap.load(file)
     attributes = performance_map.data.attrs
     if (map_sensor := str(attributes.get("sensor"))) != sensor.name:
         raise InputError(file, "sensor", map_sensor, sensor.name, "a map holds for one sensor only")

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from characterisation.cloud_files import write_ply
+from characterisation.cloud_files import write_cloud
 from characterisation.files.atomic_io import write_json
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.scores.view_score import write_scores
@@ -165,7 +165,7 @@ def _draw(session: Session, performance_map: PerformanceMap, numbers: list[int])
         fraction, sigma = performance(ideal, study.scene, performance_map)
         rng = np.random.default_rng([study.file.seed, number])
         cloud = predictor.draw(study.scene, ideal, labels, fraction, sigma, rng)
-        write_ply(cloud, session.folder / "clouds" / f"predicted_{number:04d}.ply")
+        write_cloud(cloud, session.folder / "clouds" / f"predicted_{number:04d}.ply")
 
 
 def _map(study: Study, twin: RenderedMeasurements | None, folder: Path) -> PerformanceMap:
@@ -194,4 +194,4 @@ def _show(
     for number in track(numbers, "render pictures"):
         capture, cloud = renderer.exposed_as(planned.get(number)).at_best_estimates(renderer.study.view(number))
         write_capture(capture, folder / "captures" / f"view_{number:04d}", overwrite=True)
-        write_ply(cloud, folder / "clouds" / f"rendered_{number:04d}.ply")
+        write_cloud(cloud, folder / "clouds" / f"rendered_{number:04d}.ply")

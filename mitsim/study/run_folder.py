@@ -11,7 +11,7 @@ import trimesh
 import xarray as xr
 from pydantic import ConfigDict, Field
 
-from characterisation.cloud_files import read_ply
+from characterisation.cloud_files import read_cloud
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.datasets import Schema, Variable, read_dataset
 from characterisation.files.documents import Document, validate
@@ -232,13 +232,13 @@ class Run:
     def predicted(self, view: int) -> PointCloud:
         """Return the cloud of a view that the map predicts."""
         self.check(f"clouds/predicted_{view:04d}.ply")
-        return read_ply(self._cloud_path("predicted", view))
+        return read_cloud(self._cloud_path("predicted", view))
 
     def decoded(self, view: int) -> PointCloud:
         """Return the cloud of a checked view, decoded from its rendered images."""
         path = self._cloud_path("rendered", view)
         self.check(f"clouds/rendered_{view:04d}.ply")
-        cloud, grid = read_ply(path), self.predicted(view).grid
+        cloud, grid = read_cloud(path), self.predicted(view).grid
         if (cloud.grid.height, cloud.grid.width) != (grid.height, grid.width):
             found = f"{cloud.grid.height} x {cloud.grid.width} pixels"
             raise InputError(path, "grid", found, f"{grid.height} x {grid.width}, as the predicted cloud")

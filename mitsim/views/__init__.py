@@ -6,7 +6,7 @@ writes them to files.
 """
 
 from mitsim.views.candidates import Candidates, LeftOut, View, candidate_views
-from mitsim.views.poses import write_poses, write_views
+from mitsim.views.poses import write_views
 from mitsim.views.table import ViewsTable
 
-__all__ = ["Candidates", "LeftOut", "View", "ViewsTable", "candidate_views", "write_poses", "write_views"]
+__all__ = ["Candidates", "LeftOut", "View", "ViewsTable", "candidate_views", "write_views"]

@@ -20,12 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.coupon.orientations import sphere_directions
+from characterisation.features.surfaces import unit
 from characterisation.files.errors import InputError
 from mitsim.running.progress import track_if_long
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.sensor.working_volume import in_image
-from mitsim.views.collision import Box, Obstacle, is_inside, is_near, obstacle, sensor_box
+from mitsim.views.collision import BodyBox, Obstacle, is_inside, is_near, obstacle, sensor_box
 from mitsim.views.reach import reach_directions, reach_rotations, stage_from_part, stage_from_sensor
 from mitsim.views.table import PartStage, ViewsTable
 
@@ -190,22 +191,18 @@ def _no_views_error(where: str | Path, left_out: list[LeftOut]) -> InputError:
 def directions_above(table: ViewsTable) -> Floats:
     """Return the unit directions (n, 3) of a table, part frame, above its lowest elevation, from the zenith down."""
     directions = sphere_directions(table.subdivisions)
-    height = directions @ _up(table)
+    height = directions @ unit(table.up)
     keep = height >= math.sin(math.radians(table.lowest_elevation_deg)) - 1e-9
     directions, height = directions[keep], height[keep]
     order = np.lexsort((np.arctan2(directions[:, 1], directions[:, 0]), -np.round(height, 9)))
     return np.asarray(directions[order])
 
 
-def _up(table: ViewsTable) -> Floats:
-    return np.asarray(np.asarray(table.up, float) / np.linalg.norm(table.up))
-
-
 def _free_pose(
     table: ViewsTable, sensor: Sensor, target: Floats, direction: Floats, roll_deg: float, distance: float
 ) -> Transform:
     """Return the pose of a sensor without a stage."""
-    up = _up(table)
+    up = unit(table.up)
     # a roll of 0 at the zenith has the baseline along x
     forward = np.array([0.0, 1.0, 0.0]) if abs(up[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
     reference = forward if direction @ up > 1 - 1e-6 else up
@@ -266,12 +263,9 @@ def _depth(sensor: Sensor, target: Floats, distance: float, range_mm: tuple[floa
 
 
 def _first_free(
-    part: Obstacle, box: Box, clearance: float, sensor: Sensor, nearest: Transform, distances: Floats
+    part: Obstacle, box: BodyBox, clearance: float, sensor: Sensor, nearest: Transform, distances: Floats
 ) -> float:
-    """Return the first of ascending distances [mm] at which the sensor's body is clear of the part, NaN if none.
-
-    ``nearest`` is ``world_from_sensor`` at the first distance.
-    """
+    """Return the first of ascending distances [mm] with a free body, NaN if none; ``nearest`` is the first pose."""
     outward = -(nearest @ sensor.rig.reference.sensor_from_camera).rotation[:, 2]
     inside: bool | None = None  # None: unknown. Between two free steps the body does not cross the surface
     for distance in distances.tolist():

@@ -34,9 +34,11 @@ Floats = NDArray[np.float64]
 #: winding number above which a place is inside: half-way from 0 to 1
 _INSIDE = 0.5
 
-#: corners nearer than this fraction of the part's size are merged; a surface is closed if its area vectors add to less
-#: than this fraction of its area
-_MERGE, _CLOSED = 1e-6, 1e-3
+#: corners nearer than this fraction of the part's size are merged
+_MERGE = 1e-6
+
+#: a surface is closed if its area vectors add to less than this fraction of its area
+_CLOSED = 1e-3
 
 #: distance, in units of its reach, beyond which a triangle counts as a point-like area
 _FAR = 4.0
@@ -50,7 +52,7 @@ _EDGES = np.array([(i, j) for i in range(8) for j in range(i) if np.abs(_CORNERS
 
 
 @dataclass(frozen=True)
-class Box:
+class BodyBox:
     """A box in the sensor frame, parallel to its axes: ``centre`` (3,), and ``half`` its side lengths (3,) [mm]."""
 
     centre: Floats
@@ -85,7 +87,7 @@ class Obstacle:
     solids: Solids = field(repr=False)
 
 
-def sensor_box(sensor: Sensor, body: SensorBody) -> Box:
+def sensor_box(sensor: Sensor, body: SensorBody) -> BodyBox:
     """Return the box that represents a sensor: as given, or around the apertures of its cameras and projector."""
     eyes = [(camera.centre, sensor.pupil_mm(camera) / 2) for camera in sensor.rig.cameras.values()]
     eyes.append((sensor.projector.optics.centre, sensor.projector.aperture_mm / 2))
@@ -93,8 +95,8 @@ def sensor_box(sensor: Sensor, body: SensorBody) -> Box:
     high = np.max([centre + radius for centre, radius in eyes], axis=0)
     middle = (low + high) / 2
     if body.size_mm is None:
-        return Box(middle, (high - low) / 2 + (MARGIN_MM if body.margin_mm is None else body.margin_mm))
-    return Box(middle if body.centre_mm is None else np.array(body.centre_mm), np.array(body.size_mm) / 2)
+        return BodyBox(middle, (high - low) / 2 + (MARGIN_MM if body.margin_mm is None else body.margin_mm))
+    return BodyBox(middle if body.centre_mm is None else np.array(body.centre_mm), np.array(body.size_mm) / 2)
 
 
 def obstacle(triangles: Floats) -> Obstacle:
@@ -141,8 +143,20 @@ def _solids(triangles: Floats) -> Solids:
     return Solids(chosen, middles, areas[closed], reach, bounds)
 
 
-def is_near(part: Obstacle, box: Box, part_from_sensor: Transform, clearance: float) -> bool:
-    """Return whether any triangle of a part is nearer to a box than ``clearance`` [mm], or meets it."""
+def is_near(part: Obstacle, box: BodyBox, part_from_sensor: Transform, clearance: float) -> bool:
+    """Return whether any triangle of a part is nearer to a box than ``clearance`` [mm], or meets it.
+
+    Parameters
+    ----------
+    part
+        From :func:`obstacle`.
+    box
+        In the sensor frame.
+    part_from_sensor
+        Pose of the sensor.
+    clearance
+        [mm].
+    """
     centre = part_from_sensor.points(box.centre)
     reach = float(np.linalg.norm(box.half)) + clearance
     found = [members[tree.query_ball_point(centre, reach + radius)] for tree, members, radius in part.trees]
@@ -174,10 +188,7 @@ def is_inside(part: Obstacle, place: Floats) -> bool:
 
 
 def _solid_angles(triangles: Floats) -> Floats:
-    """Return the signed solid angle (n,) [sr] of triangles (n, 3, 3) from the origin.
-
-    It is positive if the normal points away from the origin.
-    """
+    """Return signed solid angles (n,) [sr] of triangles (n, 3, 3) from the origin; positive for outward normals."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     la, lb, lc = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c))
@@ -206,10 +217,7 @@ def _beyond(points: Floats, half: Floats) -> Floats:
 
 
 def _face_distance(triangles: Floats, corners: Floats) -> Floats:
-    """Return the least distance (n,) of points (m, 3) from the inside of triangles (n, 3, 3).
-
-    It is infinite if no point is above the triangle.
-    """
+    """Return the least distance (n,) of points (m, 3) above triangles (n, 3, 3); infinite if none is there."""
     first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     normal = np.cross(first, second)
     area = (normal**2).sum(axis=1)

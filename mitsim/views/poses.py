@@ -38,27 +38,30 @@ _STAGE = (
 )
 
 
-def write_poses(folder: str | Path, found: Candidates, table: ViewsTable, sensor: str) -> None:
+def write_views(folder: str | Path, candidates: Candidates, table: ViewsTable, sensor: str) -> None:
     """Write the poses of all views into a folder, completely or not at all; an existing folder is replaced.
 
-    ``table`` names the axes of the stage and defines the robot's flange; ``sensor`` is the sensor's name.
+    Report on stderr which views were moved or are impossible.
+
+    Parameters
+    ----------
+    table
+        Names the axes of the stage and defines the robot's flange.
+    sensor
+        Name of the sensor.
     """
-    files = {"poses.csv": _poses_csv(found.views, table), "poses.json": _poses_json(found, table, sensor)}
+    views, left_out = candidates.views, candidates.left_out
+    files = {"poses.csv": _poses_csv(views, table), "poses.json": _poses_json(candidates, table, sensor)}
     if table.stage is not None:
-        files["stage.csv"] = _stage_csv(found.views, table)
-    if found.left_out:
-        files["left_out.csv"] = _left_out_csv(found.left_out)
+        files["stage.csv"] = _stage_csv(views, table)
+    if left_out:
+        files["left_out.csv"] = _left_out_csv(left_out)
     write_folder(folder, {name: text.encode("utf-8") for name, text in files.items()}, overwrite=True)
-
-
-def write_views(folder: str | Path, found: Candidates, table: ViewsTable, sensor: str) -> None:
-    """Write the poses, and report on stderr which views were moved or are impossible."""
-    write_poses(folder, found, table, sensor)
-    if found.moved_out:
-        say(f"{found.moved_out} of {len(found.views)} views are moved farther out, clear of the part")
-    if found.left_out:
-        whole = len(found.views) + len(found.left_out)
-        say(f"{len(found.left_out)} of {whole} views are impossible: {Path(folder) / 'left_out.csv'}")
+    if candidates.moved_out:
+        say(f"{candidates.moved_out} of {len(views)} views are moved farther out, clear of the part")
+    if left_out:
+        whole = len(views) + len(left_out)
+        say(f"{len(left_out)} of {whole} views are impossible: {Path(folder) / 'left_out.csv'}")
 
 
 def part_from_flange(view: View, table: ViewsTable) -> Transform | None:

@@ -21,15 +21,15 @@ used.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from characterisation.coupon.view_frame import view_frame
-from characterisation.stage.angles import TOLERANCE, about_one, about_two, turned
+from characterisation.stage.angles import Reach, about_one, about_two, least_motion, turned
+from characterisation.stage.turning_axes import rotation_about
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
 from mitsim.views.table import PartStage
@@ -37,20 +37,6 @@ from mitsim.views.table import PartStage
 Floats = NDArray[np.float64]
 
 _Z = np.array([0.0, 0.0, 1.0])
-
-#: tolerance of a limit for rounding [rad]
-_SLACK = 1e-9
-
-#: solutions with an error below the first [rad] precede all others, whose motion is increased by the second [rad^2]
-_EXACT, _ROUGH = 1e-10, 1e3
-
-
-@dataclass(frozen=True)
-class Reach:
-    """Reach of a stage for n views: ``angles`` (n, axes) [rad], NaN if impossible, and the reason, else ""."""
-
-    angles: Floats
-    reasons: list[str]
 
 
 def stage_from_sensor(sensor: Sensor, distance: float) -> Transform:
@@ -102,7 +88,7 @@ def reach_directions(stage: PartStage, directions: Floats) -> Reach:
             first = about_one(turned(start, units[1], second), wanted, units[0])
             yield np.stack([first, second], axis=1)
 
-    return _best(stage, candidates(), error, len(start))
+    return least_motion(stage.axes, candidates(), error, len(start))
 
 
 def reach_rotations(stage: PartStage, rotations: Floats) -> Reach:
@@ -112,26 +98,30 @@ def reach_rotations(stage: PartStage, rotations: Floats) -> Reach:
     third = np.broadcast_to(units[2], (len(wanted), 3))
 
     def error(angles: Floats) -> Floats:
-        shown = _turns(units[0], angles[:, 0]) @ _turns(units[1], angles[:, 1]) @ _turns(units[2], angles[:, 2])
+        shown = (
+            rotation_about(units[0], angles[:, 0])
+            @ rotation_about(units[1], angles[:, 1])
+            @ rotation_about(units[2], angles[:, 2])
+        )
         return np.asarray(np.abs(shown - wanted).max(axis=(1, 2)))
 
     def finished(first: Floats, second: Floats) -> Floats:
-        rest = _turns(units[1], -second) @ _turns(units[0], -first) @ wanted
+        rest = rotation_about(units[1], -second) @ rotation_about(units[0], -first) @ wanted
         return np.stack([first, second, _angle(rest, units[2])], axis=1)
 
     def candidates() -> Iterator[Floats]:
         for pair in about_two(third, wanted @ units[2], units[0], units[1]):
             yield finished(pair[:, 0], pair[:, 1])
         for first in _fixed(stage, 0, len(wanted)):
-            left = _turns(units[0], -first) @ wanted
+            left = rotation_about(units[0], -first) @ wanted
             yield finished(first, about_one(third, left @ units[2], units[1]))
         for last in _fixed(stage, 2, len(wanted)):
-            left = wanted @ _turns(units[2], -last)  # R_1 R_2; the axis a_1 is invariant under R_1
+            left = wanted @ rotation_about(units[2], -last)  # R_1 R_2; the axis a_1 is invariant under R_1
             across = np.broadcast_to(units[0], third.shape)
             second = -about_one(across, np.einsum("nji,j->ni", left, units[0]), units[1])
-            yield np.stack([_angle(left @ _turns(units[1], -second), units[0]), second, last], axis=1)
+            yield np.stack([_angle(left @ rotation_about(units[1], -second), units[0]), second, last], axis=1)
 
-    return _best(stage, candidates(), error, len(wanted))
+    return least_motion(stage.axes, candidates(), error, len(wanted))
 
 
 def _fixed(stage: PartStage, number: int, count: int) -> Iterator[Floats]:
@@ -141,44 +131,7 @@ def _fixed(stage: PartStage, number: int, count: int) -> Iterator[Floats]:
         yield np.full(count, angle)
 
 
-def _turns(axis: Floats, angles: Floats) -> Floats:
-    """Return rotations (n, 3, 3) about a unit axis."""
-    return np.asarray(Rotation.from_rotvec(np.nan_to_num(angles)[:, None] * axis).as_matrix())
-
-
 def _angle(rotations: Floats, axis: Floats) -> Floats:
     """Return the angle (n,) [rad] of rotations (n, 3, 3) about their common unit axis."""
     twice_sine = np.stack([rotations[:, i, j] - rotations[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
     return np.asarray(np.arctan2(twice_sine @ axis, np.trace(rotations, axis1=1, axis2=2) - 1))
-
-
-def _best(stage: PartStage, candidates: Iterator[Floats], error: Callable[[Floats], Floats], count: int) -> Reach:
-    """Return the angles (n, axes) of least motion within the limits; else the reason why there are none."""
-    best = np.full((count, len(stage.axes)), np.nan)
-    least, beyond = np.full(count, np.inf), np.full(count, np.inf)
-    low, high = np.radians([axis.limits_deg for axis in stage.axes]).T
-    for solved in candidates:
-        angles = np.stack([axis.nearest(turn) for axis, turn in zip(stage.axes, solved.T, strict=True)], axis=1)
-        off = np.where(np.isfinite(angles).all(axis=1), error(np.nan_to_num(angles)), np.inf)
-        there = off < TOLERANCE
-        excess = np.where(there, np.maximum(low - angles, angles - high).max(axis=1), np.inf)
-        excess = np.where(excess < _SLACK, 0.0, excess)
-        motion = np.where(off < _EXACT, 0.0, _ROUGH) + (angles**2).sum(axis=1)
-        better = there & ((excess < beyond) | ((excess == beyond) & (motion < least)))
-        best[better], least[better], beyond[better] = angles[better], motion[better], excess[better]
-    reasons = [_reason(stage, angles) if over > 0 else "" for angles, over in zip(best, beyond, strict=True)]
-    return Reach(np.where(beyond[:, None] > 0, np.nan, best), reasons)
-
-
-def _reason(stage: PartStage, angles: Floats) -> str:
-    """Return the reason why angles (axes,) [rad] are out of reach; NaN stands for no solution."""
-    if not np.isfinite(angles).all():
-        return "stage: no angles of its axes show this view"
-    degrees = np.degrees(angles)
-    over = [
-        max(axis.limits_deg[0] - turn, turn - axis.limits_deg[1])
-        for axis, turn in zip(stage.axes, degrees, strict=True)
-    ]
-    worst = int(np.argmax(over))
-    low, high = stage.axes[worst].limits_deg
-    return f"stage: {stage.axes[worst].name} {degrees[worst]:.1f} deg beyond {low:g} to {high:g}"

@@ -16,6 +16,13 @@ def chosen_standoffs(where: str | Path, table: ViewsTable, sensor: Sensor, radiu
 
     They are those of the table, or else the nearest at which the sensor can measure a ball around the part.
 
+    Parameters
+    ----------
+    where
+        File of the table, for the error.
+    radius_mm
+        Radius of a ball around the part.
+
     Raises
     ------
     InputError
@@ -33,6 +40,15 @@ def characterised_range(
     where: str | Path, table: ViewsTable, sensor: Sensor, standoffs: Sequence[float], distances: Sequence[float]
 ) -> tuple[float, float]:
     """Return the range of |V| [mm] that a view may have: the part of the sensor's working range that is characterised.
+
+    Parameters
+    ----------
+    where
+        File of the table, for the error.
+    standoffs
+        [mm] of the views.
+    distances
+        Characterised distances [mm].
 
     Raises
     ------

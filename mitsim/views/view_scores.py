@@ -58,6 +58,9 @@ MATT_WHITE = Finish("matt_white", float("nan"))
 #: approximate number of rays per view; with fewer, expectations over a feature change by one per cent
 RAYS = 40_000
 
+#: statistics of V_m in :class:`_ViewScore`, in the order of :func:`view_statistics`
+_STATISTICS = ("n", "sigma", "n_white", "sigma_white", "n_only")
+
 #: R_f below which a lack of points is attributed to occlusion
 OCCLUDED = 0.75
 
@@ -74,18 +77,6 @@ class _Cast:
     labels: NDArray[np.int16]
     n_only: Floats
     perturbation: Perturbation
-
-
-@dataclass(frozen=True)
-class _Scoring:
-    """Scene, task, map and predictor of a scoring; the ``predictor`` casts every ``step``-th ray of every such row."""
-
-    scene: Scene
-    task: Task
-    performance_map: PerformanceMap
-    minimum_points: float
-    predictor: Predictor
-    step: int
 
 
 @dataclass(frozen=True)
@@ -129,8 +120,7 @@ def score_candidates(
     list of dict
         For every view, the input quantities of its measurements, from which sets of views are chosen.
     """
-    looking, step = predictor.thinned_to(RAYS)
-    scoring = _Scoring(scene, task, performance_map, minimum_points, looking, step)
+    looking = predictor.thinned_to(RAYS)
     names = list(task.shapes)
     alone = [CharacterisedScene(scene.only(name), performance_map, MATT_WHITE) for name in names]
 
@@ -143,53 +133,38 @@ def score_candidates(
         return _Cast(ideal, labels, n_only, together((effect(view_of) for effect in effects), len(ideal.pixel)))
 
     def score(cast: _Cast, view: View) -> _ViewScore:
-        return _score_view(scoring, cast, view)
+        return _score_view(cast, view, scene, task, performance_map, minimum_points, looking)
 
     # the rays of the next view are cast while this view is evaluated
     scored = [one for _, one in track(one_ahead(views, cast, score), "score views", len(views))]
-    columns = {
-        key: np.array([getattr(one, key) for one in scored])
-        for key in ("n", "sigma", "n_white", "sigma_white", "n_only")
-    }
-    statistics = view_statistics(
-        names, columns["n"], columns["sigma"], columns["n_white"], columns["sigma_white"], columns["n_only"]
-    )
+    columns = (np.array([getattr(one, key) for one in scored]) for key in _STATISTICS)
+    statistics = view_statistics(names, *columns)
     scores = score_views(statistics, task, minimum_points)
-    scores["mean_sigma"] = statistics["mean_sigma"]
-    for name in ("n_white", "mean_sigma_white", "n_only_white"):
+    for name in ("mean_sigma", "n_white", "mean_sigma_white", "n_only_white"):
         scores[name] = statistics[name]
-    uncertainty = np.array([[one.measurements[m].uncertainty for one in scored] for m in range(len(task.measurements))])
-    chance = np.array([[one.measurements[m].chance for one in scored] for m in range(len(task.measurements))])
+    uncertainty, chance = (
+        np.array([[getattr(one.measurements[m], name) for one in scored] for m in range(len(task.measurements))])
+        for name in ("uncertainty", "chance")
+    )
     possible = np.isfinite(uncertainty) & (chance >= LEAST_CHANCE)
+
+    def add(name: str, dims: tuple[str, ...], values: Any, long_name: str, units: str = "1") -> None:
+        scores[name] = (dims, values, {"long_name": long_name, "units": units})
+
     by = ("measurement", "view")
-    scores["predicted_uncertainty"] = (
-        by,
-        uncertainty,
-        {"long_name": "predicted standard uncertainty", "units": "mm or deg"},
-    )
-    scores["chance"] = (by, chance, {"long_name": "chance that there are enough points", "units": "1"})
-    scores["uncertainty_possible"] = (
-        by,
-        possible,
-        {"long_name": "whether the measurement is possible, by uncertainty and chance", "units": "1"},
-    )
+    add("predicted_uncertainty", by, uncertainty, "predicted standard uncertainty", "mm or deg")
+    add("chance", by, chance, "chance that there are enough points")
+    long_name = "whether the measurement is possible, by uncertainty and chance"
+    add("uncertainty_possible", by, possible, long_name)
     risk = screening_risk(scores)
-    scores["uncertainty_rank"] = (
-        by,
-        rank_views(-risk, possible),
-        {"long_name": "rank by predicted risk, uncertainty over the square root of chance; 1 is best", "units": "1"},
-    )
-    scores["overall_rank"] = (
-        "view",
-        rank_views(-risk.mean(axis=0), np.asarray(possible.all(axis=0))),
-        {
-            "long_name": "rank by the mean logarithm of the predicted risk over all measurements, 1 is best",
-            "units": "1",
-        },
-    )
+    long_name = "rank by predicted risk, uncertainty over the square root of chance; 1 is best"
+    add("uncertainty_rank", by, rank_views(-risk, possible), long_name)
+    overall = rank_views(-risk.mean(axis=0), np.asarray(possible.all(axis=0)))
+    long_name = "rank by the mean logarithm of the predicted risk over all measurements, 1 is best"
+    add("overall_rank", ("view",), overall, long_name)
     limit, feature = _limits(task, scored, scores, possible)
-    scores["limit"] = (by, limit, {"long_name": "limiting factor of the view, against the best view", "units": "1"})
-    scores["limiting_feature"] = (by, feature, {"long_name": "the feature that contributes most", "units": "1"})
+    add("limit", by, limit, "limiting factor of the view, against the best view")
+    add("limiting_feature", by, feature, "the feature that contributes most")
     measurements = task.measurements.values()
     scores["nominal"] = ("measurement", [m.nominal for m in measurements], {"units": "mm or deg"})
     tolerances = [math.nan if m.tolerance_size is None else m.tolerance_size for m in measurements]
@@ -210,14 +185,21 @@ def screening_risk(scores: xr.Dataset) -> Floats:
     return np.where(able, np.log(np.where(able, u, 1.0)) - 0.5 * np.log(np.where(able, chance, 1.0)), np.inf)
 
 
-def _score_view(scoring: _Scoring, cast: _Cast, view: View) -> _ViewScore:
-    """Return the results of a view from its rays: every ``step``-th ray of every ``step``-th row."""
-    scene, task, performance_map = scoring.scene, scoring.task, scoring.performance_map
+def _score_view(
+    cast: _Cast,
+    view: View,
+    scene: Scene,
+    task: Task,
+    performance_map: PerformanceMap,
+    minimum_points: float,
+    predictor: Predictor,
+) -> _ViewScore:
+    """Return the results of a view from the rays that a thinned predictor has cast."""
     names, ideal, labels = list(task.shapes), cast.ideal, cast.labels
     shapes = [scene.names.index(name) for name in names]
     white = performance(ideal, scene, performance_map, MATT_WHITE)
     n_white, sigma_white = feature_statistics(ideal, labels, *white, shapes)
-    thinning, pitch = scoring.step**2, scoring.predictor.grid.angular_pitch / scoring.step
+    thinning, pitch = predictor.step**2, predictor.grid.angular_pitch / predictor.step
     points_of_view = ViewPoints(ideal, labels, view.world_from_sensor, thinning, pitch)
 
     def expected(perturbation: Perturbation | None) -> dict[str, ExpectedPoints]:
@@ -227,7 +209,7 @@ def _score_view(scoring: _Scoring, cast: _Cast, view: View) -> _ViewScore:
         }
 
     as_mapped, points = expected(None), expected(cast.perturbation)
-    inputs = expected_inputs(task, points, scoring.minimum_points)
+    inputs = expected_inputs(task, points, minimum_points)
     measurements = [expected_measurement(task, name, inputs) for name in task.measurements]
     return _ViewScore(
         np.array([one.count for one in as_mapped.values()]),

@@ -30,7 +30,7 @@ def cost(name: str) -> tuple[float, float, int, int, int]:
 
     import numpy as np
 
-    from characterisation.cloud_files import write_ply
+    from characterisation.cloud_files import write_cloud
     from mitsim.capture.capture import Capture
     from mitsim.capture.packed_files import packed
     from mitsim.capture.simulated.simulate import SimulatedSensor
@@ -59,7 +59,7 @@ def cost(name: str) -> tuple[float, float, int, int, int]:
     decoded = clock()
     kept = sum(map(len, packed(capture, "c").values()))
     with tempfile.TemporaryDirectory() as folder:
-        write_ply(cloud, Path(folder) / "c.ply")
+        write_cloud(cloud, Path(folder) / "c.ply")
         points = (Path(folder) / "c.ply").stat().st_size
     plain = sum(stack.nbytes for stack in capture.images.values())
     return taken - began, decoded - taken, kept, points, plain

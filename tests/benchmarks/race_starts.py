@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from characterisation.statements.judgement import true_risk
 from characterisation.statements.selection import judge, posterior, sampled
 from mitsim.scene import backend
+from tests.proofs.judgement import true_risk
 from tests.proofs.part_cases import read_part_cases
 from tests.proofs.screening_run import PREDICTED, screen_case
 

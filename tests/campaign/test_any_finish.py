@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import time
@@ -21,7 +20,7 @@ from characterisation.maps.shipped import shipped_maps
 from mitsim.cli.options import asking
 from mitsim.maps.campaign import finish_cache, missing_finishes, one_finish
 from mitsim.maps.campaign.finish_cache import cache_folder, kept_finish
-from mitsim.maps.campaign.missing_finishes import NeededFinishes, distances_about, map_with_finishes, with_lights
+from mitsim.maps.campaign.missing_finishes import NeededFinishes, distances_about, map_with_finishes
 from mitsim.maps.campaign.one_finish import OneFinish, one_finish_campaign, plan_of
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.surface.lay import lay_left_out
@@ -223,7 +222,7 @@ def test_distances_about_the_views(shipped):
 
 @pytest.mark.parametrize("sensor", sorted(shipped_maps()))
 def test_shipped_maps_answer_for_the_coupons_that_they_were_made_of(sensor, scenes):
-    known = with_lights(PerformanceMap.load(shipped_maps()[sensor]))
+    known = PerformanceMap.load(shipped_maps()[sensor])
     wavelength = float(known.data.attrs["wavelength_nm"])
     for name, roughness in known.samples:
         parameters = {} if math.isnan(roughness) else {"Ra": str(roughness)}
@@ -231,17 +230,6 @@ def test_shipped_maps_answer_for_the_coupons_that_they_were_made_of(sensor, scen
         shown = load_scene(scenes / "coupon" / coupon, wavelength, parameters).finishes[0]
         members, _ = known.known.representing(name, roughness, shown.light)
         assert str(known.samples[members[0]]) == str((name, roughness))
-
-
-def test_a_former_map_of_a_coupon_with_more_said_does_not_answer_by_its_name(shipped):
-    names = [str(name) for name in shipped.data.variables if str(name).startswith("light_")]
-    former = shipped.data.drop_vars(names)
-    campaign = json.loads(former.attrs["campaign"])
-    campaign["samples"][1]["parameters"]["alpha"] = 0.097
-    known = with_lights(PerformanceMap(former.assign_attrs(campaign=json.dumps(campaign))))
-    told = dict(zip(map(str, known.samples), known.lights, strict=True))
-    assert told["('aluminium/ground', 0.09)"] is None
-    assert told["('aluminium/ground', 0.37)"].as_made
 
 
 def test_the_cache_is_where_the_xdg_specification_has_it(monkeypatch, tmp_path):

@@ -9,7 +9,7 @@ from characterisation.features.best_fit import best_fit, counted_as_one, motion_
 from characterisation.features.fits import fit_surface
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Cylinder, Plane
-from characterisation.scores.joining import JoinedView, fitted_covariance, pose_covariance, rigid_derivatives
+from characterisation.scores.joining import JoinedView, joined_covariance, pose_covariance, rigid_derivatives
 
 ABOUT = np.array([0.0, 0.0, 20.0])
 UP = np.array([0.0, 0.0, 1.0])
@@ -96,7 +96,7 @@ def test_poses_and_merged_shapes_have_the_covariance_that_is_predicted(count, si
             for name in ("left", "right")
         }
         fits = {name: fit_surface(points, SHAPES[name]) for name, points in joined.items()}
-        c = fitted_covariance([JoinedView(tuple(one)) for one in each], RIGID, KNOWN)
+        c = joined_covariance([JoinedView(tuple(one)) for one in each], RIGID, KNOWN, True)
         radii = np.array([fits["left"].radius - 20, fits["right"].radius - 20])
         of_shapes.append(radii @ np.linalg.solve(c[np.ix_([7, 12], [7, 12])], radii))
     # sums of squares of standard normals, within 99.9 % of their chi-squared distribution

@@ -8,7 +8,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from characterisation.cloud_files import read_ply, write_ply
+from characterisation.cloud_files import read_cloud, write_cloud
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 
@@ -27,8 +27,8 @@ def a_cloud(labelled=True, sigma=True):
 @pytest.mark.parametrize(("labelled", "sigma"), [(True, True), (False, False), (True, False)])
 def test_round_trip(tmp_path, labelled, sigma):
     cloud = a_cloud(labelled, sigma)
-    write_ply(cloud, tmp_path / "cloud.ply")
-    again = read_ply(tmp_path / "cloud.ply")
+    write_cloud(cloud, tmp_path / "cloud.ply")
+    again = read_cloud(tmp_path / "cloud.ply")
     for name in ("points", "status", "feature", "sigma", "baseline"):
         expected = getattr(cloud, name)
         if expected is None:
@@ -42,7 +42,7 @@ def test_round_trip(tmp_path, labelled, sigma):
 
 def test_other_software_reads_the_points(tmp_path):
     cloud = a_cloud()
-    write_ply(cloud, tmp_path / "cloud.ply")
+    write_cloud(cloud, tmp_path / "cloud.ply")
     vertices = trimesh.load(tmp_path / "cloud.ply").vertices
     assert np.allclose(vertices, cloud.points[cloud.valid], atol=1e-4)
 
@@ -51,7 +51,7 @@ def test_other_software_reads_the_points(tmp_path):
 @given(st.integers(0, 10**6), st.integers(0, 255), st.booleans())
 def test_damage_is_told_or_harmless(tmp_path_factory, where, value, truncate):
     folder = tmp_path_factory.mktemp("ply")
-    write_ply(a_cloud(), folder / "cloud.ply")
+    write_cloud(a_cloud(), folder / "cloud.ply")
     data = bytearray((folder / "cloud.ply").read_bytes())
     where %= len(data)
     if truncate:
@@ -60,7 +60,7 @@ def test_damage_is_told_or_harmless(tmp_path_factory, where, value, truncate):
         data[where] = value
     (folder / "cloud.ply").write_bytes(data)
     try:
-        read_ply(folder / "cloud.ply")
+        read_cloud(folder / "cloud.ply")
     except InputError as error:
         assert "cloud.ply" in str(error)
 
@@ -68,6 +68,6 @@ def test_damage_is_told_or_harmless(tmp_path_factory, where, value, truncate):
 def test_a_cloud_without_a_grid_is_refused(tmp_path):
     trimesh.PointCloud(np.zeros((3, 3))).export(tmp_path / "other.ply")
     with pytest.raises(InputError, match="no grid"):
-        read_ply(tmp_path / "other.ply")
+        read_cloud(tmp_path / "other.ply")
     with pytest.raises(InputError, match="no such file"):
-        read_ply(tmp_path / "missing.ply")
+        read_cloud(tmp_path / "missing.ply")

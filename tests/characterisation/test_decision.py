@@ -12,7 +12,6 @@ from characterisation.files.errors import InputError
 from characterisation.statements.decision import (
     Tolerance,
     acceptance,
-    conformance_probability,
     decide,
     global_risks,
     needed,
@@ -45,6 +44,12 @@ def task(decision: dict | None = None, kind: str = "radius", own: dict | None = 
 
 
 # the examples of JCGM 106:2012
+
+
+def conformance_probability(reading: float, errors: np.ndarray, tolerance: Tolerance) -> float:
+    """Return the probability that a part with this reading conforms, without other knowledge of it (JCGM 106, 7)."""
+    value = reading - errors
+    return float(((value >= tolerance.lower) & (value <= tolerance.upper)).mean())
 
 
 def test_conformance_probabilities_of_jcgm_106_7():

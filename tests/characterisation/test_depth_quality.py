@@ -125,7 +125,6 @@ def test_a_patch_with_a_gap_is_left_out():
         (lambda: mean_depth_error([], wall()), "clouds"),
         (lambda: temporal_noise([seen(wall())]), "clouds"),
         (lambda: global_planarity_trueness([]), "clouds"),
-        (lambda: local_planarity_precision(seen(wall()), patch_px=1), "patch_px"),
     ],
 )
 def test_what_cannot_be_measured_is_refused_by_name(call, field):

@@ -8,14 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from characterisation.coupon.discs import (
-    correlation_matrix,
-    disc_offsets,
-    effective_number,
-    independent_share,
-    lens_share,
-    overlap_correlation,
-)
+from characterisation.coupon.discs import disc_offsets, independent_share, lens_share
 
 
 def hexagonal(step: float, columns: int, rows: int) -> np.ndarray:
@@ -48,27 +41,6 @@ def test_the_lens_is_the_share_of_pixels_in_common(apart):
     assert np.isclose(len(here & there) / len(here), lens_share(apart, 20.0), atol=0.01)
 
 
-@pytest.mark.parametrize("length", [1.0, 3.0, 6.0])
-@pytest.mark.parametrize("apart", [0, 4, 8, 12, 16])
-def test_correlated_pixels_correlate_discs_as_the_sum_over_all_pairs_says(length, apart):
-    here, there = disc_offsets(8.0), disc_offsets(8.0) + np.array([0, apart])
-
-    def together(one, other):
-        return np.exp(-((one[:, None] - other[None]) ** 2).sum(-1) / length**2).sum()
-
-    expected = together(here, there) / together(here, here)
-    # the pixels of a disc are its area to 2 %, and a sum over them the integral to about the same
-    assert np.isclose(overlap_correlation(apart, 8.0, length), expected, atol=0.02)
-
-
-def test_effective_number_of_none_all_and_no_overlap():
-    assert effective_number(np.eye(7)) == 7
-    assert np.isclose(effective_number(np.ones((7, 7))), 1)
-    assert effective_number(np.empty((0, 0))) == 0
-    # two that share half of their area: 4 / (2 + 2 / 2)
-    assert np.isclose(effective_number([[1, 0.5], [0.5, 1]]), 4 / 3)
-
-
 def test_discs_apart_count_in_full():
     assert (independent_share(hexagonal(12.0, 4, 4), 6.0) == 1).all()
     assert independent_share(np.empty((0, 2)), 6.0).shape == (0,)
@@ -84,7 +56,7 @@ def test_a_disc_apart_counts_in_full_beside_a_pair():
 def test_a_mean_with_the_shares_has_the_variance_they_predict(centres):
     """1 / (sum of w) is w^T C w / (sum of w)^2 exactly, however the discs lie, and on one another too."""
     share = independent_share(centres, 6.0)
-    correlation = correlation_matrix(centres, 6.0)
+    correlation = lens_share(np.linalg.norm(centres[:, None] - centres, axis=-1), 6.0)
     assert np.isclose(share @ correlation @ share / share.sum() ** 2, 1 / share.sum(), rtol=1e-9)
     assert (share > 0).all()
     assert share.sum() <= len(centres) + 1e-9

@@ -14,8 +14,8 @@ from characterisation.files.errors import InputError
 from characterisation.scores.joining import (
     POSE_KNOWN,
     JoinedView,
+    joined_covariance,
     joint_information,
-    merged_covariance,
     pose_covariance,
     rigid_derivatives,
 )
@@ -101,7 +101,7 @@ def test_merged_points_carry_half_of_the_error_of_a_pose_that_only_one_feature_s
     known = pose_covariance(0.3, 0.0)
     rigid = [rigid_derivatives(one.estimate, MIDDLE) for one in (BOTH[LEFT], BOTH[RIGHT])]
     c = NOISE**2 * np.eye(4)
-    merged = merged_covariance([JoinedView((c, c)), JoinedView((c, None))], rigid, known)
+    merged = joined_covariance([JoinedView((c, c)), JoinedView((c, None))], rigid, known)
     g = joint_quadratic_form(TASK, "apart", BOTH)
     # left has (x1 + x2) / 2, right x1: their difference (x2 - x1) / 2, twice 0.3^2 / 4
     assert np.sum(g * merged) == pytest.approx(NOISE**2 * 1.5 + 0.3**2 / 2, rel=1e-6)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from characterisation.statements.judgement import falsely_accepted, pooled_share, regret, share, true_risk, within
+from characterisation.statements.coverage import share
+from tests.proofs.judgement import falsely_accepted, pooled_share, regret, true_risk, within
 
 
 def test_share_is_the_exact_interval_of_an_independent_package():

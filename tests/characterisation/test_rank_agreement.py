@@ -10,7 +10,8 @@ from hypothesis.extra.numpy import arrays
 from scipy import stats
 
 from characterisation.scores.coverage import coverage_interval
-from characterisation.scores.rank_agreement import roc_area, spearman
+from characterisation.scores.rank_agreement import spearman
+from tests.proofs.screening_figures import roc_area
 
 NAN, INF = math.nan, math.inf
 

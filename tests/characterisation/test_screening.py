@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from characterisation.scores import screening
-from characterisation.scores.screening import (
+from tests.proofs import screening_figures as screening
+from tests.proofs.screening_figures import (
     Screened,
     ceiling,
     interval,

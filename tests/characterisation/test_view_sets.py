@@ -5,10 +5,10 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from characterisation.scores.view_sets import Feature, fewest_views, greedy_views, set_uncertainty
+from characterisation.scores.view_sets import FeatureInformation, fewest_views, greedy_views, set_uncertainty
 
 
-def problem(seed: int, views: int = 12, measurements: int = 4) -> list[Feature]:
+def problem(seed: int, views: int = 12, measurements: int = 4) -> list[FeatureInformation]:
     """Two features with random information, some of it missing; each measurement needs one or both."""
     rng = np.random.default_rng(seed)
     made = []
@@ -17,11 +17,11 @@ def problem(seed: int, views: int = 12, measurements: int = 4) -> list[Feature]:
         information = root @ root.swapaxes(1, 2) * (rng.random(views) < 0.8)[:, None, None]
         g = rng.normal(size=(measurements, p))
         g[number::3] = 0
-        made.append(Feature(information, g[:, :, None] * g[:, None, :]))
+        made.append(FeatureInformation(information, g[:, :, None] * g[:, None, :]))
     return made
 
 
-def fewest_by_trying(features: list[Feature], limits: np.ndarray) -> int:
+def fewest_by_trying(features: list[FeatureInformation], limits: np.ndarray) -> int:
     count = len(features[0].information)
     for size in range(count + 1):
         for views in combinations(range(count), size):
@@ -45,7 +45,7 @@ def test_the_exact_set_is_as_few_as_the_best_of_all_sets(seed: int) -> None:
 
 def test_two_views_of_one_plane_are_better_by_the_root_of_two() -> None:
     information = np.tile(np.eye(3), (4, 1, 1)) / 0.04
-    plane = Feature(information, np.diag([1.0, 0.0, 0.0])[None])
+    plane = FeatureInformation(information, np.diag([1.0, 0.0, 0.0])[None])
     assert set_uncertainty([plane], np.array([1, 0, 0, 0]))[0] == pytest.approx(0.2)
     assert set_uncertainty([plane], np.array([1, 1, 0, 0]))[0] == pytest.approx(0.2 / np.sqrt(2))
     found = fewest_views([plane], np.array([0.2 / np.sqrt(3) * 1.001]))
@@ -53,8 +53,8 @@ def test_two_views_of_one_plane_are_better_by_the_root_of_two() -> None:
 
 
 def test_features_that_no_view_sees_together_take_two_views() -> None:
-    first = Feature(np.array([np.eye(2), np.zeros((2, 2))]), np.eye(2)[None])
-    second = Feature(np.array([np.zeros((2, 2)), np.eye(2)]), np.eye(2)[None])
+    first = FeatureInformation(np.array([np.eye(2), np.zeros((2, 2))]), np.eye(2)[None])
+    second = FeatureInformation(np.array([np.zeros((2, 2)), np.eye(2)]), np.eye(2)[None])
     found = fewest_views([first, second], np.array([3.0]))
     assert found.views == (0, 1)
     assert found.uncertainty[0] == pytest.approx(2.0, rel=1e-6)

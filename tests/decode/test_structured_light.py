@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulated_rigs import images_seen, surface_seen
 
-from characterisation.cloud_files import read_ply, write_ply
+from characterisation.cloud_files import read_cloud, write_cloud
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decode.image_context import ImageContext
@@ -245,8 +245,8 @@ def test_a_cloud_on_bent_rays_survives_the_disk(make_rig, tmp_path):
     rig = make_rig()
     cloud = decode(draw(rig, see_plane(rig), PHASE), rig)
     assert (cloud.grid.normalised is None) == (make_rig is ideal_rig)
-    write_ply(cloud, tmp_path / "cloud.ply")
-    again = read_ply(tmp_path / "cloud.ply")
+    write_cloud(cloud, tmp_path / "cloud.ply")
+    again = read_cloud(tmp_path / "cloud.ply")
     np.testing.assert_array_equal(again.points, cloud.points)
     np.testing.assert_array_equal(again.status, cloud.status)
     np.testing.assert_array_equal(again.grid.rays(), cloud.grid.rays())

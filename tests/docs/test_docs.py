@@ -15,7 +15,7 @@ import xarray as xr
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from characterisation.cloud_files import write_ply
+from characterisation.cloud_files import write_cloud
 from characterisation.coupon.patches import Coupon, measure_patches
 from characterisation.files.documents import Document, validate
 from characterisation.files.documents import fields_of as keys_of
@@ -394,7 +394,7 @@ def test_documented_variables_of_samples_and_map(patches):
 
 
 def test_documented_properties_of_a_cloud_file(tmp_path):
-    write_ply(flat_cloud(), tmp_path / "cloud.ply")
+    write_cloud(flat_cloud(), tmp_path / "cloud.ply")
     head = (tmp_path / "cloud.ply").read_bytes().partition(b"end_header")[0].decode()
     table = FORMATS.partition("<!-- columns: cloud.ply -->\n")[2].partition("\n\n")[0]
     documented = {

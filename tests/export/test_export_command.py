@@ -7,7 +7,7 @@ import trimesh
 from report.view_sphere_run import write_expecting_run
 from typer.testing import CliRunner
 
-from characterisation.cloud_files import write_ply
+from characterisation.cloud_files import write_cloud
 from characterisation.files.errors import InputError
 from mitsim.cli.program import app
 
@@ -27,7 +27,7 @@ def run_folder(tmp_path_factory):
 
 
 def test_a_cloud_goes_into_the_part_frame_in_metres(tmp_path):
-    write_ply(known_cloud(), tmp_path / "cloud.ply")
+    write_cloud(known_cloud(), tmp_path / "cloud.ply")
     (tmp_path / "pose.json").write_text(json.dumps({"world_from_sensor": POSE.matrix().tolist(), "covariance": None}))
     said = export(
         "cloud",
@@ -53,7 +53,7 @@ def test_a_cloud_without_points_is_written(tmp_path, suffix):
 
     cloud = known_cloud()
     empty = replace(cloud, points=cloud.points * float("nan"), status=cloud.status * 0 + 1)
-    write_ply(empty, tmp_path / "cloud.ply")
+    write_cloud(empty, tmp_path / "cloud.ply")
     assert "0 points" in export("cloud", tmp_path / "cloud.ply", "-o", tmp_path / f"out{suffix}")
     assert (tmp_path / f"out{suffix}").stat().st_size > 0
 
@@ -71,7 +71,7 @@ def test_a_cloud_without_points_is_written(tmp_path, suffix):
 )
 def test_bad_options_of_a_cloud_are_told(tmp_path, monkeypatch, options, message):
     monkeypatch.chdir(tmp_path)
-    write_ply(known_cloud(), tmp_path / "cloud.ply")
+    write_cloud(known_cloud(), tmp_path / "cloud.ply")
     bent = POSE.matrix()
     bent[0, 0] += 0.1
     (tmp_path / "bent.json").write_text(json.dumps({"world_from_sensor": bent.tolist()}))

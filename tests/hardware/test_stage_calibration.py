@@ -89,19 +89,6 @@ def test_a_turn_leaves_its_line_and_moves_all_else_by_rodrigues_formula():
     assert np.allclose(PAN_TILT.motion([0.4, -0.3])[0], motion[0, 0] @ motion[1, 0])
 
 
-@pytest.mark.parametrize("axes", [PAN_TILT, THREE])
-def test_derivatives_are_those_of_finite_differences(axes):
-    rng = np.random.default_rng(3)
-    angles, h = rng.uniform(-0.8, 0.8, (4, axes.count)), 1e-6
-    by_angles, by_parameters = axes.by_angles(angles), axes.by_parameters(angles)
-    for i, step in enumerate(np.eye(axes.count) * h):
-        slope = (axes.motion(angles + step) - axes.motion(angles - step)) / (2 * h)
-        assert np.allclose(by_angles[:, i], slope, atol=1e-6)
-    for i, step in enumerate(np.eye(4 * axes.count) * h):
-        slope = (axes.moved(step).motion(angles) - axes.moved(-step).motion(angles)) / (2 * h)
-        assert np.allclose(by_parameters[:, i], slope, atol=1e-6)
-
-
 def test_the_cross_matrix_is_the_cross_product():
     assert np.allclose(cross_matrix(np.array([1.0, 2, 3])) @ [4, 5, 6], np.cross([1, 2, 3], [4, 5, 6]))
 

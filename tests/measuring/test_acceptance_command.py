@@ -8,7 +8,7 @@ from scipy.stats import norm
 from seen_shapes import GRID, cloud_of, plane, sphere
 from shell import mitsim_here
 
-from characterisation.cloud_files import write_ply
+from characterisation.cloud_files import write_cloud
 from characterisation.files.errors import InputError
 from mitsim.cli.acceptance_request import read_artefacts
 
@@ -29,7 +29,7 @@ def walls(tmp_path, rng):
     for number in range(4):
         distance = plane([0, 0, 603], [0, 0, -1])
         distance[:8] = np.nan
-        write_ply(cloud_of(distance, SIGMA, rng), tmp_path / f"walls/{number}.ply")
+        write_cloud(cloud_of(distance, SIGMA, rng), tmp_path / f"walls/{number}.ply")
     return tmp_path
 
 
@@ -75,7 +75,7 @@ def test_without_a_distance_or_repeats_there_are_no_figures_that_need_them(walls
 def test_spheres_have_the_errors_of_diameter_and_spacing_that_they_were_made_with(tmp_path):
     """Without noise: PS and SD are the differences from what is called calibrated, PF is rounding alone."""
     left, right = sphere([-35, 0, 450], 20), sphere([35, 0, 460], 25)
-    write_ply(cloud_of(np.where(np.arange(GRID.width) < 100, left, right)), tmp_path / "bar.ply")
+    write_cloud(cloud_of(np.where(np.arange(GRID.width) < 100, left, right)), tmp_path / "bar.ply")
     true = float(np.hypot(70, 10))
     found, _ = of(
         tmp_path,

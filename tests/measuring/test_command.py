@@ -7,7 +7,7 @@ import pytest
 from seen_shapes import cloud_of, plane
 from typer.testing import CliRunner
 
-from characterisation.cloud_files import write_ply
+from characterisation.cloud_files import write_cloud
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import write_capture
 from mitsim.capture.simulated.rendering import Rendering
@@ -31,7 +31,7 @@ def run(*arguments):
 def clouds(tmp_path, rng):
     """Three clouds of one plane, in a folder."""
     for number in range(3):
-        write_ply(cloud_of(plane([0, 0, 500], [0, 0.3, -1]), 0.1, rng), tmp_path / f"{number}.ply")
+        write_cloud(cloud_of(plane([0, 0, 500], [0, 0.3, -1]), 0.1, rng), tmp_path / f"{number}.ply")
     return tmp_path
 
 
@@ -78,7 +78,7 @@ def test_a_difference_with_its_picture(clouds):
 
 
 def test_what_is_not_possible_ends_with_one(clouds, rng):
-    write_ply(cloud_of(rng.uniform(300, 900, (160, 200))), clouds / "noise.ply")
+    write_cloud(cloud_of(rng.uniform(300, 900, (160, 200))), clouds / "noise.ply")
     done = run(clouds / "noise.ply", "--plane", "top=20,20,100,80")
     assert done.exit_code == 1
     assert "does the window show one plane?" in done.stdout
@@ -130,5 +130,5 @@ def test_a_task_by_its_scene_and_the_pose_of_the_capture(scenes, tmp_path):
     assert 0.8 * gap["points_given"] < gap["points"] <= gap["points_given"]
     with pytest.raises(InputError, match="the pose of the sensor"):
         cloud = tmp_path / "cloud.ply"
-        write_ply(cloud_of(plane([0, 0, 500], [0, 0, -1])), cloud)
+        write_cloud(cloud_of(plane([0, 0, 500], [0, 0, -1])), cloud)
         run(cloud, "--task", folder / "task.toml", "--scene", folder / "matt_white.xml")

@@ -10,7 +10,7 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 from shell import mitsim_here
 
-from characterisation.cloud_files import write_ply
+from characterisation.cloud_files import write_cloud
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.decode.input_clouds import read_cloud
@@ -56,7 +56,7 @@ def save(path, points):
 
 def decoded(path, points):
     status = np.where(np.isfinite(points[..., 0]), Status.VALID, Status.NO_SURFACE).astype(np.uint8)
-    write_ply(PointCloud(points, status, GRID, "known", "simulated"), path)
+    write_cloud(PointCloud(points, status, GRID, "known", "simulated"), path)
     return path
 
 

@@ -139,16 +139,16 @@ def _cloud(folder):
     sys.path.insert(0, str(ROOT / "tests"))
     from report.conftest import cloud
 
-    from characterisation.cloud_files import write_ply
+    from characterisation.cloud_files import write_cloud
 
-    write_ply(cloud("simulated", 1), folder / "cloud.ply")
+    write_cloud(cloud("simulated", 1), folder / "cloud.ply")
     return folder / "cloud.ply"
 
 
 def _read_cloud(path):
-    from characterisation.cloud_files import read_ply
+    from characterisation.cloud_files import read_cloud
 
-    read_ply(path)
+    read_cloud(path)
 
 
 def _foreign(folder):

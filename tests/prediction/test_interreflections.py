@@ -11,7 +11,7 @@ from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decode.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
-from mitsim.maps.prediction.interreflections import InterreflectionEffect, Loss, found_share
+from mitsim.maps.prediction.interreflections import InterreflectionEffect, LossCurve, found_share
 from mitsim.maps.prediction.perturbation import SceneView
 from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.sensor.preset import load_sensor
@@ -104,7 +104,7 @@ def test_coarse_and_cheap_it_is_what_the_full_render_shows(n10, scenes):
 
 
 def test_points_are_lost_as_the_ratio_grows_and_none_without():
-    loss = Loss(half=3.0, half_interval=(2, 4), steepness=2.0, steepness_interval=(1, 3))
+    loss = LossCurve(half=3.0, half_interval=(2, 4), steepness=2.0, steepness_interval=(1, 3))
     found = found_share(np.array([0.0, 0.1, 3.0, 9.0, math.inf]), loss)
     np.testing.assert_allclose(found, [1, 1 / (1 + (0.1 / 3) ** 2), 0.5, 0.1, 0])
 

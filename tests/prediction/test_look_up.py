@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -159,10 +158,9 @@ def test_noise_and_loss_of_the_fast_way_are_those_of_the_map(predictors, part):
     assert np.array_equal(again.points, cloud.points, equal_nan=True)
 
 
-def test_a_face_that_the_map_does_not_know_is_told_where_it_is_seen(predictors, part):
+def test_a_face_that_the_map_does_not_know_is_told_where_it_is_seen(predictors, scenes):
     predictor, performance_map = predictors["ensenso-n10"], map_of("ensenso-n10")
-    finish = replace(part.finishes[0], roughness=9.0)
-    rough_plate = replace(part, finishes=(finish, *part.finishes[1:]))
+    rough_plate = load_scene(scenes / "two_pillars/two_pillars.xml", 850, {"plane_Ra": "9"})
     characterised = CharacterisedScene(rough_plate, performance_map)
     with pytest.raises(InputError, match="9 um"):
         predictor.look_up(characterised, POSES[0])

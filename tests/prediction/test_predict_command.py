@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from characterisation.cloud_files import read_ply
+from characterisation.cloud_files import read_cloud
 from characterisation.coupon.residual_field import autocorrelation
 from characterisation.point_cloud import PointCloud
 from mitsim.cli.program import app
@@ -37,7 +37,7 @@ def predicted(scenes: Path, folder: Path, *options: str) -> PointCloud:
         ],
     )
     assert done.exit_code == 0, done.output
-    cloud = read_ply(file)
+    cloud = read_cloud(file)
     assert f"valid\t{cloud.valid.sum()}" in done.stdout
     return cloud
 

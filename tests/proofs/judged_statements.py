@@ -1,7 +1,7 @@
 """Judge the statements and chosen views of cases: coverage of the intervals, false accepts, regrets.
 
 Signal chain: judged cases (:mod:`tests.proofs.statement_run`) -> shares of errors inside the stated intervals,
-shares of worlds that falsely accept a part, and regrets of chosen views (:mod:`characterisation.statements.judgement`).
+shares of worlds that falsely accept a part, and regrets of chosen views (:mod:`tests.proofs.judgement`).
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.scores.screening import LEAST_MEASURABLE
-from characterisation.statements.judgement import Regret, Share, falsely_accepted, pooled_share, regret, share, within
+from characterisation.statements.coverage import Share, share
 from mitsim.study.virtual.world import FINISH_DAYS
 from mitsim.views.view_scores import screening_risk
+from tests.proofs.judgement import Regret, falsely_accepted, pooled_share, regret, within
+from tests.proofs.screening_figures import LEAST_MEASURABLE
 from tests.proofs.statement_run import JudgedCase, JudgedView
 
 Floats = NDArray[np.float64]

@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, Status
 from mitsim.maps.prediction import Predictor, performance
-from mitsim.maps.prediction.interreflections import InterreflectionEffect, Loss
+from mitsim.maps.prediction.interreflections import InterreflectionEffect, LossCurve
 from mitsim.running.progress import say, track
 from mitsim.study import Study
 from mitsim.study.virtual.beyond_map import CODED, FLIGHT, MATCHED, kind_of
@@ -106,7 +106,7 @@ def seen_points(
     return SeenPoints(fraction[used], rho[used], found[used])
 
 
-def fitted_loss(cases: Sequence[Sequence[SeenPoints]], seed: int = 0, resamples: int = _RESAMPLES) -> Loss:
+def fitted_loss(cases: Sequence[Sequence[SeenPoints]], seed: int = 0, resamples: int = _RESAMPLES) -> LossCurve:
     """Return the constants of g(rho) with the largest likelihood over the views of all cases, with 95 % intervals.
 
     Raises
@@ -123,7 +123,7 @@ def fitted_loss(cases: Sequence[Sequence[SeenPoints]], seed: int = 0, resamples:
         drawn = np.array([_most_likely(views, _drawn_again(sizes, rng)) for _ in range(resamples)])
     low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
     half, steepness = (round(float(value), 3) for value in best)
-    return Loss(
+    return LossCurve(
         half=half,
         half_interval=(round(float(low[0]), 3), round(float(high[0]), 3)),
         steepness=steepness,
@@ -157,7 +157,7 @@ def _most_likely(views: Sequence[SeenPoints], times: NDArray[Any]) -> Floats:
     return np.asarray(np.exp(solution.x))
 
 
-def losses_document(command: str, cases: Sequence[str], losses: dict[str, Loss]) -> str:
+def losses_document(command: str, cases: Sequence[str], losses: dict[str, LossCurve]) -> str:
     """Return the data file of :func:`mitsim.maps.prediction.interreflections.losses` as TOML."""
     lines = [
         "# Share of points g(rho) = 1 / (1 + (rho / half)^steepness) that are found if interreflected light is rho",

@@ -1,7 +1,7 @@
 """Write the page on how well screening orders views: recall, rank correlation and probability of a value, in Markdown.
 
 Signal chain: judged cases (:mod:`tests.proofs.screening_run`) -> values of every measurement and score
-(:mod:`characterisation.scores.screening`) -> ``scores.csv``, ``reliability.png``, ``order.png`` -> ``scores.md``.
+(:mod:`tests.proofs.screening_figures`) -> ``scores.csv``, ``reliability.png``, ``order.png`` -> ``scores.md``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from characterisation.plots.style import BLUE, INK, MUTED, VERMILION, drawing
-from characterisation.scores.screening import (
+from mitsim.report.style import write_png
+from tests.proofs.part_cases import PartCase
+from tests.proofs.screening_figures import (
     Screened,
     attainable_recall,
     ceiling,
@@ -26,8 +28,6 @@ from characterisation.scores.screening import (
     recall,
     reliability,
 )
-from mitsim.report.style import write_png
-from tests.proofs.part_cases import PartCase
 from tests.proofs.screening_run import ALONE, COSINE, POINTS, PREDICTED, TALK, JudgedScreening
 from tests.proofs.tables import markdown, number, write_csv
 

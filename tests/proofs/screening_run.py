@@ -32,7 +32,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import Status
-from characterisation.scores.screening import Screened
 from characterisation.statements.selection import chance_after, posterior
 from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
@@ -42,6 +41,7 @@ from mitsim.study.virtual.race import FIRST, first_of_each, prior_risk
 from mitsim.views.view_scores import RAYS, screening_risk
 from tests.proofs.case_trials import days, keep_trials, measure_worlds, measured_truth, trials_by_kind
 from tests.proofs.part_cases import PartCase
+from tests.proofs.screening_figures import Screened
 
 Floats = NDArray[np.float64]
 
@@ -168,7 +168,8 @@ def measured_cost(cost: Floats, u: Floats, chance: Floats, once: Floats, count: 
 
 def seen_by_all(study: Study, predictor: Predictor) -> Floats:
     """Return the sum of cos(theta) / |V|^2 [1/mm^2] over the points that all eyes see, (view, feature)."""
-    looking, step = predictor.thinned_to(RAYS)
+    looking = predictor.thinned_to(RAYS)
+    step = looking.step
     scene = study.scene
     shapes = [scene.names.index(name) for name in study.task.shapes]
     sums = np.zeros((len(study.views), len(shapes)))

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from characterisation.files.atomic_io import atomic_write
 from characterisation.plots.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing
-from characterisation.statements.judgement import Regret, Share, share
+from characterisation.statements.coverage import Share, share
 from mitsim.report.style import write_png
 from tests.proofs.judged_statements import (
     PREDICTED,
@@ -27,6 +27,7 @@ from tests.proofs.judged_statements import (
     pooled,
     pooled_coverage,
 )
+from tests.proofs.judgement import Regret
 from tests.proofs.statement_csv import write_coverage_csv, write_regret_csv
 from tests.proofs.statement_run import JudgedCase
 from tests.proofs.tables import markdown, number

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from test_ensenso_files import LEFT_ROTATION, files, intrinsic, node, pack
 from typer.testing import CliRunner
 
-from characterisation.cloud_files import WrittenFrame, read_ply, write_ply
+from characterisation.cloud_files import WrittenFrame, read_cloud, write_cloud
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
@@ -142,7 +142,7 @@ def test_decode_writes_the_cloud_in_the_workspace(tmp_path):
     written = np.frombuffer(body, "<f4, <f4, <f4, <f4, <u2, <u2, <i2", WIDTH * HEIGHT)
     points = np.stack([written["f0"], written["f1"], written["f2"]], axis=-1).reshape(HEIGHT, WIDTH, 3)
     np.testing.assert_allclose(points, moved, atol=1e-3)
-    assert off_plane(read_ply(out).points) < 2e-3  # read again it is in the sensor frame
+    assert off_plane(read_cloud(out).points) < 2e-3  # read again it is in the sensor frame
     capture = read_capture(tmp_path / "c")
     with pytest.raises(InputError, match=r"--points-in: found 'robot'; allowed: sensor \| workspace"):
         written_frame(capture, "robot", "c")
@@ -167,7 +167,7 @@ def test_a_cloud_written_in_any_frame_is_the_cloud_that_was_written(tmp_path_fac
     depth = np.where(rng.random((HEIGHT, WIDTH)) < 0.9, rng.uniform(400, 800, (HEIGHT, WIDTH)), np.nan)
     cloud = decode_depth_map(depth.astype(np.float32), geometry, 300, 900, sensor="s", source="device")
     path = tmp_path_factory.mktemp("cloud") / "c.ply"
-    write_ply(cloud, path, WrittenFrame("of a robot", moved.matrix()))
-    back = read_ply(path)
+    write_cloud(cloud, path, WrittenFrame("of a robot", moved.matrix()))
+    back = read_cloud(path)
     np.testing.assert_array_equal(back.status, cloud.status)
     np.testing.assert_allclose(back.points, cloud.points, atol=2e-3)

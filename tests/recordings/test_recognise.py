@@ -19,7 +19,7 @@ from test_ensenso_files import files as ensenso_files
 from test_ensenso_files import node, pack, unpack
 from typer.testing import CliRunner
 
-from characterisation.cloud_files import read_ply
+from characterisation.cloud_files import read_cloud
 from characterisation.files.atomic_io import HOST
 from characterisation.files.errors import InputError
 from mitsim.capture.calibration import calibration_table
@@ -203,7 +203,7 @@ def test_the_command_imports_and_the_originals_are_untouched(tmp_path, monkeypat
     capture = read_capture(folder)
     assert capture.source == "device"
     run("decode", folder, "-o", tmp_path / "out.ply")
-    cloud = read_ply(tmp_path / "out.ply")
+    cloud = read_cloud(tmp_path / "out.ply")
     share = np.isfinite(CLOUD[..., 2]).mean()
     assert cloud.valid.mean() == pytest.approx(share, abs=1e-9)
     scale = 0.5 if "--scale" in options else 1.0
@@ -216,7 +216,7 @@ def test_the_command_keeps_to_the_range_that_was_given(tmp_path):
     run("import", tmp_path / "a.pcd", "-o", tmp_path / "c", "--range", 690, 710)
     run("decode", tmp_path / "c", "-o", tmp_path / "c.ply")
     z = CLOUD[..., 2]
-    np.testing.assert_array_equal(read_ply(tmp_path / "c.ply").valid, (z >= 690) & (z <= 710))
+    np.testing.assert_array_equal(read_cloud(tmp_path / "c.ply").valid, (z >= 690) & (z <= 710))
 
 
 def test_a_sensor_gives_its_name_and_its_range(tmp_path):

@@ -11,7 +11,7 @@ from simulated_rigs import images_seen, save_calibration, save_images, surface_s
 from typer.testing import CliRunner
 
 import mitsim as ms
-from characterisation.cloud_files import read_ply
+from characterisation.cloud_files import read_cloud
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture
 from mitsim.capture.recordings.image_folder import read_image_folder
@@ -67,7 +67,7 @@ def test_the_smallest_file_of_the_how_to_imports_and_decodes_at_the_first_try(tm
     done = run("decode", tmp_path / "capture", "-o", tmp_path / "cloud.ply")
     assert "50 to 20000 mm" in done.output
     assert "sigma of the points: that of a uniform error over the width of a stripe" in done.output
-    cloud = read_ply(tmp_path / "cloud.ply")
+    cloud = read_cloud(tmp_path / "cloud.ply")
     assert cloud.valid.mean() > 0.8
     off = np.linalg.norm(cloud.points - truth, axis=-1)[cloud.valid]
     assert np.median(off) < 4 < 20 > np.percentile(off, 99)  # a stripe of 1 px is worth 12 mm
@@ -209,7 +209,7 @@ def test_fringes_without_an_imager_have_the_sigma_of_their_own_noise_and_decode_
     assert "bits_from" in done.output
     done = run("decode", tmp_path / "capture", "--range", 300, 800, "-o", tmp_path / "cloud.ply")
     assert "sigma of the points: from the contrast of the fringes and the residuals of their fit, 16 DN" in done.output
-    assert np.isfinite(read_ply(tmp_path / "cloud.ply").sigma).sum() > 5000
+    assert np.isfinite(read_cloud(tmp_path / "cloud.ply").sigma).sum() > 5000
 
 
 def test_a_program_decodes_with_a_rig_and_cannot_simulate_it(tmp_path):

@@ -14,7 +14,7 @@ from scipy.io import savemat
 from simulated_rigs import images_seen, save_calibration, save_images, surface_seen
 from typer.testing import CliRunner
 
-from characterisation.cloud_files import read_ply
+from characterisation.cloud_files import read_cloud
 from mitsim.cli.program import app
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import load_sensor
@@ -217,7 +217,7 @@ def test_a_rig_file_of_the_how_to_works_at_the_first_try(tmp_path, name):
         assert done.exit_code == 0, done.output
         output += done.output
     assert "warning" not in output, output
-    cloud = read_ply(tmp_path / "cloud.ply")
+    cloud = read_cloud(tmp_path / "cloud.ply")
     points = cloud.points[cloud.valid].astype(float)
     off = np.abs(distance_from_surface(points))
     print(f"{name}: {cloud.valid.mean():.2f} valid, {np.median(off):.2f} mm, 95 % {np.percentile(off, 95):.2f} mm")

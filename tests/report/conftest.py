@@ -11,10 +11,10 @@ import pytest
 import trimesh
 import xarray as xr
 
-from characterisation.cloud_files import write_ply
+from characterisation.cloud_files import write_cloud
 from characterisation.coupon.patch_table import patch_table
 from characterisation.files.atomic_io import write_netcdf
-from characterisation.maps.performance_map import PerformanceMap
+from characterisation.maps.performance_map import SCHEMA_VERSION, PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.scores.view_score import score_views, view_statistics
 from characterisation.tasks.evaluation import Feature, Measurement, Task
@@ -53,7 +53,7 @@ def make_map() -> PerformanceMap:
                 "finish": ("sample", ["matt_white", "steel/ground"]),
                 "roughness": ("sample", [np.nan, 0.4]),
             },
-            {"source": "simulated", "name": "test map"},
+            {"source": "simulated", "name": "test map", "schema_version": SCHEMA_VERSION},
         )
     )
 
@@ -141,8 +141,8 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
     K = np.array([[40.0, 0, 15.5], [0, 40.0, 11.5], [0, 0, 1]])
     camera = Camera(K, np.zeros(0), WIDTH, HEIGHT)
     for view in checked:
-        write_ply(cloud("predicted", view), folder / "clouds" / f"predicted_{view:04d}.ply")
-        write_ply(cloud("simulated", 100 + view), folder / "clouds" / f"rendered_{view:04d}.ply")
+        write_cloud(cloud("predicted", view), folder / "clouds" / f"predicted_{view:04d}.ply")
+        write_cloud(cloud("simulated", 100 + view), folder / "clouds" / f"rendered_{view:04d}.ply")
         images = {name: rng.integers(0, 60, (1, HEIGHT, WIDTH)).astype(np.uint8) for name in ("left", "right")}
         rig = Rig({"left": camera, "right": camera})
         capture = Capture("test-sensor", "active_stereo", "simulated", rig, images)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from characterisation.cloud_files import write_ply
+from characterisation.cloud_files import write_cloud
 from characterisation.files.atomic_io import write_netcdf
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, ViewGrid
@@ -100,7 +100,7 @@ def test_a_run_of_before_is_refused_with_what_to_do(folder, name):
 def test_a_cloud_on_another_grid_is_refused(folder):
     points, status = np.full((4, 5, 3), np.nan, np.float32), np.ones((4, 5), np.uint8)
     other = PointCloud(points, status, ViewGrid(1, 1, 0, 0, 5, 4), "s", "simulated")
-    write_ply(other, folder / "clouds" / "rendered_0004.ply")
+    write_cloud(other, folder / "clouds" / "rendered_0004.ply")
     with pytest.raises(InputError, match="found 4 x 5 pixels; allowed: 24 x 32"):
         read_all(folder)
 

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from characterisation.cloud_files import read_ply
+from characterisation.cloud_files import read_cloud
 from characterisation.files.atomic_io import write_netcdf
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
@@ -166,7 +166,7 @@ def test_a_cloud_on_the_page_is_the_cloud_of_the_file(data, text, expecting):
         count = len(raw) // 8
         assert data["clouds"][str(view)]["shown"] == data["clouds"][str(view)]["count"] == count == 300
         steps = np.frombuffer(raw, "<u2", 3 * count).reshape(3, count).T
-        cloud = read_ply(expecting / "clouds" / f"predicted_{view:04d}.ply")
+        cloud = read_cloud(expecting / "clouds" / f"predicted_{view:04d}.ply")
         pose = scores["world_from_sensor"].sel(view=view).values
         expected = cloud.points[cloud.valid].astype(float) @ pose[:3, :3].T + pose[:3, 3]
         np.testing.assert_allclose(steps * box["step"] + box["origin"], expected, atol=0.51 * box["step"])

@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 import xarray as xr
 
-from characterisation.cloud_files import write_ply
+from characterisation.cloud_files import write_cloud
 from characterisation.files.atomic_io import write_netcdf
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.sensor.transforms import look_at
@@ -73,7 +73,7 @@ def write_expecting_run(folder: Path) -> Path:
     write_netcdf(scores, folder / "scores.nc")
 
     for view in WITH_CLOUD:
-        write_ply(cloud_of(view), folder / "clouds" / f"predicted_{view:04d}.ply")
+        write_cloud(cloud_of(view), folder / "clouds" / f"predicted_{view:04d}.ply")
     trimesh.creation.box((240, 240, 1)).export(folder / "part.ply")
     about = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     (folder / "run.json").write_text(json.dumps(about | {"view_sets": [SET]}), encoding="utf-8")

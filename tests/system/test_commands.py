@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from shell import ROOT, mitsim, mitsim_here
 
-from characterisation.cloud_files import read_ply
+from characterisation.cloud_files import read_cloud
 from characterisation.files.atomic_io import HOST
 from mitsim.capture.folder import read_capture
 from mitsim.capture.simulated.truth import read_exr
@@ -103,7 +103,7 @@ def test_render_decode_and_back(tmp_path):
     assert capture.images["left"].shape == (1, 480, 752)
     out = mitsim_here("decode", tmp_path / "capture", "--range", 450, 650, "-o", tmp_path / "cloud.ply").stdout
     counts = dict(line.split("\t") for line in out.splitlines())
-    cloud = read_ply(tmp_path / "cloud.ply")
+    cloud = read_cloud(tmp_path / "cloud.ply")
     assert int(counts["valid"]) == cloud.valid.sum() > 8000
     assert sum(map(int, counts.values())) == cloud.status.size
     world = capture.world_from_sensor.points(cloud.points[cloud.valid].astype(float))

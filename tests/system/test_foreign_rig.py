@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from typer.testing import CliRunner
 
-from characterisation.cloud_files import read_ply
+from characterisation.cloud_files import read_cloud
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.program import app
@@ -99,7 +99,7 @@ def test_a_rig_renders_and_its_images_come_back_through_import(tmp_path):
     assert done.exit_code == 0, done.output
     done = run.invoke(app, ["decode", str(tmp_path / "c"), "-o", str(tmp_path / "cloud.ply")])
     assert done.exit_code == 0, done.output
-    again = read_ply(tmp_path / "cloud.ply")
+    again = read_cloud(tmp_path / "cloud.ply")
     assert again.source == "device"
     np.testing.assert_array_equal(again.points, direct.points)
     np.testing.assert_array_equal(again.status, direct.status)

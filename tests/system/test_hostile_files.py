@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from characterisation.cloud_files import read_ply, write_ply
+from characterisation.cloud_files import read_cloud, write_cloud
 from characterisation.files.documents import Document, read_toml
 from characterisation.files.errors import InputError
 from characterisation.maps.shipped import map_path
@@ -86,7 +86,7 @@ def test_what_is_no_file_is_not_read(tmp_path, kind):
         place = Path("/dev/zero")
     readers = [
         lambda p: read_toml(p, Number),
-        read_ply,
+        read_cloud,
         read_grey,
         checked_xml,
         read_profile,
@@ -168,14 +168,14 @@ def test_clouds_with_points_at_infinity(tmp_path, value):
     grid = ViewGrid(40.0, 40.0, 1.5, 1.5, 4, 4)
     points, status = np.full((4, 4, 3), np.nan, np.float32), np.full((4, 4), Status.NO_SURFACE, np.uint8)
     points[1, 1], status[1, 1] = (0.0, 0.0, 500.0), Status.VALID
-    write_ply(PointCloud(points, status, grid, "s", "simulated"), tmp_path / "a.ply")
+    write_cloud(PointCloud(points, status, grid, "s", "simulated"), tmp_path / "a.ply")
     data = (tmp_path / "a.ply").read_bytes()
     old = np.float32(500.0).tobytes()
     assert data.count(old) == 1
     (tmp_path / "a.ply").write_bytes(data.replace(old, np.float32(value).tobytes()))
-    refused(read_ply, tmp_path / "a.ply")
+    refused(read_cloud, tmp_path / "a.ply")
     (tmp_path / "b.ply").write_bytes(data.replace(b'"fx": 40.0', b'"fx": 1e999'))
-    refused(read_ply, tmp_path / "b.ply")
+    refused(read_cloud, tmp_path / "b.ply")
 
 
 def test_text_of_a_quarter_of_a_gigabyte(monkeypatch):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from characterisation.cloud_files import read_ply
+from characterisation.cloud_files import read_cloud
 from characterisation.files.documents import fields_of
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
@@ -77,7 +77,7 @@ class Taken:
 
     def cloud(self, name: str, sensor: str | None = None):
         decode(self.folder, self.folder.parent / name, sensor)
-        return read_ply(self.folder.parent / name)
+        return read_cloud(self.folder.parent / name)
 
 
 @pytest.fixture(scope="module", params=OWN)
@@ -104,7 +104,7 @@ def test_the_cloud_is_the_same_with_and_without_the_sensor_file(taken, capsys):
     write_capture(with_settings(default, decoder=None, imager=None), old, overwrite=True)
     decode(old, taken.folder.parent / "old.ply")
     assert "; default settings, since settings.json has none" in capsys.readouterr().err
-    other = read_ply(taken.folder.parent / "old.ply")
+    other = read_cloud(taken.folder.parent / "old.ply")
     assert 1000 < with_file.valid.sum() != other.valid.sum()
 
 

@@ -11,7 +11,7 @@ from plain_pages import without_pictures
 from shell import ROOT, mitsim_here
 from small_study import MEASUREMENTS, few_measurements
 
-from characterisation.cloud_files import read_ply
+from characterisation.cloud_files import read_cloud
 from characterisation.maps.performance_map import PerformanceMap
 from tests.smaller_sensors import coarse_sensor
 
@@ -150,7 +150,7 @@ def test_a_run_is_exported_for_other_tools(study_folder, tmp_path):
     assert (tmp_path / "views.mod").read_text().count("robtarget view_") == views
     cloud = next((folder / "out/clouds").glob("predicted_*.ply"))
     said = mitsim_here("export", "cloud", cloud, "-o", tmp_path / "cloud.pcd").stderr
-    points = len(read_ply(cloud).points[read_ply(cloud).valid])
+    points = len(read_cloud(cloud).points[read_cloud(cloud).valid])
     assert f"{points} points, {points} of them with a covariance" in said
 
 
@@ -233,7 +233,7 @@ def test_report_and_predict_from_what_run_left(study_folder, tmp_path):
         "-o",
         tmp_path / "cloud.ply",
     )
-    cloud = read_ply(tmp_path / "cloud.ply")
+    cloud = read_cloud(tmp_path / "cloud.ply")
     assert cloud.source == "predicted"
     assert set(cloud.feature_names) >= {"plane", "pillar1", "pillar2"}
     assert cloud.valid.sum() > 1000

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from characterisation.files.documents import read_toml
 from mitsim.cli.program import app
-from mitsim.maps.prediction.interreflections import Loss, Losses, losses
+from mitsim.maps.prediction.interreflections import LossCurve, Losses, losses
 from tests.proofs import loss_fit
 from tests.proofs.loss_fit import SeenPoints, fitted_loss, losses_document
 from tests.smaller_sensors import coarse_sensor
@@ -46,7 +46,7 @@ def test_points_without_interreflections_do_not_enter_the_fit():
 
 
 def test_the_data_file_is_read_as_it_was_written(tmp_path):
-    loss = Loss(half=2.0, half_interval=(1.5, 2.5), steepness=1.0, steepness_interval=(0.5, 1.5))
+    loss = LossCurve(half=2.0, half_interval=(1.5, 2.5), steepness=1.0, steepness_interval=(0.5, 1.5))
     (tmp_path / "losses.toml").write_text(losses_document("command", ["a", "b"], {"matched": loss, "coded": loss}))
     found = read_toml(tmp_path / "losses.toml", Losses)
     assert found == Losses(command="command", cases=["a", "b"], matched=loss, coded=loss)

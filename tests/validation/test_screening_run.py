@@ -6,9 +6,9 @@ import xarray as xr
 from known_trials import NAMES, rows
 
 import tests.proofs.screening_run as screening_run
-from characterisation.scores import screening
 from characterisation.statements.selection import chance_after
 from mitsim.study import session
+from tests.proofs import screening_figures as screening
 from tests.proofs.part_cases import read_part_cases
 from tests.proofs.screening_page import cells_of, described_screening, write_screening_page
 from tests.proofs.screening_run import (

@@ -111,7 +111,16 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
     """Decode a capture of a coupon and measure its patches.
 
     Pose and calibration are those of the capture, if it has them: a stage stops near its requested position and is read
-    back, and a device has its own calibration. ``geometry`` is that of the sensor's rig.
+    back, and a device has its own calibration.
+
+    Parameters
+    ----------
+    geometry
+        That of the rig of ``sensor``.
+    sensor
+        Sensor of the campaign; pose and calibration are those of the capture, if it has them.
+    keep_images
+        Whether the result contains the capture.
     """
     coupon = shot.series.sample.at(coupon_place(capture, shot))
     if own_sensor(capture, sensor) is not sensor:
@@ -142,7 +151,17 @@ def own_sensor(capture: Capture, sensor: Sensor) -> Sensor:
 
 
 def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: Sensor) -> PointCloud:
-    """Decode the part of a capture that shows the coupon."""
+    """Decode the part of a capture that shows the coupon.
+
+    Parameters
+    ----------
+    coupon
+        At its pose in the sensor frame.
+    geometry
+        That of the capture.
+    sensor
+        Gives decoder and imager.
+    """
     grid = geometry.grid
     corners = grid.project(coupon.corners())
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, [grid.width - 1, grid.height - 1])
@@ -232,27 +251,17 @@ def _found_shot(place: Path, campaign: Campaign) -> Shot:
     label = shown.get("sample") if isinstance(shown, dict) else None
     labels = [sample.label() for sample in campaign.samples]
     if label not in labels:
-        raise InputError(
-            place / "settings.json",
-            "coupon.sample",
-            repr(label),
-            ", ".join(labels),
-            "the label of a sample of the campaign",
-        )
+        hint = "the label of a sample of the campaign"
+        raise InputError(place / "settings.json", "coupon.sample", repr(label), ", ".join(labels), hint)
     if world_from_sensor is None:
         raise InputError(place / "pose.json", "world_from_sensor", "null", "the pose, in the coupon's frame")
     pose = world_from_sensor.inverse()
     distance = float(np.linalg.norm(pose.translation - campaign.sensor.rig.reference.sensor_from_camera.translation))
     nominal = min(campaign.distances, key=lambda planned: abs(np.log(distance / planned)))
     if abs(distance / nominal - 1) > DISTANCE_SLACK:
-        known = ", ".join(f"{planned:g}" for planned in campaign.distances)
-        raise InputError(
-            place / "pose.json",
-            "distance",
-            f"{distance:.1f} mm",
-            f"within 5 % of {known} mm",
-            "add this distance to distances_mm",
-        )
+        allowed = f"within 5 % of {', '.join(f'{planned:g}' for planned in campaign.distances)} mm"
+        hint = "add this distance to distances_mm"
+        raise InputError(place / "pose.json", "distance", f"{distance:.1f} mm", allowed, hint)
     series = next(
         s for s in campaign.series if s.variant is None and s.distance == nominal and s.sample.label() == label
     )

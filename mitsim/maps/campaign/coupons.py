@@ -82,17 +82,12 @@ def load_sample(recipe: CouponRecipe, asked: tuple[Path, str] | None = None) -> 
     finish = scene.finishes[0]
     if len(scene.names) != 1 or finish is None:
         found = f"{len(scene.names)} shapes" if finish else "a BSDF without a known finish"
-        raise InputError(
-            path,
-            where,
-            found,
-            "one flat shape with a BSDF of mitsim (machined_metal, matt_white, gloss_paint, powder_coat)",
-        )
+        allowed = "one flat shape with a BSDF of mitsim (machined_metal, matt_white, gloss_paint, powder_coat)"
+        raise InputError(path, where, found, allowed)
     (x0, y0, z0), (x1, y1, z1) = scene.bounds
     if max(abs(z0), abs(z1)) > 1e-3 * (x1 - x0) or abs(x0 + x1) + abs(y0 + y1) > 1e-3 * (x1 - x0):
-        raise InputError(
-            path, where, "a coupon at another place", "a flat shape in the plane z = 0, centred, normal +z"
-        )
+        allowed = "a flat shape in the plane z = 0, centred, normal +z"
+        raise InputError(path, where, "a coupon at another place", allowed)
     # the scatter represents files that the scene names, a trace or a height map, and the deviation
     origin = Path(scene.where).read_text(encoding="utf-8") + json.dumps(dict(recipe.parameters), sort_keys=True)
     origin += repr(finish.scatter)

@@ -26,13 +26,12 @@ from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.validation import Pair
 from characterisation.point_cloud import PointCloud
-from mitsim.decode.cloud import Geometry, sensor_geometry
 from mitsim.maps.campaign.acquire import CaptureSource, coupon_cloud, coupon_place, own_sensor, simulated_source
 from mitsim.maps.campaign.coupons import Sample
 from mitsim.maps.campaign.live import LiveCampaign, plan_live
-from mitsim.maps.campaign.orders import Order, order_of, prepared_sensor
+from mitsim.maps.campaign.orders import Order, PreparedSensor, order_of, prepared_sensor
 from mitsim.maps.campaign.plan import Campaign, CampaignFile, Shot, plan_campaign
-from mitsim.maps.prediction import Predictor, performance
+from mitsim.maps.prediction import performance
 from mitsim.sensor.preset import Sensor
 
 #: relative extent in |V| of a patch on either side of its middle
@@ -41,8 +40,11 @@ PATCH_REACH = 0.015
 #: relative margin of a live stage from the ends of a map's distances, for the extent of a tilted coupon
 LIVE_MARGIN = 0.03
 
-#: relative standard error of sigma above which a pose is repeated, and the largest factor on the repeats
-LARGEST_SIGMA_ERROR, MOST_REPEATS = 0.03, 4
+#: relative standard error of sigma above which a pose is repeated
+LARGEST_SIGMA_ERROR = 0.03
+
+#: largest factor on the repeats
+MOST_REPEATS = 4
 
 #: [rad]
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
@@ -101,7 +103,14 @@ def held_out_live(
 ) -> LiveCampaign:
     """Return a campaign with a device for comparison with a map, at the stage positions within the map's distances.
 
-    The map may be that of a simulated sensor, which compares the simulation with the device.
+    Parameters
+    ----------
+    path, file
+        The campaign file, and its content.
+    sensor
+        Preset or file, as in :func:`~mitsim.maps.campaign.live.plan_live`.
+    performance_map
+        To be compared; it may be that of a simulated sensor, which compares the simulation with the device.
 
     Raises
     ------
@@ -154,25 +163,18 @@ def held_out_shots(campaign: Campaign, count: int, seed: int) -> list[Shot]:
 def compare(
     campaign: Campaign, performance_map: PerformanceMap, shots: list[Shot], take: CaptureSource, repeats: int = 1
 ) -> Iterator[Pair]:
-    """Take and predict each shot in this process; see :func:`compared`."""
-    prepared = PreparedSensor.of(campaign.sensor)
+    """Take and predict each shot in this process.
+
+    Parameters
+    ----------
+    take
+        Takes a shot.
+    repeats
+        Captures of each shot, as in :func:`compared`.
+    """
+    prepared = PreparedSensor(campaign.sensor)
     for shot in shots:
         yield compared(shot, prepared, performance_map, take, repeats)
-
-
-@dataclass(frozen=True)
-class PreparedSensor:
-    """A sensor with its geometry and predictor, for any number of shots."""
-
-    sensor: Sensor
-    geometry: Geometry
-    predictor: Predictor
-
-    @classmethod
-    def of(cls, sensor: Sensor, geometry: Geometry | None = None) -> PreparedSensor:
-        """Prepare a sensor; its geometry may be known already."""
-        geometry = geometry or sensor_geometry(sensor)
-        return cls(sensor, geometry, Predictor.of_sensor(sensor, geometry))
 
 
 def compared(
@@ -183,14 +185,24 @@ def compared(
     With few points sigma is uncertain in both. The shot is then repeated up to :data:`MOST_REPEATS` times as often,
     until the standard error of sigma is :data:`LARGEST_SIGMA_ERROR` of it. Pose and calibration are those of the first
     capture, since a stage is read back and a device has its own calibration.
+
+    Parameters
+    ----------
+    prepared
+        The sensor, prepared once.
+    take
+        Takes a shot.
+    repeats
+        Number of captures with fresh noise.
     """
     sensor = prepared.sensor
-    repeated = _repeated(shot, MOST_REPEATS * repeats)
+    seeds = (shot.series.seed + 2**32 * number for number in range(MOST_REPEATS * repeats))
+    repeated = [replace(shot, series=replace(shot.series, seed=seed)) for seed in seeds]
     first = take(repeated[0])
     sample, pose = shot.series.sample, coupon_place(first, shot)
     own = own_sensor(first, sensor)
     if own is not sensor:
-        prepared = PreparedSensor.of(own)
+        prepared = PreparedSensor(own)
     coupon = sample.at(pose)
     predictor = prepared.predictor
     surfaces = predictor.surfaces(sample.scene, pose.inverse())
@@ -202,15 +214,17 @@ def compared(
     taken = [first]
     del first
     for number, one in enumerate(repeated):
-        if number >= repeats and _sigma_is_known(_pooled(measured, known)):
-            break
+        if number >= repeats:
+            pooled = _pooled(measured, known)
+            if not pooled.sigma_error > LARGEST_SIGMA_ERROR * pooled.sigma:  # known, or impossible to estimate
+                break
         # keep only one capture and cloud at a time; with many pixels they have 100 MB each
         measured.append(
             _measure(coupon_cloud(taken.pop() if taken else take(one), coupon, prepared.geometry, sensor), coupon)
         )
         predicted.append(_measure(predictor.draw(sample.scene, ideal, labels, fraction, sigma, rng), coupon))
         if number == 0:
-            known = np.flatnonzero(_known(measured[0].patches, sample, performance_map))
+            known = np.flatnonzero(_known(measured[0][0], sample, performance_map))
     return Pair(
         sample.finish,
         sample.roughness,
@@ -218,8 +232,8 @@ def compared(
         math.acos(min(1.0, float(shot.normal[2]))),
         _pooled(measured, known),
         _pooled(predicted, known),
-        _residuals(measured),
-        _residuals(predicted),
+        np.concatenate([residuals for _, residuals in measured]),
+        np.concatenate([residuals for _, residuals in predicted]),
     )
 
 
@@ -234,7 +248,15 @@ class HeldOutOrder:
 
 
 def held_out_orders(campaign: Campaign, shots: list[Shot], map_path: Path, repeats: int) -> list[HeldOutOrder]:
-    """Return an order for each shot."""
+    """Return an order for each shot.
+
+    Parameters
+    ----------
+    map_path
+        Path of the map, the same on every machine.
+    repeats
+        Captures of each shot.
+    """
     path = str(map_path.absolute())
     return [HeldOutOrder(order_of(shot, campaign), path, _digest(path), repeats) for shot in shots]
 
@@ -248,15 +270,11 @@ def hold_out_order(held_out: HeldOutOrder) -> Pair:
         If the map is missing, or has another content.
     """
     if _digest(held_out.map_path) != held_out.digest:
-        raise InputError(
-            held_out.map_path, "", "another map than on the machine of the command", "the same file on every machine"
-        )
-    sensor = held_out.order.sensor
-    simulated, geometry = prepared_sensor(repr(sensor), sensor)
-    take = simulated_source(simulated, held_out.order.samples_per_pixel)
-    return compared(
-        held_out.order.shot(), _prepared_here(sensor, geometry), _map(held_out.map_path), take, held_out.repeats
-    )
+        found, allowed = "another map than on the machine of the command", "the same file on every machine"
+        raise InputError(held_out.map_path, "", found, allowed)
+    prepared = prepared_sensor(held_out.order.sensor)
+    take = simulated_source(prepared.simulated, held_out.order.samples_per_pixel)
+    return compared(held_out.order.shot(), prepared, _map(held_out.map_path), take, held_out.repeats)
 
 
 @lru_cache(maxsize=8)
@@ -266,52 +284,20 @@ def _digest(path: str) -> str:
 
 _map = lru_cache(maxsize=2)(PerformanceMap.load)
 
-_prepared: list[PreparedSensor] = []
-
-
-def _prepared_here(sensor: Sensor, geometry: Geometry) -> PreparedSensor:
-    """Return the sensor of this worker with its predictor, made once for a geometry."""
-    if not _prepared or _prepared[0].geometry is not geometry:
-        _prepared[:] = [PreparedSensor.of(sensor, geometry)]
-    return _prepared[0]
-
-
-@dataclass(frozen=True)
-class _Measured:
-    """The patches of a cloud, and the residuals of its points [mm]."""
-
-    patches: xr.Dataset
-    residuals: NDArray[np.float64]
+#: the patches of a cloud, and the residuals of its points [mm]
+_Measured = tuple[xr.Dataset, NDArray[np.float64]]
 
 
 def _measure(cloud: PointCloud, coupon: Coupon) -> _Measured:
-    return _Measured(measure_patches(cloud, coupon), patch_residuals(cloud, coupon))
+    return measure_patches(cloud, coupon), patch_residuals(cloud, coupon)
 
 
 def _pooled(measurements: list[_Measured], known: NDArray[np.int64]) -> Overall:
-    return overall(xr.concat([one.patches.isel(patch=known) for one in measurements], "patch"))
-
-
-def _residuals(measurements: list[_Measured]) -> NDArray[np.float64]:
-    return np.concatenate([one.residuals for one in measurements])
-
-
-def _sigma_is_known(found: Overall) -> bool:
-    """Return whether sigma is known well enough, or cannot be estimated at all."""
-    return not found.sigma_error > LARGEST_SIGMA_ERROR * found.sigma
-
-
-def _repeated(shot: Shot, count: int) -> list[Shot]:
-    """Return shots of the same coupon at the same pose, each with its own seed."""
-    seeds = [shot.series.seed + 2**32 * number for number in range(count)]
-    return [replace(shot, series=replace(shot.series, seed=seed)) for seed in seeds]
+    return overall(xr.concat([patches.isel(patch=known) for patches, _ in measurements], "patch"))
 
 
 def _known(patches: xr.Dataset, sample: Sample, performance_map: PerformanceMap) -> NDArray[np.bool_]:
-    """Return the patches for which the map has a value over their whole extent.
-
-    A tilted coupon may extend beyond the distances of the map.
-    """
+    """Return the patches for which the map has a value over their whole extent, which a tilted coupon may exceed."""
     across = np.stack([patches["normal_x"].values, patches["normal_y"].values], axis=-1)
     normals = np.column_stack([across, np.sqrt(np.maximum(1 - (across**2).sum(axis=1), 0))])
     known = np.ones(len(normals), bool)

@@ -69,25 +69,14 @@ def plan_live(
     if device is None:
         raise InputError(path, "device", "nothing", "a [device] table", "see docs/how-to/first-capture.md")
     if stage is None or stage.connection is None or stage.calibration is None:
-        raise InputError(
-            path,
-            "stage",
-            "no live stage",
-            "a [stage] with connection and calibration",
-            "the pose of the coupon must be known",
-        )
+        allowed, hint = "a [stage] with connection and calibration", "the pose of the coupon must be known"
+        raise InputError(path, "stage", "no live stage", allowed, hint)
     if device.settings.exposure_s is None:
-        raise InputError(
-            path, "device.settings.exposure_s", "nothing", "a fixed exposure [s]", "a map holds for one exposure"
-        )
+        field, hint = "device.settings.exposure_s", "a map holds for one exposure"
+        raise InputError(path, field, "nothing", "a fixed exposure [s]", hint)
     if sensor.technology != "active_stereo":
-        raise InputError(
-            f"sensor {sensor.name}",
-            "technology",
-            sensor.technology,
-            "active_stereo",
-            f"--sensor must be of the kind of the {device.kind} camera",
-        )
+        hint = f"--sensor must be of the kind of the {device.kind} camera"
+        raise InputError(f"sensor {sensor.name}", "technology", sensor.technology, "active_stereo", hint)
     if file.coupon_px is not None:
         raise InputError(path, "coupon_px", f"{file.coupon_px:g}", "nothing: a real coupon has the size of its scene")
     for number, sample in enumerate(file.samples):
@@ -103,13 +92,9 @@ def plan_live(
             raise InputError(path, "stage.calibration", f"two at {distance:g} mm", "one for each distance")
         found[distance] = calibration
     if missing := set(file.distances_mm or ()) - set(found):
-        raise InputError(
-            path,
-            "distances_mm",
-            f"{min(missing):g}",
-            ", ".join(f"{one:g}" for one in sorted(found)),
-            "calibrate the stage at each distance, since it does not move the coupon",
-        )
+        allowed = ", ".join(f"{one:g}" for one in sorted(found))
+        hint = "calibrate the stage at each distance, since it does not move the coupon"
+        raise InputError(path, "distances_mm", f"{min(missing):g}", allowed, hint)
     calibrations = {distance: found[distance] for distance in sorted(found) if range_mm[0] <= distance <= range_mm[1]}
     if not calibrations:
         known = ", ".join(f"{one:g} mm" for one in sorted(found))
@@ -127,13 +112,9 @@ def _planned(path: Path, distances: list[float] | None, found: float) -> float:
         return float(f"{found:.4g}")
     nearest = min(distances, key=lambda one: abs(math.log(found / one)))
     if abs(found / nearest - 1) > DISTANCE_SLACK:
-        raise InputError(
-            path,
-            "distances_mm",
-            ", ".join(f"{one:g}" for one in distances),
-            f"{found:.4g}, within 5 %",
-            "the stage was calibrated there",
-        )
+        planned = ", ".join(f"{one:g}" for one in distances)
+        hint = "the stage was calibrated there"
+        raise InputError(path, "distances_mm", planned, f"{found:.4g}, within 5 %", hint)
     return nearest
 
 
@@ -165,12 +146,12 @@ def live_source(live: LiveCampaign, mount: Mount) -> Iterator[CaptureSource]:
                 stage = opened.enter_context(open_stage(live.connection))  # opened last, so stopped first
                 stage.home()
                 hardware.append((camera, stage))
-            return live_capture(live, shot, *hardware[0])
+            return _live_capture(live, shot, *hardware[0])
 
         yield take
 
 
-def live_capture(live: LiveCampaign, shot: Shot, camera: LiveDevice, stage: LiveStage) -> Capture:
+def _live_capture(live: LiveCampaign, shot: Shot, camera: LiveDevice, stage: LiveStage) -> Capture:
     """Rotate the stage to a shot's normal, and take a capture with the pose at the angles that are read back."""
     distance = shot.series.distance
     calibration = live.calibrations[distance]

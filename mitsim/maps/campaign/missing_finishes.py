@@ -7,7 +7,6 @@ map's distances around the views -> one map.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ import numpy as np
 
 from characterisation.files.errors import InputError
 from characterisation.maps.joined import with_samples
-from characterisation.maps.light import Light, light_variables
+from characterisation.maps.light import Light
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.samples import Samples
 from mitsim.capture.simulated.simulate import SimulatedSensor
@@ -25,14 +24,10 @@ from mitsim.maps.campaign.one_finish import OneFinish, largest_incidence_deg
 from mitsim.running.progress import say
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
-from mitsim.scene.surface.surface_light import nominal_light
 from mitsim.sensor.preset import Sensor
 
 #: answers a question with yes or no
 Ask = Callable[[str], bool]
-
-#: parameters of a coupon's scene that do not modify its finish
-_PLAIN = {"metal", "process", "Ra", "half_size"}
 
 
 @dataclass(frozen=True)
@@ -43,47 +38,6 @@ class NeededFinishes:
     scene: str
     finishes: dict[str, Finish]
     between: tuple[float, float]
-
-
-def with_lights(performance_map: PerformanceMap) -> PerformanceMap:
-    """Return a map with the optical numbers of its samples.
-
-    If they are missing, they follow from metal, process and Ra. A sample whose campaign may have given its coupon other
-    parameters keeps unknown optical numbers.
-    """
-    data = performance_map.data
-    if any(performance_map.lights):
-        return performance_map
-    wavelength = data.attrs.get("wavelength_nm")
-    if wavelength is None:
-        return performance_map
-    lights: list[Light | None] = [
-        None if said_more else nominal_light(finish, roughness, float(wavelength))
-        for (finish, roughness), said_more in zip(
-            performance_map.samples, _has_other_parameters(performance_map), strict=True
-        )
-    ]
-    return PerformanceMap(data.assign(light_variables(lights)))
-
-
-def _has_other_parameters(performance_map: PerformanceMap) -> list[bool]:
-    """Return for each sample whether a campaign may have given its coupon more than metal, process and Ra."""
-    try:
-        samples = json.loads(str(performance_map.data.attrs.get("campaign", "{}"))).get("samples", [])
-        given = [set(one.get("parameters", {})) for one in samples]
-        roughness = [one.get("parameters", {}).get("Ra") for one in samples]
-    except (ValueError, AttributeError, TypeError):
-        return [False] * len(performance_map.samples)
-    unusual = [str(ra) for keys, ra in zip(given, roughness, strict=True) if keys - _PLAIN]
-    anywhere = any(keys - _PLAIN and "Ra" not in keys for keys in given)
-    return [anywhere or any(_is(ra, rough) for ra in unusual) for _, rough in performance_map.samples]
-
-
-def _is(written: str, roughness: float) -> bool:
-    try:
-        return abs(float(written) / roughness - 1) < 1e-6
-    except (ValueError, ZeroDivisionError):
-        return False
 
 
 def unknown_finishes(known: Samples, finishes: dict[str, Finish]) -> dict[str, Finish]:
@@ -128,13 +82,8 @@ def map_with_finishes(
     source = str(performance_map.data.attrs.get("source", ""))
     if source not in ("", "simulated"):
         name, finish = next(iter(missing.items()))
-        raise _unknown_finish_error(
-            performance_map,
-            needed,
-            name,
-            finish,
-            "the map comes from a device: characterise a coupon of this finish with that device",
-        )
+        hint = "the map comes from a device: characterise a coupon of this finish with that device"
+        raise _unknown_finish_error(performance_map, needed, name, finish, hint)
     distances = distances_about(performance_map, needed.between)
     largest = largest_incidence_deg(performance_map)
     ones = {name: OneFinish(finish, needed.sensor, largest) for name, finish in missing.items()}
@@ -146,13 +95,8 @@ def map_with_finishes(
         lacking = ", ".join(_in_words(ones[name].finish) for name in names)
         question = f"{needed.sensor.name}: its map lacks {lacking}; characterise now (about {_minutes(seconds)})?"
         if ask is None or not ask(question):
-            raise _unknown_finish_error(
-                performance_map,
-                needed,
-                names[0],
-                missing[names[0]],
-                f"add --yes to characterise it now, in about {_minutes(seconds)}; the result is kept",
-            )
+            hint = f"add --yes to characterise it now, in about {_minutes(seconds)}; the result is kept"
+            raise _unknown_finish_error(performance_map, needed, names[0], missing[names[0]], hint)
         say(f"{needed.sensor.name}: characterising {lacking} in about {_minutes(seconds)}; kept in {cache_folder()}")
         kept |= _characterise(ones, to_make, needed.sensor)
     found = [one for one in kept.values() if one is not None]

@@ -53,7 +53,11 @@ TURNS_DEG = (0.0, 45.0, 90.0, 135.0)
 #: mirror-like and glossy lobes are 5 to 20 deg wide; a matt finish varies only with cos
 BANDS = ((20.0, 3), (80.0, 2))
 REFINED = Refinement(fraction=0.3, sigma=0.7, sigma_error=0.08, subdivisions=4)
-COUPON_PX, SAMPLES_PER_PIXEL = 150.0, 16
+
+#: side of the coupon seen face on
+COUPON_PX = 150.0
+
+SAMPLES_PER_PIXEL = 16
 
 
 @dataclass(frozen=True)
@@ -150,7 +154,17 @@ def plan_of(largest_deg: float, seed: int = 1) -> CampaignFile:
 
 
 def one_finish_campaign(one: OneFinish, distance: float, file: CampaignFile, lay_deg: float = 0.0) -> Campaign:
-    """Return the campaign of a finish at a distance [mm], with its u at a lay angle if it has a lay."""
+    """Return the campaign of a finish at a distance [mm], with its u at a lay angle if it has a lay.
+
+    Parameters
+    ----------
+    distance
+        [mm].
+    file
+        The plan, from :func:`plan_of`.
+    lay_deg
+        Angle of u [deg], if the finish has a lay.
+    """
     half = half_size(one.sensor, distance, COUPON_PX if file.coupon_px is None else file.coupon_px)
     recipe = CouponRecipe(one.finish.name, (), one.sensor.wavelength_nm)
     scene = flat_coupon(one.finish, half)
@@ -163,6 +177,15 @@ def one_finish_campaign(one: OneFinish, distance: float, file: CampaignFile, lay
 
 def characterise_finish(one: OneFinish, simulated: SimulatedSensor, distance: float, folder: Path) -> PerformanceMap:
     """Run the campaign of a finish at a distance [mm] in its own folder.
+
+    Parameters
+    ----------
+    simulated
+        The sensor on the device.
+    distance
+        [mm].
+    folder
+        Empty folder for the captures.
 
     Raises
     ------

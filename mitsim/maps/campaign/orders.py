@@ -8,18 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import Geometry, sensor_geometry
+from mitsim.decode.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import Source, measured, simulated_source
 from mitsim.maps.campaign.coupons import CouponRecipe, load_sample
 from mitsim.maps.campaign.plan import Campaign, Series, Shot
 from mitsim.maps.campaign.store import Finished
+from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
+from mitsim.scene import backend
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
 
@@ -57,10 +59,9 @@ def worker_source(workers: Executor, campaign: Campaign) -> Source:
 
 def take_order(order: Order) -> Finished:
     """Take one shot; workers call this function."""
-    simulated, geometry = prepared_sensor(repr(order.sensor), order.sensor)
-    shot = order.shot()
-    capture = simulated_source(simulated, order.samples_per_pixel)(shot)
-    return measured(capture, shot, geometry, order.sensor, order.keep_images)
+    prepared, shot = prepared_sensor(order.sensor), order.shot()
+    capture = simulated_source(prepared.simulated, order.samples_per_pixel)(shot)
+    return measured(capture, shot, prepared.geometry, order.sensor, order.keep_images)
 
 
 def order_of(shot: Shot, campaign: Campaign) -> Order:
@@ -80,15 +81,31 @@ def order_of(shot: Shot, campaign: Campaign) -> Order:
     )
 
 
-_prepared: dict[str, tuple[SimulatedSensor, Geometry]] = {}
+class PreparedSensor:
+    """A sensor with everything that any number of shots share."""
 
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor, self.geometry = sensor, sensor_geometry(sensor)
 
-def prepared_sensor(key: str, sensor: Sensor) -> tuple[SimulatedSensor, Geometry]:
-    """Return the sensor on this worker's device, prepared once."""
-    if key not in _prepared:
-        from mitsim.scene import backend
-
+    @cached_property
+    def simulated(self) -> SimulatedSensor:
+        """Return the sensor on the device."""
         backend.activate(None)
+        return SimulatedSensor(self.sensor)
+
+    @cached_property
+    def predictor(self) -> Predictor:
+        """Return the predictor of its clouds."""
+        return Predictor.of_sensor(self.sensor, self.geometry)
+
+
+_prepared: dict[str, PreparedSensor] = {}
+
+
+def prepared_sensor(sensor: Sensor) -> PreparedSensor:
+    """Return the sensor of this process, prepared once."""
+    key = repr(sensor)
+    if key not in _prepared:
         _prepared.clear()
-        _prepared[key] = SimulatedSensor(sensor), sensor_geometry(sensor)
+        _prepared[key] = PreparedSensor(sensor)
     return _prepared[key]

@@ -207,16 +207,18 @@ def plan_campaign(
 ) -> Campaign:
     """Plan a campaign file that has been read from ``path``.
 
-    ``places`` is for captures with the file's ``device``: its live stage, as calibrated at each distance.
+    Parameters
+    ----------
+    path, file
+        The campaign file, and its content.
+    distances_mm
+        Distances if the file has none.
+    places
+        Live stage as calibrated at each distance, for captures with the file's ``device``.
     """
     if file.device is not None and places is None:
-        raise InputError(
-            path,
-            "device",
-            f"a live {file.device.kind}",
-            "no device: these captures are simulated",
-            "only campaigns and validations of maps take captures with a device",
-        )
+        hint = "only campaigns and validations of maps take captures with a device"
+        raise InputError(path, "device", f"a live {file.device.kind}", "no device: these captures are simulated", hint)
     stages: tuple[Stage, ...] = () if file.stage is None else (file.stage,)
     if places is None:
         check_exposure(sensor)
@@ -233,13 +235,8 @@ def plan_campaign(
     campaign = Campaign(file, sensor, distances, tuple(series), stages)
     labels = [sample.label() for sample in campaign.samples]
     if twice := next((label for label in labels if labels.count(label) > 1), None):
-        raise InputError(
-            path,
-            "samples",
-            f"{twice}, more than once",
-            "one coupon of each finish and Ra",
-            "a map identifies a sample by its finish and Ra",
-        )
+        hint = "a map identifies a sample by its finish and Ra"
+        raise InputError(path, "samples", f"{twice}, more than once", "one coupon of each finish and Ra", hint)
     return campaign
 
 
@@ -266,14 +263,9 @@ def check_exposure(sensor: Sensor) -> None:
         With the sensor and its rule.
     """
     if sensor.exposure.base_s is None:
-        raise InputError(
-            f"sensor {sensor.name}",
-            "exposure.rule",
-            sensor.exposure.rule,
-            "fixed, matt_white",
-            "a map holds for one exposure: with an automatic one, F depends on the rest of the view, "
-            "not only on distance, normal and finish",
-        )
+        hint = "a map holds for one exposure: with an automatic one, F depends on the rest of the view, "
+        hint += "not only on distance, normal and finish"
+        raise InputError(f"sensor {sensor.name}", "exposure.rule", sensor.exposure.rule, "fixed, matt_white", hint)
 
 
 def coupon_pose(
@@ -284,9 +276,16 @@ def coupon_pose(
 ) -> Transform:
     """Return ``sensor_from_coupon`` with the coupon's centre on the view axis.
 
-    ``normal`` (3,) is in the view frame (z toward the sensor, x toward the second eye). ``distance`` is |V| [mm].
-    ``axis`` (3,) is the unit view direction in the sensor frame. ``eye`` (3,) is the position of the camera; default
-    the origin.
+    Parameters
+    ----------
+    normal
+        (3,) in the view frame (z toward the sensor, x toward the second eye).
+    distance
+        |V| [mm].
+    axis
+        (3,) unit view direction in the sensor frame.
+    eye
+        (3,) position of the camera [mm]; default the origin.
     """
     z = view_axes(axis) @ normal
     x = np.cross([0.0, 1.0, 0.0], z)
@@ -312,12 +311,9 @@ def _series_of(path: Path, file: CampaignFile, index: int, distance: float, sens
     except InputError as error:
         if error.field != "half_size":
             raise
-        raise InputError(
-            *where,
-            entry.scene,
-            "a scene with a parameter half_size [mm], as coupon_px needs",
-            "give the scene <default name='half_size' value='60'/>, or leave out coupon_px",
-        ) from None
+        found = "a scene with a parameter half_size [mm], as coupon_px needs"
+        allowed = "give the scene <default name='half_size' value='60'/>, or leave out coupon_px"
+        raise InputError(*where, entry.scene, found, allowed) from None
     shown: list[tuple[Variant | None, Sample]] = [(None, sample)]
     if entry.spread:
         shown += [(name, load_sample(recipe.moved(deviation), where)) for name, deviation in VARIANTS.items()]

@@ -10,8 +10,7 @@ map.
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import astuple
 from pathlib import Path
 
@@ -36,9 +35,6 @@ KEPT = "coupons"
 
 #: number of damaged captures that are named one by one
 NAMED = 10
-
-#: number of captures after which the total time is estimated
-_TIMED = 4
 
 
 def run_campaign(campaign: Campaign, source: Source, folder: str | Path) -> PerformanceMap:
@@ -75,7 +71,17 @@ def run_campaign(campaign: Campaign, source: Source, folder: str | Path) -> Perf
 
 
 def measure_captures(campaign: Campaign, shots: Sequence[Shot], source: Source, folder: str | Path) -> PerformanceMap:
-    """Measure existing captures, see :func:`~mitsim.maps.campaign.acquire.found_shots`, and make their map."""
+    """Measure existing captures and make their map.
+
+    Parameters
+    ----------
+    shots
+        From :func:`~mitsim.maps.campaign.acquire.found_shots`.
+    source
+        Returns their results.
+    folder
+        For the map and the measured shots.
+    """
     captures = Path(folder) / KEPT
     captures.mkdir(parents=True, exist_ok=True)
     remove_partial(captures)
@@ -115,31 +121,15 @@ def _take_missing(
         if len(damaged) > NAMED:
             say(f"mitsim: and {len(damaged) - NAMED} more")
         raise damaged[0]
-    for shot, finished in track(_with_time(source(list(missing.values())), len(missing)), label, len(missing)):
+    for shot, finished in track(source(list(missing.values())), label, len(missing)):
         write_shot(captures, shot, finished)
         done[shot.series.name, shot.name] = Finished(finished.patches, finished.source)
-
-
-def _with_time(taken: Iterable[tuple[Shot, Finished]], count: int) -> Iterator[tuple[Shot, Finished]]:
-    """Pass captures on, and report the expected total time after a few; the first includes compilation."""
-    start = 0.0
-    for number, one in enumerate(taken, 1):
-        if number == 1:
-            start = time.monotonic()
-        elif number == _TIMED and count > 2 * _TIMED:
-            left = (time.monotonic() - start) / (_TIMED - 1) * (count - number)
-            duration = f"{left / 60:.0f} min" if left > 90 else f"{left:.0f} s"
-            say(f"{count} captures: about {duration} from here; a refinement adds to them")
-        yield one
 
 
 def _refined(
     campaign: Campaign, wanted: dict[Series, list[NDArray[np.float64]]], done: dict[tuple[str, str], Finished]
 ) -> tuple[dict[Series, list[NDArray[np.float64]]], int]:
-    """Add normals where a sample needs them, and the same normals for its variants.
-
-    Returns the new normals, and the number of edges that remain rough.
-    """
+    """Add normals where a sample needs them, also to its variants; return them and the number of rough edges."""
     assert campaign.file.refine is not None
     fresh: dict[Series, list[NDArray[np.float64]]] = {}
     unresolved = 0
@@ -231,13 +221,11 @@ def joined(tables: Sequence[xr.Dataset]) -> xr.Dataset:
 def _all_patches(tables: list[SampleTable]) -> xr.Dataset:
     """Join the tables; each patch keeps the number of its sample, whose finish and Ra are coordinates."""
     samples = list(dict.fromkeys((table.finish, str(table.roughness)) for table in tables))
-    columns: dict[str, list[NDArray[np.generic]]] = {}
-    for table in tables:
-        number = samples.index((table.finish, str(table.roughness)))
-        for name, values in table.patches.data_vars.items():
-            columns.setdefault(str(name), []).append(values.values)
-        columns.setdefault("sample_number", []).append(np.full(table.patches.sizes["patch"], number, np.int16))
-    whole = patch_table(**{name: np.concatenate(parts) for name, parts in columns.items()})
+    numbers = [samples.index((table.finish, str(table.roughness))) for table in tables]
+    sizes = [table.patches.sizes["patch"] for table in tables]
+    patches = [table.patches.variables for table in tables]
+    columns = {str(name): np.concatenate([one[name].values for one in patches]) for name in tables[0].patches.data_vars}
+    whole = patch_table(**columns, sample_number=np.repeat(np.array(numbers, np.int16), sizes))
     return whole.assign_coords(
         finish=("sample", [finish for finish, _ in samples]),
         roughness=("sample", [float(ra) for _, ra in samples], {"units": "um", "long_name": "roughness average Ra"}),

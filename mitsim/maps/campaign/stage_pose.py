@@ -24,7 +24,7 @@ from pydantic import Field, model_validator
 
 from characterisation.coupon.view_frame import view_frame
 from characterisation.files.atomic_io import write_json
-from characterisation.files.checked_files import read_bounded
+from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import Document, Name, validate
 from characterisation.files.errors import InputError
 from characterisation.stage.angles import Stage
@@ -138,13 +138,9 @@ class StageCalibration:
             If the table defines other axes.
         """
         if tuple(axis.name for axis in table.axes) != self.names:
-            raise InputError(
-                self.where,
-                "axes",
-                ", ".join(self.names),
-                ", ".join(axis.name for axis in table.axes),
-                "the axes of the campaign's [stage], in its order",
-            )
+            allowed = ", ".join(axis.name for axis in table.axes)
+            hint = "the axes of the campaign's [stage], in its order"
+            raise InputError(self.where, "axes", ", ".join(self.names), allowed, hint)
         zero = self.sensor_from_coupon(np.zeros(len(self.names)))
         ray = zero.translation - eye
         view = view_frame(ray / np.linalg.norm(ray), np.array([1.0, 0.0, 0.0]))
@@ -153,13 +149,9 @@ class StageCalibration:
             found = view @ direction
             apart = math.degrees(math.acos(np.clip(axis.unit() @ found, -1, 1)))
             if apart > LARGEST_MISMATCH_DEG:
-                raise InputError(
-                    self.where,
-                    f"axes.{number}.direction",
-                    f"{axis.name} {apart:.0f} deg from that of [stage]",
-                    f"up to {LARGEST_MISMATCH_DEG:g} deg",
-                    "another axis, or one that turns the other way: correct [stage], or the gear of its connection",
-                )
+                place, far = f"axes.{number}.direction", f"{axis.name} {apart:.0f} deg from that of [stage]"
+                hint = "another axis, or one that turns the other way: correct [stage], or the gear of its connection"
+                raise InputError(self.where, place, far, f"up to {LARGEST_MISMATCH_DEG:g} deg", hint)
             axes.append(axis.model_copy(update={"direction": tuple(map(float, found))}))
         normal = tuple(map(float, view @ zero.rotation[:, 2]))
         return table.model_copy(update={"axes": axes, "normal": normal, "calibration": self.checksum})
@@ -189,9 +181,8 @@ def write_stage_calibration(
     covariance: list[list[float]] | None = None
     if isinstance(calibration, CouponCalibration):
         if centre is None:
-            raise InputError(
-                "stage calibration", "centre", "none", "the coupon's middle at zero [mm]", "only its plane was found"
-            )
+            allowed = "the coupon's middle at zero [mm]"
+            raise InputError("stage calibration", "centre", "none", allowed, "only its plane was found")
         plane = calibration.zero_plane
         place = np.asarray(centre, float)
         place = place - ((place - plane.point) @ plane.normal) * plane.normal
@@ -224,13 +215,7 @@ def read_stage_calibration(path: str | Path) -> StageCalibration:
     InputError
         If it is missing or damaged, with the field.
     """
-    data = read_bounded(Path(path), "a stage calibration: see docs/how-to/first-capture.md")
-    try:
-        table = json.loads(data.decode())
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, "", f"text that is not JSON ({error})", "a stage calibration") from None
-    if not isinstance(table, dict):
-        raise InputError(path, "", type(table).__name__, "a JSON object")
+    table = read_json_object(Path(path), "a stage calibration: see docs/how-to/first-capture.md")
     read = validate(path, table, StageCalibrationFile)
     directions = np.array([axis.direction for axis in read.axes])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -27,7 +27,13 @@ from pydantic import Field
 
 from characterisation.coupon.patch_table import PATCHES, patch_table
 from characterisation.files.atomic_io import write_folder
-from characterisation.files.checked_files import LARGEST_FILE, content_checksum, is_inside, read_bounded
+from characterisation.files.checked_files import (
+    LARGEST_FILE,
+    content_checksum,
+    is_inside,
+    read_bounded,
+    read_json_object,
+)
 from characterisation.files.datasets import check_dataset
 from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError, MissingEnvironmentError
@@ -141,15 +147,7 @@ _AGAIN = "remove this folder, and run the same command again to repeat the captu
 
 def _document(folder: Path) -> ShotDocument:
     where = folder / "shot.json"
-    data = read_bounded(where, "a complete capture folder", _AGAIN)
-    try:
-        table = json.loads(data.decode())
-    except (ValueError, RecursionError):
-        raise InputError(
-            where, "", "text that is not JSON, truncated or changed", "an unchanged file", _AGAIN
-        ) from None
-    if not isinstance(table, dict):
-        raise InputError(where, "", type(table).__name__, "a JSON object", _AGAIN)
+    table = read_json_object(where, "a complete capture folder", _AGAIN)
     if isinstance(version := table.get("schema_version"), int) and version > 1:
         raise InputError(where, "schema_version", version, "up to 1", "update mitsim to read this campaign")
     if table.get("checksum") != content_checksum(table):
@@ -181,9 +179,8 @@ def _table_bytes(patches: xr.Dataset) -> bytes:
 
 def _table(data: bytes, where: Path) -> xr.Dataset:
     try:
-        table: NDArray[np.void] = np.lib.format.read_array(
-            io.BytesIO(data), allow_pickle=False, max_header_size=_LONGEST_HEADER
-        )
+        stream = io.BytesIO(data)
+        table: NDArray[np.void] = np.lib.format.read_array(stream, False, max_header_size=_LONGEST_HEADER)
     except Exception as error:  # numpy raises many types for a damaged header, which is Python text
         cause = " ".join(str(error).split())[:200]
         raise InputError(where, "", f"a table that cannot be read ({cause})", "an unchanged file", _AGAIN) from None

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 
@@ -54,13 +54,17 @@ from mitsim.sensor.vignetting import camera_illumination
 
 Floats = NDArray[np.float64]
 
-#: number of pixels of the coarse camera, and number of its pixels that a fringe covers at least
-PIXELS, PIXELS_OF_FRINGE = 20_000, 6
+#: number of pixels of the coarse camera
+PIXELS = 20_000
 
-#: camera paths and photons per render of interreflections. A phase code has two renders, which
-#: distinguish their noise from a bias. With large pixels photons are efficient: 300 000 remove two thirds of the noise
-#: of 80 000 camera paths
-PATHS, PHOTONS = 180_000, 400_000
+#: least number of its pixels that a fringe covers
+PIXELS_OF_FRINGE = 6
+
+#: camera paths per render of interreflections. A phase code has two renders, which distinguish their noise from a bias
+PATHS = 180_000
+
+#: photons per render. With large pixels 300 000 of them remove two thirds of the noise of 80 000 camera paths
+PHOTONS = 400_000
 
 #: number of views that are rendered at once: recording a kernel takes about as long as rendering one of them
 TOGETHER = 16
@@ -72,7 +76,7 @@ SMOOTHED_PX = 3.0
 NOISIEST = 4.0
 
 
-class Loss(Document):
+class LossCurve(Document):
     """Constants r, ``half``, and k, ``steepness``, of g(rho), each with its 95 % interval."""
 
     half: float
@@ -86,8 +90,8 @@ class Losses(Document):
 
     command: str
     cases: list[str]
-    matched: Loss
-    coded: Loss
+    matched: LossCurve
+    coded: LossCurve
 
 
 @cache
@@ -166,7 +170,7 @@ class InterreflectionEffect:
         nothing = Perturbation.none(len(rho))
         if isinstance(self.sensor.settings, MatcherSettings):
             noisier = 1 + rho / (1 + rho / (NOISIEST - 1))
-            return Perturbation(found_share(rho, losses().matched), noisier, *_unbiased(nothing))
+            return replace(nothing, kept=found_share(rho, losses().matched), noisier=noisier)
         kept, displaced, scattered = found_share(rho, losses().coded), nothing.displaced, nothing.scattered
         if isinstance(self.sensor.pattern, AmplitudeModulation):
             kept = 1.0 - found.rejected
@@ -199,19 +203,9 @@ class InterreflectionEffect:
         """Render the interreflections in several views at once; each image is the one that :meth:`render` returns."""
         given = scene, self.rays, self.light, poses
         direct = trace_poses(*given, LightPaths(samples=self.samples, seed=seed))
-        indirect = [
-            trace_poses(
-                *given,
-                LightPaths(
-                    samples=self.samples,
-                    seed=2 * seed + half,
-                    depth=self.depth,
-                    photons=self.photons,
-                    indirect_only=True,
-                ),
-            )
-            for half in range(1 if self.fringe is None else 2)
-        ]
+        paths = LightPaths(self.samples, 2 * seed, self.depth, photons=self.photons, indirect_only=True)
+        halves = range(1 if self.fringe is None else 2)
+        indirect = [trace_poses(*given, replace(paths, seed=2 * seed + half)) for half in halves]
         return [
             self._image(shapes_met(scene, self.middles, pose), direct[k], [one[k] for one in indirect])
             for k, pose in enumerate(poses)
@@ -222,9 +216,8 @@ class InterreflectionEffect:
     ) -> InterreflectionImage:
         """Return the interreflections of one view from its direct light and one or two renders of the other light."""
         code = self.sensor.pattern
-        own = (
-            1 if not isinstance(code, AmplitudeModulation) else code.steps
-        )  # number of images whose mean is the total light
+        # number of images whose mean is the total light
+        own = code.steps if isinstance(code, AmplitudeModulation) else 1
         white = np.stack([direct[:own].mean(axis=0), np.mean([one[:own].mean(axis=0) for one in indirect], axis=0)])
         first, other = smoothed(white, shape, SMOOTHED_PX / self.step).astype(float)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -269,11 +262,7 @@ def _light(sensor: Sensor) -> ProjectedPatterns | ModulatedLight:
     return ProjectedPatterns(np.concatenate([white, fringes(sensor)]), sensor.projector)
 
 
-def _unbiased(nothing: Perturbation) -> tuple[Floats, Floats, Floats]:
-    return nothing.displaced, nothing.scattered, nothing.shared
-
-
-def found_share(rho: Floats, loss: Loss) -> Floats:
+def found_share(rho: Floats, loss: LossCurve) -> Floats:
     """Return g(rho), the share of points that are found at the right place."""
     with np.errstate(over="ignore"):
         return np.asarray(1 / (1 + (rho / loss.half) ** loss.steepness))

@@ -48,9 +48,11 @@ from mitsim.sensor.preset import Sensor
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-#: standard deviations of the window that averages A_2, and of the window over which both renders are compared, in
-#: pixels of the sensor
-WINDOW_PX, AGREED_PX = 2.0, 12.0
+#: standard deviation of the window that averages A_2 [px] of the sensor
+WINDOW_PX = 2.0
+
+#: standard deviation of the window over which both renders are compared [px] of the sensor
+AGREED_PX = 12.0
 
 #: three phase shifts, the fewest that determine an amplitude
 _PHASE_SHIFTS = 2 * np.pi * np.arange(3) / 3

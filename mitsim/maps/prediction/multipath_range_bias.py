@@ -48,8 +48,18 @@ def path_bias(
 ) -> tuple[Floats, Floats]:
     """Return the bias of the path (H, W) [mm], and whether the decoder rejects the phases (H, W), 1 or 0.
 
-    The bias is 0 without direct light. ``direct`` and ``other`` (F, H, W) are in DN. ``shape`` (H, W) is the shape that
-    a pixel shows, -1 for none. ``step`` is the number of sensor pixels per pixel along an axis.
+    The bias is 0 without direct light.
+
+    Parameters
+    ----------
+    direct, other
+        Complex amplitudes A_1 and A_2 (F, H, W) [DN].
+    code, settings, imager
+        Of the sensor.
+    shape
+        (H, W) shape that a pixel shows, -1 for none.
+    step
+        Number of sensor pixels per pixel along an axis.
     """
     size, own = np.abs(direct), np.angle(direct)
     turned = other * np.exp(-1j * own)

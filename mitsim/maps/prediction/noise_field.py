@@ -63,8 +63,11 @@ COSINES = 32
 #: border of the grid, in square roots of the largest area; rho is 3e-6 across it, so the periodic field does not wrap
 _BORDER = 2.0
 
-#: points per chunk: waves of a chunk stay in the cache, and each look-up in the map has a fixed cost
-_WAVE_POINTS, _LOOK_UP_POINTS = 2048, 32768
+#: points per chunk of waves, which stay in the cache
+_WAVE_POINTS = 2048
+
+#: points per look-up in the map, each of which has a fixed cost
+_LOOK_UP_POINTS = 32768
 
 
 def correlated_noise(
@@ -72,7 +75,14 @@ def correlated_noise(
 ) -> Singles:
     """Return the errors (h, w) of the points of a view in units of the map's sigma; 0 where the map has none.
 
-    ``mapped`` includes normals.
+    Parameters
+    ----------
+    performance_map
+        Gives noise areas and persistent noise.
+    mapped
+        The view, with normals.
+    rng
+        Random generator.
     """
     assert mapped.normal is not None
     predicted = np.isfinite(mapped.sigma)

@@ -27,7 +27,12 @@ def performance(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return F and sigma (n,) of every ideal point; 0 and NaN if an eye does not see it, NaN if the map has no answer.
 
-    ``finish`` replaces the finishes of the scene: matt white, to normalise the view score.
+    Parameters
+    ----------
+    ideal
+        Points of the view.
+    finish
+        Replaces the finishes of the scene: matt white, to normalise the view score.
     """
     fraction = np.full(len(ideal.pixel), np.nan)
     sigma = np.full(len(ideal.pixel), np.nan)
@@ -68,7 +73,13 @@ def expected_points(
     """Return the predicted points of one shape in the world frame, which is the part frame; one row per possible point.
 
     Where the map has no noise area, the area is that of independent points, 1/F, and there is no persistent noise.
-    ``perturbation`` holds effects that flat coupons cannot show (:mod:`mitsim.maps.prediction.perturbation`).
+
+    Parameters
+    ----------
+    shape
+        Index into the scene's names.
+    perturbation
+        Effects that flat coupons cannot show (:mod:`mitsim.maps.prediction.perturbation`).
     """
     ideal, labels, world_from_sensor = view.ideal, view.labels, view.world_from_sensor
     finish = scene.finishes[shape]
@@ -121,6 +132,15 @@ def feature_statistics(
     """Return the expected number of points n and the mean sigma [mm] of each shape, (features,) each; NaN if n is 0.
 
     The mean of sigma is over the expected points, so each pixel is weighted by its F.
+
+    Parameters
+    ----------
+    ideal, labels
+        Points of the view, and the shapes (H, W) that its rays show.
+    fraction, sigma
+        F and sigma [mm] (n,) of the points, from :func:`performance`.
+    shapes
+        Indices into the scene's names.
     """
     label = labels.reshape(-1)[ideal.pixel]
     weight = np.where(np.isfinite(sigma), np.nan_to_num(fraction), 0.0)

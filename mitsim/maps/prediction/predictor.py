@@ -110,10 +110,10 @@ class Predictor:
         assert self.step == 1, "thinned already"
         return Predictor(self.rig, self.grid, self.seen, self.sensor, self.edge_margin_px, step)
 
-    def thinned_to(self, rays: int) -> tuple[Predictor, int]:
-        """Return a predictor that casts about ``rays`` rays, and its step, as in :meth:`thinned`."""
+    def thinned_to(self, rays: int) -> Predictor:
+        """Return a predictor that casts about ``rays`` rays, as :meth:`thinned`."""
         step = max(1, math.floor(math.sqrt(self.grid.width * self.grid.height / rays)))
-        return (self.thinned(step) if step > 1 else self), step
+        return self.thinned(step) if step > 1 else self
 
     def surfaces(self, scene: Scene, world_from_sensor: Transform) -> Surfaces:
         """Return the ray-cast surfaces of a view, in the sensor frame."""
@@ -213,8 +213,19 @@ class Predictor:
 
         P is the ideal point, V^ the unit vector along its ray, R_N a normal deviate and R_U a uniform one. The talk of
         Kinnell and Justham (2018; slide *Simulating the Point Cloud*) writes rho_e for F and sigma_e for sigma. The
-        deviates R_N of neighbours are independent, as in the talk, or ``correlated`` as measured in the map. The
         equations are in :meth:`_cloud`.
+
+        Parameters
+        ----------
+        characterised
+            The scene with F and sigma of its faces.
+        world_from_sensor
+            Pose of the sensor.
+        rng
+            Random generator.
+        correlated
+            Whether the deviates of neighbours are correlated as measured in the map; otherwise independent, as in the
+            talk.
 
         Raises
         ------
@@ -239,7 +250,14 @@ class Predictor:
     ) -> PointCloud:
         """Draw a cloud from ideal points, F and sigma (n,), with the equations of :meth:`predict`.
 
-        F and sigma are NaN where the map has no answer; such points are lost.
+        Parameters
+        ----------
+        ideal, labels
+            Points of the view, and the shapes (H, W) that the pixels show.
+        fraction, sigma
+            F and sigma [mm] (n,); NaN where the map has no answer. Such points are lost.
+        rng
+            Random generator.
         """
         size = (self.grid.height, self.grid.width)
 

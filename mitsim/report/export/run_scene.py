@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from characterisation.cloud_files import read_ply
+from characterisation.cloud_files import read_cloud
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, ViewGrid
@@ -165,4 +165,4 @@ def _cloud_name(kind: str, number: int) -> str:
 def _read_own(run: Run, kind: str, number: int) -> PointCloud:
     name = _cloud_name(kind, number)
     run.check(name)
-    return read_ply(run.folder / name)
+    return read_cloud(run.folder / name)

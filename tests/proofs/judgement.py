@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import beta
+
+from characterisation.statements.coverage import Share, share
 
 Floats = NDArray[np.float64]
 
@@ -22,30 +23,6 @@ _HALVES = 200
 
 #: number of resamples of a bootstrap
 _RESAMPLES = 1000
-
-
-@dataclass(frozen=True)
-class Share:
-    """A share ``count`` of ``of``, and its 95 % interval [1]."""
-
-    count: int
-    of: int
-    low: float
-    high: float
-
-    @property
-    def value(self) -> float:
-        """Return the share itself; NaN of none."""
-        return self.count / self.of if self.of else float("nan")
-
-
-def share(inside: ArrayLike) -> Share:
-    """Return the share of true among independent trials (n,), with its exact interval (Clopper and Pearson 1934)."""
-    each = np.asarray(inside, bool)
-    k, n = int(each.sum()), len(each)
-    low = float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0
-    high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
-    return Share(k, n, low, high if n else 1.0)
 
 
 def pooled_share(inside: ArrayLike, seed: int = 0) -> Share:

@@ -1,7 +1,7 @@
 """Test whether a score ranks the best views first, with the true risks of the views.
 
 Signal chain: cost of every view by a score, lower is better, infinite for a view predicted to be impossible; errors of
-the view in many worlds -> true risk (:func:`characterisation.statements.judgement.true_risk`) -> recall of the first
+the view in many worlds -> true risk (:func:`tests.proofs.judgement.true_risk`) -> recall of the first
 views, rank correlation with the ceiling that the number of worlds sets, ROC area of *can be measured*.
 
 Every score is treated equally: views that it predicts to be impossible are tied behind all others, and are never among
@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from characterisation.scores.rank_agreement import roc_area, spearman
-from characterisation.statements.judgement import true_risk
+from characterisation.scores.rank_agreement import spearman
+from tests.proofs.judgement import true_risk
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.int64]
@@ -103,6 +103,20 @@ def measurable_area(one: Screened) -> float:
     It is NaN if all views are of one kind.
     """
     return roc_area(-one.cost, one.measurable)
+
+
+def roc_area(score: Floats, measurable: NDArray[np.bool_]) -> float:
+    """Return the area under the ROC curve of a score that separates measurable views from the others.
+
+    It is the probability that a measurable view scores higher than another, a tie counting as half (Mann and Whitney's
+    U over its greatest value; Hanley and McNeil, Radiology 143 (1982) 29-36). Views predicted to be impossible, NaN or
+    -inf, score lowest. The area is NaN, not defined, where all views are of one kind.
+    """
+    known = np.where(score > -np.inf, score, -np.inf)
+    yes, no = known[measurable, None], known[~measurable]
+    if not yes.size or not no.size:
+        return math.nan
+    return float((np.count_nonzero(yes > no) + np.count_nonzero(yes == no) / 2) / (yes.size * no.size))
 
 
 def attainable_recall(one: Screened, first: int, seed: int = 0) -> float:
