@@ -9,21 +9,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from characterisation.files.checked_files import read_json_object
-from characterisation.files.documents import Document, validate
+from characterisation.files.documents import validate
 from characterisation.statements.verdict_words import Judged
+from mitsim.study.statement_file import PartialDocument
 
 #: name of the file in the folder
 CHOICE = "choice.json"
 
 
-class _Loose(Document):
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
-
-
-class ComparedMeasurement(_Loose):
+class ComparedMeasurement(PartialDocument):
     """One measurement: its tolerance as in the task, and its decision rule in words."""
 
     unit: str
@@ -40,7 +37,7 @@ class ComparedMeasurement(_Loose):
         return self.tolerance
 
 
-class CellEntry(_Loose):
+class CellEntry(PartialDocument):
     """One measurement by one sensor from ``view``, in the measurement's unit; null without a value.
 
     ``by`` is ``statement`` or ``screening``, or ``none`` if no view can make the measurement. ``demand`` is the figure
@@ -67,7 +64,7 @@ class CellEntry(_Loose):
 _Row = tuple[float, float, float, float]
 
 
-class PoseEntry(_Loose):
+class PoseEntry(PartialDocument):
     """Pose of the sensor: number of the view, angles [deg], |V| [mm], and the 4 x 4 matrix in the part frame."""
 
     view: int
@@ -78,7 +75,7 @@ class PoseEntry(_Loose):
     world_from_sensor: tuple[_Row, _Row, _Row, _Row]
 
 
-class CaptureEntry(_Loose):
+class CaptureEntry(PartialDocument):
     """Effort of one capture: images, exposures of each [s], total exposure time [s] without readout."""
 
     images: int
@@ -86,7 +83,7 @@ class CaptureEntry(_Loose):
     seconds: float
 
 
-class SensorEntry(_Loose):
+class SensorEntry(PartialDocument):
     """One sensor of the table; ``ratio`` is the largest demand of its measurements, null if one cannot be made.
 
     ``status`` is ``stated`` (virtual measurements), ``screened`` (screening only: far from fitting, or out of time) or
@@ -106,7 +103,7 @@ class SensorEntry(_Loose):
     map_digest: str = ""
 
 
-class ChoiceDocument(_Loose):
+class ChoiceDocument(PartialDocument):
     """``choice.json``; ``sensors`` are sorted, best first."""
 
     schema_version: Literal[1]

@@ -48,7 +48,7 @@ from mitsim.study.view_sets.confirmed_set import (
     write_set_csv,
 )
 from mitsim.study.virtual.plan import race_rules
-from mitsim.study.virtual.race_table import raced_errors, with_race
+from mitsim.study.virtual.race import raced_errors, with_race
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import write_statement
 

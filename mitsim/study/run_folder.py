@@ -9,12 +9,12 @@ from typing import Literal
 import numpy as np
 import trimesh
 import xarray as xr
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from characterisation.cloud_files import read_ply
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.datasets import Schema, Variable, read_dataset
-from characterisation.files.documents import Document, validate
+from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
@@ -22,7 +22,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.scene.surface.lay import LayLeftOut
 from mitsim.study.run_files import check_own
-from mitsim.study.statement_file import StatementDocument, read_statement
+from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement
 
 _MADE_BY = "a folder made by mitsim run"
 
@@ -91,10 +91,9 @@ _PATCHES = Schema(
 )
 
 
-class MeasurementEntry(Document):
+class MeasurementEntry(PartialDocument):
     """Entry of a measurement in ``run.json``; ``kind`` and ``tolerance`` as in the task."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     nominal: float
     unit: str
     features: list[str]
@@ -102,19 +101,17 @@ class MeasurementEntry(Document):
     tolerance: float | tuple[float, float] | None = None
 
 
-class ResidualEntry(Document):
+class ResidualEntry(PartialDocument):
     """Quality of the renders in ``run.json``, in units of the sensor's noise [1]; ``outliers`` is a share of pixels."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     noise: float
     quadrature: float
     outliers: float
 
 
-class ConfirmedEntry(Document):
+class ConfirmedEntry(PartialDocument):
     """Result of one measurement from virtual measurements of a whole set of views."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     unit: str
     trials: int
     without_value: float
@@ -122,15 +119,14 @@ class ConfirmedEntry(Document):
     standard_uncertainty: float | None
 
 
-class TriedEntry(Document):
+class TriedEntry(PartialDocument):
     """A set of views that was measured, and its largest ratio of error to limit; None without a value."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     views: list[int]
     excess: float | None = None
 
 
-class ViewSetEntry(Document):
+class ViewSetEntry(PartialDocument):
     """Set of views that together keep limits, given for each measurement in its unit.
 
     ``exact`` is true if no smaller set keeps the limits. ``feasible`` is false for a limit that even all views together
@@ -138,7 +134,6 @@ class ViewSetEntry(Document):
     set, ``tried`` all sets that were measured.
     """
 
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     limits: dict[str, float]
     views: list[int]
     uncertainty: dict[str, float | None] = Field(default_factory=dict)
@@ -149,10 +144,9 @@ class ViewSetEntry(Document):
     tried: list[TriedEntry] = Field(default_factory=list)
 
 
-class RunDocument(Document):
+class RunDocument(PartialDocument):
     """``run.json``, as far as a report needs it; other keys are ignored."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     schema_version: Literal[1]
     mitsim: str
     study: str

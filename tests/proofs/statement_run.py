@@ -23,7 +23,7 @@ from mitsim.running.progress import say
 from mitsim.study import StatementTable, Study
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import ALL, Raced
-from mitsim.study.virtual.trial_errors import stated_errors_of_trials
+from mitsim.study.virtual.trials import stated_errors_of_trials
 from mitsim.views import View
 from mitsim.views.view_scores import screening_risk
 from tests.proofs.case_trials import (

@@ -52,9 +52,6 @@ LARGEST_DEMAND = 3.0
 #: number of views raced for each measurement, trials of each view, and trials at the start of a statement
 SHORTLIST, RACE_TRIALS, FIRST_TRIALS = 3, 8, 24
 
-#: number of trials from which the 95 % interval follows from order statistics, for any distribution
-SURE_TRIALS = 80
-
 #: a measurement's own best view is stated if its risk in the race is below this fraction of the common view's risk
 _WORTH_STATING = 0.8
 

@@ -12,11 +12,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from characterisation.files.atomic_io import atomic_write, write_json
 from characterisation.files.checked_files import read_json_object
-from characterisation.files.documents import Document, validate
+from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from mitsim.running.progress import say
 from mitsim.running.text_table import aligned
@@ -24,6 +24,7 @@ from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import ExposureTable, Study
 from mitsim.study.exposures.exposure_plan import ExposurePlan, PlanRules, plan_exposures
 from mitsim.study.exposures.exposure_sweep import ExposureResult, ExposureSweep
+from mitsim.study.statement_file import PartialDocument
 from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.views import View
@@ -35,10 +36,8 @@ _NO_LIMITS = (1e-9, 1e3)
 PLAN_VERSION = 1
 
 
-class _StoredPlan(Document):
+class _StoredPlan(PartialDocument):
     """The keys of a stored plan that virtual measurements need."""
-
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
     digest: str
     exposures_s: list[float] = Field(min_length=1, max_length=7)

@@ -31,8 +31,7 @@ from mitsim.study.exposures.planned import with_exposure
 from mitsim.study.view_sets.joined import JoinedMeasurements
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import digits
-from mitsim.study.virtual.trial_errors import errors_of_trials
-from mitsim.study.virtual.trials import TrialFolder
+from mitsim.study.virtual.trials import TrialFolder, errors_of_trials
 from mitsim.study.virtual.world import SET_DAYS, Trial
 
 #: largest number of sets to measure

@@ -25,8 +25,7 @@ from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable, Study
 from mitsim.study.virtual.influences import influences
 from mitsim.study.virtual.race import Job, TrialRunner, complete
-from mitsim.study.virtual.trial_errors import errors_of_trials, stated_errors_of_trials
-from mitsim.study.virtual.trials import TrialFolder
+from mitsim.study.virtual.trials import TrialFolder, errors_of_trials, stated_errors_of_trials
 from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, STATEMENT_DAYS, Trial, Unknowns
 from mitsim.views import View
 

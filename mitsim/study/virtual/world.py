@@ -57,9 +57,6 @@ OWN_FINISH_DAYS, STATEMENT_DAYS, SET_DAYS = 1 << 19, 1 << 20, 1 << 21
 #: offset of the day of the streams from which ``swapped`` takes a group
 _ELSEWHERE = 1 << 32
 
-#: reference temperature of lengths [C], ISO 1
-REFERENCE_C = 20.0
-
 
 @dataclass(frozen=True)
 class Trial:

@@ -165,11 +165,6 @@ def fixed_variance(
     return level, total - temporal / len(images), float(np.sqrt(spread**2 + left))
 
 
-def with_noise(imager: Imager, full_well: float, read_noise: float, dsnu: float, prnu: float) -> Imager:
-    """Return the imager with the fitted noise."""
-    return replace(imager, full_well=full_well, read_noise=read_noise, dsnu=dsnu, prnu=prnu)
-
-
 def _bins(
     mean: Floats, variance: Floats, level: Floats, freedom: int, chip: Imager
 ) -> list[tuple[float, float, float]]:
