@@ -6,6 +6,7 @@ screening alone.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Literal
 
@@ -44,21 +45,21 @@ class CellEntry(PartialDocument):
     that the decision rule limits to 1. Without a tolerance it is the uncertainty relative to that of the best sensor.
     """
 
-    by: Literal["statement", "screening", "none"]
-    view: int | None
-    uncertainty: float | None
-    bias: float | None
-    share_of_tolerance: float | None
-    demand: float | None
-    demand_interval: tuple[float, float] | None
-    verdict: Literal["fits", "no tolerance", "not decided", "does not fit", "undecidable"]
-    fits_corrected: bool
-    accepted: tuple[float | None, float] | None
-    needed: float | None
-    false_accept: float | None
-    false_reject: float | None
-    trials: int
-    without_value: float
+    by: Literal["statement", "screening", "none"] = "none"
+    view: int | None = None
+    uncertainty: float | None = None
+    bias: float | None = None
+    share_of_tolerance: float | None = None
+    demand: float | None = None
+    demand_interval: tuple[float, float] | None = None
+    verdict: Literal["fits", "no tolerance", "not decided", "does not fit", "undecidable"] = "undecidable"
+    fits_corrected: bool = False
+    accepted: tuple[float | None, float] | None = None
+    needed: float | None = None
+    false_accept: float | None = None
+    false_reject: float | None = None
+    trials: int = 0
+    without_value: float = 1.0
 
 
 _Row = tuple[float, float, float, float]
@@ -141,14 +142,17 @@ def read_choice(folder: Path) -> ChoiceDocument | None:
 
 def judged(entry: SensorEntry) -> list[Judged]:
     """Return the verdicts of a sensor, for their summary in words."""
-    nan = float("nan")
+
+    def number(value: float | None) -> float:
+        return math.nan if value is None else value
+
     return [
         Judged(
             name,
             "",
             cell.verdict,
-            nan if cell.uncertainty is None else cell.uncertainty,
-            nan if cell.needed is None else cell.needed,
+            number(cell.uncertainty),
+            number(cell.needed),
             cell.fits_corrected,
             cell.without_value,
         )

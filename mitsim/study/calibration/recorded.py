@@ -23,26 +23,31 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import eyes as all_eyes
-from mitsim.sensor.rig_parameters import moved, parameter_names, parameter_values
+from mitsim.sensor.rig_parameters import parameter_names, parameter_values
 from mitsim.sensor.transforms import Transform
+from mitsim.study.calibration import bundle
 from mitsim.study.calibration.board import Board
-from mitsim.study.calibration.bundle import BoardView, homographies, observation_covariance, view_jacobian
 
 Floats = NDArray[np.float64]
 
-#: One sigma of the prior of any lens, *assumed*: principal point of a camera, and of a projector along columns and
-#: along rows (projectors shift their image), relative to the size; fx / fy; distortion.
-_CAMERA_MIDDLE, _PROJECTOR_MIDDLE, _ASPECT = (0.05, 0.05), (0.05, 0.5), 0.005
+#: One sigma of the prior of a lens, all *assumed*. Principal point relative to the size, along columns and rows;
+#: projectors shift their image.
+_CAMERA_MIDDLE, _PROJECTOR_MIDDLE = (0.05, 0.05), (0.05, 0.5)
+#: ratio of the focal lengths fx / fy
+_ASPECT = 0.005
 _DISTORTION: Mapping[str, float] = {"k1": 0.2, "k2": 0.2, "p1": 0.002, "p2": 0.002, "k3": 1e-3}
 _ROUNDS = 4
-#: limits of the adjustment: number of steps; last step, in squared standard uncertainties, and its gain; damping
-_MOST_STEPS, _SMALL_STEP, _SMALL_GAIN, _STUCK = 300, 1e-4, 1e-9, 1e9
+#: largest number of steps of the adjustment
+_MOST_STEPS = 300
+#: last step, in squared standard uncertainties, and its relative gain
+_SMALL_STEP, _SMALL_GAIN = 1e-4, 1e-9
+#: damping with which the adjustment cannot go on
+_STUCK = 1e9
 #: least number of poses: two views of a plane leave the focal length to the prior
 LEAST_POSES = 3
 
@@ -103,19 +108,16 @@ def calibrate_recorded(
     for _ in range(_ROUNDS):
         rig, places, normal = _adjusted(rig, places, boards, board, noise, rig_prior(rig, sizes))
         noise = _noise(rig, places, boards, board, normal)
-    adjusted = _Adjustment(rig, places, noise, normal)
-    covariance = _covariance(adjusted, boards, board, source, own_units)
+    matrix = _covariance(rig, places, noise, normal, boards, board, own_units)
+    details: dict[str, str | float] = {
+        "board": str(board),
+        "poses": float(len(places)),
+        "corners": float(sum(len(each.corners) for each in boards)),
+        "corner_noise_px": float(noise[:, 0].max()),
+        "coordinate_noise_px": float(noise[:, 1].max()),
+    }
+    covariance = RigCovariance(parameter_names(rig), matrix, source, details)
     return RecordedCalibration(rig, places, covariance, *noise.T)
-
-
-@dataclass(frozen=True)
-class _Adjustment:
-    """An adjusted rig, its places sensor_from_board, ``noise`` (poses, 2) [px] and ``normal`` matrix (q, q)."""
-
-    rig: Rig
-    places: list[Transform]
-    noise: Floats
-    normal: Floats
 
 
 @dataclass(frozen=True)
@@ -159,34 +161,20 @@ def _start(
     """Return rig and poses by OpenCV, eye by eye: one focal length, central principal point, no distortion."""
     flags = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_USE_INTRINSIC_GUESS
     flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
-    found: dict[str, tuple[Floats, list[Transform]]] = {}
+    cameras, poses, reference = dict[str, Camera](), dict[str, list[Transform]](), next(iter(sizes))
     for eye, (width, height) in sizes.items():
         free = 0 if eye == "projector" else cv2.CALIB_FIX_PRINCIPAL_POINT
-        points = [board.corners[each.corners].astype(np.float32) for each in boards]
-        pixels = [each.pixels[eye].astype(np.float32).reshape(-1, 1, 2) for each in boards]
+        points = [board.corners[each.corners] for each in boards]
         tries = []
         for share in (0.6, 1.0, 1.6, 2.5):
             guess = np.array([[share * width, 0, (width - 1) / 2], [0, share * width, (height - 1) / 2], [0, 0, 1.0]])
-            tries.append(cv2.calibrateCamera(points, pixels, (width, height), guess, np.zeros(5), flags=flags | free))
-        _, matrix, _, turns, shifts = min(tries, key=lambda one: one[0])
-        found[eye] = (
-            np.asarray(matrix, np.float64),
-            [
-                Transform(Rotation.from_rotvec(turn.ravel()).as_matrix(), np.asarray(shift, np.float64).ravel())
-                for turn, shift in zip(turns, shifts, strict=True)
-            ],
-        )
-    reference = next(iter(sizes))
-    places = found[reference][1]
-    cameras = {}
-    for eye, (width, height) in sizes.items():
-        apart = [one @ other.inverse() for one, other in zip(places, found[eye][1], strict=True)]
-        turn = Rotation.from_matrix([each.rotation for each in apart]).mean().as_matrix()
-        place = Transform(turn, np.median([each.translation for each in apart], axis=0))
-        place = Transform.identity() if eye == reference else place
-        cameras[eye] = Camera(found[eye][0], np.zeros(5), width, height, place)
+            pixels, options = [each.pixels[eye] for each in boards], {"distCoeffs": np.zeros(5), "flags": flags | free}
+            tries.append(bundle.eye_start(points, pixels, (width, height), guess, **options))
+        _, matrix, _, poses[eye] = min(tries, key=lambda one: one[0])
+        place = Transform.identity() if eye == reference else bundle.second_eye(poses[reference], poses[eye])
+        cameras[eye] = Camera(matrix, np.zeros(5), width, height, place)
     projector = cameras.pop("projector", None)
-    return Rig(cameras, projector), places
+    return Rig(cameras, projector), poses[reference]
 
 
 def _adjusted(
@@ -198,17 +186,13 @@ def _adjusted(
     prior: Prior,
 ) -> tuple[Rig, list[Transform], Floats]:
     """Minimise the weighted squares over rig and poses by Levenberg-Marquardt; also return the normal matrix (q, q)."""
-    count, damping = len(prior.names), 1e-3
+    damping = 1e-3
     cost, normal, gradient = _normal(rig, places, boards, board, noise, prior)
     for _ in range(_MOST_STEPS):
         scale = 1 / np.sqrt(np.diag(normal))
         scaled = normal * np.outer(scale, scale)
         step = scale * np.linalg.solve(scaled + damping * np.eye(len(scale)), scale * gradient)
-        tried_rig = moved(rig, prior.names, step[:count])
-        tried = [
-            Transform(Rotation.from_rotvec(turn[:3]).as_matrix() @ place.rotation, place.translation + turn[3:])
-            for turn, place in zip(step[count:].reshape(-1, 6), places, strict=True)
-        ]
+        tried_rig, tried = bundle.stepped(rig, places, prior.names, step)
         new = _normal(tried_rig, tried, boards, board, noise, prior)
         if new[0] > cost * (1 + 1e-12):
             damping *= 4
@@ -258,14 +242,16 @@ def _residuals(
 ) -> tuple[Floats, Floats, Floats]:
     """Return derivatives of the pixels of one pose, (n, eyes, 2, p + 6), (n, eyes, 2, 3), residuals (n, 2 eyes)."""
     optics, corners = all_eyes(rig), board.corners[recorded.corners]
-    jacobian, by_point = view_jacobian(optics, names, place, corners)
+    jacobian, by_point = bundle.view_jacobian(optics, names, place, corners)
     at = place.points(corners)
     left = np.concatenate([recorded.pixels[name] - eye.project(at) for name, eye in optics.items()], axis=1)
     return jacobian, by_point, left
 
 
 def _whitening(rig: Rig, place: Transform, recorded: RecordedBoard, by_point: Floats, noise: Floats) -> Floats:
-    covariance = observation_covariance(all_eyes(rig), by_point, BoardView(place, recorded.corners, *map(float, noise)))
+    covariance = bundle.observation_covariance(
+        all_eyes(rig), by_point, bundle.BoardView(place, recorded.corners, *map(float, noise))
+    )
     return np.linalg.inv(np.linalg.cholesky(covariance))
 
 
@@ -280,7 +266,7 @@ def _noise(rig: Rig, places: list[Transform], boards: Sequence[RecordedBoard], b
         for index, eye in enumerate(optics):
             part = left[:, 2 * index : 2 * index + 2]
             if eye == "projector":
-                turned = homographies(by_point[:, 0], by_point[:, index], place)
+                turned = bundle.homographies(by_point[:, 0], by_point[:, index], place)
                 own = [part - np.einsum("nij,nj->ni", turned, left[:, :2])]
             else:
                 camera.append(part)
@@ -289,9 +275,15 @@ def _noise(rig: Rig, places: list[Transform], boards: Sequence[RecordedBoard], b
 
 
 def _covariance(
-    adjusted: _Adjustment, boards: Sequence[RecordedBoard], board: Board, source: str, own_units: bool
-) -> RigCovariance:
-    rig, places, noise, normal = adjusted.rig, adjusted.places, adjusted.noise, adjusted.normal
+    rig: Rig,
+    places: list[Transform],
+    noise: Floats,
+    normal: Floats,
+    boards: Sequence[RecordedBoard],
+    board: Board,
+    own_units: bool,
+) -> Floats:
+    """Return the covariance of the rig's parameters (p, p) after an adjustment with a normal matrix (q, q)."""
     names = parameter_names(rig)
     count = len(names)
     modes, sigma = board.imperfections()
@@ -301,19 +293,10 @@ def _covariance(
     for number, (place, recorded, own_noise) in enumerate(zip(places, boards, noise, strict=True)):
         jacobian, by_point, left = _residuals(rig, place, recorded, board, names)
         whiten = _whitening(rig, place, recorded, by_point, own_noise)
-        shifts = np.einsum("ij,mnj->mni", place.rotation, modes[:, recorded.corners])
-        moves = np.einsum("neak,mnk->neam", by_point, shifts).reshape(len(left), -1, len(modes))
+        moves = bundle.board_derivatives(place, modes[:, recorded.corners], by_point).reshape(len(left), -1, len(modes))
         flat = np.einsum("nij,njk->nik", whiten, jacobian.reshape(len(left), -1, count + 6))
         own = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]
         shared[own] += np.einsum("nip,nim->pm", flat, np.einsum("nij,njm->nim", whiten, moves))
-    scale = 1 / np.sqrt(np.diag(normal))
-    inverse = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
+    inverse = bundle.inverse_of(normal)
     spread = (inverse @ shared)[:count] * sigma
-    details: dict[str, str | float] = {
-        "board": str(board),
-        "poses": float(len(places)),
-        "corners": float(sum(len(b.corners) for b in boards)),
-        "corner_noise_px": float(noise[:, 0].max()),
-        "coordinate_noise_px": float(noise[:, 1].max()),
-    }
-    return RigCovariance(names, inverse[:count, :count] + spread @ spread.T, source, details)
+    return np.asarray(inverse[:count, :count] + spread @ spread.T)

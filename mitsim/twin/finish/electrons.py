@@ -13,6 +13,7 @@ the first knee of a companding curve, and with a gamma, a grey level is wider th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from mitsim.capture.capture import Capture
 from mitsim.sensor.image_formation import converter
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise
+from mitsim.sensor.preset import Sensor, load_sensor, presets
 
 Floats = NDArray[np.float64]
 
@@ -76,6 +78,20 @@ def linearised(levels: NDArray[np.unsignedinteger[Any]] | Floats, chip: Imager) 
         return np.asarray((values - chip.black_level) / chip.gain)
     share = np.clip((values - chip.black_level) / (chip.full_scale - chip.black_level), 0.0, None)
     return np.asarray(chip.full_well * share**chip.gamma)
+
+
+def sensor_of(capture: Capture, name: str | None, where: str | Path) -> Sensor:
+    """Return the sensor of a name or file, by default the preset that a capture names.
+
+    Raises
+    ------
+    InputError
+        If the capture names none.
+    """
+    if name is None and capture.sensor not in presets():
+        found = f"none, and {where} comes from {capture.sensor}, which is not a preset"
+        raise InputError("--sensor", "", found, f"one of {', '.join(presets())}, or the path of a .toml file")
+    return load_sensor(capture.sensor if name is None else name)
 
 
 def chip_of(capture: Capture, imager: Imager, where: str) -> Imager:

@@ -26,8 +26,9 @@ from mitsim.running.progress import say, track
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.pattern import DotPattern
-from mitsim.sensor.preset import Sensor, load_sensor, presets
+from mitsim.sensor.preset import Sensor
 from mitsim.twin.finish.dots import Dots, compare_dots
+from mitsim.twin.finish.electrons import sensor_of
 from mitsim.twin.finish.estimate import Fit, Parameter, fit_views
 from mitsim.twin.finish.finish import MetalFinish, metal_finish
 from mitsim.twin.finish.observation import CouponCapture, View, observe
@@ -92,12 +93,12 @@ class CouponFit:
     @property
     def rms_dn(self) -> float:
         """Root mean square residual of all blocks [DN]."""
-        return _pooled([(r.view.size, r.rms_dn) for r in self.fit.residuals])
+        return _pooled(self.fit.residuals, "rms_dn")
 
     @property
     def rms_in_noise(self) -> float:
         """Root mean square residual of all blocks in standard deviations of a block's noise [1]."""
-        return _pooled([(r.view.size, r.rms_in_noise) for r in self.fit.residuals])
+        return _pooled(self.fit.residuals, "rms_in_noise")
 
     @property
     def worst(self) -> Residual:
@@ -180,7 +181,8 @@ def fit_captures(
         raise InputError("CAPTURES", "", "none", "one capture folder or more")
     if len({path.resolve() for path in captures}) < len(captures):
         raise InputError("CAPTURES", "", "a folder twice", "each capture once", "the same noise twice is not a repeat")
-    chosen, first = _sensor(captures[0], sensor), read_capture(captures[0])
+    first = read_capture(captures[0])
+    chosen = sensor_of(first, sensor, captures[0])
     path = scene or _own_scene(first, captures[0])
     recipe = CouponRecipe(str(path), tuple(sorted((parameters or {}).items())), chosen.wavelength_nm)
     sample = load_sample(recipe)
@@ -234,21 +236,6 @@ def fit_captures(
     )
 
 
-def _sensor(folder: Path, name: str | None) -> Sensor:
-    if name is not None:
-        return load_sensor(name)
-    own = read_capture(folder).sensor
-    if own not in presets():
-        raise InputError(
-            folder / "capture.json",
-            "sensor",
-            own,
-            f"one of {', '.join(presets())}",
-            "give the preset or the sensor file: --sensor",
-        )
-    return load_sensor(own)
-
-
 def _own_scene(capture: Capture, folder: Path) -> Path:
     named = capture.settings.get("scene")
     if isinstance(named, str) and Path(named).is_file():
@@ -285,23 +272,15 @@ def _exponential(parameter: Parameter | None) -> tuple[float, float]:
 
 def _uncertain(pair: tuple[float, float], parameter: Parameter | None) -> dict[str, Any]:
     relative = (math.nan, math.nan) if parameter is None else (parameter.by_covariance, parameter.by_jackknife)
-    return {
-        "value": pair[0],
-        "uncertainty": pair[1],
-        "relative_by_covariance": relative[0],
-        "relative_by_jackknife": relative[1],
-    }
+    names = ("value", "uncertainty", "relative_by_covariance", "relative_by_jackknife")
+    return dict(zip(names, (*pair, *relative), strict=True))
 
 
 def _linear(parameter: Parameter | None) -> dict[str, Any] | None:
     if parameter is None:
         return None
-    return {
-        "value": parameter.value,
-        "uncertainty": parameter.uncertainty,
-        "by_covariance": parameter.by_covariance,
-        "by_jackknife": parameter.by_jackknife,
-    }
+    names = ("value", "uncertainty", "by_covariance", "by_jackknife")
+    return {name: getattr(parameter, name) for name in names}
 
 
 def _view_numbers(residual: Residual) -> dict[str, Any]:
@@ -321,6 +300,7 @@ def _view_numbers(residual: Residual) -> dict[str, Any]:
     }
 
 
-def _pooled(parts: list[tuple[int, float]]) -> float:
-    known = [(size, rms) for size, rms in parts if size]
+def _pooled(residuals: Sequence[Residual], name: str) -> float:
+    """Return the root mean square of a property of residuals, weighted by their numbers of blocks."""
+    known = [(residual.view.size, getattr(residual, name)) for residual in residuals if residual.view.size]
     return math.sqrt(sum(size * rms**2 for size, rms in known) / sum(size for size, _ in known))

@@ -24,7 +24,7 @@ from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor
-from mitsim.twin.compare.specimen_patches import run_length
+from mitsim.twin.compare.specimen_patches import contrast_window
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
 from mitsim.twin.sensor.estimate import scaled, unscaled
@@ -37,9 +37,6 @@ Floats = NDArray[np.float64]
 
 #: side of a patch [px], and the least number of patches of a capture
 PATCH_PX, FEWEST_PATCHES = 40, 8
-
-#: limits of the window of local means [px], and its width in run lengths of the pattern: as `mitsim validate captures`
-_WINDOWS, _RUNS = (7, 31), 2.5
 
 _ALONE = ("crossings", "sharpness", "noise in the dark half", "noise in the bright half", "grain")
 
@@ -101,7 +98,7 @@ def with_values(sensor: Sensor, parameters: Sequence[Parameter], theta: Floats) 
 
 @dataclass(frozen=True)
 class DotDraws:
-    """Simulated dots that a fit compares with: how many ``number``, their ``seed``, and patches of ``patch_px``."""
+    """Simulated dots that a fit compares with: their ``number`` and ``seed``, in patches of ``patch_px``."""
 
     number: int = 3
     seed: int = 1
@@ -144,7 +141,7 @@ def fit_dots(
         seen = f"{len(field.corners)} patches of {patch_px} px of it"
         raise InputError(where, "specimen", seen, f"{FEWEST_PATCHES} or more", "a larger --window, or a nearer view")
     roi = Roi(field.column, field.row, *field.mask.shape[::-1])
-    window = int(np.clip(np.nan_to_num(_RUNS * run_length(capture, place), nan=_WINDOWS[1]), *_WINDOWS)) // 2 * 2 + 1
+    window = contrast_window(capture, place)
     black = sensor.imager.black_level
     real = field_figures(capture.images[name][0][roi.slices].astype(float), field, window, black)
     simulator = SpecimenSimulator(sensor, place, roi)

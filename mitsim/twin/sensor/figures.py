@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
 from mitsim.sensor.camera import Camera
+from mitsim.twin.compare.specimen_patches import patch_corners
 from mitsim.twin.finish.fine_detail import finest_detail
 
 Floats = NDArray[np.float64]
@@ -78,17 +79,9 @@ class Field:
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         row, column = (int(rows[0]), int(columns[0])) if len(rows) else (0, 0)
         window_mask = mask[row : rows[-1] + 1, column : columns[-1] + 1] if len(rows) else np.zeros((0, 0), bool)
-        corners = np.array(
-            [
-                (top, left)
-                for top in range(0, window_mask.shape[0] - patch_px + 1, patch_px)
-                for left in range(0, window_mask.shape[1] - patch_px + 1, patch_px)
-                if window_mask[top : top + patch_px, left : left + patch_px].mean() >= least_share
-            ]
-        ).reshape(-1, 2)
-        return cls(
-            column, row, window_mask, patch_px, corners, _basis(camera, corners + np.array([row, column]), patch_px)
-        )
+        corners = np.array(patch_corners(mask, patch_px, least_share), int).reshape(-1, 2)
+        basis = _basis(camera, corners, patch_px)
+        return cls(column, row, window_mask, patch_px, corners - [row, column], basis)
 
     def patches(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return the values (P, patch_px^2) of an image's window (h, w) in every patch."""

@@ -47,7 +47,11 @@ _SMOOTHINGS, _SURE = (0.05, 3.0), 3.0
 #: share of the specimen's pixels away from edges of the print, above which the noise is estimated from these alone
 _LEAST_QUIET = 0.2
 
-_EVERY_SOURCE = "imager.dsnu_e", "imager.prnu"
+#: parts of the noise that one image of a light does not separate
+UNSEPARATED = tuple(
+    Undetermined(f"imager.{key}", 0.0, "repeats of one pose; until then read_noise_e and full_well_e include it")
+    for key in ("dsnu_e", "prnu", "row_noise_e", "column_pattern_e")
+)
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,8 @@ def fit_imager(groups: list[list[InputCapture]], sensor: Sensor, places: dict[st
     imager, curve = _with_curve(imager, groups, sensor)
     estimates += curve
     if repeated:
-        line = repeated_line([_repeats(group, _specimen_mask(group[0], places)) for group in repeated], imager)
+        masked = [(_images(group), _specimen_mask(group[0], places)) for group in repeated]
+        line = repeated_line([Repeats.of(images, mask, _PIXELS) for images, mask in masked], imager)
         if line is not None:
             names = tuple(source.name for group in repeated for source in group)
             imager, found = _with_line(imager, line, names, "photon transfer of repeats")
@@ -82,13 +87,13 @@ def fit_imager(groups: list[list[InputCapture]], sensor: Sensor, places: dict[st
             found_one = _from_one_image(group[0], imager, places)
             if found_one is not None:
                 imager, found = found_one
-                determined_by = "repeats of one pose; until then read_noise_e and full_well_e include it"
-                undetermined = [
-                    Undetermined(key, 0.0, determined_by)
-                    for key in (*_EVERY_SOURCE, "imager.row_noise_e", "imager.column_pattern_e")
-                ]
-                return ImagerFit(imager, (*estimates, *found), tuple(undetermined), True)
+                return ImagerFit(imager, (*estimates, *found), UNSEPARATED, True)
     return ImagerFit(imager, tuple(estimates), (), False)
+
+
+def without_fixed_pattern(imager: Imager) -> Imager:
+    """Return the imager without fixed pattern and row noise, which one image does not separate from other noise."""
+    return replace(imager, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0)
 
 
 def smoothing_of(
@@ -157,7 +162,7 @@ def _with_curve(imager: Imager, groups: list[list[InputCapture]], sensor: Sensor
     if sensor.technology != "active_stereo" or imager.companding or imager.gamma != 1:
         return imager, []
     for source in (group[0] for group in groups if group[0].kind == "off"):
-        image = next(iter(source.capture.images.values()))[0]
+        image = source.image
         levels, mask = image.astype(float), (image > 0) & (image < imager.full_scale)
         knee = first_knee(levels, mask, imager)
         if knee is not None:
@@ -167,17 +172,16 @@ def _with_curve(imager: Imager, groups: list[list[InputCapture]], sensor: Sensor
     return imager, []
 
 
-def _repeats(group: list[InputCapture], mask: NDArray[np.bool_]) -> Repeats:
-    """Return the first image of every repeat."""
-    images = np.stack([next(iter(source.capture.images.values()))[0] for source in group])
-    return Repeats.of(images, mask, _PIXELS)
+def _images(group: list[InputCapture]) -> NDArray[np.unsignedinteger]:
+    """Return the first images (n, H, W) of captures."""
+    return np.stack([source.image for source in group])
 
 
 def _with_black_level(imager: Imager, dark: list[list[InputCapture]]) -> tuple[Imager, Estimate]:
     input_captures = [source for group in dark for source in group]
-    levels = [float(next(iter(source.capture.images.values()))[0].mean()) for source in input_captures]
-    image = next(iter(input_captures[0].capture.images.values()))[0]
-    value, spread = float(np.mean(levels)), float(image.std() / np.sqrt(image.size * len(input_captures)))
+    image = input_captures[0].image
+    value = float(np.mean([float(source.image.mean()) for source in input_captures]))
+    spread = float(image.std() / np.sqrt(image.size * len(input_captures)))
     names = tuple(source.name for source in input_captures)
     estimate = Estimate("imager.black_level_dn", value, spread, "DN", names, "mean grey level in the dark")
     return replace(imager, black_level=value), estimate
@@ -208,24 +212,14 @@ def _with_fixed(
             undetermined.append(Undetermined(key, before.dsnu if kind == "dark" else before.prnu, determined_by))
             continue
         group = groups[0]
-        images = np.stack([next(iter(source.capture.images.values()))[0] for source in group])
-        level, variance, spread = fixed_variance(images, _specimen_mask(group[0], places), imager)
+        level, variance, spread = fixed_variance(_images(group), _specimen_mask(group[0], places), imager)
         if kind == "off":
             variance -= imager.dsnu**2
         root = float(np.sqrt(max(variance, 0.0)))
         spread_root = spread / (2 * root) if root > 0 else float(np.sqrt(spread))
-        scale = 1.0 if kind == "dark" else level
-        names = tuple(source.name for source in group)
-        estimates.append(
-            Estimate(
-                key,
-                root / scale,
-                spread_root / scale,
-                "e-" if kind == "dark" else "1",
-                names,
-                "finest detail of the mean of repeats",
-            )
-        )
+        scale, unit = (1.0, "e-") if kind == "dark" else (level, "1")
+        names, method = tuple(source.name for source in group), "finest detail of the mean of repeats"
+        estimates.append(Estimate(key, root / scale, spread_root / scale, unit, names, method))
         imager = replace(imager, dsnu=root) if kind == "dark" else replace(imager, prnu=root / scale)
     return imager, estimates, undetermined
 
@@ -233,27 +227,22 @@ def _with_fixed(
 def _from_one_image(
     source: InputCapture, imager: Imager, places: dict[str, Place]
 ) -> tuple[Imager, list[Estimate]] | None:
-    image, mask = next(iter(source.capture.images.values()))[0], _specimen_mask(source, places)
+    image, mask = source.image, _specimen_mask(source, places)
     names, method = (source.name,), "finest detail of one image by level, including its fixed pattern"
     estimates = []
-    bare = replace(imager, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0)
+    bare = without_fixed_pattern(imager)
     smoothing, spread = smoothing_of(image, mask)
     quiet = quiet_pixels(image.astype(float), denoised(image.astype(float), mask), mask)
     mask = quiet if quiet.mean() > _LEAST_QUIET * mask.mean() else mask
     gain = 1.0
     if smoothing > max(_SURE * spread, 0.2):
         bare, gain = replace(bare, smoothing_px=smoothing), fine_gain(smoothing)
-        estimates.append(
-            Estimate(
-                "imager.smoothing_px", smoothing, spread, "px", names, "correlation of neighbours in finest detail"
-            )
-        )
+        by_neighbours = "correlation of neighbours in finest detail"
+        estimates.append(Estimate("imager.smoothing_px", smoothing, spread, "px", names, by_neighbours))
     line = one_image_line(image, mask, imager)
     if line is not None:
-        line = TransferLine(
-            line.offset / gain, line.slope / gain, line.covariance / gain**2, line.bins, line.chi_square
-        )
-        line = line.not_negative()
+        scaled = replace(line, offset=line.offset / gain, slope=line.slope / gain, covariance=line.covariance / gain**2)
+        line = scaled.not_negative()
         if line.full_well(imager)[1] < 0.3 * line.full_well(imager)[0] and line.offset >= 0:
             found, from_line = _with_line(bare, line, names, method)
             return found, [*estimates, *from_line]
