@@ -143,7 +143,7 @@ def open_study(
         folder / file.scene, sensor.wavelength_nm, {name: str(value) for name, value in file.parameters.items()}
     )
     check_features(task, folder / file.task, scene.names)
-    file = with_limits(path, file, task)
+    file = _with_limits(path, file, task)
     radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
     standoffs = chosen_standoffs(path, file.views, sensor, radius)
     campaign, chosen_map = None, None
@@ -216,16 +216,8 @@ def read_map(name: str | Path, sensor: Sensor, folder: str | Path = ".") -> Perf
     return performance_map
 
 
-def with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
-    """Return the study with the limits of its set: those of the file, or those from the tolerances of the task.
-
-    Limits from tolerances assume a normal error without bias.
-
-    Raises
-    ------
-    InputError
-        For a limit of an unknown measurement, or if there is neither a limit nor a tolerance.
-    """
+def _with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
+    """Return the study with limits of its set; those from tolerances assume a normal error without bias."""
     if file.set is None:
         return file
     for name in file.set.limits:

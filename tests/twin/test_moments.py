@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsim.twin.sensor.estimate import Estimate, combined, pooled
-from mitsim.twin.sensor.modulation import modulation
+from mitsim.twin.sensor.defocus import modulation
 from mitsim.twin.sensor.moments import Prior, match_moments
 
 A = np.array([[1.0, 0.4], [0.2, 1.0], [0.5, -0.7]])

@@ -3,8 +3,7 @@
 Signal chain: captures, sorted (:mod:`mitsim.twin.sensor.input_captures`) -> repeats and dark captures: photon transfer
 (:mod:`mitsim.twin.sensor.photon_transfer`) -> projector off: light of the room (:mod:`mitsim.twin.sensor.room`) ->
 dots: the remaining parameters (:mod:`mitsim.twin.sensor.dots`) -> row errors (:mod:`mitsim.twin.sensor.rows`) ->
-several captures combined (:mod:`mitsim.twin.sensor.estimate`) -> the sensor file
-(:mod:`mitsim.twin.sensor.sensor_text`).
+several captures combined (:mod:`mitsim.twin.sensor.estimate`) -> the sensor file (:mod:`mitsim.twin.sensor.write`).
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Signal chain: images of the code -> white and black -> line of black over white through all pixels of the print: black
 level of the imager, share of light without a pattern -> finest detail of both by level: full well, read noise ->
-difference of stripes on and off, by width: blur (:mod:`mitsim.twin.sensor.modulation`); if it changes with depth, the
-projector's focus and aperture (:mod:`mitsim.twin.sensor.defocus`).
+difference of stripes on and off, by width: blur; if it changes with depth, the projector's focus and aperture
+(:mod:`mitsim.twin.sensor.defocus`).
 """
 
 from __future__ import annotations
@@ -23,10 +23,9 @@ from mitsim.sensor.transforms import Transform
 from mitsim.twin.finish.electrons import linearised
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
-from mitsim.twin.sensor.defocus import Defocus, fit_defocus
+from mitsim.twin.sensor.defocus import Defocus, fit_defocus, fitted_blur
 from mitsim.twin.sensor.estimate import Estimate
 from mitsim.twin.sensor.input_captures import InputCapture
-from mitsim.twin.sensor.modulation import fitted_blur
 from mitsim.twin.sensor.noise import without_fixed_pattern
 from mitsim.twin.sensor.photon_transfer import one_image_line
 
