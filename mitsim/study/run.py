@@ -57,7 +57,6 @@ from mitsim.study.view_sets.confirmed_set import (
 from mitsim.study.virtual.plan import race_rules
 from mitsim.study.virtual.race import Raced, raced_errors, with_race
 from mitsim.study.virtual.rendered import RenderedMeasurements
-from mitsim.study.virtual.stated import write_statement
 
 #: number of best views per measurement whose predicted clouds are written to the run folder
 SHOWN = 3
@@ -112,7 +111,7 @@ def run_study(
     leaders = list(dict.fromkeys(raced.leaders().values()))
     stated = session.state(study.view(leaders[0])) if leaders else None
     if stated is not None:
-        write_statement(folder / "statement.json", stated.document)
+        write_json(folder / "statement.json", stated.document)
     clock.lap("state")
     tried = _confirm(session, chosen, search)
     chosen = tried[-1].chosen if tried else chosen

@@ -65,7 +65,7 @@ def test_jobs_are_the_pairs_of_finish_and_view(plan, n10):
     plan.write_text(PLAN.replace("captures = 5\n", ""))
     jobs = read_jobs(plan, SCENE, n10, COMMON)
     views = {job.view for job in jobs}
-    assert len(jobs) == 2 * len(views) == len({job.folder for job in jobs}) == len({job.seed for job in jobs})
+    assert len(jobs) == 2 * len(views) == len({job.folder for job in jobs}) == len({job.settings.seed for job in jobs})
     first, last = jobs[0], jobs[-1]
     assert first.settings.parameters == {"pillar_Ra": "0.4", "plane_Ra": "0.4"} and not first.settings.deviation
     assert last.settings.parameters == {"pillar_Ra": "0.6", "plane_Ra": "0.8"} and last.settings.deviation == "alpha=1"

@@ -27,6 +27,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from characterisation.files.atomic_io import write_json
 from characterisation.files.datasets import Schema, Variable, read_dataset
 from characterisation.files.errors import InputError
 from characterisation.statements.decision import demand, tolerance_of
@@ -41,7 +42,6 @@ from mitsim.study.choose.candidates import CandidateSensor
 from mitsim.study.session import Session, StatedView
 from mitsim.study.virtual.plan import map_digest, trial_digest
 from mitsim.study.virtual.race import ALL, Raced, RaceRules
-from mitsim.study.virtual.stated import write_statement
 from mitsim.views.view_scores import screening_risk
 
 Floats = NDArray[np.float64]
@@ -280,7 +280,7 @@ def _state(one: SensorResult, view: int, count: int) -> None:
 
 def _finish(one: SensorResult, view: int) -> None:
     """Write the statement of a view, and free the memory of the sensor."""
-    write_statement(one.session.folder / "statement.json", one.stated[view].document)
+    write_json(one.session.folder / "statement.json", one.stated[view].document)
     one.session.release()
     gc.collect()
 

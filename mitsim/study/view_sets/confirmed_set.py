@@ -129,11 +129,10 @@ def _next_set(
 
 def _missed(tried: TriedSet, limits: dict[str, float]) -> str:
     """Return text such as ``radius missed, 1.3 times its limit``."""
-    found = {
-        one.measurement: _excess(one, limits[one.measurement]) for one in tried.stated if one.measurement in limits
-    }
-    words = [f"{name} missed, {ratio:.2g} times its limit" for name, ratio in found.items() if 1 < ratio < math.inf]
-    return "; ".join(words + [f"{name} without a value" for name, ratio in found.items() if ratio == math.inf])
+    stated = {one.measurement: one for one in tried.stated}
+    ratios = {name: _excess(one, limits[name]) for name, one in stated.items() if name in limits}
+    words = [f"{name} missed, {ratio:.2g} times its limit" for name, ratio in ratios.items() if 1 < ratio < math.inf]
+    return "; ".join(words + [f"{name} without a value" for name, ratio in ratios.items() if ratio == math.inf])
 
 
 def stricter(
@@ -164,8 +163,7 @@ def state_set(
         digest, None, ["set", list(chosen.views), table.joining, list(table.pose_known), _JOINING_VERSION]
     )
     trials = TrialFolder.of(folder / "set_trials" / decided_by, decided_by, study.task)
-    by_number = {view.number: view for view in study.views}
-    runner = JoinedMeasurements(renderer, [by_number[number] for number in chosen.views], table)
+    runner = JoinedMeasurements(renderer, [study.view(number) for number in chosen.views], table)
     days = [SET_DAYS + k for k in range(table.trials)]
     missing = [day for day in days if Trial(day) not in trials.known(0)]
     for day, outcome in track(runner.run(missing), "confirm the set", len(missing)):
@@ -189,11 +187,9 @@ def tried_entries(tried: Sequence[TriedSet], limits: dict[str, float]) -> list[d
             "excess": json_values(one.excess(limits)),
             "searched": one.searched,
             "expected": dict(zip(limits, one.chosen.uncertainty.tolist(), strict=True)),
-            "found": {
-                each.measurement: json_values(each.root_mean_square)
-                for each in one.stated
-                if each.measurement in limits
-            },
+            "found": json_values(
+                {each.measurement: each.root_mean_square for each in one.stated if each.measurement in limits}
+            ),
         }
         for one in tried
     ]
@@ -221,25 +217,17 @@ def confirmed_entry(stated: Sequence[Statement]) -> dict[str, Any]:
 
 def write_set_csv(path: Path, table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> None:
     """Write limit, expected and confirmed uncertainty of every measurement, one row each."""
+
+    def text(value: float | None) -> str:
+        return "" if value is None or not math.isfinite(value) else f"{value:.4g}"
+
     expected = dict(zip(table.limits, chosen.uncertainty.tolist(), strict=True))
     lines = ["measurement,unit,limit,expected_uncertainty,trials,without_value,bias,uncertainty,low,high,verdict"]
     for one in stated:
-        limit, u = table.limits.get(one.measurement), expected.get(one.measurement)
-        numbers = [one.bias, one.standard_uncertainty, *one.interval]
-        lines.append(
-            ",".join(
-                [
-                    one.measurement,
-                    one.unit,
-                    "" if limit is None else f"{limit:g}",
-                    "" if u is None else f"{u:.4g}",
-                    str(one.trials),
-                    f"{one.without_value:.4g}",
-                    *("" if not math.isfinite(number) else f"{number:.4g}" for number in numbers),
-                    one.verdict,
-                ]
-            )
-        )
+        limit = f"{table.limits[one.measurement]:g}" if one.measurement in table.limits else ""
+        counts = [text(expected.get(one.measurement)), str(one.trials), text(one.without_value)]
+        numbers = map(text, (one.bias, one.standard_uncertainty, *one.interval))
+        lines.append(",".join([one.measurement, one.unit, limit, *counts, *numbers, one.verdict]))
     with atomic_write(path) as file:
         file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
@@ -249,17 +237,9 @@ def set_table(table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> 
     expected = dict(zip(table.limits, chosen.uncertainty.tolist(), strict=True))
     rows = [("measurement", "unit", "limit", "expected u", "bias", "u", "no value", "limit kept")]
     for one in stated:
-        limit, u = table.limits.get(one.measurement), expected.get(one.measurement)
-        rows.append(
-            (
-                one.measurement,
-                one.unit,
-                "-" if limit is None else f"{limit:g}",
-                "-" if u is None else f"{u:.2g}",
-                digits(one.bias),
-                digits(one.standard_uncertainty),
-                f"{100 * one.without_value:.0f} %",
-                "-" if limit is None else "yes" if one.root_mean_square <= limit else "no",
-            )
-        )
+        limit = table.limits.get(one.measurement)
+        kept = "-" if limit is None else "yes" if one.root_mean_square <= limit else "no"
+        wanted = ("-", "-") if limit is None else (f"{limit:g}", f"{expected[one.measurement]:.2g}")
+        numbers = digits(one.bias), digits(one.standard_uncertainty), f"{100 * one.without_value:.0f} %"
+        rows.append((one.measurement, one.unit, *wanted, *numbers, kept))
     return "\n".join(aligned(rows))

@@ -19,6 +19,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,27 +138,13 @@ class RenderedMeasurements:
         captured = self._captured(view, world)
         return self._cloud(captured), captured.assumed
 
-    def measured(self, lit: TracedLight, planned: PlannedExposure | None) -> tuple[PointCloud, Outcome]:
-        """Return the labelled cloud of a world's light with planned exposures, and the outcome of its measurement.
-
-        The light is kept for other exposures.
-        """
-        captured = self._exposed(lit, planned, True)
-        cloud = self._cloud(captured)
-        return cloud, self._outcome(cloud, captured)
-
     def _finish(self, captured: _Captured, job: Job) -> Outcome:
-        return self._outcome(self._cloud(captured), captured)
-
-    def _outcome(self, cloud: PointCloud, captured: _Captured) -> Outcome:
-        return Outcome.of(measure(cloud, self.study.task, captured.assumed.inverse().matrix(), MINIMUM_POINTS, False))
+        cloud, part_from_world = self._cloud(captured), captured.assumed.inverse().matrix()
+        return Outcome.of(measure(cloud, self.study.task, part_from_world, MINIMUM_POINTS, False))
 
     def _captured(self, view: View, world: World) -> _Captured:
-        return self._exposed(self.lit(view, world), self.planned, False)
-
-    def _exposed(self, lit: TracedLight, planned: PlannedExposure | None, keep: bool) -> _Captured:
-        world = lit.world
-        capture = self.exposed(lit, planned, world.seed, keep)
+        lit = self.lit(view, world)
+        capture = self.exposed(lit, self.planned, world.seed)
         labels = self.predictor.quick_labels(self.study.scene, lit.assumed)
         surfaces = self.predictor.surfaces(self.study.scene, lit.assumed) if self._has_form and world.form else None
         return _Captured(capture, world, lit.assumed, surfaces, labels)
@@ -202,9 +189,8 @@ class RenderedMeasurements:
         points = displaced(cloud, captured.world, captured.assumed, scene.centre)
         if captured.surfaces is not None:
             form = self.unknowns.table.form.features
-            points = form_deviation(
-                points, captured.surfaces, scene, form, captured.assumed, cloud.grid, captured.world.form
-            )
+            seed = captured.world.form
+            points = form_deviation(points, captured.surfaces, scene, form, captured.assumed, cloud.grid, seed)
         return replace(cloud, points=points, feature=captured.labels, feature_names=scene.names)
 
     def _scene(self, finish: int) -> tuple[Scene, list[Floats]]:
@@ -214,25 +200,17 @@ class RenderedMeasurements:
             file, scene = self.study.file, self.study.scene
             if finish >= 0:
                 parameters = {name: str(value) for name, value in file.parameters.items()}
-                scene = load_scene(
-                    scene.where,
-                    self.study.sensor.wavelength_nm,
-                    parameters,
-                    lambda name: finish_deviation(self.unknowns, finish, name),
-                )
+                wavelength_nm = self.study.sensor.wavelength_nm
+                drawn = partial(finish_deviation, self.unknowns, finish)
+                scene = load_scene(scene.where, wavelength_nm, parameters, drawn)
             self._scenes[finish] = scene, directional_albedos(scene)
         return self._scenes[finish]
 
     def _shared_with(self, view: View, finish: int) -> _SharedLight:
-        if self._cached is not None and (self._cached.view, self._cached.finish) == (
-            view.number,
-            finish,
-        ):
-            return self._cached
-        self._cached = None  # release the memory first
-        self._cached = self._render_shared_light(
-            self.simulated, view.world_from_sensor, view, finish, self.unknowns.seed
-        )
+        if self._cached is None or (self._cached.view, self._cached.finish) != (view.number, finish):
+            self._cached = None  # release the memory first
+            pose, seed = view.world_from_sensor, self.unknowns.seed
+            self._cached = self._render_shared_light(self.simulated, pose, view, finish, seed)
         return self._cached
 
     def _render_shared_light(

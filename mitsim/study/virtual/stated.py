@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
-from characterisation.files.atomic_io import json_values, write_json
+import numpy as np
+
+from characterisation.files.atomic_io import json_values
 from characterisation.statements.budget import budget
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import common_losses, losses
@@ -49,17 +50,11 @@ def state_view(
     again = {group: stated_errors_of_trials(study.task, trials, view.number, some) for group, some in swapped.items()}
     out = []
     for m, (name, asked) in enumerate(study.task.measurements.items()):
-        found = stated_errors(by_trial[m])
-        known = found[[math.isfinite(error) for error in found]]
-        lines = (
-            budget(
-                found[: len(pairs)],
-                {group: errors[m] for group, errors in again.items()},
-                float(known.var(ddof=1)) if len(known) > 1 else None,
-            )
-            if pairs and len(known) > 1
-            else ()
-        )
+        errors, lines = stated_errors(by_trial[m]), ()
+        known = errors[np.isfinite(errors)]
+        if pairs and len(known) > 1:
+            redrawn = {group: of_group[m] for group, of_group in again.items()}
+            lines = budget(errors[: len(pairs)], redrawn, float(known.var(ddof=1)))
         stated = statement(name, asked.unit, by_trial[m], tolerance_of(study.task, name), lines, second[m])
         out.append(replace(stated, losses=losses(trials.reasons(view.number, base, name))))
     return out
@@ -68,13 +63,9 @@ def state_view(
 def budget_groups(unknowns: Unknowns, source: str) -> list[str]:
     """Return the groups of unknowns with a line in the budget: those that are drawn and can have an effect."""
     table = unknowns.table
-    idle = set()
+    idle = {"light", "unit"} if source == "map" else {BEYOND}
     if not any(size > 0 for size in table.form.features.values()):
         idle.add("form")
-    if source == "map":
-        idle |= {"light", "unit"}
-    else:
-        idle.add(BEYOND)
     if source != "map" and not any(table.finish.model_dump().values()):
         idle.add("finish")
     return [group for group in GROUPS if group in unknowns.varied and group not in idle]
@@ -100,7 +91,7 @@ def statement_document(
         "study": str(study.path),
         "sensor": study.sensor.name,
         "measured_by": source,
-        "map_source": _map_source(study),
+        "map_source": "" if study.performance_map is None else study.performance_map.data.attrs.get("source", ""),
         "seed": study.file.seed,
         "view": view.number,
         "world_from_sensor": view.world_from_sensor.matrix().tolist(),
@@ -112,26 +103,10 @@ def statement_document(
     }
 
 
-def write_statement(path: str | Path, document: dict[str, Any]) -> None:
-    """Write ``statement.json`` completely or not at all."""
-    write_json(path, document)
-
-
 def statement_table(stated: Sequence[Statement]) -> str:
     """Return the statements as a text table."""
-    head = (
-        "measurement",
-        "unit",
-        "bias",
-        "u",
-        "95 % interval of the error",
-        "after correction",
-        "no value",
-        "most of it from",
-        "accepted readings",
-        "verdict",
-    )
-    rows = [head]
+    about_error = ("bias", "u", "95 % interval of the error", "after correction", "no value", "most of it from")
+    rows = [("measurement", "unit", *about_error, "accepted readings", "verdict")]
     for one in stated:
         largest = one.budget[0] if one.budget else None
         rows.append(
@@ -187,10 +162,6 @@ def _measurement(one: Statement) -> dict[str, Any]:
     known = math.isfinite(one.repeatability) and math.isfinite(one.standard_uncertainty)
     table["after_repeats"] = {str(n): one.after_repeats(n) for n in (1, 4, 16)} if known else {}
     return {key: json_values(value) for key, value in table.items()}
-
-
-def _map_source(study: Study) -> str:
-    return "" if study.performance_map is None else str(study.performance_map.data.attrs.get("source", ""))
 
 
 def digits(value: float) -> str:
