@@ -57,6 +57,7 @@ from mitsim.study.view_sets.confirmed_set import (
 from mitsim.study.virtual.plan import race_rules
 from mitsim.study.virtual.race import Raced, raced_errors, with_race
 from mitsim.study.virtual.rendered import RenderedMeasurements
+from mitsim.study.virtual.stated import statement_document
 
 #: number of best views per measurement whose predicted clouds are written to the run folder
 SHOWN = 3
@@ -111,7 +112,7 @@ def run_study(
     leaders = list(dict.fromkeys(raced.leaders().values()))
     stated = session.state(study.view(leaders[0])) if leaders else None
     if stated is not None:
-        write_json(folder / "statement.json", stated.document)
+        write_json(folder / "statement.json", statement_document(session, stated))
     clock.lap("state")
     tried = _confirm(session, chosen, search)
     chosen = tried[-1].chosen if tried else chosen
@@ -136,15 +137,15 @@ def _confirm(session: Session, chosen: ViewSet | None, search: Search) -> list[T
 
     The list is empty without a set, or if measurements are drawn from a map.
     """
-    study, folder, table = session.study, session.folder, session.study.file.set
+    table = session.study.file.set
     if table is None or chosen is None or not chosen.views or table.trials < 2:
         return []
     if session.renderer is None:
         say("the set of views is not confirmed: clouds drawn from a map cannot be joined")
         return []
-    tried = confirmed_set(study, chosen, search, session.renderer, session.digest, folder)
+    tried = confirmed_set(session, chosen, search)
     best = tried[-1]
-    write_set_csv(folder / "view_set.csv", table, best.chosen, best.stated)
+    write_set_csv(session.folder / "view_set.csv", table, best.chosen, best.stated)
     kept = "keeps its limits" if best.excess(table.limits) <= 1 else "the best set found, misses a limit"
     views = ", ".join(map(str, best.chosen.views))
     say(

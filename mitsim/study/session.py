@@ -8,7 +8,7 @@ used again under the same digest -> scores of all views, race, exposures and sta
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,7 +26,7 @@ from mitsim.running.executor import Executor
 from mitsim.running.progress import say
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable, Study
-from mitsim.study.exposures.planned import planned_for, rendered, with_exposure
+from mitsim.study.exposures.planned import planned_for
 from mitsim.study.run_files import claim_folder
 from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.plan import measured_by, measurements_of, race_rules, study_digest, trial_digest
@@ -34,23 +34,11 @@ from mitsim.study.virtual.race import Raced, RaceRules, run_race
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.screening import screen
 from mitsim.study.virtual.spread_out import SpreadMeasurements, spread_over
-from mitsim.study.virtual.stated import state_view, statement_document
+from mitsim.study.virtual.stated import StatedView, state_view
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import Unknowns
 from mitsim.views import View
-
-
-@dataclass(frozen=True)
-class StatedView:
-    """Statements of every measurement from one view, and the ``document`` of ``statement.json``.
-
-    ``planned`` are the exposures that they hold for, None for the sensor's own rule.
-    """
-
-    statements: list[Statement]
-    document: dict[str, Any]
-    planned: PlannedExposure | None
 
 
 class Session:
@@ -157,20 +145,11 @@ class Session:
             If the sensor cannot take or merge the exposures, or measurements are drawn from a map, which holds only for
             the exposure that it was made with.
         """
-        if self.study.file.exposure is None:
-            return None
-        return planned_for(rendered(self.measurements), view, self.digest, self.folder)
+        return planned_for(self, view)
 
     def state(self, view: View, table: StatementTable | None = None) -> StatedView:
         """State every measurement from one view at its exposures; ``table`` replaces the study's numbers of trials."""
-        study, runner, trials, planned = self.study, self.runner, self.trials, self.exposures(view)
-        if planned is not None:
-            assert not isinstance(runner, MappedMeasurements)  # exposures() rejects a map
-            runner = runner.exposed_as(planned)
-            trials = TrialFolder.of(self.folder / "planned_trials", with_exposure(self.digest, planned), study.task)
-        stated = state_view(study, view, runner, trials, self.unknowns, table or study.file.statement)
-        document = statement_document(study, view, stated, self.unknowns, self.source, planned)
-        return StatedView(stated, document, planned)
+        return state_view(self, view, table)
 
     def release(self) -> None:
         """Free the memory of the measurements, which are prepared again when they are needed."""

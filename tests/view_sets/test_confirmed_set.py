@@ -17,7 +17,7 @@ LIMITS = {"apart": 0.1, "radius": 0.1}
 
 
 @pytest.fixture
-def search_and_measure(monkeypatch, tmp_path):
+def search_and_measure(monkeypatch):
     """Views of noise 0.2 as the map has it and of 0.2 ``hope`` in truth, with a ``floor`` that no view averages."""
 
     def run(hope=(1.0, 1.0), floor=0.0, most=VIEWS):
@@ -29,7 +29,7 @@ def search_and_measure(monkeypatch, tmp_path):
             count = max([one for one, fine in zip(wanted, able, strict=True) if fine], default=0)
             return ViewSet(tuple(range(count)), np.full(2, 0.2 / np.sqrt(max(count, 1))), able, True)
 
-        def state(study, chosen, here, digest, folder):
+        def state(session, chosen):
             measured.append(len(chosen.views))
             rng = np.random.default_rng(len(measured))
             spread = 0.2 * np.array(hope) / np.sqrt(len(chosen.views))
@@ -40,7 +40,8 @@ def search_and_measure(monkeypatch, tmp_path):
 
         monkeypatch.setattr(confirmed_set, "state_set", state)
         study = SimpleNamespace(file=SimpleNamespace(set=SetTable(limits=LIMITS)), task=TASK)
-        tried = confirmed_set.confirmed_set(study, search(LIMITS), search, None, "", tmp_path)
+        session = SimpleNamespace(study=study)
+        tried = confirmed_set.confirmed_set(session, search(LIMITS), search)
         assert measured[0] == 4 and len(measured) == len(tried) <= MOST_SETS
         return tried, measured
 

@@ -39,9 +39,10 @@ from mitsim.running.executor import Executor
 from mitsim.running.progress import say
 from mitsim.study import StatementTable
 from mitsim.study.choose.candidates import CandidateSensor
-from mitsim.study.session import Session, StatedView
+from mitsim.study.session import Session
 from mitsim.study.virtual.plan import map_digest, trial_digest
 from mitsim.study.virtual.race import ALL, Raced, RaceRules
+from mitsim.study.virtual.stated import StatedView, statement_document
 from mitsim.views.view_scores import screening_risk
 
 Floats = NDArray[np.float64]
@@ -280,7 +281,7 @@ def _state(one: SensorResult, view: int, count: int) -> None:
 
 def _finish(one: SensorResult, view: int) -> None:
     """Write the statement of a view, and free the memory of the sensor."""
-    write_json(one.session.folder / "statement.json", one.stated[view].document)
+    write_json(one.session.folder / "statement.json", statement_document(one.session, one.stated[view]))
     one.session.release()
     gc.collect()
 

@@ -10,7 +10,7 @@ import hashlib
 import math
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
@@ -29,6 +29,9 @@ from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.views import View
 
+if TYPE_CHECKING:
+    from mitsim.study.session import Session
+
 #: default exposure limits of a sensor file [s], which are not those of a device
 _NO_LIMITS = (1e-9, 1e3)
 
@@ -44,27 +47,28 @@ class _StoredPlan(PartialDocument):
     power: float = Field(gt=0, le=1)
 
 
-def planned_for(renderer: RenderedMeasurements, view: View, digest: str, folder: Path) -> PlannedExposure:
-    """Return the exposures of a view's captures: those that the study gives in [exposure], or planned ones.
+def planned_for(session: Session, view: View) -> PlannedExposure | None:
+    """Return the exposures of a view: those of the study, or planned ones; None for the sensor's own rule.
 
-    A plan in ``folder`` with the same ``digest`` is used again. ``digest`` identifies everything but the exposures that
-    determines a trial.
+    A plan in the folder of the session is used again if all that determines a trial is the same.
 
     Raises
     ------
     InputError
-        If the sensor cannot take or merge the exposures of the study.
+        If the sensor cannot take or merge the exposures of the study, or measurements are drawn from a map, which holds
+        only for the exposure that it was made with.
     """
-    study = renderer.study
-    table = study.file.exposure
-    assert table is not None
+    study, table = session.study, session.study.file.exposure
+    if table is None:
+        return None
+    renderer = rendered(session.measurements)
     if table.exposures_s is not None:
         given = PlannedExposure(tuple(sorted(table.exposures_s)), table.power)
         _check_given(study, given)
         return given
     rules = PlanRules(table.most, table.within)
-    path = folder / "exposures" / f"view_{view.number:04d}.json"
-    digest_of_plan = with_exposure(digest, None, asdict(rules))
+    path = session.folder / "exposures" / f"view_{view.number:04d}.json"
+    digest_of_plan = with_exposure(session.digest, None, asdict(rules))
     if path.exists():
         try:
             stored = validate(path, read_json_object(path), _StoredPlan)

@@ -26,10 +26,10 @@ from characterisation.statements.losses import losses
 from characterisation.statements.statement import Statement, statement
 from mitsim.running.progress import say, track
 from mitsim.running.text_table import aligned
-from mitsim.study import SetTable, Study
+from mitsim.study import SetTable
 from mitsim.study.exposures.planned import with_exposure
+from mitsim.study.session import Session
 from mitsim.study.view_sets.joined import JoinedMeasurements
-from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import digits
 from mitsim.study.virtual.trials import TrialFolder, errors_of_trials
 from mitsim.study.virtual.world import SET_DAYS, Trial
@@ -71,19 +71,17 @@ class TriedSet:
         return max((_excess(found[name], limits[name]) for name in reachable), default=0.0)
 
 
-def confirmed_set(
-    study: Study, first: ViewSet, search: Search, renderer: RenderedMeasurements, digest: str, folder: Path
-) -> list[TriedSet]:
+def confirmed_set(session: Session, first: ViewSet, search: Search) -> list[TriedSet]:
     """Measure the first set, and sets for stricter limits until one keeps the limits.
 
     Returns all measured sets, the best last: the set that keeps all reachable limits, or the one of least excess.
     Trials in the folder are reused. Says of each set which limits it misses, and why no further set is tried.
     """
-    table = study.file.set
+    table = session.study.file.set
     assert table is not None
     chosen, searched, tried = first, dict(table.limits), list[TriedSet]()
     while True:
-        stated = state_set(study, chosen, renderer, digest, folder)
+        stated = state_set(session, chosen)
         tried.append(TriedSet(chosen, dict(searched), tuple(stated)))
         if tried[-1].excess(table.limits) <= 1:
             break
@@ -153,16 +151,13 @@ def _excess(one: Statement, limit: float) -> float:
     return one.root_mean_square / limit if math.isfinite(one.root_mean_square) else math.inf
 
 
-def state_set(
-    study: Study, chosen: ViewSet, renderer: RenderedMeasurements, digest: str, folder: Path
-) -> list[Statement]:
-    """State every measurement from a set of views together, and reuse trials in the folder."""
-    table = study.file.set
-    assert table is not None
-    decided_by = with_exposure(
-        digest, None, ["set", list(chosen.views), table.joining, list(table.pose_known), _JOINING_VERSION]
-    )
-    trials = TrialFolder.of(folder / "set_trials" / decided_by, decided_by, study.task)
+def state_set(session: Session, chosen: ViewSet) -> list[Statement]:
+    """State every measurement from a set of views together, and reuse trials in the folder of the session."""
+    study, renderer, table = session.study, session.renderer, session.study.file.set
+    assert table is not None and renderer is not None  # clouds drawn from a map cannot be joined
+    what = ["set", list(chosen.views), table.joining, list(table.pose_known), _JOINING_VERSION]
+    decided_by = with_exposure(session.digest, None, what)
+    trials = TrialFolder.of(session.folder / "set_trials" / decided_by, decided_by, study.task)
     runner = JoinedMeasurements(renderer, [study.view(number) for number in chosen.views], table)
     days = [SET_DAYS + k for k in range(table.trials)]
     missing = [day for day in days if Trial(day) not in trials.known(0)]

@@ -181,9 +181,9 @@ class _Tiles:
         self.clean, self.inside, self.square, self.own, self.black = clean, inside, square, own, black
         self.rising = np.argsort(clean, axis=None)
         self.rising_levels = clean.reshape(-1)[self.rising]
-        self.ranks = np.empty(clean.size, np.intp)
-        self.ranks[self.rising] = np.arange(clean.size)
-        self.ranks = self.ranks.reshape(clean.shape)
+        ranks = np.empty(clean.size, np.intp)
+        ranks[self.rising] = np.arange(clean.size)
+        self.ranks = ranks.reshape(clean.shape)
         self.used = np.flatnonzero(inside[:, _RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX])
 
     @classmethod
