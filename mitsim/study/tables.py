@@ -76,7 +76,7 @@ class RaceTable(Document):
 class StatementTable(Document):
     """How the uncertainty of the chosen view is stated.
 
-    ``trials`` are made in worlds that no race uses. ``pairs`` of them serve each line of the budget, with one more
+    ``trials`` are made with draws that no race uses. ``pairs`` of them serve each line of the budget, with one more
     trial each.
     """
 

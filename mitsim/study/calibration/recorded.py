@@ -121,7 +121,7 @@ def calibrate_recorded(
 
 
 @dataclass(frozen=True)
-class Prior:
+class LensPrior:
     """Prior of the rig's parameters ``names``: ``rows`` (m, p) times them is ``values`` (m,) +- ``sigma``."""
 
     names: tuple[str, ...]
@@ -130,7 +130,7 @@ class Prior:
     sigma: Floats
 
 
-def rig_prior(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> Prior:
+def rig_prior(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> LensPrior:
     """Return the prior of any camera and projector: central principal point, square pixels, little distortion."""
     names = parameter_names(rig)
     rows, values, sigma = [], [], []
@@ -152,7 +152,7 @@ def rig_prior(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> Prior:
         known({f"{eye}.focal_x_px": 1.0, f"{eye}.focal_y_px": -1.0}, 0.0, _ASPECT * focal)
         for name, spread in _DISTORTION.items():
             known({f"{eye}.{name}": 1.0}, 0.0, spread)
-    return Prior(names, np.array(rows), np.array(values), np.array(sigma))
+    return LensPrior(names, np.array(rows), np.array(values), np.array(sigma))
 
 
 def _start(
@@ -183,7 +183,7 @@ def _adjusted(
     boards: Sequence[RecordedBoard],
     board: Board,
     noise: Floats,
-    prior: Prior,
+    prior: LensPrior,
 ) -> tuple[Rig, list[Transform], Floats]:
     """Minimise the weighted squares over rig and poses by Levenberg-Marquardt; also return the normal matrix (q, q)."""
     damping = 1e-3
@@ -215,7 +215,7 @@ def _normal(
     boards: Sequence[RecordedBoard],
     board: Board,
     noise: Floats,
-    prior: Prior,
+    prior: LensPrior,
 ) -> tuple[float, Floats, Floats]:
     """Return weighted sum of squares, normal matrix (q, q) and gradient (q,) for the rig, then six of each pose."""
     count = len(prior.names)

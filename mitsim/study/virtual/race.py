@@ -1,6 +1,6 @@
 """Race: find the view that measures best, with virtual measurements of the promising views only.
 
-Signal chain: scores of all candidate views -> shortlist -> trials of every view on it, in the same worlds -> posterior
+Signal chain: scores of all candidate views -> shortlist -> trials of every view on it, with the same draws -> posterior
 of their risks (:mod:`characterisation.statements.selection`) -> more trials where the choice is open -> the best view
 of every measurement, and of all together.
 
@@ -94,7 +94,7 @@ class Raced:
     """Result of a race.
 
     ``views`` (v,) are view numbers. ``standings`` are by measurement, with :data:`ALL` for all together. ``errors``
-    (measurement, v, world) are in the units of the task, NaN without a value, infinite if not tried. ``decided`` says
+    (measurement, v, trial) are in the units of the task, NaN without a value, infinite if not tried. ``decided`` says
     whether every leader reached the confidence.
     """
 

@@ -1,6 +1,6 @@
 """State the uncertainty of every measurement from one view, with its budget.
 
-Signal chain: trials in worlds that were not used to choose the view -> the same trials with one group of unknowns
+Signal chain: trials with draws that were not used to choose the view -> the same trials with one group of unknowns
 redrawn -> :class:`characterisation.statements.statement.Statement` of every measurement -> ``statement.json``.
 """
 
@@ -51,7 +51,7 @@ class StatedView:
 def state_view(session: Session, view: View, table: StatementTable | None = None) -> StatedView:
     """State every measurement from one view at its exposures, and reuse trials in the folder of the session.
 
-    Worlds of the race are not used: they selected the view, and are biased in its favour. ``table`` replaces the
+    Draws of the race are not used: they selected the view, and are biased in its favour. ``table`` replaces the
     study's numbers of trials.
     """
     study, runner, trials, planned = session.study, session.runner, session.trials, session.exposures(view)

@@ -25,7 +25,7 @@ from mitsim.capture.folder import read_capture, write_capture
 from mitsim.decode.cloud import decoder_settings
 from mitsim.running.numbers import NONE, rounded, two_digits
 from mitsim.running.progress import say
-from mitsim.twin.compare.compare_captures import Comparison, Row, compare_captures
+from mitsim.twin.compare.compare_captures import ComparedRow, Comparison, compare_captures
 from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.compare.rebuild import check_technology, projector_was_on, rebuild
 from mitsim.twin.compare.specimen_patches import PATCH_PX, SpecimenPatches, reference_levels
@@ -122,7 +122,7 @@ def _whose(recorded: Capture) -> str:
     return "maker's simulation" if recorded.source == "simulated" else "real"
 
 
-def comparison_table(rows: tuple[Row, ...], first: str = "real") -> str:
+def comparison_table(rows: tuple[ComparedRow, ...], first: str = "real") -> str:
     """Return a Markdown table with a row for each quantity; ``first`` names the column of the given capture."""
     lines = [
         f"| quantity | unit | {first} | simulated | difference | u | margin | verdict |",
@@ -141,7 +141,7 @@ def comparison_table(rows: tuple[Row, ...], first: str = "real") -> str:
     return "\n".join(lines) + "\n"
 
 
-def _places(row: Row) -> int:
+def _places(row: ComparedRow) -> int:
     """Return the number of decimals that shows two digits of the uncertainty, 1 to 4."""
     if not row.uncertainty > 0:
         return 3

@@ -59,7 +59,7 @@ _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
-class Row:
+class ComparedRow:
     """A quantity of both captures; ``uncertainty`` (k = 1) and ``margin`` of the difference are in its unit.
 
     ``why`` is the reason for the verdict. Unknown numbers are NaN; all are NaN if the quantity does not apply.
@@ -83,7 +83,7 @@ class Comparison:
     ``image_patches`` and ``cloud_patches`` are their numbers; ``window_px`` is the window of the contrast.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[ComparedRow, ...]
     image_patches: int
     cloud_patches: int
     window_px: int
@@ -158,7 +158,7 @@ def compare_captures(
     for number, quantity in enumerate(QUANTITIES):
         if quantity.name in inapplicable:
             none, why = float("nan"), inapplicable[quantity.name]
-            rows.append(Row(quantity.name, quantity.unit, none, none, none, none, none, "does not apply", why))
+            rows.append(ComparedRow(quantity.name, quantity.unit, none, none, none, none, none, "does not apply", why))
             continue
         rng = np.random.default_rng([seed, number])
         rows += _row(quantity, real_patches, simulated_patches, patches[quantity.of], reasons, rng)
@@ -234,16 +234,16 @@ def _row(
     patches: int,
     reasons: Mapping[str, str],
     rng: np.random.Generator,
-) -> list[Row]:
+) -> list[ComparedRow]:
     """Return the row of a quantity; none for the share of a status that occurs in neither capture."""
     every = np.arange(patches)[None]
     real, simulated = (float(quantity.figure(seen, every)[0]) for seen in (real_patches, simulated_patches))
     if quantity.name.startswith("share") and not (real > 0 or simulated > 0):
         return []
     draws = rng.integers(0, patches, (DRAWS, patches))
-    off = quantity.figure(simulated_patches, draws) - quantity.figure(real_patches, draws)
-    off = off[np.isfinite(off)]
-    uncertainty = float(off.std(ddof=1)) if len(off) > DRAWS // 2 else float("nan")
+    drawn = quantity.figure(simulated_patches, draws) - quantity.figure(real_patches, draws)
+    drawn = drawn[np.isfinite(drawn)]
+    uncertainty = float(drawn.std(ddof=1)) if len(drawn) > DRAWS // 2 else float("nan")
     if uncertainty <= _ROUNDING * abs(simulated - real):
         uncertainty = 0.0
     margin = quantity.margin if np.isfinite(real) else float("nan")
@@ -252,7 +252,9 @@ def _row(
     verdict, why = _verdict(simulated - real, uncertainty, margin, reasons.get(quantity.name, ""))
     if verdict == "agrees" and quantity.factor > 1 and COVERAGE * uncertainty > _TOO_UNCERTAIN * abs(real):
         verdict, why = "not comparable", f"2 u is over {100 * _TOO_UNCERTAIN:.0f} % of it"
-    return [Row(quantity.name, quantity.unit, real, simulated, simulated - real, uncertainty, margin, verdict, why)]
+    return [
+        ComparedRow(quantity.name, quantity.unit, real, simulated, simulated - real, uncertainty, margin, verdict, why)
+    ]
 
 
 def _verdict(difference: float, uncertainty: float, margin: float, reason: str) -> tuple[Verdict, str]:
@@ -270,7 +272,7 @@ def _verdict(difference: float, uncertainty: float, margin: float, reason: str) 
 
 def _histogram_row(
     real_patches: SpecimenPatches, simulated_patches: SpecimenPatches, reasons: Mapping[str, str], seed: int
-) -> Row:
+) -> ComparedRow:
     """Return the row of Wasserstein's distance [DN] between the histograms of all pixels on the specimen."""
     counts = np.stack([real_patches.levels, simulated_patches.levels])
     distance = _distance(*counts.sum(axis=1))
@@ -284,7 +286,7 @@ def _histogram_row(
     uncertainty = float(np.percentile(exchanged, 95)) / COVERAGE
     margin = 0.05 * median_level(real_patches.levels.sum(axis=0))
     verdict, why = _verdict(distance, uncertainty, margin, reasons.get(HISTOGRAMS, ""))
-    return Row(HISTOGRAMS, "DN", float("nan"), float("nan"), distance, uncertainty, margin, verdict, why)
+    return ComparedRow(HISTOGRAMS, "DN", float("nan"), float("nan"), distance, uncertainty, margin, verdict, why)
 
 
 def _distance(one: Floats, other: Floats) -> float:

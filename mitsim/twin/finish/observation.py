@@ -46,7 +46,7 @@ _UNLIT = 1e-3
 
 
 @dataclass(frozen=True)
-class View:
+class CouponView:
     """A coupon in the images of one camera at one exposure: N pixels in ``size`` blocks.
 
     - ``capture``: index of the capture; ``name``: its name in messages; ``camera``; ``exposure_s`` [s].
@@ -125,7 +125,7 @@ def observe(
     *,
     pattern: Pattern,
     lit_room: bool = False,
-) -> list[View]:
+) -> list[CouponView]:
     """Return the view of a coupon by every camera at every exposure.
 
     Parameters
@@ -176,7 +176,7 @@ def observe(
             room_s = float(seconds) if lit_room and not ambient else 0.0
             illumination = np.ones(len(rows)) if loss is None else loss[roi.slices][rows, columns].astype(float)
             views.append(
-                View(
+                CouponView(
                     coupon_capture.index,
                     where,
                     name,

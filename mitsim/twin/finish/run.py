@@ -29,9 +29,9 @@ from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor
 from mitsim.twin.finish.dots import Dots, compare_dots
 from mitsim.twin.finish.electrons import sensor_of
-from mitsim.twin.finish.estimate import Fit, Parameter, fit_views
+from mitsim.twin.finish.estimate import Fit, FittedQuantity, fit_views
 from mitsim.twin.finish.finish import MetalFinish, metal_finish
-from mitsim.twin.finish.observation import CouponCapture, View, observe
+from mitsim.twin.finish.observation import CouponCapture, CouponView, observe
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.problem import Residual
 from mitsim.twin.finish.specimen import place_of
@@ -191,7 +191,7 @@ def fit_captures(
     metal = None if finish.name == DIFFUSE else metal_finish(finish, chosen.wavelength_nm, str(path))
     block = block_px or (KNOWN_BLOCK_PX if pattern_is_known(first, chosen) else UNKNOWN_BLOCK_PX)
 
-    views: list[View] = []
+    views: list[CouponView] = []
     dots: list[Dots] = []
     places: list[Place] = []
     rig_and_renderer: tuple[Rig, WhiteCouponRenderer] | None = None
@@ -262,7 +262,7 @@ def _same(first: Rig, second: Rig) -> bool:
     )
 
 
-def _exponential(parameter: Parameter | None) -> tuple[float, float]:
+def _exponential(parameter: FittedQuantity | None) -> tuple[float, float]:
     """Return value and standard uncertainty of a quantity whose logarithm was fitted."""
     if parameter is None:
         return math.nan, math.nan
@@ -270,13 +270,13 @@ def _exponential(parameter: Parameter | None) -> tuple[float, float]:
     return value, value * parameter.uncertainty
 
 
-def _uncertain(pair: tuple[float, float], parameter: Parameter | None) -> dict[str, Any]:
+def _uncertain(pair: tuple[float, float], parameter: FittedQuantity | None) -> dict[str, Any]:
     relative = (math.nan, math.nan) if parameter is None else (parameter.by_covariance, parameter.by_jackknife)
     names = ("value", "uncertainty", "relative_by_covariance", "relative_by_jackknife")
     return dict(zip(names, (*pair, *relative), strict=True))
 
 
-def _linear(parameter: Parameter | None) -> dict[str, Any] | None:
+def _linear(parameter: FittedQuantity | None) -> dict[str, Any] | None:
     if parameter is None:
         return None
     names = ("value", "uncertainty", "by_covariance", "by_jackknife")

@@ -23,7 +23,7 @@ from mitsim.twin.finish.electrons import linearised
 from mitsim.twin.finish.fine_detail import FINEST, finest_detail
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
-from mitsim.twin.sensor.estimate import Estimate, Undetermined
+from mitsim.twin.sensor.estimate import FittedKey, Undetermined
 from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.photon_transfer import (
     Repeats,
@@ -59,7 +59,7 @@ class ImagerFit:
     """The fitted ``imager``, ``estimates`` of its numbers, undetermined numbers, and whether its noise is ``known``."""
 
     imager: Imager
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[FittedKey, ...]
     undetermined: tuple[Undetermined, ...]
     known: bool
 
@@ -154,7 +154,7 @@ def _specimen_mask(source: InputCapture, places: dict[str, Place]) -> NDArray[np
     return image_mask(places[source.name], camera, MARGIN_PX)
 
 
-def _with_curve(imager: Imager, groups: list[list[InputCapture]], sensor: Sensor) -> tuple[Imager, list[Estimate]]:
+def _with_curve(imager: Imager, groups: list[list[InputCapture]], sensor: Sensor) -> tuple[Imager, list[FittedKey]]:
     """Return the imager with the knee of its curve, if one image shows it; only stereo sensor files may have one.
 
     The whole image is used: a curve belongs to the imager, whatever it sees. Black and saturated pixels are left out.
@@ -167,7 +167,9 @@ def _with_curve(imager: Imager, groups: list[list[InputCapture]], sensor: Sensor
         knee = first_knee(levels, mask, imager)
         if knee is not None:
             method = f"noise by level of one image: the first knee, {knee.slope:g} times as steep beyond it"
-            knee_estimate = Estimate("imager.companding_dn", knee.level, knee.uncertainty, "DN", (source.name,), method)
+            knee_estimate = FittedKey(
+                "imager.companding_dn", knee.level, knee.uncertainty, "DN", (source.name,), method
+            )
             return replace(imager, companding=knee.companding(imager.bits)), [knee_estimate]
     return imager, []
 
@@ -177,31 +179,31 @@ def _images(group: list[InputCapture]) -> NDArray[np.unsignedinteger]:
     return np.stack([source.image for source in group])
 
 
-def _with_black_level(imager: Imager, dark: list[list[InputCapture]]) -> tuple[Imager, Estimate]:
+def _with_black_level(imager: Imager, dark: list[list[InputCapture]]) -> tuple[Imager, FittedKey]:
     input_captures = [source for group in dark for source in group]
     image = input_captures[0].image
     value = float(np.mean([float(source.image.mean()) for source in input_captures]))
     spread = float(image.std() / np.sqrt(image.size * len(input_captures)))
     names = tuple(source.name for source in input_captures)
-    estimate = Estimate("imager.black_level_dn", value, spread, "DN", names, "mean grey level in the dark")
+    estimate = FittedKey("imager.black_level_dn", value, spread, "DN", names, "mean grey level in the dark")
     return replace(imager, black_level=value), estimate
 
 
 def _with_line(
     imager: Imager, line: TransferLine, names: tuple[str, ...], method: str
-) -> tuple[Imager, list[Estimate]]:
+) -> tuple[Imager, list[FittedKey]]:
     (well, well_u), (read, read_u) = line.full_well(imager), line.read_noise()
     return replace(imager, full_well=well, read_noise=read, row_noise=0.0), [
-        Estimate("imager.full_well_e", well, well_u, "e-", names, method),
-        Estimate("imager.read_noise_e", read, read_u, "e-", names, method),
+        FittedKey("imager.full_well_e", well, well_u, "e-", names, method),
+        FittedKey("imager.read_noise_e", read, read_u, "e-", names, method),
     ]
 
 
 def _with_fixed(
     imager: Imager, before: Imager, repeated: list[list[InputCapture]], places: dict[str, Place]
-) -> tuple[Imager, list[Estimate], list[Undetermined]]:
+) -> tuple[Imager, list[FittedKey], list[Undetermined]]:
     """Estimate DSNU from dark repeats, PRNU from repeats in uniform light."""
-    estimates: list[Estimate] = []
+    estimates: list[FittedKey] = []
     undetermined = [Undetermined("imager.row_noise_e", 0.0, "the mean of rows in the dark; read_noise_e includes it")]
     for kind, key, determined_by in (
         ("dark", "imager.dsnu_e", "repeats in the dark"),
@@ -219,14 +221,14 @@ def _with_fixed(
         spread_root = spread / (2 * root) if root > 0 else float(np.sqrt(spread))
         scale, unit = (1.0, "e-") if kind == "dark" else (level, "1")
         names, method = tuple(source.name for source in group), "finest detail of the mean of repeats"
-        estimates.append(Estimate(key, root / scale, spread_root / scale, unit, names, method))
+        estimates.append(FittedKey(key, root / scale, spread_root / scale, unit, names, method))
         imager = replace(imager, dsnu=root) if kind == "dark" else replace(imager, prnu=root / scale)
     return imager, estimates, undetermined
 
 
 def _from_one_image(
     source: InputCapture, imager: Imager, places: dict[str, Place]
-) -> tuple[Imager, list[Estimate]] | None:
+) -> tuple[Imager, list[FittedKey]] | None:
     image, mask = source.image, _specimen_mask(source, places)
     names, method = (source.name,), "finest detail of one image by level, including its fixed pattern"
     estimates = []
@@ -238,7 +240,7 @@ def _from_one_image(
     if smoothing > max(_SURE * spread, 0.2):
         bare, gain = replace(bare, smoothing_px=smoothing), fine_gain(smoothing)
         by_neighbours = "correlation of neighbours in finest detail"
-        estimates.append(Estimate("imager.smoothing_px", smoothing, spread, "px", names, by_neighbours))
+        estimates.append(FittedKey("imager.smoothing_px", smoothing, spread, "px", names, by_neighbours))
     line = one_image_line(image, mask, imager)
     if line is not None:
         scaled = replace(line, offset=line.offset / gain, slope=line.slope / gain, covariance=line.covariance / gain**2)
@@ -256,7 +258,9 @@ def _from_one_image(
     read = imager.read_noise
     if variance > level + 1.0:
         value = float(np.sqrt(variance - level))
-        estimates.append(Estimate("imager.read_noise_e", value, relative * variance / (2 * value), "e-", names, method))
+        estimates.append(
+            FittedKey("imager.read_noise_e", value, relative * variance / (2 * value), "e-", names, method)
+        )
         return replace(bare, read_noise=value), estimates
     if variance <= 0:
         return None
@@ -264,7 +268,7 @@ def _from_one_image(
     share = level / (level + read**2)
     kappa = variance * share / level
     well = imager.full_well / kappa
-    estimates.append(Estimate("imager.full_well_e", well, relative * well, "e-", names, method))
+    estimates.append(FittedKey("imager.full_well_e", well, relative * well, "e-", names, method))
     value = float(np.sqrt(variance * (1 - share))) / kappa
-    estimates.append(Estimate("imager.read_noise_e", value, relative * value, "e-", names, method))
+    estimates.append(FittedKey("imager.read_noise_e", value, relative * value, "e-", names, method))
     return replace(bare, full_well=well, read_noise=value), estimates

@@ -20,7 +20,7 @@ from mitsim.twin.compare.rebuild import like
 from mitsim.twin.finish.electrons import chip_of, linearised
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
-from mitsim.twin.sensor.estimate import Estimate
+from mitsim.twin.sensor.estimate import FittedKey
 from mitsim.twin.sensor.figures import Field
 from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.parameters import ROOM_KEYS
@@ -35,7 +35,7 @@ class RoomFit:
     """Six ``terms`` of the irradiance [W/mm^2], and the estimates of the file's numbers."""
 
     terms: tuple[float, ...]
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[FittedKey, ...]
 
 
 def fit_room(input_captures: list[InputCapture], sensor: Sensor, places: dict[str, Place]) -> RoomFit | None:
@@ -80,5 +80,5 @@ def fit_room(input_captures: list[InputCapture], sensor: Sensor, places: dict[st
             gradient[index], gradient[0] = 1 / found[0], -value / found[0]
         spread = float(np.sqrt(gradient @ covariance @ gradient))
         key, unit = f"room.{ROOM_KEYS[index]}", "W/mm^2" if index == 0 else "1"
-        estimates.append(Estimate(key, float(value), spread, unit, names, "level with the projector off"))
+        estimates.append(FittedKey(key, float(value), spread, unit, names, "level with the projector off"))
     return RoomFit(tuple(float(term) for term in terms), tuple(estimates))

@@ -27,7 +27,7 @@ from mitsim.twin.compare.rebuild import like
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import specimen_place
 from mitsim.twin.sensor.dots import DotDraws, DotsFit, fit_dots
-from mitsim.twin.sensor.estimate import Estimate, Undetermined, combined, pooled
+from mitsim.twin.sensor.estimate import FittedKey, Undetermined, combined, pooled
 from mitsim.twin.sensor.input_captures import InputCapture, read_input_captures, repeats
 from mitsim.twin.sensor.noise import UNSEPARATED, ImagerFit, fit_imager, without_fixed_pattern
 from mitsim.twin.sensor.parameters import (
@@ -58,7 +58,7 @@ class SensorFit:
 
     sensor: Sensor = field(repr=False)
     input_captures: tuple[InputCapture, ...] = field(repr=False)
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[FittedKey, ...]
     undetermined: tuple[Undetermined, ...]
     dots: dict[str, DotsFit] = field(repr=False)
     places: dict[str, Place] = field(repr=False)
@@ -114,7 +114,7 @@ def fit_sensor(
     shared, undetermined = _combined_estimates(dots, base, imager, room)
     estimates += shared
     if isinstance(base.pattern, LightCode):
-        coded: list[Estimate] = []
+        coded: list[FittedKey] = []
         for source in on_captures:
             own = replace(like(source.capture, base, source.name), imager=base.imager)
             coded += fit_stripes(source, own, places[source.name])
@@ -190,16 +190,16 @@ def _dots(
 
 def _combined_estimates(
     dots: dict[str, DotsFit], base: Sensor, imager: ImagerFit, room: RoomFit | None
-) -> tuple[list[Estimate], list[Undetermined]]:
+) -> tuple[list[FittedKey], list[Undetermined]]:
     """Combine the estimates of all captures of dots key by key, and list the keys that none determines."""
-    estimates: list[Estimate] = []
+    estimates: list[FittedKey] = []
     undetermined: list[Undetermined] = list(imager.undetermined)
     parameters: dict[str, Parameter] = {}
     for name, fit in dots.items():
         values, spreads = fit.in_file_units()
         for parameter, value, spread in zip(fit.parameters, values.tolist(), spreads.tolist(), strict=True):
             method = "figures of the dots over the field"
-            estimates.append(Estimate(parameter.key, value, spread, parameter.unit, (name,), method, parameter.scale))
+            estimates.append(FittedKey(parameter.key, value, spread, parameter.unit, (name,), method, parameter.scale))
         parameters |= {parameter.key: parameter for parameter in (*fit.parameters, *fit.undetermined)}
     known = {one.key for one in estimates}
     undetermined += [
@@ -212,11 +212,13 @@ def _combined_estimates(
     return pooled(estimates), undetermined
 
 
-def _turn_estimates(rows: dict[str, Rows]) -> list[Estimate]:
+def _turn_estimates(rows: dict[str, Rows]) -> list[FittedKey]:
     out = []
     for key in ("row_mrad", "roll_mrad"):
         pairs = [getattr(found, key) for found in rows.values()]
         if pairs:
             value, spread = combined([p[0] for p in pairs], [p[1] for p in pairs])
-            out.append(Estimate(f"misalignment.{key}", value, spread, "mrad", tuple(rows), "row errors over the field"))
+            out.append(
+                FittedKey(f"misalignment.{key}", value, spread, "mrad", tuple(rows), "row errors over the field")
+            )
     return out

@@ -24,7 +24,7 @@ from mitsim.twin.finish.electrons import linearised
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
 from mitsim.twin.sensor.defocus import Defocus, fit_defocus, fitted_blur
-from mitsim.twin.sensor.estimate import Estimate
+from mitsim.twin.sensor.estimate import FittedKey
 from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.noise import without_fixed_pattern
 from mitsim.twin.sensor.photon_transfer import one_image_line
@@ -42,7 +42,7 @@ _UNSATURATED, _SURE = 0.97, 2.0
 
 
 @dataclass(frozen=True)
-class Stripes:
+class StripeImages:
     """White, black and pairs of stripes of a capture's first camera [DN]; ``widths`` of the stripes [projector px].
 
     ``pairs`` (n, 2, H, W): on and off; ``across``: whether the stripes are along the columns.
@@ -55,7 +55,7 @@ class Stripes:
     across: NDArray[np.bool_]
 
 
-def stripes_of(source: InputCapture) -> Stripes | None:
+def stripes_of(source: InputCapture) -> StripeImages | None:
     """Extract the stripes of a capture; None if it has no stripes with their inverse.
 
     The brightest and the darkest of the stripes replace a missing white or black image.
@@ -80,10 +80,10 @@ def stripes_of(source: InputCapture) -> Stripes | None:
     every = np.array(pairs, float)
     white = images[names.index("white")].astype(float) if "white" in names else every.max(axis=(0, 1))
     black = images[names.index("black")].astype(float) if "black" in names else every.min(axis=(0, 1))
-    return Stripes(white, black, every, np.array(widths), np.array(across))
+    return StripeImages(white, black, every, np.array(widths), np.array(across))
 
 
-def fit_stripes(source: InputCapture, sensor: Sensor, place: Place) -> list[Estimate]:
+def fit_stripes(source: InputCapture, sensor: Sensor, place: Place) -> list[FittedKey]:
     """Fit one capture of stripes; the sensor must have the capture's own cameras and exposure."""
     seen = stripes_of(source)
     if seen is None:
@@ -100,8 +100,8 @@ def fit_stripes(source: InputCapture, sensor: Sensor, place: Place) -> list[Esti
 
 
 def _levels(
-    source: InputCapture, imager: Imager, seen: Stripes, even: NDArray[np.bool_]
-) -> tuple[Imager, list[Estimate]]:
+    source: InputCapture, imager: Imager, seen: StripeImages, even: NDArray[np.bool_]
+) -> tuple[Imager, list[FittedKey]]:
     """Estimate the imager's black level and the light without a pattern from the line of black over white."""
     white, black = seen.white[even], seen.black[even]
     if len(white) < 500 or np.percentile(white, 95) < 2 * np.percentile(white, 5):
@@ -121,26 +121,28 @@ def _levels(
     method, names = "line of the black image over the white one through the print", (source.name,)
     room = method + "; includes the room"
     return replace(imager, black_level=level), [
-        Estimate("imager.black_level_dn", level, float(spread[1]) / (1 - slope), "DN", names, method),
-        Estimate("projector.black_level", share, float(spread[0]), "1", names, room),
+        FittedKey("imager.black_level_dn", level, float(spread[1]) / (1 - slope), "DN", names, method),
+        FittedKey("projector.black_level", share, float(spread[0]), "1", names, room),
     ]
 
 
 def _noise(
-    source: InputCapture, imager: Imager, seen: Stripes, even: NDArray[np.bool_]
-) -> tuple[Imager, list[Estimate]]:
+    source: InputCapture, imager: Imager, seen: StripeImages, even: NDArray[np.bool_]
+) -> tuple[Imager, list[FittedKey]]:
     line = one_image_line(seen.white.astype(np.uint16), even, imager)
     if line is None:
         return imager, []
     (well, well_u), (read, read_u) = line.full_well(imager), line.read_noise()
     method, names = "finest detail of the white image by level, including its fixed pattern", (source.name,)
     return replace(without_fixed_pattern(imager), full_well=well, read_noise=read), [
-        Estimate("imager.full_well_e", well, well_u / well**2, "e-", names, method, "inverse"),
-        Estimate("imager.read_noise_e", read, read_u, "e-", names, method),
+        FittedKey("imager.full_well_e", well, well_u / well**2, "e-", names, method, "inverse"),
+        FittedKey("imager.read_noise_e", read, read_u, "e-", names, method),
     ]
 
 
-def _blur(source: InputCapture, chip: Imager, place: Place, seen: Stripes, even: NDArray[np.bool_]) -> list[Estimate]:
+def _blur(
+    source: InputCapture, chip: Imager, place: Place, seen: StripeImages, even: NDArray[np.bool_]
+) -> list[FittedKey]:
     """Estimate the blur of camera and projector together from the modulation of stripes of every width, by blocks."""
     white, black = linearised(seen.white, chip), linearised(seen.black, chip)
     depth = white - black
@@ -170,20 +172,20 @@ def _blur(source: InputCapture, chip: Imager, place: Place, seen: Stripes, even:
     spread = 1.2533 * float(np.std(values, ddof=1)) / np.sqrt(len(values))
     method = "modulation of stripes by width, including the projector's blur"
     return [
-        Estimate("imager.blur_px", blur, spread, "px", names, method),
-        Estimate("projector.aperture_mm", 0.0, 0.0, "mm", names, "imager.blur_px includes its blur"),
+        FittedKey("imager.blur_px", blur, spread, "px", names, method),
+        FittedKey("projector.aperture_mm", 0.0, 0.0, "mm", names, "imager.blur_px includes its blur"),
     ]
 
 
-def _focus(source: InputCapture, focus: Defocus, scale: float) -> list[Estimate]:
+def _focus(source: InputCapture, focus: Defocus, scale: float) -> list[FittedKey]:
     """Return the estimates of a focus; one projector pixel is ``scale`` camera pixels."""
     spread, names = np.sqrt(np.diag(focus.covariance)), (source.name,)
     method = "modulation of stripes by width and depth"
     blur = min(focus.still_px * scale, 5.0)
     return [
-        Estimate("imager.blur_px", blur, float(spread[0]) * scale, "px", names, method + ", independent of depth"),
-        Estimate("projector.aperture_mm", focus.aperture_mm, float(spread[1]), "mm", names, method),
-        Estimate("projector.focus_mm", focus.focus_mm, float(spread[2]), "mm", names, method),
+        FittedKey("imager.blur_px", blur, float(spread[0]) * scale, "px", names, method + ", independent of depth"),
+        FittedKey("projector.aperture_mm", focus.aperture_mm, float(spread[1]), "mm", names, method),
+        FittedKey("projector.focus_mm", focus.focus_mm, float(spread[2]), "mm", names, method),
     ]
 
 

@@ -21,7 +21,7 @@ from characterisation.files.atomic_io import atomic_write
 from mitsim.running.numbers import two_digits
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import load_sensor
-from mitsim.twin.sensor.estimate import Estimate
+from mitsim.twin.sensor.estimate import FittedKey
 from mitsim.twin.sensor.run import SensorFit, sensor_path
 
 _TABLE = re.compile(r"^\s*\[(?!\[)\s*([^\]]+?)\s*\]")
@@ -76,7 +76,7 @@ def fit_table(fit: SensorFit) -> str:
 
 def _entries(fit: SensorFit) -> dict[str, Entry]:
     entries: dict[str, Entry] = {}
-    arrays: dict[str, dict[int, Estimate]] = {}
+    arrays: dict[str, dict[int, FittedKey]] = {}
     for one in fit.estimates:
         match = _ARRAY.match(one.key)
         if one.key == "imager.companding_dn":
@@ -106,7 +106,7 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
     return entries
 
 
-def _comment(one: Estimate) -> str:
+def _comment(one: FittedKey) -> str:
     low, high = one.interval()
     found = f"fitted: {one.value:.4g} {one.unit}, 95 % interval {low:.4g} to {high:.4g}"
     return f"{found}; {one.method}; {', '.join(one.captures)}"
