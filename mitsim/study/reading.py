@@ -228,33 +228,20 @@ def _with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
     tolerances = {name: tolerance_of(task, name) for name in task.measurements}
     limits = {name: needed(_NORMAL, one) for name, one in tolerances.items() if one is not None}
     if not limits:
-        raise InputError(
-            path,
-            "set.limits",
-            "none, and no tolerance in the task",
-            "a limit for at least one measurement, or a tolerance in the task",
-        )
+        allowed = "a limit for at least one measurement, or a tolerance in the task"
+        raise InputError(path, "set.limits", "none, and no tolerance in the task", allowed)
     return file.model_copy(update={"set": file.set.model_copy(update={"limits": limits})})
 
 
 def _check_finishes(path: Path, scene: Scene, task: Task, known: Samples) -> None:
     if MATT_WHITE.name not in known.names:
-        raise InputError(
-            path,
-            "characterisation",
-            "no matt_white sample",
-            "a campaign that has one",
-            "the view score is normalised by the values of matt white",
-        )
+        hint = "the view score is normalised by the values of matt white"
+        raise InputError(path, "characterisation", "no matt_white sample", "a campaign that has one", hint)
     for name, finish in zip(scene.names, scene.finishes, strict=True):
         # lamps, and fixtures with a BSDF of Mitsuba, only hide and shade; they have no predicted points
         if finish is None and name in task.shapes:
-            raise InputError(
-                scene.where,
-                f"shape {name!r}",
-                "a BSDF of no known finish",
-                "machined_metal, gloss_paint, powder_coat or matt_white",
-            )
+            allowed = "machined_metal, gloss_paint, powder_coat or matt_white"
+            raise InputError(scene.where, f"shape {name!r}", "a BSDF of no known finish", allowed)
 
 
 def _check_campaign(scene: Scene, known: Samples) -> None:

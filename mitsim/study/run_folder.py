@@ -21,12 +21,11 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.scene.surface.lay import LayLeftOut
-from mitsim.study.run_files import check_own
+from mitsim.study.run_files import AGAIN, check_own
 from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement
 
 _MADE_BY = "a folder made by mitsim run"
 
-_AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"
 _BY_VIEW, _BY_FEATURE, _VIEW = ("measurement", "view"), ("view", "feature"), ("view",)
 _ALL = {"measurement": Variable(("measurement",), "text"), "view": Variable(_VIEW, "whole", 0, 1e9)}
 
@@ -68,7 +67,7 @@ _SCORES = Schema(
         "xyz": (3, 3),
     },
     ("measurement", "view", "feature"),
-    _AGAIN,
+    AGAIN,
 )
 _ERRORS = Variable(("measurement", "view", "repeat"), gaps=True)
 _CHECKS = Schema(
@@ -76,7 +75,7 @@ _CHECKS = Schema(
     {"value": _ERRORS, "error": _ERRORS, **_ALL},
     {"repeat": (0, 1_000_000)},
     ("measurement", "view"),
-    _AGAIN,
+    AGAIN,
 )
 _PATCHES = Schema(
     "patches of a campaign",
@@ -87,7 +86,7 @@ _PATCHES = Schema(
         "finish": Variable(("sample",), "text"),
         "roughness": Variable(("sample",), low=0.0, high=1e6, gaps=True),
     },
-    hint=_AGAIN,
+    hint=AGAIN,
 )
 
 
@@ -209,8 +208,10 @@ class Run:
         """
         return name in self.about.files if self.about.files else (self.folder / name).exists()
 
-    def _cloud_path(self, kind: str, view: int) -> Path:
-        return self.folder / "clouds" / f"{kind}_{view:04d}.ply"
+    def _cloud(self, kind: str, view: int) -> PointCloud:
+        name = f"clouds/{kind}_{view:04d}.ply"
+        self.check(name)
+        return read_ply(self.folder / name)
 
     def part(self) -> trimesh.Trimesh | None:
         """Return the part's surface [mm], part frame; None if the run has no ``part.ply``."""
@@ -225,16 +226,16 @@ class Run:
 
     def predicted(self, view: int) -> PointCloud:
         """Return the cloud of a view that the map predicts."""
-        self.check(f"clouds/predicted_{view:04d}.ply")
-        return read_ply(self._cloud_path("predicted", view))
+        return self._cloud("predicted", view)
 
     def decoded(self, view: int) -> PointCloud:
         """Return the cloud of a checked view, decoded from its rendered images."""
-        path = self._cloud_path("rendered", view)
-        self.check(f"clouds/rendered_{view:04d}.ply")
-        cloud, grid = read_ply(path), self.predicted(view).grid
+        cloud, grid = self._cloud("rendered", view), self.predicted(view).grid
         if (cloud.grid.height, cloud.grid.width) != (grid.height, grid.width):
-            found = f"{cloud.grid.height} x {cloud.grid.width} pixels"
+            found, path = (
+                f"{cloud.grid.height} x {cloud.grid.width} pixels",
+                self.folder / f"clouds/rendered_{view:04d}.ply",
+            )
             raise InputError(path, "grid", found, f"{grid.height} x {grid.width}, as the predicted cloud")
         return cloud
 
@@ -255,7 +256,8 @@ def read_run(folder: str | Path) -> Run:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "", "no such folder", _MADE_BY)
-    about = _read_about(folder / "run.json")
+    table = read_json_object(folder / "run.json", _MADE_BY, "mitsim run writes it last: let the run finish")
+    about = validate(folder / "run.json", table, RunDocument)
     own = about.files
     check_own(folder, own, ("map.nc", "samples.nc", "scores.nc", "checks.nc", "statement.json"))
     performance_map = PerformanceMap.load(folder / "map.nc")
@@ -289,11 +291,6 @@ def read_run(folder: str | Path) -> Run:
     stated = "statement.json" in own or not own
     statement = read_statement(folder / "statement.json") if stated else None
     return Run(folder, about, performance_map, patches, scores, checks, statement)
-
-
-def _read_about(path: Path) -> RunDocument:
-    table = read_json_object(path, _MADE_BY, "mitsim run writes it last: let the run finish")
-    return validate(path, table, RunDocument)
 
 
 def _mesh(path: Path) -> trimesh.Trimesh | None:

@@ -83,13 +83,11 @@ def validate_captures(
     """
     recorded = read_capture(real)
     if simulated is None and rendered_here(recorded):
-        raise InputError(
-            real,
-            "source",
-            "a simulation of mitsim",
+        allowed, hint = (
             "device, replay, or simulated by a maker's virtual camera",
             "name SIMULATED to compare two simulations",
         )
+        raise InputError(real, "source", "a simulation of mitsim", allowed, hint)
     own = None if simulated is not None else sensor_of(recorded, sensor, real)
     if own is not None:
         check_technology(recorded, own, str(real))  # before the capture is decoded

@@ -222,10 +222,5 @@ def projector_was_on(real: Capture, given: Literal["on", "off"] | None, where: s
         return known
     if real.technology != "active_stereo" or real.source == "simulated":
         return True
-    raise InputError(
-        f"{where}/settings.json",
-        "projector_on",
-        "nothing",
-        "true or false",
-        "give --projector on or off, here or for mitsim import",
-    )
+    hint = "give --projector on or off, here or for mitsim import"
+    raise InputError(f"{where}/settings.json", "projector_on", "nothing", "true or false", hint)

@@ -94,13 +94,11 @@ def fit_views(views: Sequence[CouponView], finish: MetalFinish | None, where: st
     problem = Problem(views, finish)
     if problem.count < FEWEST_BLOCKS:
         whole = sum(view.whole for view in views)
-        raise InputError(
-            where,
-            "images",
+        found, hint = (
             f"{problem.count} of {whole} blocks on the coupon free of saturation",
-            f"{FEWEST_BLOCKS} or more",
             "shorter exposures, other poses, or smaller blocks",
         )
+        raise InputError(where, "images", found, f"{FEWEST_BLOCKS} or more", hint)
     every = np.ones(problem.count, bool)
     values = _first(problem, every)
     grain = 0.0

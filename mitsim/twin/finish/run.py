@@ -214,13 +214,11 @@ def fit_captures(
         places.append(place)
     if not sum(view.whole for view in views):
         why = "; ".join(dict.fromkeys(f"{view.camera} of {view.name}: {view.why_no_block}" for view in views[:4]))
-        raise InputError(
-            "captures",
-            "images",
+        found, hint = (
             f"no block of {block} px on the coupon: {why}",
-            "a coupon in the images",
             "give the region of the image that shows it: --window",
         )
+        raise InputError("captures", "images", found, "a coupon in the images", hint)
     say(f"fitting {sum(len(view.block) for view in views)} pixels in {sum(view.size for view in views)} blocks")
     return CouponFit(
         chosen,
@@ -240,14 +238,8 @@ def _own_scene(capture: Capture, folder: Path) -> Path:
     named = capture.settings.get("scene")
     if isinstance(named, str) and Path(named).is_file():
         return Path(named)
-    found = repr(named) if named else "nothing"
-    raise InputError(
-        folder / "settings.json",
-        "scene",
-        found,
-        "an existing scene file",
-        "give the scene of the coupon: --scene scenes/coupon/coupon.xml",
-    )
+    found, hint = repr(named) if named else "nothing", "give the scene of the coupon: --scene scenes/coupon/coupon.xml"
+    raise InputError(folder / "settings.json", "scene", found, "an existing scene file", hint)
 
 
 def _same(first: Rig, second: Rig) -> bool:
