@@ -145,13 +145,13 @@ def _confirm(session: Session, chosen: ViewSet | None, search: Search) -> list[T
         return []
     tried = confirmed_set(session, chosen, search)
     best = tried[-1]
-    write_set_csv(session.folder / "view_set.csv", table, best.chosen, best.stated)
+    write_set_csv(session.folder / "view_set.csv", table, best)
     kept = "keeps its limits" if best.excess(table.limits) <= 1 else "the best set found, misses a limit"
     views = ", ".join(map(str, best.chosen.views))
     say(
         f"{len(best.chosen.views)} views ({views}), {joining_in_words(table)}, measured together {table.trials} times: "
         f"{kept} (sets measured: {len(tried)})\n"
-        f"{set_table(table, best.chosen, best.stated)}"
+        f"{set_table(table, best)}"
     )
     return tried
 

@@ -10,7 +10,7 @@ import mitsim.study.view_sets.confirmed_set as confirmed_set
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import statement
 from mitsim.study import SetTable
-from mitsim.study.view_sets.confirmed_set import MOST_SETS, stricter, tried_entries
+from mitsim.study.view_sets.confirmed_set import MOST_SETS, TriedSet, stricter, tried_entries
 
 VIEWS = 12
 LIMITS = {"apart": 0.1, "radius": 0.1}
@@ -94,7 +94,7 @@ def test_only_missed_limits_become_stricter_by_what_was_missed():
     errors = np.array([-1.0, 1.0] * 50)
     errors *= np.sqrt(99 / 100)  # a standard deviation of 1 with n - 1
     stated = [statement("apart", "mm", 0.16 * errors), statement("radius", "mm", 0.09 * errors)]
-    found = stricter(dict(LIMITS), LIMITS, chosen, stated)
+    found = stricter(TriedSet(chosen, dict(LIMITS), tuple(stated)), LIMITS)
     assert found["apart"] == pytest.approx(0.05) and found["radius"] == 0.1
     nothing = [statement("apart", "mm", np.full(9, np.nan)), stated[1]]
-    assert stricter(dict(LIMITS), LIMITS, chosen, nothing)["apart"] < 0.1
+    assert stricter(TriedSet(chosen, dict(LIMITS), tuple(nothing)), LIMITS)["apart"] < 0.1

@@ -150,9 +150,20 @@ def coverage(
     count: int,
     rng: np.random.Generator,
 ) -> Floats:
-    """Return errors over sigma of ``count`` simulated calibrations, (count, n), each from its own stream.
+    """Return errors over sigma of simulated calibrations, (count, n), each from its own stream.
 
-    ``stated`` is the sigma of the n parameters by their names.
+    Parameters
+    ----------
+    rig, eyes
+        Nominal rig, and those of its eyes that are calibrated, the reference camera first.
+    board, views
+        Board, and its poses with the noise of corners.
+    stated
+        Sigma of the n parameters, by their names.
+    count
+        Number of calibrations.
+    rng
+        Source of the streams.
     """
     names, sigma, rows = list(stated), np.array(list(stated.values())), []
     for stream in rng.spawn(count):

@@ -74,10 +74,20 @@ def sensor_drift(sensor: Sensor) -> Drift:
 def calibrate(
     sensor: Sensor, board: Board | None = None, poses: int = POSES, seed: int = 1, drift: Drift | None = None
 ) -> VirtualCalibration:
-    """Calibrate a sensor virtually.
+    """Calibrate a sensor virtually; equal seeds give equal results.
 
-    ``board`` None is :func:`default_board` at the middle of the working range; ``drift`` None is
-    :func:`sensor_drift`. Equal seeds give equal results.
+    Parameters
+    ----------
+    sensor
+        Its eyes are calibrated.
+    board
+        By default :func:`default_board` at the middle of the working range.
+    poses
+        Number of poses of the board.
+    seed
+        Of the noise of corners, and of the rigs drawn for the accuracy.
+    drift
+        Drift since the calibration, by default :func:`sensor_drift`.
 
     Raises
     ------

@@ -134,7 +134,18 @@ def choose_sensor(
 ) -> list[SensorResult]:
     """Screen, race and state sensors; return them, best first.
 
-    After each sensor, ``report_results`` receives the results so far and whether they are final.
+    Parameters
+    ----------
+    candidates
+        Sensors, each with the study for it.
+    folder
+        Finished work is kept in a folder of it for each sensor.
+    minutes
+        Total time, shared among the sensors [min].
+    report_results
+        Receives the results so far, and whether they are final, after each sensor.
+    workers
+        Processes or cluster that make the trials; by default this process makes them.
     """
     end = time.monotonic() + 60 * minutes
     found = list[SensorResult]()

@@ -31,7 +31,7 @@ from mitsim.study.exposures.planned import with_exposure
 from mitsim.study.session import Session
 from mitsim.study.view_sets.joined import JoinedMeasurements
 from mitsim.study.virtual.stated import digits
-from mitsim.study.virtual.trials import TrialFolder, errors_of_trials
+from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import SET_DAYS, Trial
 
 #: largest number of sets to measure
@@ -89,7 +89,7 @@ def confirmed_set(session: Session, first: ViewSet, search: Search) -> list[Trie
         if len(tried) == MOST_SETS:
             say(f"no further set is tried: {MOST_SETS} sets were measured, the most that a run measures")
             break
-        found = _next_set(search, searched, stricter(searched, table.limits, chosen, stated), first, tried)
+        found = _next_set(search, stricter(tried[-1], table.limits), first, tried)
         if found is None:
             say(
                 f"no further set is tried: by the map, no set of other views is more accurate "
@@ -102,15 +102,16 @@ def confirmed_set(session: Session, first: ViewSet, search: Search) -> list[Trie
 
 
 def _next_set(
-    search: Search, before: dict[str, float], strict: dict[str, float], first: ViewSet, tried: Sequence[TriedSet]
+    search: Search, strict: dict[str, float], first: ViewSet, tried: Sequence[TriedSet]
 ) -> tuple[ViewSet, dict[str, float]] | None:
     """Return a set that is not measured yet, with the limits of its search: the strictest that the map can keep.
 
-    ``before`` are the limits of the last search, ``strict`` those by what it missed. A limit that no set can keep is
-    taken back half of the way, in ratio, to the limit before. If the set is an old one, limits that were missed become
-    stricter by the least step. None if :data:`MOST_SEARCHES` searches find no new set.
+    ``strict`` are the limits by what the last search missed. A limit that no set can keep is taken back half of the
+    way, in ratio, to the limit before. If the set is an old one, limits that were missed become stricter by the least
+    step. None if :data:`MOST_SEARCHES` searches find no new set.
     """
-    limits, missed = dict(strict), [name for name in strict if strict[name] < before[name]]
+    limits, before = dict(strict), tried[-1].searched
+    missed = [name for name in strict if strict[name] < before[name]]
     for _ in range(MOST_SEARCHES):
         chosen = search(limits)
         lost = [name for name, once, now in zip(limits, first.feasible, chosen.feasible, strict=True) if once > now]
@@ -133,17 +134,14 @@ def _missed(tried: TriedSet, limits: dict[str, float]) -> str:
     return "; ".join(words + [f"{name} without a value" for name, ratio in ratios.items() if ratio == math.inf])
 
 
-def stricter(
-    searched: dict[str, float], limits: dict[str, float], chosen: ViewSet, stated: Sequence[Statement]
-) -> dict[str, float]:
+def stricter(tried: TriedSet, limits: dict[str, float]) -> dict[str, float]:
     """Return the limits for the next search: missed limits times the ratio of expected to measured uncertainty."""
-    out, found = dict(searched), {one.measurement: one for one in stated}
-    for name, expected, able in zip(limits, chosen.uncertainty.tolist(), chosen.feasible, strict=True):
-        one = found[name]
-        if not able or _excess(one, limits[name]) <= 1:
-            continue
-        optimism = _WITHOUT_VALUE if not one.root_mean_square > 0 else expected / one.root_mean_square
-        out[name] = min(limits[name] * optimism, _TIGHTENING * searched[name])
+    out, stated = dict(tried.searched), {one.measurement: one for one in tried.stated}
+    for name, expected, able in zip(limits, tried.chosen.uncertainty.tolist(), tried.chosen.feasible, strict=True):
+        error = stated[name].root_mean_square
+        if able and _excess(stated[name], limits[name]) > 1:
+            optimism = expected / error if error > 0 else _WITHOUT_VALUE
+            out[name] = min(limits[name] * optimism, _TIGHTENING * tried.searched[name])
     return out
 
 
@@ -164,7 +162,7 @@ def state_set(session: Session, chosen: ViewSet) -> list[Statement]:
     for day, outcome in track(runner.run(missing), "confirm the set", len(missing)):
         trials.add(0, Trial(day), outcome)
     wanted = [Trial(day) for day in days]
-    found = errors_of_trials(study.task, trials, 0, wanted)
+    found = trials.errors_of_parts(0, wanted)
     return [
         replace(
             statement(name, asked.unit, found[m], tolerance_of(study.task, name)),
@@ -210,15 +208,15 @@ def confirmed_entry(stated: Sequence[Statement]) -> dict[str, Any]:
     return out
 
 
-def write_set_csv(path: Path, table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> None:
+def write_set_csv(path: Path, table: SetTable, tried: TriedSet) -> None:
     """Write limit, expected and confirmed uncertainty of every measurement, one row each."""
 
     def text(value: float | None) -> str:
         return "" if value is None or not math.isfinite(value) else f"{value:.4g}"
 
-    expected = dict(zip(table.limits, chosen.uncertainty.tolist(), strict=True))
+    expected = dict(zip(table.limits, tried.chosen.uncertainty.tolist(), strict=True))
     lines = ["measurement,unit,limit,expected_uncertainty,trials,without_value,bias,uncertainty,low,high,verdict"]
-    for one in stated:
+    for one in tried.stated:
         limit = f"{table.limits[one.measurement]:g}" if one.measurement in table.limits else ""
         counts = [text(expected.get(one.measurement)), str(one.trials), text(one.without_value)]
         numbers = map(text, (one.bias, one.standard_uncertainty, *one.interval))
@@ -227,11 +225,11 @@ def write_set_csv(path: Path, table: SetTable, chosen: ViewSet, stated: Sequence
         file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def set_table(table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> str:
+def set_table(table: SetTable, tried: TriedSet) -> str:
     """Return the set as a text table: limit, expected u, and bias and u from virtual measurements."""
-    expected = dict(zip(table.limits, chosen.uncertainty.tolist(), strict=True))
+    expected = dict(zip(table.limits, tried.chosen.uncertainty.tolist(), strict=True))
     rows = [("measurement", "unit", "limit", "expected u", "bias", "u", "no value", "limit kept")]
-    for one in stated:
+    for one in tried.stated:
         limit = table.limits.get(one.measurement)
         kept = "-" if limit is None else "yes" if one.root_mean_square <= limit else "no"
         wanted = ("-", "-") if limit is None else (f"{limit:g}", f"{expected[one.measurement]:.2g}")

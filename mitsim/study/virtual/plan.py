@@ -93,6 +93,19 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: 
 
     These are sensor, calibration, unknowns, task, views, the scene with its meshes and textures, and, for clouds drawn
     from the map, the map.
+
+    Parameters
+    ----------
+    study, unknowns
+        The study, and its unknowns prepared for drawing.
+    source
+        How trials are made: ``render`` or ``map``.
+    separate_light
+        Whether every trial renders all of its light.
+
+    See Also
+    --------
+    study_digest : Digest of everything that determines the results of a study.
     """
     file = study.file
     content = {

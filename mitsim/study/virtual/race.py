@@ -153,7 +153,19 @@ def prior_risk(u: Floats) -> Floats:
 def run_race(
     views: Sequence[View], scores: xr.Dataset, runner: TrialRunner, trials: TrialFolder, rules: RaceRules
 ) -> Raced:
-    """Race the views on the shortlist, and reuse trials in the folder."""
+    """Race the views on the shortlist, and reuse trials in the folder.
+
+    Parameters
+    ----------
+    views, scores
+        All candidate views, and their scores by the map.
+    runner
+        Makes the virtual measurements.
+    trials
+        Finished trials, to which those of the race are added.
+    rules
+        Shortlist, largest number of trials, and the end of the race.
+    """
     numbers = shortlist(scores, rules.shortlist)
     if not numbers:
         say("race: the map predicts that no view can make any measurement")

@@ -28,7 +28,7 @@ from mitsim.study.exposures.planned import with_exposure
 from mitsim.study.virtual.influences import influences
 from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.race import Job, complete
-from mitsim.study.virtual.trials import TrialFolder, errors_of_trials, stated_errors_of_trials
+from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, STATEMENT_DAYS, Trial, Unknowns
 from mitsim.views import View
 
@@ -70,9 +70,9 @@ def state_view(session: Session, view: View, table: StatementTable | None = None
     repeats = [Trial(one.day, one.capture + 1) for one in pairs]
     wanted = [*base, *repeats, *(trial for some in swapped.values() for trial in some)]
     complete(trials, runner, [Job(view, trial) for trial in wanted], f"state view {view.number}")
-    by_trial = errors_of_trials(study.task, trials, view.number, base)
-    second = stated_errors_of_trials(study.task, trials, view.number, repeats)
-    again = {group: stated_errors_of_trials(study.task, trials, view.number, some) for group, some in swapped.items()}
+    by_trial = trials.errors_of_parts(view.number, base)
+    second = trials.stated_errors(view.number, repeats)
+    again = {group: trials.stated_errors(view.number, some) for group, some in swapped.items()}
     out = []
     for m, (name, asked) in enumerate(study.task.measurements.items()):
         errors = stated_errors(by_trial[m])

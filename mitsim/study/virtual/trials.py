@@ -81,13 +81,17 @@ class TrialFolder:
     ) -> None:
         self.folder, self.digest, self.measurements = Path(folder), digest, tuple(measurements)
         self.folded = dict(folded or {})
+        self.folded_values: dict[str, FoldedValue] = {}
         self._known: dict[int, dict[Trial, Outcome]] = {}
 
     @classmethod
     def of(cls, folder: str | Path, digest: str, task: Task) -> TrialFolder:
         """Return the trials of a task in a folder."""
-        folded = {name: math.prod(one.shape) for name, one in folded_values(task).items()}
-        return cls(folder, digest, list(task.measurements), folded)
+        folded = folded_values(task)
+        counts = {name: math.prod(one.shape) for name, one in folded.items()}
+        trials = cls(folder, digest, list(task.measurements), counts)
+        trials.folded_values = folded
+        return trials
 
     def known(self, view: int) -> dict[Trial, Outcome]:
         """Return the finished trials of a view; the file is read once."""
@@ -133,6 +137,27 @@ class TrialFolder:
         """Return the deviations (trials, k m) behind a value that folds; NaN in trials without a value."""
         known, none = self.known(view), [math.nan] * self.folded[measurement]
         return np.array([known[trial].deviations.get(measurement, none) for trial in trials], float)
+
+    def errors_of_parts(self, view: int, trials: Sequence[Trial]) -> list[Floats | OneSidedErrors]:
+        """Return the errors (n,) of finished trials of a view, for every measurement of the task in its order."""
+        plain = self.errors(view, trials)
+        return [
+            self._one_sided(self.folded_values[name], view, trials) if name in self.folded_values else plain[m]
+            for m, name in enumerate(self.measurements)
+        ]
+
+    def stated_errors(self, view: int, trials: Sequence[Trial]) -> Floats:
+        """Return the errors (measurements, n) of finished trials that a statement is about, NaN without a value.
+
+        Those of a value that folds are at the limit of its tolerance.
+        """
+        errors = self.errors_of_parts(view, trials)
+        return np.array([stated_errors(one) for one in errors], float).reshape(len(errors), len(trials))
+
+    def _one_sided(self, folded: FoldedValue, view: int, trials: Sequence[Trial]) -> OneSidedErrors:
+        vectors = self.deviations(view, trials, folded.name).reshape(len(trials), *folded.shape)
+        directions = np.array([folded.direction(trial.day) for trial in trials]).reshape(vectors.shape)
+        return OneSidedErrors(vectors, directions, folded.size, folded.limit, folded.fold)
 
     def reasons(self, view: int, trials: Sequence[Trial], measurement: str) -> list[str]:
         """Return the known reasons why a measurement has no value in finished trials of a view."""
@@ -193,32 +218,6 @@ class TrialFolder:
             for name, count in self.folded.items()
             if math.isfinite(outcome.errors[name])
         )
-
-
-def errors_of_trials(
-    task: Task, trials: TrialFolder, view: int, wanted: Sequence[Trial]
-) -> list[Floats | OneSidedErrors]:
-    """Return the errors (n,) of finished trials of a view, for every measurement of the task in its order."""
-    plain, folded = trials.errors(view, wanted), folded_values(task)
-    return [
-        _one_sided(folded[name], trials, view, wanted) if name in folded else plain[m]
-        for m, name in enumerate(trials.measurements)
-    ]
-
-
-def stated_errors_of_trials(task: Task, trials: TrialFolder, view: int, wanted: Sequence[Trial]) -> Floats:
-    """Return the errors (measurements, n) of finished trials that a statement is about, NaN without a value.
-
-    Those of a value that folds are at the limit of its tolerance.
-    """
-    found = errors_of_trials(task, trials, view, wanted)
-    return np.array([stated_errors(one) for one in found], float).reshape(len(found), len(wanted))
-
-
-def _one_sided(folded: FoldedValue, trials: TrialFolder, view: int, wanted: Sequence[Trial]) -> OneSidedErrors:
-    vectors = trials.deviations(view, wanted, folded.name).reshape(len(wanted), *folded.shape)
-    directions = np.array([folded.direction(trial.day) for trial in wanted]).reshape(vectors.shape)
-    return OneSidedErrors(vectors, directions, folded.size, folded.limit, folded.fold)
 
 
 def _numbers(values: Iterable[float | None]) -> list[float]:

@@ -75,6 +75,23 @@ def validate_captures(
 ) -> CaptureValidation:
     """Compare a simulated capture with a real one, and write the numbers and the twin to a folder.
 
+    Parameters
+    ----------
+    real
+        Folder of the real capture, or of one of a maker's virtual camera.
+    simulated
+        Folder of the simulated capture; None rebuilds ``real`` with a sensor.
+    output
+        Folder for ``comparison.json`` and the twin.
+    sensor
+        Preset or sensor file of the twin; None is the preset that ``real`` names.
+    roi
+        Region of the reference image [px] that shows only the specimen; None is the plane of most points.
+    projector
+        ``on`` or ``off``; None is what the settings of ``real`` say.
+    seed
+        Of the twin's noise and of the bootstrap.
+
     Raises
     ------
     InputError

@@ -51,10 +51,18 @@ class PixelNoise:
 
 
 def pixel_noise(imager: Imager, chip: Imager, count: int, exposure_s: float, ambient: bool) -> PixelNoise:
-    """Return the noise of the mean of ``count`` images of one exposure [s].
+    """Return the noise of the mean of several images of one exposure; shot noise of the scene's own light is neglected.
 
-    With ``ambient``, an image with the projector off is subtracted. Its read noise adds, and the fixed pattern cancels.
-    The shot noise of the scene's own light is neglected. ``chip`` is the imager with the capture's number of bits.
+    Parameters
+    ----------
+    imager
+        Source of the noise.
+    chip
+        The imager with the capture's number of bits (:func:`chip_of`).
+    count, exposure_s
+        Number of images, and their exposure [s].
+    ambient
+        Whether an image with the projector off is subtracted. Its read noise adds, and the fixed pattern cancels.
     """
     per_image = 1.0 / count + (1.0 if ambient else 0.0)
     level = 1.0 / chip.gain  # e- of a grey level
