@@ -17,8 +17,9 @@ with the camera's.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -103,12 +104,12 @@ def calibrate_recorded(
     """
     if len(boards) < LEAST_POSES:
         raise InputError("boards", "", f"{len(boards)} poses", f"{LEAST_POSES} or more, tilted against one another")
-    rig, places = _start(boards, board, sizes)
+    observed, (rig, places) = _Observations(boards, board), _start(boards, board, sizes)
     noise = np.tile([0.1, 0.1 if "projector" in sizes else 0.0], (len(boards), 1))
     for _ in range(_ROUNDS):
-        rig, places, normal = _adjusted(rig, places, boards, board, noise, rig_prior(rig, sizes))
-        noise = _noise(rig, places, boards, board, normal)
-    matrix = _covariance(rig, places, noise, normal, boards, board, own_units)
+        rig, places, normal = observed.adjusted(rig, places, noise, rig_prior(rig, sizes))
+        noise = observed.noise(rig, places, normal)
+    matrix = observed.covariance(rig, places, noise, normal, own_units)
     details: dict[str, str | float] = {
         "board": str(board),
         "poses": float(len(places)),
@@ -177,126 +178,116 @@ def _start(
     return Rig(cameras, projector), poses[reference]
 
 
-def _adjusted(
-    rig: Rig,
-    places: list[Transform],
-    boards: Sequence[RecordedBoard],
-    board: Board,
-    noise: Floats,
-    prior: LensPrior,
-) -> tuple[Rig, list[Transform], Floats]:
-    """Minimise the weighted squares over rig and poses by Levenberg-Marquardt; also return the normal matrix (q, q)."""
-    damping = 1e-3
-    cost, normal, gradient = _normal(rig, places, boards, board, noise, prior)
-    for _ in range(_MOST_STEPS):
-        scale = 1 / np.sqrt(np.diag(normal))
-        scaled = normal * np.outer(scale, scale)
-        step = scale * np.linalg.solve(scaled + damping * np.eye(len(scale)), scale * gradient)
-        tried_rig, tried = bundle.stepped(rig, places, prior.names, step)
-        new = _normal(tried_rig, tried, boards, board, noise, prior)
-        if new[0] > cost * (1 + 1e-12):
-            damping *= 4
-            if damping > _STUCK:
+@dataclass(frozen=True)
+class _Observations:
+    """A ``board`` and its corners as recorded at several poses."""
+
+    boards: Sequence[RecordedBoard]
+    board: Board
+
+    def residuals(self, rig: Rig, place: Transform, recorded: RecordedBoard) -> tuple[Floats, Floats, Floats]:
+        """Return derivatives of one pose's pixels, (n, eyes, 2, p + 6), (n, eyes, 2, 3), and residuals (n, 2 eyes)."""
+        optics, corners = all_eyes(rig), self.board.corners[recorded.corners]
+        jacobian, by_point = bundle.view_jacobian(optics, parameter_names(rig), place, corners)
+        at = place.points(corners)
+        left = np.concatenate([recorded.pixels[name] - eye.project(at) for name, eye in optics.items()], axis=1)
+        return jacobian, by_point, left
+
+    def whitened(self, rig: Rig, places: Sequence[Transform], noise: Floats) -> Iterator[_Whitened]:
+        """Yield what each pose contributes to an adjustment, at a noise (poses, 2) [px]."""
+        count = len(parameter_names(rig))
+        for number, (place, recorded, own) in enumerate(zip(places, self.boards, noise, strict=True)):
+            jacobian, by_point, left = self.residuals(rig, place, recorded)
+            view = bundle.BoardView(place, recorded.corners, *map(float, own))
+            covariance = bundle.observation_covariance(all_eyes(rig), by_point, view)
+            whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+            flat = np.einsum("nij,njk->nik", whiten, jacobian.reshape(len(left), -1, count + 6))
+            indices = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]
+            yield _Whitened(view, indices, flat, whiten, by_point, left)
+
+    def adjusted(
+        self, rig: Rig, places: list[Transform], noise: Floats, prior: LensPrior
+    ) -> tuple[Rig, list[Transform], Floats]:
+        """Minimise weighted squares over rig and poses by Levenberg-Marquardt; also return the normal matrix (q, q)."""
+        damping = 1e-3
+        cost, normal, gradient = self._normal(rig, places, noise, prior)
+        for _ in range(_MOST_STEPS):
+            scale = 1 / np.sqrt(np.diag(normal))
+            scaled = normal * np.outer(scale, scale)
+            step = scale * np.linalg.solve(scaled + damping * np.eye(len(scale)), scale * gradient)
+            tried_rig, tried = bundle.stepped(rig, places, prior.names, step)
+            new = self._normal(tried_rig, tried, noise, prior)
+            if new[0] > cost * (1 + 1e-12):
+                damping *= 4
+                if damping > _STUCK:
+                    return rig, places, normal
+                continue
+            gained = cost - new[0]
+            rig, places, damping = tried_rig, tried, max(damping / 3, 1e-12)
+            cost, normal, gradient = new
+            if gained < _SMALL_GAIN * cost and float(step @ normal @ step) < _SMALL_STEP:
                 return rig, places, normal
-            continue
-        gained = cost - new[0]
-        rig, places, damping = tried_rig, tried, max(damping / 3, 1e-12)
-        cost, normal, gradient = new
-        if gained < _SMALL_GAIN * cost and float(step @ normal @ step) < _SMALL_STEP:
-            return rig, places, normal
-    raise InputError(
-        "boards", "", f"an adjustment that does not converge in {_MOST_STEPS} steps", "poses that determine it"
-    )
+        found = f"an adjustment that does not converge in {_MOST_STEPS} steps"
+        raise InputError("boards", "", found, "poses that determine it")
+
+    def _normal(
+        self, rig: Rig, places: list[Transform], noise: Floats, prior: LensPrior
+    ) -> tuple[float, Floats, Floats]:
+        """Return weighted sum of squares, normal matrix (q, q) and gradient (q,) for the rig, then six of each pose."""
+        count = len(prior.names)
+        size = count + 6 * len(places)
+        normal, gradient = np.zeros((size, size)), np.zeros(size)
+        weighted = prior.rows / prior.sigma[:, None]
+        off = (prior.values - prior.rows @ parameter_values(rig, prior.names)) / prior.sigma
+        normal[:count, :count], gradient[:count] = weighted.T @ weighted, weighted.T @ off
+        cost = float(off @ off)
+        for pose in self.whitened(rig, places, noise):
+            flat = pose.jacobian.reshape(-1, count + 6)
+            white = np.einsum("nij,nj->ni", pose.whiten, pose.left).ravel()
+            normal[np.ix_(pose.indices, pose.indices)] += flat.T @ flat
+            gradient[pose.indices] += flat.T @ white
+            cost += float(white @ white)
+        return cost, normal, gradient
+
+    def noise(self, rig: Rig, places: list[Transform], normal: Floats) -> Floats:
+        """Return the noise of a camera's corner and the projector's part, (poses, 2), from residuals and freedom."""
+        out, optics = [], list(all_eyes(rig))
+        count = sum(2 * len(optics) * len(recorded.corners) for recorded in self.boards)
+        lost = count / max(count - len(normal), 1)
+        for place, recorded in zip(places, self.boards, strict=True):
+            _, by_point, left = self.residuals(rig, place, recorded)
+            camera, own = [], [np.zeros(1)]
+            for index, eye in enumerate(optics):
+                part = left[:, 2 * index : 2 * index + 2]
+                if eye == "projector":
+                    turned = bundle.homographies(by_point[:, 0], by_point[:, index], place)
+                    own = [part - np.einsum("nij,nj->ni", turned, left[:, :2])]
+                else:
+                    camera.append(part)
+            out.append([np.mean(np.concatenate(camera) ** 2), np.mean(np.concatenate(own) ** 2)])
+        return np.sqrt(np.array(out) * lost)
+
+    def covariance(self, rig: Rig, places: list[Transform], noise: Floats, normal: Floats, own_units: bool) -> Floats:
+        """Return the covariance of the rig's parameters (p, p) after an adjustment with a normal matrix (q, q)."""
+        count, (modes, sigma) = len(parameter_names(rig)), self.board.imperfections()
+        if own_units:
+            sigma = np.concatenate([[0.0], sigma[1:]])  # the first is the scale
+        shared = np.zeros((len(normal), len(modes)))
+        for pose in self.whitened(rig, places, noise):
+            moves = bundle.board_derivatives(pose.view.sensor_from_board, modes[:, pose.view.corners], pose.by_point)
+            moved = np.einsum("nij,njm->nim", pose.whiten, moves.reshape(len(pose.left), -1, len(modes)))
+            shared[pose.indices] += np.einsum("nip,nim->pm", pose.jacobian, moved)
+        inverse = bundle.inverse_of(normal)
+        spread = (inverse @ shared)[:count] * sigma
+        return np.asarray(inverse[:count, :count] + spread @ spread.T)
 
 
-def _normal(
-    rig: Rig,
-    places: list[Transform],
-    boards: Sequence[RecordedBoard],
-    board: Board,
-    noise: Floats,
-    prior: LensPrior,
-) -> tuple[float, Floats, Floats]:
-    """Return weighted sum of squares, normal matrix (q, q) and gradient (q,) for the rig, then six of each pose."""
-    count = len(prior.names)
-    size = count + 6 * len(places)
-    normal, gradient = np.zeros((size, size)), np.zeros(size)
-    weighted = prior.rows / prior.sigma[:, None]
-    off = (prior.values - prior.rows @ parameter_values(rig, prior.names)) / prior.sigma
-    normal[:count, :count], gradient[:count] = weighted.T @ weighted, weighted.T @ off
-    cost = float(off @ off)
-    for number, (place, recorded, own_noise) in enumerate(zip(places, boards, noise, strict=True)):
-        jacobian, by_point, left = _residuals(rig, place, recorded, board, prior.names)
-        whiten = _whitening(rig, place, recorded, by_point, own_noise)
-        flat = np.einsum("nij,njk->nik", whiten, jacobian.reshape(len(left), -1, count + 6)).reshape(-1, count + 6)
-        white = np.einsum("nij,nj->ni", whiten, left).ravel()
-        own = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]
-        normal[np.ix_(own, own)] += flat.T @ flat
-        gradient[own] += flat.T @ white
-        cost += float(white @ white)
-    return cost, normal, gradient
+class _Whitened(NamedTuple):
+    """One pose of the board: its parameters' ``indices``, whitened ``jacobian``, ``whiten`` (n, 2 eyes, 2 eyes)."""
 
-
-def _residuals(
-    rig: Rig, place: Transform, recorded: RecordedBoard, board: Board, names: tuple[str, ...]
-) -> tuple[Floats, Floats, Floats]:
-    """Return derivatives of the pixels of one pose, (n, eyes, 2, p + 6), (n, eyes, 2, 3), residuals (n, 2 eyes)."""
-    optics, corners = all_eyes(rig), board.corners[recorded.corners]
-    jacobian, by_point = bundle.view_jacobian(optics, names, place, corners)
-    at = place.points(corners)
-    left = np.concatenate([recorded.pixels[name] - eye.project(at) for name, eye in optics.items()], axis=1)
-    return jacobian, by_point, left
-
-
-def _whitening(rig: Rig, place: Transform, recorded: RecordedBoard, by_point: Floats, noise: Floats) -> Floats:
-    covariance = bundle.observation_covariance(
-        all_eyes(rig), by_point, bundle.BoardView(place, recorded.corners, *map(float, noise))
-    )
-    return np.linalg.inv(np.linalg.cholesky(covariance))
-
-
-def _noise(rig: Rig, places: list[Transform], boards: Sequence[RecordedBoard], board: Board, normal: Floats) -> Floats:
-    """Return the noise of a camera's corner and the projector's part, (poses, 2), from residuals and freedom."""
-    out, names, optics = [], parameter_names(rig), list(all_eyes(rig))
-    count = sum(2 * len(optics) * len(recorded.corners) for recorded in boards)
-    lost = count / max(count - len(normal), 1)
-    for place, recorded in zip(places, boards, strict=True):
-        _, by_point, left = _residuals(rig, place, recorded, board, names)
-        camera, own = [], [np.zeros(1)]
-        for index, eye in enumerate(optics):
-            part = left[:, 2 * index : 2 * index + 2]
-            if eye == "projector":
-                turned = bundle.homographies(by_point[:, 0], by_point[:, index], place)
-                own = [part - np.einsum("nij,nj->ni", turned, left[:, :2])]
-            else:
-                camera.append(part)
-        out.append([np.mean(np.concatenate(camera) ** 2), np.mean(np.concatenate(own) ** 2)])
-    return np.sqrt(np.array(out) * lost)
-
-
-def _covariance(
-    rig: Rig,
-    places: list[Transform],
-    noise: Floats,
-    normal: Floats,
-    boards: Sequence[RecordedBoard],
-    board: Board,
-    own_units: bool,
-) -> Floats:
-    """Return the covariance of the rig's parameters (p, p) after an adjustment with a normal matrix (q, q)."""
-    names = parameter_names(rig)
-    count = len(names)
-    modes, sigma = board.imperfections()
-    if own_units:
-        sigma = np.concatenate([[0.0], sigma[1:]])  # the first is the scale
-    shared = np.zeros((len(normal), len(modes)))
-    for number, (place, recorded, own_noise) in enumerate(zip(places, boards, noise, strict=True)):
-        jacobian, by_point, left = _residuals(rig, place, recorded, board, names)
-        whiten = _whitening(rig, place, recorded, by_point, own_noise)
-        moves = bundle.board_derivatives(place, modes[:, recorded.corners], by_point).reshape(len(left), -1, len(modes))
-        flat = np.einsum("nij,njk->nik", whiten, jacobian.reshape(len(left), -1, count + 6))
-        own = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]
-        shared[own] += np.einsum("nip,nim->pm", flat, np.einsum("nij,njm->nim", whiten, moves))
-    inverse = bundle.inverse_of(normal)
-    spread = (inverse @ shared)[:count] * sigma
-    return np.asarray(inverse[:count, :count] + spread @ spread.T)
+    view: bundle.BoardView
+    indices: list[int]
+    jacobian: Floats
+    whiten: Floats
+    by_point: Floats
+    left: Floats
