@@ -280,12 +280,11 @@ def read_run(folder: str | Path) -> Run:
         if absent := sorted(set(entry.features) - seen):
             allowed = "features of scores.nc"
             raise InputError(folder / "run.json", f"measurements.{name}.features", absent[0], allowed)
-    unknown = sorted(set(checks["view"].values.tolist()) - set(scores["view"].values.tolist()))
-    if unknown:
-        raise InputError(folder / "checks.nc", "view", unknown[0], "views of scores.nc")
-    for i, chosen in enumerate(about.view_sets):
-        if missing := sorted(set(chosen.views) - set(scores["view"].values.tolist())):
-            raise InputError(folder / "run.json", f"view_sets[{i}].views", missing[0], "views of scores.nc")
+    named = [("checks.nc", "view", checks["view"].values.tolist())]
+    named += [("run.json", f"view_sets[{i}].views", chosen.views) for i, chosen in enumerate(about.view_sets)]
+    for name, key, views in named:
+        if missing := sorted(set(views) - set(scores["view"].values.tolist())):
+            raise InputError(folder / name, key, missing[0], "views of scores.nc")
     for name in ("possible", "uncertainty_possible"):
         scores[name] = scores[name].astype(bool)  # netCDF has no booleans
     stated = "statement.json" in own or not own

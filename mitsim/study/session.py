@@ -33,7 +33,7 @@ from mitsim.study.virtual.plan import measured_by, measurements_of, race_rules, 
 from mitsim.study.virtual.race import Raced, RaceRules, run_race
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.screening import screen
-from mitsim.study.virtual.spread_out import SpreadMeasurements, spread_over
+from mitsim.study.virtual.spread_out import SpreadMeasurements
 from mitsim.study.virtual.stated import StatedView, state_view
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.trials import TrialFolder
@@ -100,7 +100,12 @@ class Session:
     @cached_property
     def runner(self) -> RenderedMeasurements | MappedMeasurements | SpreadMeasurements:
         """Return the maker of the trials: the measurements of this process, or workers that make the same."""
-        return spread_over(self.workers, self.measurements, self.digest)
+        if self.workers is None:
+            return self.measurements
+        if self.renderer is None:
+            say("clouds are drawn from a map in this process, not by workers")
+            return self.measurements
+        return SpreadMeasurements(self.workers, self.renderer, self.digest)
 
     @cached_property
     def trials(self) -> TrialFolder:

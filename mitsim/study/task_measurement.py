@@ -11,8 +11,7 @@ sensor, for a measurement that it lacks, and for another pose of the sensor.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -136,23 +135,13 @@ class Correction(PartialDocument):
         return math.nan if u is None or u_bias is None else math.hypot(u, u_bias)
 
 
-class _StatementOfView(PartialDocument):
-    sensor: str
-    world_from_sensor: list[list[float]]
-    measurements: dict[str, Correction]
-
-
-@dataclass(frozen=True)
-class ViewStatement:
-    """Statement of uncertainty for one view, from the ``statement.json`` at ``path``.
-
-    ``sensor`` is its name; ``world_from_sensor`` is the pose of the view; ``corrections`` are by measurement.
-    """
+class ViewStatement(PartialDocument):
+    """Statement of uncertainty for one view, from the ``statement.json`` at ``path``."""
 
     path: Path
     sensor: str
-    world_from_sensor: Transform
-    corrections: Mapping[str, Correction]
+    world_from_sensor: list[list[float]]
+    measurements: dict[str, Correction]
 
     def check(self, sensor: str, pose: Transform) -> None:
         """Check that a cloud's sensor and its ``pose``, world from sensor, are those of the statement.
@@ -164,7 +153,7 @@ class ViewStatement:
         """
         if sensor != self.sensor:
             raise InputError(self.path, "sensor", self.sensor, f"{sensor}, the sensor of the cloud")
-        difference = self.world_from_sensor.inverse() @ pose
+        difference = _pose(self.path, self.world_from_sensor).inverse() @ pose
         distance_mm = float(np.linalg.norm(difference.translation))
         rotation_deg = math.degrees(math.acos(min(max((float(np.trace(difference.rotation)) - 1) / 2, -1.0), 1.0)))
         if distance_mm > SAME_PLACE_MM or rotation_deg > SAME_ANGLE_DEG:
@@ -230,12 +219,12 @@ def corrected(result: Result, statement: ViewStatement) -> Result:
     InputError
         If the statement lacks the measurement, has it in another unit, or has no bias for it.
     """
-    if result.name not in statement.corrections:
-        known = ", ".join(statement.corrections)
+    if result.name not in statement.measurements:
+        known = ", ".join(statement.measurements)
         raise InputError(
             statement.path, "measurements", known, f"a statement with {result.name}, a measurement of the task"
         )
-    correction = statement.corrections[result.name]
+    correction = statement.measurements[result.name]
     if correction.unit != result.unit or correction.bias is None:
         found = "no bias" if correction.bias is None else f"bias {correction.bias:g} {correction.unit}"
         raise InputError(statement.path, f"measurements.{result.name}", found, f"a bias in {result.unit}")
@@ -257,8 +246,7 @@ def read_view_statement(path: Path) -> ViewStatement:
         If the file cannot be read, or is not a statement.
     """
     table = read_json_object(path, "a statement.json of mitsim run or mitsim budget")
-    statement = validate(path, table, _StatementOfView)
-    return ViewStatement(path, statement.sensor, _pose(path, statement.world_from_sensor), statement.measurements)
+    return validate(path, table | {"path": path}, ViewStatement)
 
 
 def read_pose(path: Path, view: int | None = None) -> Transform:

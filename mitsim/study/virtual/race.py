@@ -280,10 +280,10 @@ def with_race(scores: xr.Dataset, raced: Raced) -> xr.Dataset:
     places = {int(view): place for place, view in enumerate(scores["view"].values)}
     shape = (len(names), scores.sizes["view"])
     risk, count = np.full(shape, np.nan), np.zeros(shape, int)
-    for m, name in enumerate(names):
-        for v, view in enumerate(raced.views):
-            risk[m, places[int(view)]] = raced.standings[name].risk[v]
-            count[m, places[int(view)]] = int((~np.isinf(raced.errors[m, v])).sum())
+    columns = [places[int(view)] for view in raced.views]
+    if columns:
+        risk[:, columns] = [raced.standings[name].risk for name in names]
+        count[:, columns] = (~np.isinf(raced.errors)).sum(axis=2)
     screened = scores["uncertainty_rank"].transpose("measurement", "view").values
     order = np.lexsort((screened, np.where(np.isfinite(risk), risk, np.inf)), axis=1)
     rank = np.empty(shape, int)

@@ -2,7 +2,7 @@
 
 Signal chain: capture -> cloud, from its own decoder -> plane of the points in the image region that the user gave, or
 of most points (:mod:`mitsim.twin.finish.place`) -> its outline, and the bend of its points
-(:mod:`mitsim.twin.finish.bend`) -> pixels and view rays that meet it.
+(:mod:`mitsim.twin.finish.place`) -> pixels and view rays that meet it.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
-from mitsim.twin.finish.bend import Bend, fit_bend
-from mitsim.twin.finish.place import Place, found_place, known_place, plane_points
+from mitsim.twin.finish.place import Bend, Place, fit_bend, found_place, known_place, plane_points
 
 Floats = NDArray[np.float64]
 
