@@ -94,11 +94,9 @@ def fit_views(views: Sequence[CouponView], finish: MetalFinish | None, where: st
     problem = Problem(views, finish)
     if problem.count < FEWEST_BLOCKS:
         whole = sum(view.whole for view in views)
-        found, hint = (
-            f"{problem.count} of {whole} blocks on the coupon free of saturation",
-            "shorter exposures, other poses, or smaller blocks",
-        )
-        raise InputError(where, "images", found, f"{FEWEST_BLOCKS} or more", hint)
+        free = f"{problem.count} of {whole} blocks on the coupon free of saturation"
+        hint = "shorter exposures, other poses, or smaller blocks"
+        raise InputError(where, "images", free, f"{FEWEST_BLOCKS} or more", hint)
     every = np.ones(problem.count, bool)
     values = _first(problem, every)
     grain = 0.0
@@ -112,16 +110,13 @@ def fit_views(views: Sequence[CouponView], finish: MetalFinish | None, where: st
     results, slopes = problem.results(values)
     by_covariance = np.sqrt(np.einsum("ik,kl,il->i", slopes, covariance, slopes))
     by_jackknife = _jackknife(problem, values, variance)
-    found = [
-        FittedQuantity(float(v), float(c), float(j))
-        for v, c, j in zip(results, by_covariance, by_jackknife, strict=True)
-    ]
-    metal = finish is not None
+    rows = np.stack([results, by_covariance, by_jackknife], axis=1).tolist()
+    fitted, metal = [FittedQuantity(*row) for row in rows], finish is not None
     return Fit(
-        found[0],
-        found[1] if metal else None,
-        found[2] if metal else None,
-        found[-1] if problem.lit_room else None,
+        fitted[0],
+        fitted[1] if metal else None,
+        fitted[2] if metal else None,
+        fitted[-1] if problem.lit_room else None,
         chi_square,
         problem.count,
         len(problem.unit),
