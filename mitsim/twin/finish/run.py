@@ -19,12 +19,12 @@ import numpy as np
 from characterisation.files.atomic_io import json_values
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
+from mitsim.capture.calibration import calibration_table
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.maps.campaign.coupons import CouponRecipe, load_sample
 from mitsim.running.progress import say, track
 from mitsim.scene.light_transport.ambient import has_emitters
-from mitsim.sensor.camera import Rig
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor
 from mitsim.twin.finish.dots import Dots, compare_dots
@@ -194,15 +194,18 @@ def fit_captures(
     views: list[CouponView] = []
     dots: list[Dots] = []
     places: list[Place] = []
-    rig_and_renderer: tuple[Rig, WhiteCouponRenderer] | None = None
-    unknown = False
+    renderer, calibration, unknown = (
+        WhiteCouponRenderer(with_rig(chosen, first.rig)),
+        calibration_table(first.rig),
+        False,
+    )
     for index, folder in enumerate(track(list(captures), "captures", len(captures))):
         capture = read_capture(folder)
         if capture.sensor != first.sensor:
             raise InputError(folder, "sensor", capture.sensor, f"{first.sensor}, as in {captures[0]}")
-        if rig_and_renderer is None or not _same(rig_and_renderer[0], capture.rig):
-            rig_and_renderer = capture.rig, WhiteCouponRenderer(with_rig(chosen, capture.rig))
-        renderer, known = rig_and_renderer[1], pattern_is_known(capture, chosen)
+        if calibration_table(capture.rig) != calibration:
+            renderer, calibration = WhiteCouponRenderer(with_rig(chosen, capture.rig)), calibration_table(capture.rig)
+        known = pattern_is_known(capture, chosen)
         unknown |= not known
         place = place_of(capture, renderer.sensor, (sample.width, sample.height), str(folder), roi)
         lit = capture.source != "simulated" or has_emitters(sample.scene)
@@ -214,11 +217,9 @@ def fit_captures(
         places.append(place)
     if not sum(view.whole for view in views):
         why = "; ".join(dict.fromkeys(f"{view.camera} of {view.name}: {view.why_no_block}" for view in views[:4]))
-        found, hint = (
-            f"no block of {block} px on the coupon: {why}",
-            "give the region of the image that shows it: --window",
-        )
-        raise InputError("captures", "images", found, "a coupon in the images", hint)
+        none = f"no block of {block} px on the coupon: {why}"
+        hint = "give the region of the image that shows it: --window"
+        raise InputError("captures", "images", none, "a coupon in the images", hint)
     say(f"fitting {sum(len(view.block) for view in views)} pixels in {sum(view.size for view in views)} blocks")
     return CouponFit(
         chosen,
@@ -240,18 +241,6 @@ def _own_scene(capture: Capture, folder: Path) -> Path:
         return Path(named)
     found, hint = repr(named) if named else "nothing", "give the scene of the coupon: --scene scenes/coupon/coupon.xml"
     raise InputError(folder / "settings.json", "scene", found, "an existing scene file", hint)
-
-
-def _same(first: Rig, second: Rig) -> bool:
-    """Return whether two rigs have the same cameras at the same poses."""
-    if list(first.cameras) != list(second.cameras):
-        return False
-    return all(
-        np.array_equal(a.matrix, b.matrix)
-        and np.array_equal(a.distortion, b.distortion)
-        and np.array_equal(a.sensor_from_camera.matrix(), b.sensor_from_camera.matrix())
-        for a, b in zip(first.cameras.values(), second.cameras.values(), strict=True)
-    )
 
 
 def _exponential(parameter: FittedQuantity | None) -> tuple[float, float]:

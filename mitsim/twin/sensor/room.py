@@ -21,7 +21,7 @@ from mitsim.twin.finish.electrons import chip_of, linearised
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
 from mitsim.twin.sensor.estimate import FittedKey
-from mitsim.twin.sensor.figures import Field
+from mitsim.twin.sensor.figures import SpecimenField
 from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.parameters import ROOM_KEYS
 
@@ -51,8 +51,8 @@ def fit_room(input_captures: list[InputCapture], sensor: Sensor, places: dict[st
         loss = camera_illumination(sensor.imager.corner_illumination, camera)
         scale = electrons_per_radiance(sensor.imager, sensor.wavelength_nm, own.exposure.base_s) * REFLECTANCE / np.pi
         irradiance = electrons / scale / (1.0 if loss is None else loss)
-        field = Field.of(camera, image_mask(places[source.name], camera, MARGIN_PX), _PATCH_PX)
-        corners = field.corners + np.array([field.row, field.column])
+        field = SpecimenField.of(camera, image_mask(places[source.name], camera, MARGIN_PX), _PATCH_PX)
+        corners = field.corners + np.array([field.roi.top, field.roi.left])
         if not len(corners):
             continue
         middles = corners[:, ::-1] + (_PATCH_PX - 1) / 2
