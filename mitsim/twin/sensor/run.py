@@ -27,7 +27,7 @@ from mitsim.twin.compare.rebuild import like
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import specimen_place
 from mitsim.twin.sensor.dots import DotDraws, DotsFit, fit_dots
-from mitsim.twin.sensor.estimate import FittedKey, Undetermined, combined, pooled
+from mitsim.twin.sensor.estimate import FittedKey, Undetermined, pooled
 from mitsim.twin.sensor.input_captures import InputCapture, read_input_captures, repeats
 from mitsim.twin.sensor.noise import UNSEPARATED, ImagerFit, fit_imager, without_fixed_pattern
 from mitsim.twin.sensor.parameters import (
@@ -42,7 +42,7 @@ from mitsim.twin.sensor.parameters import (
     pattern_parameters,
 )
 from mitsim.twin.sensor.room import RoomFit, fit_room
-from mitsim.twin.sensor.rows import Rows, row_turns
+from mitsim.twin.sensor.rows import row_turns
 from mitsim.twin.sensor.stripes import fit_stripes
 
 Floats = NDArray[np.float64]
@@ -54,15 +54,12 @@ _MISFIT = 10.0
 
 @dataclass(frozen=True)
 class SensorFit:
-    """Result of a fit: ``estimates``, undetermined numbers (``undetermined``), and the fits of every capture."""
+    """Result of a fit: ``estimates``, and numbers that no capture determines (``undetermined``)."""
 
     sensor: Sensor = field(repr=False)
     input_captures: tuple[InputCapture, ...] = field(repr=False)
     estimates: tuple[FittedKey, ...]
     undetermined: tuple[Undetermined, ...]
-    dots: dict[str, DotsFit] = field(repr=False)
-    places: dict[str, Place] = field(repr=False)
-    rows: dict[str, Rows] = field(repr=False)
 
 
 def fit_sensor(
@@ -119,14 +116,14 @@ def fit_sensor(
             own = replace(like(source.capture, base, source.name), imager=base.imager)
             coded += fit_stripes(source, own, places[source.name])
         estimates += pooled(coded)
-    rows, assumed = {}, chosen.unknowns.calibration
+    turned, assumed, method = list[FittedKey](), chosen.unknowns.calibration, "row errors over the field"
     for source in lit:
         settings, _ = decoder_settings(source.capture)
         turns = row_turns(source.capture, settings, places[source.name], (assumed.row_mrad, assumed.roll_mrad))
-        if turns is not None:
-            rows[source.name] = turns
-    estimates += _turn_estimates(rows)
-    return SensorFit(base, tuple(input_captures), tuple(estimates), tuple(undetermined), dots, places, rows)
+        for key, pair in turns.items():
+            turned.append(FittedKey(f"misalignment.{key}", *pair, "mrad", (source.name,), method))
+    estimates += pooled(turned)
+    return SensorFit(base, tuple(input_captures), tuple(estimates), tuple(undetermined))
 
 
 def sensor_path(name: str | Path) -> Path:
@@ -210,15 +207,3 @@ def _combined_estimates(
     if room is None and dots:
         undetermined.append(Undetermined(BLACK_LEVEL.key, BLACK_LEVEL.read(base), BLACK_LEVEL.determined_by))
     return pooled(estimates), undetermined
-
-
-def _turn_estimates(rows: dict[str, Rows]) -> list[FittedKey]:
-    out = []
-    for key in ("row_mrad", "roll_mrad"):
-        pairs = [getattr(found, key) for found in rows.values()]
-        if pairs:
-            value, spread = combined([p[0] for p in pairs], [p[1] for p in pairs])
-            out.append(
-                FittedKey(f"misalignment.{key}", value, spread, "mrad", tuple(rows), "row errors over the field")
-            )
-    return out
