@@ -278,7 +278,7 @@ def test_an_uncertainty_of_rounding_is_none():
             self.source = source
 
     quantity = replace(QUANTITIES[0], figure=constant, margin=0.0, factor=1.0)
-    row = compare_module._row(quantity, Seen("device"), Seen("simulated"), 400, {}, np.random.default_rng(1))
+    (row,) = compare_module._row(quantity, Seen("device"), Seen("simulated"), 400, {}, np.random.default_rng(1))
     assert (row.uncertainty, row.verdict, row.why) == (0.0, "differs", "by more than the margin")
 
 
