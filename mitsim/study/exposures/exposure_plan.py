@@ -187,7 +187,7 @@ def _sweep(
             if exposure.exposures_s[0] >= longest:
                 break
     unique = {one.exposure: one for one in found}
-    return sorted(unique.values(), key=_product)
+    return sorted(unique.values(), key=lambda one: one.exposure.seconds * one.exposure.power)
 
 
 def _feasible_exposure(seconds: float, shortest: float, longest: float, dimmable: bool) -> PlannedExposure | None:
@@ -198,19 +198,9 @@ def _feasible_exposure(seconds: float, shortest: float, longest: float, dimmable
     if seconds >= longest:
         return PlannedExposure((longest,))
     if seconds >= shortest:
-        return PlannedExposure((_rounded(seconds),))
+        return PlannedExposure((float(f"{seconds:.3g}"),))  # three digits, so that a user can type it in
     power = seconds / shortest
     return PlannedExposure((shortest,), float(f"{power:.2g}")) if dimmable and power >= LEAST_POWER else None
-
-
-def _rounded(seconds: float) -> float:
-    """Return an exposure [s] rounded to three significant digits, so that a user can type it in."""
-    return float(f"{seconds:.3g}")
-
-
-def _product(one: ExposureResult) -> float:
-    """Return total exposure times power [s]."""
-    return one.exposure.seconds * one.exposure.power
 
 
 def _greedy_sets(
