@@ -27,8 +27,11 @@ Floats = NDArray[np.float64]
 #: terms of the series
 _HARMONICS = np.arange(1, 40, 2)
 
-#: side of a block [px]; least share of decoded pixels; largest relative spread of depths and of white levels [1]
-_BLOCK_PX, _LEAST_SHARE, _DEEP, _EVEN = 32, 0.15, 0.025, 0.12
+#: side of a block [px], and least share of its pixels that are decoded
+_BLOCK_PX, _LEAST_SHARE = 32, 0.15
+
+#: largest relative spread of depths and of white levels in a block [1]
+_DEEP, _EVEN = 0.025, 0.12
 
 #: least white minus black [DN of 8 bit]; below, rounding raises the modulation of fine stripes
 _LEAST_DN = 50.0

@@ -20,7 +20,7 @@ from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import Sensor
 from mitsim.twin.compare.denoise import denoised
 from mitsim.twin.finish.electrons import linearised
-from mitsim.twin.finish.fine_detail import FINEST, finest_detail
+from mitsim.twin.finish.fine_detail import FINEST, MEDIAN_SQUARE, finest_detail
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
 from mitsim.twin.sensor.estimate import FittedKey, Undetermined
@@ -252,7 +252,7 @@ def _from_one_image(
     electrons = linearised(image, imager)
     level = float(np.median(electrons[mask]))
     fine = finest_detail(electrons)
-    variance = float(np.median(fine[mask] ** 2)) / 0.45493642311957283
+    variance = float(np.median(fine[mask] ** 2)) / MEDIAN_SQUARE
     variance = (variance - float(widths(np.array(float(np.median(image[mask]))), imager)) ** 2 / 12) / gain
     relative = float(np.sqrt(2 / (mask.sum() * 0.37 * independent_share())))
     read = imager.read_noise

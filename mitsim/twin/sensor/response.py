@@ -35,18 +35,26 @@ from scipy.special import ndtr
 
 from mitsim.sensor.imager import Imager
 from mitsim.twin.compare.denoise import denoised
-from mitsim.twin.finish.fine_detail import FINEST, finest_detail, noise_of_levels
+from mitsim.twin.finish.fine_detail import FINEST, MEDIAN_SQUARE, finest_detail, noise_of_levels
 from mitsim.twin.sensor.photon_transfer import independent_share
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: side of a tile and its rim, which the weights reach [px]; largest number of tiles, least number with quiet pixels
-_TILE_PX, _RIM_PX, _TILES, _FEWEST = 32, 2, 120, 8
+#: side of a tile and its rim, which the weights reach [px]
+_TILE_PX, _RIM_PX = 32, 2
 
-#: slope beyond a knee; steps of its level [DN], coarse and fine; fine steps to either side of a coarse level, and of a
-#: level that is known, and as many at most
-_SLOPE, _COARSE_DN, _STEP_DN, _AROUND, _BESIDE_IT, _FARTHEST = 0.5, 3.0, 0.5, 4, 1, 20
+#: largest number of tiles, and least number with quiet pixels
+_TILES, _FEWEST = 120, 8
+
+#: slope beyond a knee; chips compand by steps of two
+_SLOPE = 0.5
+
+#: steps of a knee's level, coarse and fine [DN]
+_COARSE_DN, _STEP_DN = 3.0, 0.5
+
+#: fine steps to either side of a coarse level, of a level that is known, and as many at most
+_AROUND, _BESIDE_IT, _FARTHEST = 4, 1, 20
 
 #: how far a level's own share of the light begins under the knee of the file [DN]
 _ROUNDED_DOWN_DN = 0.5
@@ -68,9 +76,6 @@ _QUIET, _LARGEST = 0.5, 4.0
 
 #: squares of the weights of finest detail along an axis (32, 36): of the pixels of a tile and its rim, for those within
 _WEIGHTS = sum(np.eye(_TILE_PX, _TILE_PX + 2 * _RIM_PX, at) * weight for at, weight in enumerate(FINEST**2))
-
-#: median of chi-square with one degree of freedom
-_MEDIAN_SQUARE = 0.45493642311957283
 
 
 @dataclass(frozen=True)
@@ -214,7 +219,7 @@ class _Tiles:
 
     def fitted(self, knee: float, slope: float) -> Floats:
         """The a and b of all tiles, by weighted least squares."""
-        middle = float(np.median(self.square)) / _MEDIAN_SQUARE
+        middle = float(np.median(self.square)) / MEDIAN_SQUARE
         numbers = np.array([0.0, middle / max(float(np.median(self.clean)), 1.0)])
         variance, excess = np.full_like(self.square, middle), self.square - 1 / 12 - self.own
         for _ in range(3):
