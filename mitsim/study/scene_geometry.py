@@ -35,7 +35,7 @@ class SceneGeometry:
     ``corners`` (n, 3, 3) of triangles [mm], part frame; ``shape`` (n,) index into ``names``. For every eye, the
     reference camera first: ``centres`` (k, 3) [mm] and ``rays`` (k, 4, 3), unit vectors through the corners of its
     image in cyclic order, both in the sensor frame. ``reach`` holds the nearest and farthest working distance [mm].
-    ``camera`` is the name of the reference camera.
+    ``camera`` is the name of the reference camera, empty if the file is old.
     """
 
     corners: Floats
@@ -44,7 +44,7 @@ class SceneGeometry:
     centres: Floats
     rays: Floats
     reach: tuple[float, float]
-    camera: str
+    camera: str = ""
 
 
 def write_scene_geometry(folder: Path, scene: Scene, sensor: Sensor) -> None:
@@ -98,7 +98,7 @@ def read_scene_geometry(folder: Path) -> SceneGeometry | None:
                 data["centres"].astype(float).reshape(-1, 3),
                 data["rays"].astype(float).reshape(-1, 4, 3),
                 (near, far),
-                str(data["camera"]),
+                str(data["camera"]) if "camera" in data else "",
             )
     except InputError:
         raise
