@@ -31,20 +31,20 @@ _NAMES = {
     "Transform": "mitsim.sensor.transforms",
     "Truth": "mitsim.capture.simulated.truth",
     "decode": "mitsim.decode.captures",
-    "label": "mitsim.study.measurements",
+    "label": "mitsim.study.task_measurement",
     "load_scene": "mitsim.decode.captures",
     "load_sensor": "mitsim.decode.captures",
     "look_at": "mitsim.sensor.poses",
-    "measure": "mitsim.study.measurements",
+    "measure": "mitsim.study.task_measurement",
     "open_study": "mitsim.study.reading",
     "performance_map": "mitsim.maps.use",
     "predict": "mitsim.maps.use",
     "read_capture": "mitsim.decode.captures",
     "read_cloud": "mitsim.decode.captures",
-    "read_task": "mitsim.study.measurements",
+    "read_task": "characterisation.tasks.task_reading",
     "render": "mitsim.decode.captures",
-    "score": "mitsim.study.programs",
-    "statement": "mitsim.study.programs",
+    "score": "mitsim.study.session",
+    "statement": "mitsim.study.session",
     "triangulate": "mitsim.decode.own_code",
     "write_capture": "mitsim.decode.captures",
     "write_cloud": "mitsim.decode.captures",
@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from characterisation.statements.statement import Statement
     from characterisation.tasks.result import Result
     from characterisation.tasks.task_file import Task
+    from characterisation.tasks.task_reading import read_task
     from mitsim.capture.capture import Capture
     from mitsim.capture.simulated.truth import Truth
     from mitsim.decode.captures import (
@@ -77,9 +78,9 @@ if TYPE_CHECKING:
     from mitsim.sensor.preset import Sensor
     from mitsim.sensor.transforms import Transform
     from mitsim.study import Study
-    from mitsim.study.measurements import label, measure, read_task
-    from mitsim.study.programs import score, statement
     from mitsim.study.reading import open_study
+    from mitsim.study.session import score, statement
+    from mitsim.study.task_measurement import label, measure
 
 __all__ = [
     "BudgetLine",

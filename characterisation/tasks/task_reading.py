@@ -38,13 +38,30 @@ LEANING = 1e-3
 
 
 def read_task(path: str | Path) -> Task:
-    """Read a task file.
+    """Read a task TOML file: features of a part, and the measurements of them.
+
+    Parameters
+    ----------
+    path
+        The file; its keys are in ``docs/reference/task.md``.
+
+    Returns
+    -------
+    Task
+        ``features`` and ``measurements`` by name, geometry in the part frame [mm].
 
     Raises
     ------
     InputError
-        If the file cannot be used, a feature does not match the features from which it is derived, or a measurement
-        names the wrong features for its kind.
+        If the file is missing or is not TOML, a feature does not match the features from which it is derived, or a
+        measurement names the wrong features for its kind; the error names the key.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> task = ms.read_task("task.toml")
+    >>> task.measurements["pillar1_radius"].nominal
+    20.0
     """
     task = read_toml(path, Task)
     for name in task.features:

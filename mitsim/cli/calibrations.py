@@ -56,9 +56,8 @@ def calibrate(
     from mitsim.sensor.rig_covariance import write_rig_covariance
     from mitsim.study.calibration.board import parse_board
     from mitsim.study.calibration.simulated import coverage
-    from mitsim.study.calibration.table import calibration_table, coverage_table
     from mitsim.study.calibration.virtual_calibration import calibrate as calibrate_sensor
-    from mitsim.study.calibration.virtual_calibration import sensor_drift
+    from mitsim.study.calibration.virtual_calibration import calibration_table, coverage_table, sensor_drift
 
     known = list(Drift().numbers())
     terms = {}

@@ -28,7 +28,7 @@ from mitsim.cli.options import (
 
 if TYPE_CHECKING:
     from mitsim.running.executor import Executor
-    from mitsim.study.many_captures import CommonSettings
+    from mitsim.study.many_captures import CaptureSettings
 
 
 def render(
@@ -90,12 +90,12 @@ def render(
         option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
         raise InputError(option, "", given, "only with --many", "a single capture runs in this process")
     start(variant)
-    if many is not None:
-        from mitsim.sensor.noise_sources import Noise
-        from mitsim.study.many_captures import CommonSettings
+    from mitsim.sensor.noise_sources import Noise
+    from mitsim.study.many_captures import CaptureJob, CaptureSettings, digest_of, origin_of
 
-        common = CommonSettings(definitions(define), deviation, seed, samples, depth, Noise.parse(noise), truth)
-        _render_many(many, scene, sensor, common, output, requested_workers(scheduler, processes))
+    settings = CaptureSettings(definitions(define), deviation, seed, samples, depth, Noise.parse(noise), truth)
+    if many is not None:
+        _render_many(many, scene, sensor, settings, output, requested_workers(scheduler, processes))
         return
     assert position is not None
     from dataclasses import asdict
@@ -109,28 +109,12 @@ def render(
     from mitsim.running.progress import say
     from mitsim.scene.first_hits import sees_nothing
     from mitsim.scene.surface.scatter import Deviation
-    from mitsim.sensor.noise_sources import Noise
-    from mitsim.study.many_captures import Job, digest_of, origin_of
 
     chosen, moved = interface.load_sensor(sensor), Deviation.parse(deviation)
     loaded = interface.load_scene(scene, chosen, definitions(define), deviation=moved)
     pose = pose_of(position, target, roll, chosen)
-    defined = tuple(sorted(definitions(define).items()))
-    digest = Job(
-        chosen,
-        str(scene),
-        defined,
-        moved,
-        "",
-        0,
-        pose,
-        seed,
-        samples,
-        depth,
-        Noise.parse(noise),
-        truth,
-        origin_of(scene, chosen, definitions(define)),
-    ).digest()
+    origin = origin_of(scene, chosen, definitions(define))
+    digest = CaptureJob(chosen, str(scene), "", 0, pose, settings, origin).digest()
     remove_partial_beside(output)
     if digest_of(output, "render") == digest:
         read_capture(output)
@@ -166,7 +150,7 @@ def render(
 
 
 def _render_many(
-    plan: Path, scene: Path, sensor: str, common: CommonSettings, output: Path, workers: Executor | None
+    plan: Path, scene: Path, sensor: str, common: CaptureSettings, output: Path, workers: Executor | None
 ) -> None:
     """Simulate the missing captures of a plan, and report their number."""
     from mitsim.capture.simulated.simulate import SimulatedSensor

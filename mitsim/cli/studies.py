@@ -169,9 +169,10 @@ def state(
     Example: mitsim study state scenes/two_pillars/study.toml --view 12 -o runs/view_12
     """
     start(variant)
+    from characterisation.files.atomic_io import write_json
     from mitsim.study import open_study, with_plan
     from mitsim.study.session import Session
-    from mitsim.study.virtual.stated import write_statement
+    from mitsim.study.virtual.stated import statement_document
 
     check_folder(output)
     chosen = with_plan(open_study(study, ask=asking(yes)), plan)
@@ -179,7 +180,7 @@ def state(
     session = Session(chosen, output, requested_workers(scheduler, processes))
     session.claim(f"budget of view {view}")
     stated = session.state(seen_from)
-    write_statement(output / "statement.json", stated.document)
+    write_json(output / "statement.json", statement_document(session, stated))
     _tell_statement(stated.statements, output)
 
 

@@ -6,24 +6,22 @@ screening alone.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from characterisation.files.checked_files import read_json_object
-from characterisation.files.documents import Document, validate
+from characterisation.files.documents import validate
 from characterisation.statements.verdict_words import Judged
+from mitsim.study.statement_file import PartialDocument
 
 #: name of the file in the folder
 CHOICE = "choice.json"
 
 
-class _Loose(Document):
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
-
-
-class ComparedMeasurement(_Loose):
+class ComparedMeasurement(PartialDocument):
     """One measurement: its tolerance as in the task, and its decision rule in words."""
 
     unit: str
@@ -40,34 +38,34 @@ class ComparedMeasurement(_Loose):
         return self.tolerance
 
 
-class CellEntry(_Loose):
+class CellEntry(PartialDocument):
     """One measurement by one sensor from ``view``, in the measurement's unit; null without a value.
 
     ``by`` is ``statement`` or ``screening``, or ``none`` if no view can make the measurement. ``demand`` is the figure
     that the decision rule limits to 1. Without a tolerance it is the uncertainty relative to that of the best sensor.
     """
 
-    by: Literal["statement", "screening", "none"]
-    view: int | None
-    uncertainty: float | None
-    bias: float | None
-    share_of_tolerance: float | None
-    demand: float | None
-    demand_interval: tuple[float, float] | None
-    verdict: Literal["fits", "no tolerance", "not decided", "does not fit", "undecidable"]
-    fits_corrected: bool
-    accepted: tuple[float | None, float] | None
-    needed: float | None
-    false_accept: float | None
-    false_reject: float | None
-    trials: int
-    without_value: float
+    by: Literal["statement", "screening", "none"] = "none"
+    view: int | None = None
+    uncertainty: float | None = None
+    bias: float | None = None
+    share_of_tolerance: float | None = None
+    demand: float | None = None
+    demand_interval: tuple[float, float] | None = None
+    verdict: Literal["fits", "no tolerance", "not decided", "does not fit", "undecidable"] = "undecidable"
+    fits_corrected: bool = False
+    accepted: tuple[float | None, float] | None = None
+    needed: float | None = None
+    false_accept: float | None = None
+    false_reject: float | None = None
+    trials: int = 0
+    without_value: float = 1.0
 
 
 _Row = tuple[float, float, float, float]
 
 
-class PoseEntry(_Loose):
+class PoseEntry(PartialDocument):
     """Pose of the sensor: number of the view, angles [deg], |V| [mm], and the 4 x 4 matrix in the part frame."""
 
     view: int
@@ -78,7 +76,7 @@ class PoseEntry(_Loose):
     world_from_sensor: tuple[_Row, _Row, _Row, _Row]
 
 
-class CaptureEntry(_Loose):
+class CaptureEntry(PartialDocument):
     """Effort of one capture: images, exposures of each [s], total exposure time [s] without readout."""
 
     images: int
@@ -86,7 +84,7 @@ class CaptureEntry(_Loose):
     seconds: float
 
 
-class SensorEntry(_Loose):
+class SensorEntry(PartialDocument):
     """One sensor of the table; ``ratio`` is the largest demand of its measurements, null if one cannot be made.
 
     ``status`` is ``stated`` (virtual measurements), ``screened`` (screening only: far from fitting, or out of time) or
@@ -106,7 +104,7 @@ class SensorEntry(_Loose):
     map_digest: str = ""
 
 
-class ChoiceDocument(_Loose):
+class ChoiceDocument(PartialDocument):
     """``choice.json``; ``sensors`` are sorted, best first."""
 
     schema_version: Literal[1]
@@ -144,14 +142,17 @@ def read_choice(folder: Path) -> ChoiceDocument | None:
 
 def judged(entry: SensorEntry) -> list[Judged]:
     """Return the verdicts of a sensor, for their summary in words."""
-    nan = float("nan")
+
+    def number(value: float | None) -> float:
+        return math.nan if value is None else value
+
     return [
         Judged(
             name,
             "",
             cell.verdict,
-            nan if cell.uncertainty is None else cell.uncertainty,
-            nan if cell.needed is None else cell.needed,
+            number(cell.uncertainty),
+            number(cell.needed),
             cell.fits_corrected,
             cell.without_value,
         )

@@ -11,7 +11,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -69,55 +69,10 @@ class ManyFile(Document):
 
 
 @dataclass(frozen=True)
-class Job:
-    """One capture as plain values, for any worker with this version of mitsim and access to the scene.
+class CaptureSettings:
+    """Settings of a capture. In those of all captures, a finish may replace ``parameters`` and ``deviation``."""
 
-    ``origin`` is a digest of the sensor, the scene's XML and the files that it names.
-    """
-
-    sensor: Sensor
-    scene: str
-    parameters: tuple[tuple[str, str], ...]
-    deviation: Deviation
-    finish: str
-    view: int
-    world_from_sensor: Transform
-    seed: int
-    samples: int
-    depth: int
-    noise: Noise
-    truth: bool
-    origin: str
-
-    @property
-    def place(self) -> Path:
-        """Return its folder, relative to the output."""
-        return Path(self.finish) / f"view_{self.view:04d}"
-
-    def digest(self) -> str:
-        """Return the SHA-256 of everything that determines the capture: its origin, and the values of the job."""
-        own = [
-            __version__,
-            self.origin,
-            self.parameters,
-            asdict(self.deviation),
-            self.finish,
-            self.view,
-            self.world_from_sensor.matrix().round(9).tolist(),
-            self.seed,
-            self.samples,
-            self.depth,
-            asdict(self.noise),
-            self.truth,
-        ]
-        return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()
-
-
-@dataclass(frozen=True)
-class CommonSettings:
-    """Settings of all captures; a finish may replace ``parameters`` and ``deviation``."""
-
-    parameters: dict[str, str]
+    parameters: Mapping[str, str]
     deviation: str
     seed: int
     samples: int
@@ -126,8 +81,57 @@ class CommonSettings:
     truth: bool
 
 
-def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, common: CommonSettings) -> list[Job]:
-    """All jobs of a plan, finish by finish, views from the zenith down.
+@dataclass(frozen=True)
+class CaptureJob:
+    """One capture as plain values, for any worker with this version of mitsim and access to the scene.
+
+    ``origin`` is a digest of the sensor, the scene's XML and the files that it names.
+    """
+
+    sensor: Sensor
+    scene: str
+    finish: str
+    view: int
+    world_from_sensor: Transform
+    settings: CaptureSettings
+    origin: str
+
+    @property
+    def folder(self) -> Path:
+        """Return its folder, relative to the output."""
+        return Path(self.finish) / f"view_{self.view:04d}"
+
+    def digest(self) -> str:
+        """Return the SHA-256 of everything that determines the capture: its origin, and the values of the job."""
+        settings = self.settings
+        own = [
+            __version__,
+            self.origin,
+            sorted(settings.parameters.items()),
+            asdict(Deviation.parse(settings.deviation)),
+            self.finish,
+            self.view,
+            self.world_from_sensor.matrix().round(9).tolist(),
+            settings.seed,
+            settings.samples,
+            settings.depth,
+            asdict(settings.noise),
+            settings.truth,
+        ]
+        return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()
+
+
+def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, common: CaptureSettings) -> list[CaptureJob]:
+    """Return all jobs of a plan, finish by finish, views from the zenith down.
+
+    Parameters
+    ----------
+    plan, scene
+        Files of the plan and of the scene.
+    sensor
+        The sensor that takes all captures.
+    common
+        Settings of all captures; each gets a seed of its own.
 
     Raises
     ------
@@ -135,41 +139,28 @@ def read_jobs(plan: str | Path, scene: str | Path, sensor: Sensor, common: Commo
         If the plan or the scene is not valid with any of the finishes, or no view is possible.
     """
     file = read_toml(plan, ManyFile)
-    jobs: list[Job] = []
+    jobs: list[CaptureJob] = []
     for index, finish in enumerate(file.finishes):
-        parameters = common.parameters | {name: str(value) for name, value in finish.parameters.items()}
-        deviation = Deviation.parse(finish.deviation or common.deviation, f"{plan}: finishes.{finish.name}")
-        loaded = load_scene(scene, sensor.wavelength_nm, parameters, deviation)
+        parameters = {**common.parameters, **{name: str(value) for name, value in finish.parameters.items()}}
+        deviation = finish.deviation or common.deviation
+        parsed = Deviation.parse(deviation, f"{plan}: finishes.{finish.name}")
+        loaded = load_scene(scene, sensor.wavelength_nm, parameters, parsed)
         origin = origin_of(Path(scene), sensor, parameters)
         radius = float(np.linalg.norm(loaded.bounds[1] - loaded.bounds[0])) / 2
         standoffs = chosen_standoffs(plan, file.views, sensor, radius)
-        found = candidate_views(file.views, sensor, standoffs, loaded.centre, triangles(loaded), where=plan)
-        for view in found.views:
-            (seed,) = np.random.SeedSequence([common.seed, index, view.number]).generate_state(1)
-            jobs.append(
-                Job(
-                    sensor,
-                    str(Path(scene).absolute()),
-                    tuple(sorted(parameters.items())),
-                    deviation,
-                    finish.name,
-                    view.number,
-                    view.world_from_sensor,
-                    int(seed),
-                    common.samples,
-                    common.depth,
-                    common.noise,
-                    common.truth,
-                    origin,
-                )
-            )
+        candidates = candidate_views(file.views, sensor, standoffs, loaded.centre, triangles(loaded), where=plan)
+        for view in candidates.views:
+            (seed,) = np.random.SeedSequence([common.seed, index, view.number]).generate_state(1).tolist()
+            settings = replace(common, parameters=parameters, deviation=deviation, seed=seed)
+            where, pose = str(Path(scene).absolute()), view.world_from_sensor
+            jobs.append(CaptureJob(sensor, where, finish.name, view.number, pose, settings, origin))
     if file.captures is None or file.captures >= len(jobs):
         return jobs
     drawn = np.random.default_rng(common.seed).choice(len(jobs), file.captures, replace=False)
     return [jobs[number] for number in sorted(drawn)]
 
 
-def missing_jobs(jobs: Sequence[Job], output: str | Path) -> list[Job]:
+def missing_jobs(jobs: Sequence[CaptureJob], output: str | Path) -> list[CaptureJob]:
     """Return the jobs without a finished folder, and remove partial folders of killed processes.
 
     Raises
@@ -180,7 +171,7 @@ def missing_jobs(jobs: Sequence[Job], output: str | Path) -> list[Job]:
     output = Path(output)
     missing = []
     for job in jobs:
-        folder = output / job.place
+        folder = output / job.folder
         if not folder.exists():
             missing.append(job)
         elif digest_of(folder) != job.digest():
@@ -197,46 +188,41 @@ def missing_jobs(jobs: Sequence[Job], output: str | Path) -> list[Job]:
     return missing
 
 
-def render_many(taken: Iterable[tuple[Job, dict[str, bytes]]], output: str | Path, total: int) -> None:
+def render_many(taken: Iterable[tuple[CaptureJob, dict[str, bytes]]], output: str | Path, total: int) -> None:
     """Write captures as they are finished, with a progress bar; each one completely or not at all."""
     for job, files in track(taken, "render", total):
-        folder = Path(output) / job.place
+        folder = Path(output) / job.folder
         folder.parent.mkdir(parents=True, exist_ok=True)
         write_packed(files, folder)
 
 
-def in_turn(jobs: Sequence[Job], simulated: SimulatedSensor) -> Iterator[tuple[Job, dict[str, bytes]]]:
+def in_turn(jobs: Sequence[CaptureJob], simulated: SimulatedSensor) -> Iterator[tuple[CaptureJob, dict[str, bytes]]]:
     """Take captures in this process, one after another."""
     for job in jobs:
         yield job, _taken(job, simulated)
 
 
-def take_job(job: Job) -> dict[str, bytes]:
+def take_job(job: CaptureJob) -> dict[str, bytes]:
     """Take and pack one capture; workers call this function. Packing takes time, but reduces the size to a fifth."""
     simulated = prepared_sensor(job.sensor).simulated
     return _taken(job, simulated)
 
 
-def _taken(job: Job, simulated: SimulatedSensor) -> dict[str, bytes]:
+def _taken(job: CaptureJob, simulated: SimulatedSensor) -> dict[str, bytes]:
     """Return the files of a capture's folder, on request with the truth of its cameras as OpenEXR."""
-    scene = _scene(job.scene, job.sensor.wavelength_nm, job.parameters, job.deviation)
-    rendering = Rendering(job.samples, job.depth)
-    capture = simulated.capture(scene, job.world_from_sensor, seed=job.seed, rendering=rendering, noise=job.noise)
-    capture.settings["deviation"] = asdict(job.deviation)
-    capture.settings["many"] = {
-        "digest": job.digest(),
-        "scene": job.scene,
-        "parameters": dict(job.parameters),
-        "finish": job.finish,
-        "view": job.view,
-    }
-    truth: dict[str, bytes] = {}
-    if job.truth:
-        every = true_images(
-            simulated, scene, job.world_from_sensor, samples=job.samples, depth=job.depth, seed=job.seed
-        )
-        truth = {name: encode_exr(one) for name, one in every.items()}
-    return packed(capture, job.place, truth=truth)
+    settings, pose, parameters = job.settings, job.world_from_sensor, dict(sorted(job.settings.parameters.items()))
+    seed, samples, deviation = settings.seed, settings.samples, Deviation.parse(settings.deviation)
+    scene = _scene(job.scene, job.sensor.wavelength_nm, tuple(parameters.items()), deviation)
+    rendering = Rendering(samples, settings.depth)
+    capture = simulated.capture(scene, pose, seed=seed, rendering=rendering, noise=settings.noise)
+    capture.settings["deviation"] = asdict(deviation)
+    about = {"scene": job.scene, "parameters": parameters, "finish": job.finish, "view": job.view}
+    capture.settings["many"] = {"digest": job.digest(), **about}
+    every = (
+        true_images(simulated, scene, pose, samples=samples, depth=settings.depth, seed=seed) if settings.truth else {}
+    )
+    truth = {name: encode_exr(image) for name, image in every.items()}
+    return packed(capture, job.folder, truth=truth)
 
 
 @lru_cache(maxsize=1)  # jobs come finish by finish, and materials of scenes that are kept are part of every kernel

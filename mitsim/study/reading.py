@@ -142,7 +142,7 @@ def open_study(
         folder / file.scene, sensor.wavelength_nm, {name: str(value) for name, value in file.parameters.items()}
     )
     check_features(task, folder / file.task, scene.names)
-    file = with_limits(path, file, task)
+    file = _with_limits(path, file, task)
     radius = float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])) / 2
     standoffs = chosen_standoffs(path, file.views, sensor, radius)
     campaign, chosen_map = None, None
@@ -215,16 +215,8 @@ def read_map(name: str | Path, sensor: Sensor, folder: str | Path = ".") -> Perf
     return performance_map
 
 
-def with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
-    """Return the study with the limits of its set: those of the file, or those from the tolerances of the task.
-
-    Limits from tolerances assume a normal error without bias.
-
-    Raises
-    ------
-    InputError
-        For a limit of an unknown measurement, or if there is neither a limit nor a tolerance.
-    """
+def _with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
+    """Return the study with limits of its set; those from tolerances assume a normal error without bias."""
     if file.set is None:
         return file
     for name in file.set.limits:
@@ -235,33 +227,20 @@ def with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
     tolerances = {name: tolerance_of(task, name) for name in task.measurements}
     limits = {name: needed(_NORMAL, one) for name, one in tolerances.items() if one is not None}
     if not limits:
-        raise InputError(
-            path,
-            "set.limits",
-            "none, and no tolerance in the task",
-            "a limit for at least one measurement, or a tolerance in the task",
-        )
+        allowed = "a limit for at least one measurement, or a tolerance in the task"
+        raise InputError(path, "set.limits", "none, and no tolerance in the task", allowed)
     return file.model_copy(update={"set": file.set.model_copy(update={"limits": limits})})
 
 
 def _check_finishes(path: Path, scene: Scene, task: Task, known: Samples) -> None:
     if MATT_WHITE.name not in known.names:
-        raise InputError(
-            path,
-            "characterisation",
-            "no matt_white sample",
-            "a campaign that has one",
-            "the view score is normalised by the values of matt white",
-        )
+        hint = "the view score is normalised by the values of matt white"
+        raise InputError(path, "characterisation", "no matt_white sample", "a campaign that has one", hint)
     for name, finish in zip(scene.names, scene.finishes, strict=True):
         # lamps, and fixtures with a BSDF of Mitsuba, only hide and shade; they have no predicted points
         if finish is None and name in task.shapes:
-            raise InputError(
-                scene.where,
-                f"shape {name!r}",
-                "a BSDF of no known finish",
-                "machined_metal, gloss_paint, powder_coat or matt_white",
-            )
+            allowed = "machined_metal, gloss_paint, powder_coat or matt_white"
+            raise InputError(scene.where, f"shape {name!r}", "a BSDF of no known finish", allowed)
 
 
 def _check_campaign(scene: Scene, known: Samples) -> None:

@@ -8,8 +8,12 @@ best view (:mod:`mitsim.study.virtual.stated`) -> predicted clouds, and images, 
 
 from __future__ import annotations
 
+import os
+import platform
 import time
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -33,24 +37,27 @@ from mitsim.maps.campaign.run import run_campaign, write_netcdf
 from mitsim.maps.prediction import performance
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say, track
+from mitsim.running.version import __version__
+from mitsim.scene.surface.lay import lay_left_out
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.study import Study
-from mitsim.study.record import Outcome, own_files, run_record
+from mitsim.study import Study, finishes_of_features
 from mitsim.study.run_files import digests_of
 from mitsim.study.scoring import pose_columns, score_study
 from mitsim.study.session import Session
 from mitsim.study.view_sets.confirmed_set import (
     Search,
     TriedSet,
+    confirmed_entry,
     confirmed_set,
     joining_in_words,
     set_table,
+    tried_entries,
     write_set_csv,
 )
 from mitsim.study.virtual.plan import race_rules
-from mitsim.study.virtual.race_table import raced_errors, with_race
+from mitsim.study.virtual.race import Raced, raced_errors, with_race
 from mitsim.study.virtual.rendered import RenderedMeasurements
-from mitsim.study.virtual.stated import write_statement
+from mitsim.study.virtual.stated import statement_document
 
 #: number of best views per measurement whose predicted clouds are written to the run folder
 SHOWN = 3
@@ -105,7 +112,7 @@ def run_study(
     leaders = list(dict.fromkeys(raced.leaders().values()))
     stated = session.state(study.view(leaders[0])) if leaders else None
     if stated is not None:
-        write_statement(folder / "statement.json", stated.document)
+        write_json(folder / "statement.json", statement_document(session, stated))
     clock.lap("state")
     tried = _confirm(session, chosen, search)
     chosen = tried[-1].chosen if tried else chosen
@@ -117,9 +124,10 @@ def run_study(
         _show(twin, shown, folder, {} if stated is None else {leaders[0]: stated.planned})
         residuals += [_residual(twin, number) for number in shown[:1]]
     clock.lap("pictures")
-    outcome = Outcome(raced, shown, chosen, tried, largest_residual(residuals), clock.steps)
-    about = run_record(study, performance_map, outcome)
-    about["files"] = digests_of(folder, own_files(study, drawn, shown, stated is not None))
+    about = _record(study, performance_map, raced, shown, largest_residual(residuals))
+    about["view_sets"] = [] if chosen is None else [_set_record(study, chosen, tried)]
+    about["seconds"] = clock.steps
+    about["files"] = digests_of(folder, _own_files(study, drawn, shown, stated is not None))
     write_json(folder / "run.json", about)
     return [] if stated is None else stated.statements
 
@@ -129,21 +137,21 @@ def _confirm(session: Session, chosen: ViewSet | None, search: Search) -> list[T
 
     The list is empty without a set, or if measurements are drawn from a map.
     """
-    study, folder, table = session.study, session.folder, session.study.file.set
+    table = session.study.file.set
     if table is None or chosen is None or not chosen.views or table.trials < 2:
         return []
     if session.renderer is None:
         say("the set of views is not confirmed: clouds drawn from a map cannot be joined")
         return []
-    tried = confirmed_set(study, chosen, search, session.renderer, session.digest, folder)
+    tried = confirmed_set(session, chosen, search)
     best = tried[-1]
-    write_set_csv(folder / "view_set.csv", table, best.chosen, best.stated)
+    write_set_csv(session.folder / "view_set.csv", table, best)
     kept = "keeps its limits" if best.excess(table.limits) <= 1 else "the best set found, misses a limit"
     views = ", ".join(map(str, best.chosen.views))
     say(
         f"{len(best.chosen.views)} views ({views}), {joining_in_words(table)}, measured together {table.trials} times: "
         f"{kept} (sets measured: {len(tried)})\n"
-        f"{set_table(table, best.chosen, best.stated)}"
+        f"{set_table(table, best)}"
     )
     return tried
 
@@ -195,3 +203,73 @@ def _show(
         capture, cloud = renderer.exposed_as(planned.get(number)).at_best_estimates(renderer.study.view(number))
         write_capture(capture, folder / "captures" / f"view_{number:04d}", overwrite=True)
         write_cloud(cloud, folder / "clouds" / f"rendered_{number:04d}.ply")
+
+
+def _own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) -> list[str]:
+    """Return the paths of the files that a report of the run reads.
+
+    The index of a capture has the digests of its other files.
+    """
+    names = ["map.nc", "scores.csv", "scores.nc", "checks.nc", "part.ply", "stand.npz"]
+    names += ["samples.nc"] if study.campaign is not None else []
+    names += ["statement.json"] if stated else []
+    names += [f"clouds/predicted_{view:04d}.ply" for view in drawn]
+    names += [f"clouds/rendered_{view:04d}.ply" for view in shown]
+    return names + [f"captures/view_{view:04d}/capture.json" for view in shown]
+
+
+def _record(
+    study: Study, performance_map: PerformanceMap, raced: Raced, shown: list[int], residual: RenderResidual | None
+) -> dict[str, Any]:
+    """Return the record of a run, ``run.json``, without its sets of views, its times and the digests of its files."""
+    finishes = finishes_of_features(study)
+    lays = {name: lay_left_out(one.name, one.scatter) for name, one in finishes.items() if one is not None}
+    return {
+        "schema_version": 1,
+        "mitsim": __version__,
+        "study": str(study.path),
+        "scene": study.scene.where,
+        "sensor": study.sensor.name,
+        "source": "simulated",
+        "map_source": performance_map.data.attrs.get("source", ""),
+        "exposure_rule": study.sensor.exposure.rule,
+        "seed": study.file.seed,
+        "views": len(study.views),
+        "view_sets": [],
+        "checked_views": shown,
+        "raced_views": len(raced.views),
+        "race_trials": raced.trials,
+        "race_decided": raced.decided,
+        "leaders": raced.leaders(),
+        "confidence": {name: one.confidence for name, one in raced.standings.items()},
+        "light_path_depth": study.file.measure.light_path_depth,
+        "score_light_path_depth": study.file.score.light_path_depth,
+        "render_residual": None if residual is None else asdict(residual),
+        "features": {name: str(one) for name, one in finishes.items()},
+        "lay": {name: left_out for name, left_out in lays.items() if left_out is not None},
+        "measurements": {
+            name: {key: getattr(one, key) for key in ("kind", "nominal", "unit", "features", "tolerance")}
+            for name, one in study.task.measurements.items()
+        },
+        "seconds": {},
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "cores": os.cpu_count(),
+    }
+
+
+def _set_record(study: Study, chosen: ViewSet, tried: list[TriedSet]) -> dict[str, Any]:
+    table = study.file.set
+    assert table is not None
+    limits, known = table.limits, table.pose_known
+    return {
+        "limits": limits,
+        "views": list(chosen.views),
+        "exact": chosen.exact,
+        "uncertainty": dict(zip(limits, chosen.uncertainty.tolist(), strict=True)),
+        "feasible": dict(zip(limits, chosen.feasible.tolist(), strict=True)),
+        "joining": {"kind": table.joining, "position_mm": known[0], "angle_deg": known[1]},
+        "joined": joining_in_words(table),
+        "confirmed": confirmed_entry(tried[-1].stated if tried else ()),
+        "tried": tried_entries(tried, limits),
+    }

@@ -10,12 +10,12 @@ written last and names the files of its run with their SHA-256. Readers of a run
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from characterisation.files.atomic_io import write_json
+from characterisation.files.checked_files import read_json_object
 from characterisation.files.errors import InputError
 from mitsim.running.version import __version__
 
@@ -30,7 +30,8 @@ EARLIER = "earlier"
 _KNOWN_BY = ("run.json", "scores.nc", "checks.nc", "statement.json")
 _RESULTS = (*_KNOWN_BY, "report.html", "scores.csv", "part.ply", "stand.npz", "poses", "clouds", "captures")
 
-_AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"
+#: hint for a folder whose files are of several runs
+AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"
 
 
 def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
@@ -70,13 +71,8 @@ def claim_folder(folder: str | Path, command: str, digest: str) -> Path | None:
             folder.mkdir(parents=True, exist_ok=True)
             write_json(folder / OWNER, mine)
     except OSError as error:
-        raise InputError(
-            folder,
-            "",
-            f"a folder that cannot be written to ({error.strerror})",
-            "a writable folder",
-            "choose another with -o",
-        ) from None
+        found = f"a folder that cannot be written to ({error.strerror})"
+        raise InputError(folder, "", found, "a writable folder", "choose another with -o") from None
     return moved
 
 
@@ -99,17 +95,12 @@ def check_own(folder: Path, files: Mapping[str, str], names: Iterable[str]) -> N
         try:
             found = _sha256(folder / name)
         except FileNotFoundError:
-            raise InputError(folder / name, "", "no such file", "a file that run.json names", _AGAIN) from None
+            raise InputError(folder / name, "", "no such file", "a file that run.json names", AGAIN) from None
         except OSError as error:
             raise InputError(folder / name, "", f"a file that cannot be read ({error.strerror})", "a file") from None
         if found != files[name]:
-            raise InputError(
-                folder / name,
-                "sha256",
-                "a file of another run, or a changed one",
-                "the file that run.json names",
-                _AGAIN,
-            )
+            other, allowed = "a file of another run, or a changed one", "the file that run.json names"
+            raise InputError(folder / name, "sha256", other, allowed, AGAIN)
 
 
 def _sha256(path: Path) -> str:
@@ -119,10 +110,9 @@ def _sha256(path: Path) -> str:
 
 def _owner(path: Path) -> dict[str, object]:
     try:
-        table = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
+        return read_json_object(path)
+    except InputError:
         return {}
-    return table if isinstance(table, dict) else {}
 
 
 def _free_place(folder: Path, name: str) -> Path:

@@ -9,24 +9,23 @@ from typing import Literal
 import numpy as np
 import trimesh
 import xarray as xr
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from characterisation.cloud_files import read_cloud
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.datasets import Schema, Variable, read_dataset
-from characterisation.files.documents import Document, validate
+from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.scene.surface.lay import LayLeftOut
-from mitsim.study.run_files import check_own
-from mitsim.study.statement_file import StatementDocument, read_statement
+from mitsim.study.run_files import AGAIN, check_own
+from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement
 
 _MADE_BY = "a folder made by mitsim run"
 
-_AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"
 _BY_VIEW, _BY_FEATURE, _VIEW = ("measurement", "view"), ("view", "feature"), ("view",)
 _ALL = {"measurement": Variable(("measurement",), "text"), "view": Variable(_VIEW, "whole", 0, 1e9)}
 
@@ -68,7 +67,7 @@ _SCORES = Schema(
         "xyz": (3, 3),
     },
     ("measurement", "view", "feature"),
-    _AGAIN,
+    AGAIN,
 )
 _ERRORS = Variable(("measurement", "view", "repeat"), gaps=True)
 _CHECKS = Schema(
@@ -76,7 +75,7 @@ _CHECKS = Schema(
     {"value": _ERRORS, "error": _ERRORS, **_ALL},
     {"repeat": (0, 1_000_000)},
     ("measurement", "view"),
-    _AGAIN,
+    AGAIN,
 )
 _PATCHES = Schema(
     "patches of a campaign",
@@ -87,14 +86,13 @@ _PATCHES = Schema(
         "finish": Variable(("sample",), "text"),
         "roughness": Variable(("sample",), low=0.0, high=1e6, gaps=True),
     },
-    hint=_AGAIN,
+    hint=AGAIN,
 )
 
 
-class MeasurementEntry(Document):
+class MeasurementEntry(PartialDocument):
     """Entry of a measurement in ``run.json``; ``kind`` and ``tolerance`` as in the task."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     nominal: float
     unit: str
     features: list[str]
@@ -102,19 +100,17 @@ class MeasurementEntry(Document):
     tolerance: float | tuple[float, float] | None = None
 
 
-class ResidualEntry(Document):
+class ResidualEntry(PartialDocument):
     """Quality of the renders in ``run.json``, in units of the sensor's noise [1]; ``outliers`` is a share of pixels."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     noise: float
     quadrature: float
     outliers: float
 
 
-class ConfirmedEntry(Document):
+class ConfirmedEntry(PartialDocument):
     """Result of one measurement from virtual measurements of a whole set of views."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     unit: str
     trials: int
     without_value: float
@@ -122,15 +118,14 @@ class ConfirmedEntry(Document):
     standard_uncertainty: float | None
 
 
-class TriedEntry(Document):
+class TriedEntry(PartialDocument):
     """A set of views that was measured, and its largest ratio of error to limit; None without a value."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     views: list[int]
     excess: float | None = None
 
 
-class ViewSetEntry(Document):
+class ViewSetEntry(PartialDocument):
     """Set of views that together keep limits, given for each measurement in its unit.
 
     ``exact`` is true if no smaller set keeps the limits. ``feasible`` is false for a limit that even all views together
@@ -138,7 +133,6 @@ class ViewSetEntry(Document):
     set, ``tried`` all sets that were measured.
     """
 
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     limits: dict[str, float]
     views: list[int]
     uncertainty: dict[str, float | None] = Field(default_factory=dict)
@@ -149,10 +143,9 @@ class ViewSetEntry(Document):
     tried: list[TriedEntry] = Field(default_factory=list)
 
 
-class RunDocument(Document):
+class RunDocument(PartialDocument):
     """``run.json``, as far as a report needs it; other keys are ignored."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
     schema_version: Literal[1]
     mitsim: str
     study: str
@@ -215,8 +208,10 @@ class Run:
         """
         return name in self.about.files if self.about.files else (self.folder / name).exists()
 
-    def _cloud_path(self, kind: str, view: int) -> Path:
-        return self.folder / "clouds" / f"{kind}_{view:04d}.ply"
+    def _cloud(self, kind: str, view: int) -> PointCloud:
+        name = f"clouds/{kind}_{view:04d}.ply"
+        self.check(name)
+        return read_cloud(self.folder / name)
 
     def part(self) -> trimesh.Trimesh | None:
         """Return the part's surface [mm], part frame; None if the run has no ``part.ply``."""
@@ -231,16 +226,16 @@ class Run:
 
     def predicted(self, view: int) -> PointCloud:
         """Return the cloud of a view that the map predicts."""
-        self.check(f"clouds/predicted_{view:04d}.ply")
-        return read_cloud(self._cloud_path("predicted", view))
+        return self._cloud("predicted", view)
 
     def decoded(self, view: int) -> PointCloud:
         """Return the cloud of a checked view, decoded from its rendered images."""
-        path = self._cloud_path("rendered", view)
-        self.check(f"clouds/rendered_{view:04d}.ply")
-        cloud, grid = read_cloud(path), self.predicted(view).grid
+        cloud, grid = self._cloud("rendered", view), self.predicted(view).grid
         if (cloud.grid.height, cloud.grid.width) != (grid.height, grid.width):
-            found = f"{cloud.grid.height} x {cloud.grid.width} pixels"
+            found, path = (
+                f"{cloud.grid.height} x {cloud.grid.width} pixels",
+                self.folder / f"clouds/rendered_{view:04d}.ply",
+            )
             raise InputError(path, "grid", found, f"{grid.height} x {grid.width}, as the predicted cloud")
         return cloud
 
@@ -261,7 +256,8 @@ def read_run(folder: str | Path) -> Run:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "", "no such folder", _MADE_BY)
-    about = _read_about(folder / "run.json")
+    table = read_json_object(folder / "run.json", _MADE_BY, "mitsim run writes it last: let the run finish")
+    about = validate(folder / "run.json", table, RunDocument)
     own = about.files
     check_own(folder, own, ("map.nc", "samples.nc", "scores.nc", "checks.nc", "statement.json"))
     performance_map = PerformanceMap.load(folder / "map.nc")
@@ -284,22 +280,16 @@ def read_run(folder: str | Path) -> Run:
         if absent := sorted(set(entry.features) - seen):
             allowed = "features of scores.nc"
             raise InputError(folder / "run.json", f"measurements.{name}.features", absent[0], allowed)
-    unknown = sorted(set(checks["view"].values.tolist()) - set(scores["view"].values.tolist()))
-    if unknown:
-        raise InputError(folder / "checks.nc", "view", unknown[0], "views of scores.nc")
-    for i, chosen in enumerate(about.view_sets):
-        if missing := sorted(set(chosen.views) - set(scores["view"].values.tolist())):
-            raise InputError(folder / "run.json", f"view_sets[{i}].views", missing[0], "views of scores.nc")
+    named = [("checks.nc", "view", checks["view"].values.tolist())]
+    named += [("run.json", f"view_sets[{i}].views", chosen.views) for i, chosen in enumerate(about.view_sets)]
+    for name, key, views in named:
+        if missing := sorted(set(views) - set(scores["view"].values.tolist())):
+            raise InputError(folder / name, key, missing[0], "views of scores.nc")
     for name in ("possible", "uncertainty_possible"):
         scores[name] = scores[name].astype(bool)  # netCDF has no booleans
     stated = "statement.json" in own or not own
     statement = read_statement(folder / "statement.json") if stated else None
     return Run(folder, about, performance_map, patches, scores, checks, statement)
-
-
-def _read_about(path: Path) -> RunDocument:
-    table = read_json_object(path, _MADE_BY, "mitsim run writes it last: let the run finish")
-    return validate(path, table, RunDocument)
 
 
 def _mesh(path: Path) -> trimesh.Trimesh | None:

@@ -7,15 +7,18 @@ used again under the same digest -> scores of all views, race, exposures and sta
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from contextlib import nullcontext
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import xarray as xr
 
+from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
-from characterisation.statements.statement import Statement
+from characterisation.statements.statement import Statements
 from characterisation.tasks.evaluation import InputQuantity
 from mitsim.decode.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
@@ -23,32 +26,19 @@ from mitsim.running.executor import Executor
 from mitsim.running.progress import say
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable, Study
-from mitsim.study.exposures.planned import planned_for, rendered, with_exposure
+from mitsim.study.exposures.planned import planned_for
 from mitsim.study.run_files import claim_folder
 from mitsim.study.virtual.mapped import MappedMeasurements
-from mitsim.study.virtual.plan import measured_by, measurements_of, race_rules, trial_digest
+from mitsim.study.virtual.plan import measured_by, measurements_of, race_rules, study_digest, trial_digest
 from mitsim.study.virtual.race import Raced, RaceRules, run_race
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.screening import screen
-from mitsim.study.virtual.spread_out import SpreadMeasurements, spread_over
-from mitsim.study.virtual.stated import state_view, statement_document
-from mitsim.study.virtual.study_digest import study_digest
+from mitsim.study.virtual.spread_out import SpreadMeasurements
+from mitsim.study.virtual.stated import StatedView, state_view
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import Unknowns
 from mitsim.views import View
-
-
-@dataclass(frozen=True)
-class StatedView:
-    """Statements of every measurement from one view, and the ``document`` of ``statement.json``.
-
-    ``planned`` are the exposures that they hold for, None for the sensor's own rule.
-    """
-
-    statements: list[Statement]
-    document: dict[str, Any]
-    planned: PlannedExposure | None
 
 
 class Session:
@@ -110,7 +100,12 @@ class Session:
     @cached_property
     def runner(self) -> RenderedMeasurements | MappedMeasurements | SpreadMeasurements:
         """Return the maker of the trials: the measurements of this process, or workers that make the same."""
-        return spread_over(self.workers, self.measurements, self.digest)
+        if self.workers is None:
+            return self.measurements
+        if self.renderer is None:
+            say("clouds are drawn from a map in this process, not by workers")
+            return self.measurements
+        return SpreadMeasurements(self.workers, self.renderer, self.digest)
 
     @cached_property
     def trials(self) -> TrialFolder:
@@ -155,22 +150,117 @@ class Session:
             If the sensor cannot take or merge the exposures, or measurements are drawn from a map, which holds only for
             the exposure that it was made with.
         """
-        if self.study.file.exposure is None:
-            return None
-        return planned_for(rendered(self.measurements), view, self.digest, self.folder)
+        return planned_for(self, view)
 
     def state(self, view: View, table: StatementTable | None = None) -> StatedView:
         """State every measurement from one view at its exposures; ``table`` replaces the study's numbers of trials."""
-        study, runner, trials, planned = self.study, self.runner, self.trials, self.exposures(view)
-        if planned is not None:
-            assert not isinstance(runner, MappedMeasurements)  # exposures() rejects a map
-            runner = runner.exposed_as(planned)
-            trials = TrialFolder.of(self.folder / "planned_trials", with_exposure(self.digest, planned), study.task)
-        stated = state_view(study, view, runner, trials, self.unknowns, table or study.file.statement)
-        document = statement_document(study, view, stated, self.unknowns, self.source, planned)
-        return StatedView(stated, document, planned)
+        return state_view(self, view, table)
 
     def release(self) -> None:
         """Free the memory of the measurements, which are prepared again when they are needed."""
         for name in ("measurements", "runner", "predictor"):
             vars(self).pop(name, None)
+
+
+def score(study: Study) -> xr.Dataset:
+    """Score all views of a study by the uncertainty that the map predicts for them; nothing is rendered.
+
+    Parameters
+    ----------
+    study
+        From :func:`mitsim.open_study`.
+
+    Returns
+    -------
+    xarray.Dataset
+        The coordinate ``view`` holds the numbers of the views.
+
+        Over ``measurement`` and ``view``: ``predicted_uncertainty``, standard, in the ``unit`` (mm or deg) of the
+        measurement, infinite or NaN if a view cannot measure; ``chance`` that it can, 0 to 1; ``uncertainty_rank`` by
+        u / sqrt(chance), 1 for the best, chances under 1/2 last; ``V_m``, the score of Kinnell and Justham (2018), and
+        ``rank`` by it.
+
+        Over ``view``: ``overall_rank``, by the mean of log(u / sqrt(chance)) over the measurements; ``azimuth_deg``
+        about the z axis of the world, from x; ``elevation_deg`` above the plane z = 0, 90 from above; ``roll_deg``
+        about the line of sight, clockwise as the sensor sees; ``standoff_mm``; and ``world_from_sensor`` (view, 4, 4).
+
+        Select variables of equal dimensions before ``to_dataframe()`` makes a pandas table of them. Other variables of
+        the dataset are not part of the interface.
+
+    Raises
+    ------
+    InputError
+        If the study has a campaign instead of a map.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> scores = ms.score(ms.open_study("study.toml"))
+    >>> table = scores[["predicted_uncertainty", "uncertainty_rank"]].to_dataframe()
+    >>> list(table.index.names)
+    ['measurement', 'view']
+    >>> one = scores.sel(measurement="pillar1_radius")
+    >>> best = int(one["view"][one["uncertainty_rank"].argmin("view")])
+    >>> best in scores["view"].values, int(one["uncertainty_rank"].sel(view=best))
+    (True, 1)
+    """
+    if study.performance_map is None:
+        found, hint = "a campaign that was not run", "open the study with performance_map=''"
+        raise InputError(study.path, "characterisation.campaign", found, "a performance map", hint)
+    return Session(study).screen()[0]
+
+
+def statement(
+    study: Study, view: int, *, trials: int | None = None, pairs: int | None = None, folder: str | Path | None = None
+) -> Statements:
+    """State the uncertainty of every measurement from one view, by virtual measurements of it.
+
+    Each trial draws calibration, finish, room light, temperature, pose and noise anew, renders, decodes and measures
+    (JCGM 101:2008).
+
+    Parameters
+    ----------
+    study
+        From :func:`mitsim.open_study`.
+    view
+        Number of the view.
+    trials
+        Number of virtual measurements, at least 2; by default that of the study (200). A trial takes 0.2 to 1 s. With
+        fewer than 39, the 95 % interval assumes normal errors. Rare large errors then make u, interval and budget
+        wrong by a factor of two or more: see ``settled``.
+    pairs
+        Trials of which each line of the budget needs another one; by default those of the study (16). The budget has
+        eight lines at most, so the total is ``trials`` + 8 ``pairs``. 0: no budget.
+    folder
+        Where finished trials are kept for reuse by the next call; by default they are not kept.
+
+    Returns
+    -------
+    list of Statement
+        One for each measurement, in a list whose ``plot()`` draws them: ``bias``, ``standard_uncertainty`` and the 95 %
+        ``interval`` of the error, in ``unit`` (mm or deg); ``settled``, whether one significant digit of u is certain;
+        ``budget`` by group of unknowns, each a :class:`BudgetLine`; ``verdict``, ``no tolerance`` if the task has none.
+
+    Raises
+    ------
+    InputError
+        If there is no such view, or a number is out of its range.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> study = ms.open_study("study.toml")
+    >>> stated = {one.measurement: one for one in ms.statement(study, 4, trials=4, pairs=0)}
+    >>> stated["pillar1_radius"].trials, stated["pillar1_radius"].unit
+    (4, 'mm')
+    """
+    table = study.file.statement
+    numbers = {"trials": table.trials if trials is None else trials, "pairs": table.pairs if pairs is None else pairs}
+    for (name, value), least in zip(numbers.items(), (2, 0), strict=True):
+        if not least <= value <= 1_000_000:
+            raise InputError("statement", name, value, f"{least} to 1000000")
+    chosen = study.view(view, "statement: view")
+    with nullcontext(folder) if folder is not None else TemporaryDirectory() as kept:
+        session = Session(study, kept)
+        session.claim(f"budget of view {view}")
+        return Statements(session.state(chosen, StatementTable(**numbers)).statements)

@@ -6,18 +6,18 @@ import os
 from pathlib import Path
 from typing import Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import Document, validate
 from characterisation.statements.statement import ANY_PART
 
 
-class _Loose(Document):
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+class PartialDocument(Document, extra="ignore"):
+    """A file written by mitsim, as far as its reader needs it: other keys are ignored."""
 
 
-class BudgetEntry(_Loose):
+class BudgetEntry(PartialDocument):
     """One line of the budget."""
 
     group: str
@@ -29,7 +29,7 @@ class BudgetEntry(_Loose):
     fresh: bool
 
 
-class DecisionEntry(_Loose):
+class DecisionEntry(PartialDocument):
     """Result of the decision rule for a measurement, as far as a report needs it."""
 
     rule: str
@@ -44,14 +44,14 @@ class DecisionEntry(_Loose):
     demand_interval: tuple[float | None, float | None] | None = None
 
 
-class LossEntry(_Loose):
+class LossEntry(PartialDocument):
     """A kind of reason why trials had no value, and their number."""
 
     reason: str
     count: int = Field(ge=0)
 
 
-class StatedMeasurement(_Loose):
+class StatedMeasurement(PartialDocument):
     """One measurement of ``statement.json``."""
 
     unit: str
@@ -75,7 +75,7 @@ class StatedMeasurement(_Loose):
     errors_of: str = ANY_PART
 
 
-class InfluenceEntry(_Loose):
+class InfluenceEntry(PartialDocument):
     """An influence, and whether the statement contains it."""
 
     name: str
@@ -83,14 +83,14 @@ class InfluenceEntry(_Loose):
     how: str
 
 
-class ExposureEntry(_Loose):
+class ExposureEntry(PartialDocument):
     """Exposures [s] of the captures behind a statement, and the share of the projector's power."""
 
     exposures_s: list[float] = Field(min_length=1)
     power: float
 
 
-class StatementDocument(_Loose):
+class StatementDocument(PartialDocument):
     """``statement.json``."""
 
     schema_version: Literal[1]

@@ -30,16 +30,9 @@ class CharacterisationTable(Document):
 
 
 class CheckTable(Document):
-    """Number of best views that are rendered once more for the report's pictures.
-
-    Every unknown is then at its best estimate. The other keys come from studies that were written before virtual
-    measurements existed. They are read and ignored.
-    """
+    """Number of best views that are rendered once more for the report's pictures, unknowns at their best estimates."""
 
     views: int = Field(default=4, ge=0, le=10000)
-    repeats: int = Field(default=1, ge=1, le=1000)
-    samples_per_pixel: int = Field(default=16, ge=1, le=4096)
-    light_path_depth: int = Field(default=1, ge=1, le=16)
 
 
 class ScoreTable(Document):
@@ -83,7 +76,7 @@ class RaceTable(Document):
 class StatementTable(Document):
     """How the uncertainty of the chosen view is stated.
 
-    ``trials`` are made in worlds that no race uses. ``pairs`` of them serve each line of the budget, with one more
+    ``trials`` are made with draws that no race uses. ``pairs`` of them serve each line of the budget, with one more
     trial each.
     """
 

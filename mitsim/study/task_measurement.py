@@ -11,48 +11,137 @@ sensor, for a measurement that it lacks, and for another pose of the sensor.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from characterisation.files.checked_files import read_json_object
+from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
-from characterisation.tasks.evaluation import measure
+from characterisation.tasks import evaluation
 from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
+from characterisation.tasks.task_reading import check_features
+from mitsim.decode.input_clouds import margin_of
 from mitsim.maps.prediction.predictor import EDGE_MARGIN_PX, Predictor
 from mitsim.scene.load import Scene
 from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.poses import as_pose
+from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
+from mitsim.study.statement_file import PartialDocument
 
 #: largest difference between the sensor's pose and that of a statement [mm], [deg]
 SAME_PLACE_MM, SAME_ANGLE_DEG = 10.0, 2.0
 
 
-@dataclass(frozen=True)
-class Correction:
-    """Bias of one measurement, and its standard uncertainty after the bias is subtracted, both in ``unit``."""
+def label(cloud: PointCloud, scene: Scene, sensor: Sensor, pose: Transform | ArrayLike) -> PointCloud:
+    """Label every pixel of a cloud with the shape of the part that it shows, by the part's geometry.
+
+    Parameters
+    ----------
+    cloud
+        Decoded or predicted; (H, W, 3) [mm] in the sensor frame.
+    scene
+        The part.
+    sensor
+        Pixels closer to the edge of a shape than half its matching block, and at least 3 px, are not labelled.
+    pose
+        ``world_from_sensor``, known within a few mm.
+
+    Returns
+    -------
+    PointCloud
+        The same points, with ``feature`` (H, W), an index into ``feature_names``, -1 for none.
+
+    Raises
+    ------
+    InputError
+        If the pose is not a rigid motion.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> sensor = ms.load_sensor("small.toml")
+    >>> scene, pose = ms.load_scene("two_pillars.xml", sensor), ms.look_at((0, -300, 400))
+    >>> cloud = ms.label(ms.read_cloud("cloud.ply"), scene, sensor, pose)
+    >>> cloud.feature_names
+    ('plane', 'pillar1', 'pillar1_top', 'pillar2', 'pillar2_top')
+    >>> cloud.of_feature("plane").shape[1]
+    3
+    """
+    return _labelled(cloud, scene, as_pose(pose, "label"), margin_of(sensor.settings))
+
+
+def measure(cloud: PointCloud, task: Task, pose: Transform | ArrayLike) -> dict[str, Result]:
+    """Measure a task in a labelled cloud.
+
+    Parameters
+    ----------
+    cloud
+        From :func:`label`, or from :func:`predict`, whose clouds are labelled.
+    task
+        From :func:`read_task`.
+    pose
+        ``world_from_sensor``: fits start from the nominal features at this pose, known within a few mm.
+
+    Returns
+    -------
+    dict of str to Result
+        By measurement: ``value``, ``error`` against the nominal, and standard ``uncertainty`` from the covariance of
+        the fit, each in ``unit`` (mm or deg); ``points``, the number of points used. If a measurement was not possible,
+        ``value`` is NaN and ``reason`` gives the cause. The uncertainty excludes errors common to many points:
+        calibration, reflections, correlated noise. :func:`statement` includes them.
+
+    Raises
+    ------
+    InputError
+        If the cloud has no labels, or lacks a shape of the task.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> sensor = ms.load_sensor("small.toml")
+    >>> scene, pose = ms.load_scene("two_pillars.xml", sensor), ms.look_at((0, -300, 400))
+    >>> cloud = ms.label(ms.read_cloud("cloud.ply"), scene, sensor, pose)
+    >>> results = ms.measure(cloud, ms.read_task("task.toml"), pose)
+    >>> radius = results["pillar1_radius"]
+    >>> radius.unit, radius.possible, radius.points > 100
+    ('mm', True, True)
+    """
+    if cloud.feature is None:
+        allowed = "a cloud with labelled pixels"
+        raise InputError("measure", "cloud", "a cloud without labels", allowed, "label it with mitsim.label")
+    check_features(task, "measure: task", cloud.feature_names)
+    return evaluation.measure(cloud, task, as_pose(pose, "measure").inverse().matrix())
+
+
+class Correction(PartialDocument):
+    """Bias of one measurement, its standard uncertainty, and that of the error, all in ``unit``; None if unknown."""
 
     unit: str
-    bias: float
-    uncertainty: float
+    bias: float | None
+    bias_uncertainty: float | None
+    standard_uncertainty: float | None
+
+    @property
+    def uncertainty(self) -> float:
+        """Standard uncertainty after the bias is subtracted, sqrt(u^2 + u_bias^2); NaN if one is unknown."""
+        u, u_bias = self.standard_uncertainty, self.bias_uncertainty
+        return math.nan if u is None or u_bias is None else math.hypot(u, u_bias)
 
 
-@dataclass(frozen=True)
-class ViewStatement:
-    """Statement of uncertainty for one view, from the ``statement.json`` at ``path``.
-
-    ``sensor`` is its name; ``world_from_sensor`` is the pose of the view; ``corrections`` are by measurement.
-    """
+class ViewStatement(PartialDocument):
+    """Statement of uncertainty for one view, from the ``statement.json`` at ``path``."""
 
     path: Path
     sensor: str
-    world_from_sensor: Transform
-    corrections: Mapping[str, Correction]
+    world_from_sensor: list[list[float]]
+    measurements: dict[str, Correction]
 
     def check(self, sensor: str, pose: Transform) -> None:
         """Check that a cloud's sensor and its ``pose``, world from sensor, are those of the statement.
@@ -64,7 +153,7 @@ class ViewStatement:
         """
         if sensor != self.sensor:
             raise InputError(self.path, "sensor", self.sensor, f"{sensor}, the sensor of the cloud")
-        difference = self.world_from_sensor.inverse() @ pose
+        difference = _pose(self.path, self.world_from_sensor).inverse() @ pose
         distance_mm = float(np.linalg.norm(difference.translation))
         rotation_deg = math.degrees(math.acos(min(max((float(np.trace(difference.rotation)) - 1) / 2, -1.0), 1.0)))
         if distance_mm > SAME_PLACE_MM or rotation_deg > SAME_ANGLE_DEG:
@@ -112,22 +201,14 @@ def measure_task(
     """
     if statement is not None:
         statement.check(cloud.sensor, world_from_sensor)
-    results = measure_labelled(labelled_cloud(cloud, scene, world_from_sensor, margin_px), task, world_from_sensor)
-    return results if statement is None else [corrected(one, statement) if one.possible else one for one in results]
+    labelled = _labelled(cloud, scene, world_from_sensor, margin_px)
+    results = evaluation.measure(labelled, task, world_from_sensor.inverse().matrix()).values()
+    return [result if statement is None or not result.possible else corrected(result, statement) for result in results]
 
 
-def labelled_cloud(cloud: PointCloud, scene: Scene, world_from_sensor: Transform, margin_px: int = 0) -> PointCloud:
-    """Label each pixel of a cloud with the shape of the part that it shows.
-
-    The label is the index in ``scene.names``. It is -1 within ``margin_px`` of the edge of a shape, at least 3 px.
-    """
+def _labelled(cloud: PointCloud, scene: Scene, world_from_sensor: Transform, margin_px: int) -> PointCloud:
     labels = _predictor_of_grid(cloud, max(margin_px, EDGE_MARGIN_PX)).quick_labels(scene, world_from_sensor)
     return replace(cloud, feature=labels, feature_names=scene.names)
-
-
-def measure_labelled(labelled: PointCloud, task: Task, world_from_sensor: Transform) -> list[Result]:
-    """Measure a task in a labelled cloud (:func:`labelled_cloud`), whose labels include all shapes of the task."""
-    return list(measure(labelled, task, world_from_sensor.inverse().matrix()).values())
 
 
 def corrected(result: Result, statement: ViewStatement) -> Result:
@@ -138,14 +219,14 @@ def corrected(result: Result, statement: ViewStatement) -> Result:
     InputError
         If the statement lacks the measurement, has it in another unit, or has no bias for it.
     """
-    if result.name not in statement.corrections:
-        known = ", ".join(statement.corrections)
+    if result.name not in statement.measurements:
+        known = ", ".join(statement.measurements)
         raise InputError(
             statement.path, "measurements", known, f"a statement with {result.name}, a measurement of the task"
         )
-    correction = statement.corrections[result.name]
-    if correction.unit != result.unit or not math.isfinite(correction.bias):
-        found = f"bias {correction.bias:g} {correction.unit}"
+    correction = statement.measurements[result.name]
+    if correction.unit != result.unit or correction.bias is None:
+        found = "no bias" if correction.bias is None else f"bias {correction.bias:g} {correction.unit}"
         raise InputError(statement.path, f"measurements.{result.name}", found, f"a bias in {result.unit}")
     return replace(
         result,
@@ -159,27 +240,13 @@ def corrected(result: Result, statement: ViewStatement) -> Result:
 def read_view_statement(path: Path) -> ViewStatement:
     """Read sensor, pose, biases and uncertainties from a ``statement.json``.
 
-    The uncertainty after correction is sqrt(u^2 + u_bias^2), from ``standard_uncertainty`` and ``bias_uncertainty``.
-
     Raises
     ------
     InputError
         If the file cannot be read, or is not a statement.
     """
-    table = _json(path, "a statement.json of mitsim run or mitsim study state")
-    try:
-        corrections = {
-            str(name): Correction(
-                str(one["unit"]),
-                _number(one["bias"]),
-                math.hypot(_number(one["standard_uncertainty"]), _number(one["bias_uncertainty"])),
-            )
-            for name, one in table["measurements"].items()
-        }
-        pose = Transform.from_matrix(np.array(table["world_from_sensor"], float).reshape(4, 4))
-        return ViewStatement(path, str(table["sensor"]), pose, corrections)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(path, "", f"a file that is not a statement ({error!r})", "a statement.json") from None
+    table = read_json_object(path, "a statement.json of mitsim run or mitsim study state")
+    return validate(path, table | {"path": path}, ViewStatement)
 
 
 def read_pose(path: Path, view: int | None = None) -> Transform:
@@ -190,7 +257,7 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
     InputError
         If the file cannot be read, has no pose or no such view, or its matrix is not a rigid motion.
     """
-    table = _json(path, "pose.json of a capture, poses.json of a run, or statement.json")
+    table = read_json_object(path, "pose.json of a capture, poses.json of a run, or statement.json")
     matrix = table.get("world_from_sensor")
     if "views" in table:
         try:
@@ -207,6 +274,10 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
                 f"a view of {path}: {min(known, default=0)} to {max(known, default=0)}",
             )
         matrix = known[view]
+    return _pose(path, matrix)
+
+
+def _pose(path: Path, matrix: Any) -> Transform:
     try:
         pose = Transform.from_matrix(np.array(matrix, float).reshape(4, 4))
     except (TypeError, ValueError):
@@ -224,11 +295,3 @@ def _predictor_of_grid(cloud: PointCloud, margin_px: int) -> Predictor:
     matrix = np.array([[grid.fx, 0, grid.cx], [0, grid.fy, grid.cy], [0, 0, 1]])
     camera = Camera(matrix, np.zeros(0), grid.width, grid.height, Transform(grid.rotation, grid.origin))
     return Predictor(Rig({"grid": camera}), grid, np.ones((grid.height, grid.width), bool), cloud.sensor, margin_px)
-
-
-def _number(value: Any) -> float:
-    return math.nan if value is None else float(value)
-
-
-def _json(path: Path, description: str) -> dict[str, Any]:
-    return read_json_object(path, description)

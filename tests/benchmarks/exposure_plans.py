@@ -33,13 +33,15 @@ def main() -> None:
 
     backend.activate(None)
     from characterisation.files.documents import read_toml
+    from characterisation.tasks.evaluation import measure
     from mitsim.sensor.exposure import PlannedExposure
-    from mitsim.study import StudyFile, open_study
+    from mitsim.study import MINIMUM_POINTS, StudyFile, open_study
     from mitsim.study.exposures.exposure_plan import PlanRules
     from mitsim.study.exposures.exposure_sweep import needed_shapes
     from mitsim.study.exposures.planned import exposure_in_words, plan_view
     from mitsim.study.virtual.plan import measurements_of
     from mitsim.study.virtual.study_unknowns import study_unknowns
+    from mitsim.study.virtual.trials import Outcome
     from mitsim.study.virtual.world import Trial
 
     print(
@@ -61,9 +63,11 @@ def main() -> None:
                 (Trial(FIRST_DAY + k) for k in range(given.worlds)), key=lambda trial: maker.unknowns.draw(trial).finish
             )
             for trial in days:
-                lit = maker.lit(view, maker.unknowns.draw(trial))
+                world = maker.unknowns.draw(trial)
                 for planned in (False, True):
-                    cloud, found = maker.measured(lit, plan.exposure if planned else None)
+                    cloud, assumed = maker.exposed_as(plan.exposure if planned else None).cloud_of(view, world)
+                    part_from_world = assumed.inverse().matrix()
+                    found = Outcome.of(measure(cloud, study.task, part_from_world, MINIMUM_POINTS, False))
                     points[planned].append([len(cloud.of_feature(name)) for name in shapes])
                     errors[planned].append([found.errors[name] for name in names])
             before, after = (np.array(errors[planned]) for planned in (False, True))

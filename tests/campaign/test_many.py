@@ -13,7 +13,7 @@ from mitsim.capture.folder import read_capture
 from mitsim.cli.program import app
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor
-from mitsim.study.many_captures import CommonSettings, ManyFile, read_jobs
+from mitsim.study.many_captures import CaptureSettings, ManyFile, read_jobs
 from tests.smaller_sensors import coarse_sensor
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -33,7 +33,7 @@ name = "wide"
 parameters = { plane_Ra = 0.8 }
 deviation = "alpha=1"
 """
-COMMON = CommonSettings({"pillar_Ra": "0.6"}, "", 3, 1, 1, Noise(), False)
+COMMON = CaptureSettings({"pillar_Ra": "0.6"}, "", 3, 1, 1, Noise(), False)
 OPTIONS = ["--samples", "1", "--depth", "1", "--seed", "3"]
 
 
@@ -65,10 +65,10 @@ def test_jobs_are_the_pairs_of_finish_and_view(plan, n10):
     plan.write_text(PLAN.replace("captures = 5\n", ""))
     jobs = read_jobs(plan, SCENE, n10, COMMON)
     views = {job.view for job in jobs}
-    assert len(jobs) == 2 * len(views) == len({job.place for job in jobs}) == len({job.seed for job in jobs})
+    assert len(jobs) == 2 * len(views) == len({job.folder for job in jobs}) == len({job.settings.seed for job in jobs})
     first, last = jobs[0], jobs[-1]
-    assert dict(first.parameters) == {"pillar_Ra": "0.4", "plane_Ra": "0.4"} and first.deviation.alpha == 0
-    assert dict(last.parameters) == {"pillar_Ra": "0.6", "plane_Ra": "0.8"} and last.deviation.alpha == 1
+    assert first.settings.parameters == {"pillar_Ra": "0.4", "plane_Ra": "0.4"} and not first.settings.deviation
+    assert last.settings.parameters == {"pillar_Ra": "0.6", "plane_Ra": "0.8"} and last.settings.deviation == "alpha=1"
     assert len({job.digest() for job in jobs}) == len(jobs)
     plan.write_text(PLAN)
     drawn = read_jobs(plan, SCENE, n10, COMMON)

@@ -28,7 +28,7 @@ from characterisation.tasks.evaluation import (
     read_task,
 )
 from mitsim.sensor.transforms import Transform
-from mitsim.study.task_measurement import measure_labelled
+from mitsim.study import task_measurement
 
 TASK = Path(__file__).parents[2] / "scenes" / "two_pillars" / "task.toml"
 Z = np.array([0.0, 0.0, 1.0])
@@ -110,7 +110,7 @@ def test_each_feature_is_fitted_once_for_all_measurements_and_their_counts(monke
 
     monkeypatch.setattr(evaluation, "fit_surface", counted)
     pose_of_part = Transform.from_matrix(np.linalg.inv(matrix))
-    results = {one.name: one for one in measure_labelled(cloud, task, pose_of_part)}
+    results = task_measurement.measure(cloud, task, pose_of_part)
     assert len(fitted) == len(task.shapes)
     seen = {name: int((cloud.feature == k).sum()) for k, name in enumerate(cloud.feature_names)}
     radius = results["pillar1_radius"]

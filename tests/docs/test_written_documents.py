@@ -20,7 +20,7 @@ from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.study.exposures.exposure_plan import ExposurePlan
 from mitsim.study.exposures.exposure_sweep import ExposureResult, FeatureResult
 from mitsim.study.exposures.planned import plan_document, write_plan_csv
-from mitsim.study.virtual.stated import statement_document
+from mitsim.study.virtual.stated import StatedView, statement_document
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,8 @@ def test_keys_of_a_statement(stated):
     )
     view = SimpleNamespace(number=3, world_from_sensor=Transform.from_matrix(np.eye(4)))
     unknowns = SimpleNamespace(table=UnknownsTable(), calibration=SimpleNamespace(source="a calibration"))
-    written = statement_document(study, view, [stated], unknowns, "render", PlannedExposure((1e-3,)))
+    session = SimpleNamespace(study=study, unknowns=unknowns, source="render")
+    written = statement_document(session, StatedView(view, [stated], PlannedExposure((1e-3,))))
     assert first_column("columns: statement.json") == set(written)
     measurement = written["measurements"]["radius"]
     assert first_column("columns: statement.json measurement") == set(measurement)

@@ -78,5 +78,5 @@ def test_files_without_a_pose_are_refused(text, match, tmp_path):
 def test_a_file_that_is_no_statement_is_refused(tmp_path):
     path = tmp_path / "statement.json"
     path.write_text('{"sensor": "x"}', encoding="utf-8")
-    with pytest.raises(InputError, match="not a statement"):
+    with pytest.raises(InputError, match="a value for each"):
         read_view_statement(path)

@@ -420,9 +420,9 @@ deviation = "alpha=1"
 def _read_many(path):
     from mitsim.sensor.noise_sources import Noise
     from mitsim.sensor.preset import load_sensor
-    from mitsim.study.many_captures import CommonSettings, read_jobs
+    from mitsim.study.many_captures import CaptureSettings, read_jobs
 
-    common = CommonSettings({}, "", 1, 1, 1, Noise(), False)
+    common = CaptureSettings({}, "", 1, 1, 1, Noise(), False)
     read_jobs(path, SCENES / "two_pillars" / "two_pillars.xml", load_sensor("ensenso-n10"), common)
 
 

@@ -115,7 +115,10 @@ def take_up_trials(path: Path, folders: Mapping[str, TrialFolder]) -> dict[str, 
                     ): _outcome(folder, values[i], behind[i])
                     for i in rows
                 }
-                taken[kind] += folder.take_up(int(view), trials)
+                whole = {trial: outcome for trial, outcome in trials.items() if folder.is_whole(outcome)}
+                for trial, outcome in whole.items():
+                    folder.known(int(view)).setdefault(trial, outcome)
+                taken[kind] += len(whole)
     except (KeyError, ValueError, IndexError, TypeError) as problem:
         raise InputError(
             path,

@@ -23,7 +23,6 @@ from mitsim.running.progress import say
 from mitsim.study import StatementTable, Study
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import ALL, Raced
-from mitsim.study.virtual.trial_errors import stated_errors_of_trials
 from mitsim.views import View
 from mitsim.views.view_scores import screening_risk
 from tests.proofs.case_trials import (
@@ -122,5 +121,5 @@ def _stated(case: PartCase, trials_of_kind: dict[str, Session], view: View, why:
     table = StatementTable(trials=tool.study.file.statement.trials, pairs=0)
     stated = tool.state(view, table)
     measure_worlds(case, "apart", apart, [view], {view.number: days(count)})
-    errors = stated_errors_of_trials(apart.study.task, apart.trials, view.number, days(count))
+    errors = apart.trials.stated_errors(view.number, days(count))
     return JudgedView(view.number, why, tuple(stated.statements), errors)

@@ -34,7 +34,7 @@ from mitsim.twin.finish.dots import compare_dots
 from mitsim.twin.finish.electrons import PixelNoise, linearised, pixel_noise
 from mitsim.twin.finish.estimate import fit_views
 from mitsim.twin.finish.finish import ALPHA_RANGE, metal_finish
-from mitsim.twin.finish.observation import CouponCapture, View, observe
+from mitsim.twin.finish.observation import CouponCapture, CouponView, observe
 from mitsim.twin.finish.place import found_place, known_place
 from mitsim.twin.finish.run import KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX, fit_captures
 from mitsim.twin.finish.specimen import place_of
@@ -193,7 +193,7 @@ def plain_views(ground):
         specular = lobe.reflectance(ground.scatter(math.log(TRUE_ALPHA)), Directions(view, lamp))
         mean = TRUE_POWER * unit * ((1 - TRUE_SHARE) * specular + TRUE_SHARE * ground.normal_reflectance)
         views.append(
-            View(
+            CouponView(
                 number,
                 f"pose {number}",
                 "left",

@@ -21,7 +21,7 @@ from mitsim.sensor.preset import load_sensor, presets
 from mitsim.sensor.transforms import look_at
 from mitsim.twin.sensor import run, specimen_simulator
 from mitsim.twin.sensor.input_captures import read_input_captures, repeats
-from mitsim.twin.sensor.sensor_text import Entry, moved_paths, with_cameras, with_entries, with_exposure
+from mitsim.twin.sensor.write import Entry, moved_paths, with_cameras, with_entries, with_exposure
 
 sys.path.insert(0, str(Path(__file__).parent))
 

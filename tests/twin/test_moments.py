@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.twin.sensor.estimate import Estimate, combined, pooled
-from mitsim.twin.sensor.modulation import modulation
+from mitsim.twin.sensor.defocus import modulation
+from mitsim.twin.sensor.estimate import FittedKey, combined, pooled
 from mitsim.twin.sensor.moments import Prior, match_moments
 
 A = np.array([[1.0, 0.4], [0.2, 1.0], [0.5, -0.7]])
@@ -53,10 +53,10 @@ def test_captures_that_differ_beyond_their_uncertainty_are_less_sure_together():
 
 
 def test_the_inverse_of_a_full_well_has_the_symmetric_interval():
-    one = Estimate("imager.full_well_e", 10_000.0, 1e-5, "e-", ("a",), "", "inverse")
+    one = FittedKey("imager.full_well_e", 10_000.0, 1e-5, "e-", ("a",), "", "inverse")
     low, high = one.interval()
     assert 1 / low - 1e-4 == pytest.approx(1e-4 - 1 / high)
-    other = Estimate("imager.full_well_e", 5_000.0, 1e-4, "e-", ("b",), "", "inverse")
+    other = FittedKey("imager.full_well_e", 5_000.0, 1e-4, "e-", ("b",), "", "inverse")
     (both,) = pooled([one, other])
     assert both.captures == ("a", "b") and 9_000 < both.value < 10_000
 

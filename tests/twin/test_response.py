@@ -113,8 +113,8 @@ def test_the_curve_of_a_knee_is_one_that_a_sensor_file_takes():
 
 def test_an_offset_is_negative_by_chance_or_not():
     covariance = np.array([[4.0, -0.1], [-0.1, 0.01]])
-    by_chance = TransferLine(-3.0, 1.0, covariance, 8, 5.0).not_negative()
+    by_chance = TransferLine(-3.0, 1.0, covariance).not_negative()
     assert by_chance.offset == 0 and by_chance.slope == pytest.approx(1 - 0.1 / 4.0 * 3)
     assert by_chance.covariance[1, 1] == pytest.approx(0.01 - 0.01 / 4)
-    far = TransferLine(-7.0, 1.0, covariance, 8, 5.0)
+    far = TransferLine(-7.0, 1.0, covariance)
     assert far.not_negative() is far

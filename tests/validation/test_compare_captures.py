@@ -244,7 +244,7 @@ def test_a_rebuilt_capture_is_as_bright_and_agrees(n10_module, changed, tmp_path
 
 
 def test_a_texture_stands_in_where_the_projector_was_off(n10_module, real, place):
-    twin = rebuild(real, n10_module, place, "real", projector_on=False, seed=4).capture
+    twin = rebuild(real, n10_module, place, "real", projector_on=False, seed=4)
     found = rows(compare_captures(real, twin, place, n10_module.settings, "twin", projector_on=False))
     assert found["contrast"].verdict == "not comparable"
     # lens and pixels blurred the recording already; a second time would take a sixth of the contrast of these dots
@@ -276,7 +276,7 @@ def test_an_uncertainty_of_rounding_is_none():
             self.source = source
 
     quantity = replace(QUANTITIES[0], figure=constant, margin=0.0, factor=1.0)
-    row = compare_module._row(quantity, Seen("device"), Seen("simulated"), 400, {}, np.random.default_rng(1))
+    (row,) = compare_module._row(quantity, Seen("device"), Seen("simulated"), 400, {}, np.random.default_rng(1))
     assert (row.uncertainty, row.verdict, row.why) == (0.0, "differs", "by more than the margin")
 
 
@@ -334,7 +334,7 @@ def test_a_simulated_capture_of_another_place_is_refused(n10_module, real, place
         ),
     )
     with pytest.raises(InputError, match=r"twin: pose: found a specimen .* % nearer or farther"):
-        compared_twin = rebuild(real, n10_module, near, "real").capture
+        compared_twin = rebuild(real, n10_module, near, "real")
         compare_captures(real, compared_twin, place, n10_module.settings, "twin")
 
 

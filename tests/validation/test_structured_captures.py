@@ -89,8 +89,7 @@ def test_the_power_is_that_of_the_device_and_rows_that_do_not_apply_say_so(david
     assert rows["median grey level"].simulated == pytest.approx(rows["median grey level"].real, rel=0.03)
     for quantity in ("F", "sigma, median", "distance"):
         assert rows[quantity].verdict == "agrees", rows[quantity]
-    page = (tmp_path / "out" / "index.md").read_text()
-    assert f"Grey levels are those of {words}." in page
+    assert f"Grey levels are those of {words}." in found.preamble
     assert "nan" not in found.table.lower()
     stored = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert {row["quantity"] for row in stored["rows"] if row["verdict"] == "does not apply"} == UNFIT

@@ -10,14 +10,14 @@ import mitsim.study.view_sets.confirmed_set as confirmed_set
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import statement
 from mitsim.study import SetTable
-from mitsim.study.view_sets.confirmed_set import MOST_SETS, stricter, tried_entries
+from mitsim.study.view_sets.confirmed_set import MOST_SETS, TriedSet, stricter, tried_entries
 
 VIEWS = 12
 LIMITS = {"apart": 0.1, "radius": 0.1}
 
 
 @pytest.fixture
-def search_and_measure(monkeypatch, tmp_path):
+def search_and_measure(monkeypatch):
     """Views of noise 0.2 as the map has it and of 0.2 ``hope`` in truth, with a ``floor`` that no view averages."""
 
     def run(hope=(1.0, 1.0), floor=0.0, most=VIEWS):
@@ -29,7 +29,7 @@ def search_and_measure(monkeypatch, tmp_path):
             count = max([one for one, fine in zip(wanted, able, strict=True) if fine], default=0)
             return ViewSet(tuple(range(count)), np.full(2, 0.2 / np.sqrt(max(count, 1))), able, True)
 
-        def state(study, chosen, here, digest, folder):
+        def state(session, chosen):
             measured.append(len(chosen.views))
             rng = np.random.default_rng(len(measured))
             spread = 0.2 * np.array(hope) / np.sqrt(len(chosen.views))
@@ -40,7 +40,8 @@ def search_and_measure(monkeypatch, tmp_path):
 
         monkeypatch.setattr(confirmed_set, "state_set", state)
         study = SimpleNamespace(file=SimpleNamespace(set=SetTable(limits=LIMITS)), task=TASK)
-        tried = confirmed_set.confirmed_set(study, search(LIMITS), search, None, "", tmp_path)
+        session = SimpleNamespace(study=study)
+        tried = confirmed_set.confirmed_set(session, search(LIMITS), search)
         assert measured[0] == 4 and len(measured) == len(tried) <= MOST_SETS
         return tried, measured
 
@@ -93,7 +94,7 @@ def test_only_missed_limits_become_stricter_by_what_was_missed():
     errors = np.array([-1.0, 1.0] * 50)
     errors *= np.sqrt(99 / 100)  # a standard deviation of 1 with n - 1
     stated = [statement("apart", "mm", 0.16 * errors), statement("radius", "mm", 0.09 * errors)]
-    found = stricter(dict(LIMITS), LIMITS, chosen, stated)
+    found = stricter(TriedSet(chosen, dict(LIMITS), tuple(stated)), LIMITS)
     assert found["apart"] == pytest.approx(0.05) and found["radius"] == 0.1
     nothing = [statement("apart", "mm", np.full(9, np.nan)), stated[1]]
-    assert stricter(dict(LIMITS), LIMITS, chosen, nothing)["apart"] < 0.1
+    assert stricter(TriedSet(chosen, dict(LIMITS), tuple(nothing)), LIMITS)["apart"] < 0.1

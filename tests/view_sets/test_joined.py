@@ -13,7 +13,7 @@ from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import statement
 from mitsim.sensor.transforms import Transform
 from mitsim.study import SetTable
-from mitsim.study.view_sets.confirmed_set import confirmed_entry, joining_in_words, set_table, write_set_csv
+from mitsim.study.view_sets.confirmed_set import TriedSet, confirmed_entry, joining_in_words, set_table, write_set_csv
 from mitsim.study.view_sets.joined import JoinedMeasurements
 
 #: the balls are seen from 500 mm above
@@ -135,8 +135,9 @@ def test_what_is_written_of_a_set_says_limit_expected_and_confirmed(tmp_path):
         statement("apart", "mm", np.random.default_rng(0).normal(0, 0.2, 60)),
         statement("radius", "mm", np.full(60, np.nan)),
     ]
-    assert [row.split()[-1] for row in set_table(table(), chosen, stated).splitlines()[1:]] == ["no", "-"]
-    write_set_csv(tmp_path / "view_set.csv", table(), chosen, stated)
+    tried = TriedSet(chosen, table().limits, tuple(stated))
+    assert [row.split()[-1] for row in set_table(table(), tried).splitlines()[1:]] == ["no", "-"]
+    write_set_csv(tmp_path / "view_set.csv", table(), tried)
     rows = (tmp_path / "view_set.csv").read_text().splitlines()
     assert rows[1].startswith("apart,mm,0.1,0.08,60,0,") and rows[2].startswith("radius,mm,,,60,1,,,,")
     entry = confirmed_entry(stated)

@@ -21,12 +21,12 @@ from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.study import StudyFile, open_study
+from mitsim.study.session import Session
 from mitsim.study.virtual.plan import measurements_of, trial_digest
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import displaced
-from mitsim.study.virtual.stated import budget_groups, state_view, statement_document
+from mitsim.study.virtual.stated import budget_groups, statement_document
 from mitsim.study.virtual.study_unknowns import study_unknowns
-from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import Trial, finish_deviation
 from tests.smaller_sensors import binned, coarse_sensor, middle_part
 
@@ -247,14 +247,12 @@ def test_parts_whose_faces_face_one_another(tmp_path):
 
 def test_a_statement_from_a_few_trials(coarse_n10, tmp_path):
     study = study_of(coarse_n10, statement={"trials": 6, "pairs": 2}, unknowns={"pose": {"told_mm": 0.1}})
-    unknowns = study_unknowns(study)
-    maker = measurements_of(study, unknowns)
-    trials = TrialFolder.of(tmp_path, trial_digest(study, unknowns, "render"), study.task)
+    session = Session(study, tmp_path)
     view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
-    stated = state_view(study, view, maker, trials, unknowns, study.file.statement)
-    assert [one.measurement for one in stated] == list(study.task.measurements)
-    groups = budget_groups(unknowns, "render")
-    assert "form" not in groups and {line.group for line in stated[0].budget} <= set(groups)
+    stated = session.state(view)
+    assert [one.measurement for one in stated.statements] == list(study.task.measurements)
+    groups = budget_groups(session.unknowns, "render")
+    assert "form" not in groups and {line.group for line in stated.statements[0].budget} <= set(groups)
     # a second start has nothing left to do, and says the same to the last bit
 
     class Nobody:
@@ -266,13 +264,14 @@ def test_a_statement_from_a_few_trials(coarse_n10, tmp_path):
             assert not list(jobs)
             return iter(())
 
-    again = TrialFolder.of(tmp_path, trial_digest(study, unknowns, "render"), study.task)
-    assert state_view(study, view, Nobody(), again, unknowns, study.file.statement) == stated
-    document = statement_document(study, view, stated, unknowns, "render")
+    again = Session(study, tmp_path)
+    again.runner = Nobody()
+    assert again.state(view) == stated
+    document = statement_document(session, stated)
     missing = [one["name"] for one in document["influences"] if not one["included"]]
     assert "form of the part" in missing and "interreflections" in missing
     other = study_of(coarse_n10, unknowns={"pose": {"told_mm": 0.2}})
-    assert trial_digest(other, study_unknowns(other), "render") != trial_digest(study, unknowns, "render")
+    assert trial_digest(other, study_unknowns(other), "render") != session.digest
 
 
 def test_unknowns_of_a_study_are_checked(tmp_path):

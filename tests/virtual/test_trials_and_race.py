@@ -11,9 +11,7 @@ import xarray as xr
 
 from characterisation.files.documents import validate
 from characterisation.tasks.task_file import Task
-from mitsim.study.virtual.race import ALL, FIRST, Job, RaceRules, run_race, shortlist
-from mitsim.study.virtual.race_table import raced_errors, with_race
-from mitsim.study.virtual.trial_errors import errors_of_trials, stated_errors_of_trials
+from mitsim.study.virtual.race import ALL, FIRST, Job, RaceRules, raced_errors, run_race, shortlist, with_race
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
 
@@ -218,9 +216,8 @@ def test_a_kept_trial_without_its_deviations_is_measured_again(tmp_path, kept):
     line = {"day": 1, "capture": 0, "swapped": "", "errors": [0.1, 0.2], "deviations": kept}
     path.write_text(good + json.dumps(line) + "\n")
     assert list(TrialFolder(tmp_path, "d", NAMES, FOLDED).known(3)) == [Trial(0)]
-    other = TrialFolder(tmp_path / "other", "d", NAMES, FOLDED)
-    outcomes = {Trial(1): Outcome({"radius": 0.1, "angle": 0.2}), Trial(2): Outcome({"radius": 0.1, "angle": math.nan})}
-    assert other.take_up(3, outcomes) == 1 and list(other.known(3)) == [Trial(2)]
+    assert not trials.is_whole(Outcome({"radius": 0.1, "angle": 0.2}))
+    assert trials.is_whole(Outcome({"radius": 0.1, "angle": math.nan}))
 
 
 ZONES = """
@@ -253,12 +250,12 @@ def test_repeats_and_redrawn_trials_are_about_the_same_part(tmp_path):
         trials.add(3, day, outcome)
         trials.add(3, Trial(day.day, 1), outcome)
         trials.add(3, Trial(day.day, 0, "pose"), outcome)
-    place, size = errors_of_trials(task, trials, 3, days)
+    place, size = trials.errors_of_parts(3, days)
     assert place.stated.mean() == pytest.approx(0.2, abs=4 * 2 / 20)  # 2 sigma^2 / r for r = 10
     assert place.stated.std() == pytest.approx(2, rel=0.15)
     np.testing.assert_array_equal(size, np.full(400, 0.5))
     for other in ([Trial(day.day, 1) for day in days], [Trial(day.day, 0, "pose") for day in days]):
-        np.testing.assert_array_equal(stated_errors_of_trials(task, trials, 3, other)[0], place.stated)
+        np.testing.assert_array_equal(trials.stated_errors(3, other)[0], place.stated)
 
 
 def test_trials_of_another_study_are_moved_aside_and_not_used(tmp_path):

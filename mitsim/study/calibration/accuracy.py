@@ -130,7 +130,19 @@ def measuring_volume(eyes: Mapping[str, Camera], working_range_mm: tuple[float, 
 def accuracy(
     sensor: Sensor, eyes: Mapping[str, Camera], covariance: RigCovariance, draws: int, rng: np.random.Generator
 ) -> Accuracy:
-    """Return the errors of drawn rigs, measured with the sensor's nominal rig."""
+    """Return the errors of drawn rigs, measured with the sensor's nominal rig.
+
+    Parameters
+    ----------
+    sensor
+        Its decoder and its nominal rig measure.
+    eyes
+        All eyes that the decoder uses, the reference camera first.
+    covariance
+        From which ``draws`` rigs are drawn.
+    rng
+        Source of the draws; each has its own stream.
+    """
     volume = measuring_volume(eyes, sensor.working_range_mm)
     bars = volume.points(_BARS)
     across = np.linspace(-0.8, 0.8, _PLATE_POINTS)
@@ -162,7 +174,16 @@ def accuracy(
 def measured_points(sensor: Sensor, points: Floats, true: Rig, path: tuple[float, float] = (0.0, 0.0)) -> Floats:
     """Return points (n, 3) as the sensor's decoder places them, with its nominal rig, if ``true`` is the real rig.
 
-    ``path``: offset [mm] and scale error [1] of a time-of-flight path.
+    Parameters
+    ----------
+    sensor
+        Its decoder's geometry is followed.
+    points
+        True points (n, 3) in the sensor frame [mm].
+    true
+        Rig that projects the points.
+    path
+        Offset [mm] and scale error [1] of a time-of-flight path.
     """
     nominal, eye = sensor.rig, true.reference
     pixels = eye.project(points)

@@ -20,13 +20,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.rig_parameters import MATRIX_NAMES, POSE_NAMES, distortion_names, parameter_names
+from mitsim.sensor.rig_parameters import MATRIX_NAMES, POSE_NAMES, distortion_names, moved, parameter_names
 from mitsim.sensor.transforms import Transform
 from mitsim.study.calibration.board import Board
 
@@ -67,16 +69,63 @@ class Linearised:
 
     def response(self) -> tuple[Floats, Floats]:
         """Return (J^T J)^-1 (q, q), and the effect of board errors on all parameters, (J^T J)^-1 J^T G (q, m)."""
-        scale = 1 / np.sqrt(np.diag(self.normal))
-        inverse = np.linalg.inv(self.normal * np.outer(scale, scale)) * np.outer(scale, scale)
+        inverse = inverse_of(self.normal)
         return inverse, inverse @ self.board
 
     def covariance(self) -> Floats:
         """Return the covariance of the rig's parameters (p, p) from noise and board together."""
         count = len(self.names)
-        inverse, moved = self.response()
-        spread = moved[:count] * self.board_sigma
+        inverse, shared = self.response()
+        spread = shared[:count] * self.board_sigma
         return np.asarray(inverse[:count] @ self.noise @ inverse[:count].T + spread @ spread.T)
+
+
+def inverse_of(normal: Floats) -> Floats:
+    """Return the inverse of a normal matrix (q, q), whose parameters may differ by many orders of magnitude."""
+    scale = 1 / np.sqrt(np.diag(normal))
+    return np.asarray(np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale))
+
+
+def eye_start(
+    points: Sequence[Floats], pixels: Sequence[Floats], size: tuple[int, int], guess: Floats, **options: Any
+) -> tuple[float, Floats, Floats, list[Transform]]:
+    """Return misfit, matrix, distortion and poses ``camera_from_board`` of one eye alone, by ``cv2.calibrateCamera``.
+
+    Parameters
+    ----------
+    points, pixels
+        Points (n, 3) of the board and their pixels (n, 2), for each pose.
+    size
+        Width and height of the image [px].
+    guess
+        Initial matrix (3, 3).
+    **options
+        ``distCoeffs``, ``flags`` and others of OpenCV's function.
+    """
+    seen = [each.astype(np.float32).reshape(-1, 1, 2) for each in pixels]
+    flat = [each.astype(np.float32) for each in points]
+    misfit, matrix, distortion, turns, shifts = cv2.calibrateCamera(flat, seen, size, guess, **options)
+    poses = [
+        Transform(Rotation.from_rotvec(turn.ravel()).as_matrix(), np.asarray(shift, np.float64).ravel())
+        for turn, shift in zip(turns, shifts, strict=True)
+    ]
+    return misfit, np.asarray(matrix, np.float64), np.asarray(distortion, np.float64).reshape(-1), poses
+
+
+def second_eye(first: Sequence[Transform], second: Sequence[Transform]) -> Transform:
+    """Return the pose of an eye in the frame of a first one: their mean over poses of the board in both frames."""
+    apart = [one @ other.inverse() for one, other in zip(first, second, strict=True)]
+    turn = Rotation.from_matrix([each.rotation for each in apart]).mean().as_matrix()
+    return Transform(turn, np.median([each.translation for each in apart], axis=0))
+
+
+def stepped(rig: Rig, places: Sequence[Transform], names: tuple[str, ...], step: Floats) -> tuple[Rig, list[Transform]]:
+    """Return rig and poses of the board after a step (p + 6 poses,) of an adjustment of the parameters ``names``."""
+    turns = step[len(names) :].reshape(-1, 6)
+    return moved(rig, names, step[: len(names)]), [
+        Transform(Rotation.from_rotvec(turn[:3]).as_matrix() @ place.rotation, place.translation + turn[3:])
+        for turn, place in zip(turns, places, strict=True)
+    ]
 
 
 def linearise(rig: Rig, eyes: Mapping[str, Camera], board: Board, views: Sequence[BoardView]) -> Linearised:
@@ -88,19 +137,22 @@ def linearise(rig: Rig, eyes: Mapping[str, Camera], board: Board, views: Sequenc
     normal, noise = np.zeros((size, size)), np.zeros((size, size))
     shared = np.zeros((size, len(modes)))
     for number, view in enumerate(views):
-        first = len(names) + 6 * number
-        own = [*range(len(names)), *range(first, first + 6)]
+        own = [*range(len(names)), *range(first := len(names) + 6 * number, first + 6)]
         jacobian, by_point = view_jacobian(eyes, names, view.sensor_from_board, board.corners[view.corners])
         covariance = observation_covariance(eyes, by_point, view)
-        place = view.sensor_from_board
-        shifts = np.einsum("ij,mnj->mni", place.rotation, modes[:, view.corners])
-        to_board = np.einsum("neak,mnk->neam", by_point, shifts)
+        to_board = board_derivatives(view.sensor_from_board, modes[:, view.corners], by_point)
         part = jacobian.reshape(len(view.corners), -1, len(own))  # groups all coordinates of a corner
         normal[np.ix_(own, own)] += np.einsum("nop,noq->pq", part, part)
         weighted = np.einsum("nor,nrq->noq", covariance, part)
         noise[np.ix_(own, own)] += np.einsum("nop,noq->pq", part, weighted)
         shared[own] += np.einsum("nop,nom->pm", part, to_board.reshape(len(view.corners), -1, len(modes)))
     return Linearised(names, normal, noise, shared, sigma)
+
+
+def board_derivatives(place: Transform, modes: Floats, by_point: Floats) -> Floats:
+    """Return derivatives (n, eyes, 2, m) of pixels by imperfections (m, n, 3) of the board at a pose."""
+    shifts = np.einsum("ij,mnj->mni", place.rotation, modes)
+    return np.asarray(np.einsum("neak,mnk->neam", by_point, shifts))
 
 
 def eye_jacobian(eye: Camera, points: Floats) -> tuple[Floats, Floats]:

@@ -17,32 +17,38 @@ with the camera's.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import eyes as all_eyes
-from mitsim.sensor.rig_parameters import moved, parameter_names, parameter_values
+from mitsim.sensor.rig_parameters import parameter_names, parameter_values
 from mitsim.sensor.transforms import Transform
+from mitsim.study.calibration import bundle
 from mitsim.study.calibration.board import Board
-from mitsim.study.calibration.bundle import BoardView, homographies, observation_covariance, view_jacobian
 
 Floats = NDArray[np.float64]
 
-#: One sigma of the prior of any lens, *assumed*: principal point of a camera, and of a projector along columns and
-#: along rows (projectors shift their image), relative to the size; fx / fy; distortion.
-_CAMERA_MIDDLE, _PROJECTOR_MIDDLE, _ASPECT = (0.05, 0.05), (0.05, 0.5), 0.005
+#: One sigma of the prior of a lens, all *assumed*. Principal point relative to the size, along columns and rows;
+#: projectors shift their image.
+_CAMERA_MIDDLE, _PROJECTOR_MIDDLE = (0.05, 0.05), (0.05, 0.5)
+#: ratio of the focal lengths fx / fy
+_ASPECT = 0.005
 _DISTORTION: Mapping[str, float] = {"k1": 0.2, "k2": 0.2, "p1": 0.002, "p2": 0.002, "k3": 1e-3}
 _ROUNDS = 4
-#: limits of the adjustment: number of steps; last step, in squared standard uncertainties, and its gain; damping
-_MOST_STEPS, _SMALL_STEP, _SMALL_GAIN, _STUCK = 300, 1e-4, 1e-9, 1e9
+#: largest number of steps of the adjustment
+_MOST_STEPS = 300
+#: last step, in squared standard uncertainties, and its relative gain
+_SMALL_STEP, _SMALL_GAIN = 1e-4, 1e-9
+#: damping with which the adjustment cannot go on
+_STUCK = 1e9
 #: least number of poses: two views of a plane leave the focal length to the prior
 LEAST_POSES = 3
 
@@ -98,28 +104,25 @@ def calibrate_recorded(
     """
     if len(boards) < LEAST_POSES:
         raise InputError("boards", "", f"{len(boards)} poses", f"{LEAST_POSES} or more, tilted against one another")
-    rig, places = _start(boards, board, sizes)
+    observed, (rig, places) = _Observations(boards, board), _start(boards, board, sizes)
     noise = np.tile([0.1, 0.1 if "projector" in sizes else 0.0], (len(boards), 1))
     for _ in range(_ROUNDS):
-        rig, places, normal = _adjusted(rig, places, boards, board, noise, rig_prior(rig, sizes))
-        noise = _noise(rig, places, boards, board, normal)
-    adjusted = _Adjustment(rig, places, noise, normal)
-    covariance = _covariance(adjusted, boards, board, source, own_units)
+        rig, places, normal = observed.adjusted(rig, places, noise, rig_prior(rig, sizes))
+        noise = observed.noise(rig, places, normal)
+    matrix = observed.covariance(rig, places, noise, normal, own_units)
+    details: dict[str, str | float] = {
+        "board": str(board),
+        "poses": float(len(places)),
+        "corners": float(sum(len(each.corners) for each in boards)),
+        "corner_noise_px": float(noise[:, 0].max()),
+        "coordinate_noise_px": float(noise[:, 1].max()),
+    }
+    covariance = RigCovariance(parameter_names(rig), matrix, source, details)
     return RecordedCalibration(rig, places, covariance, *noise.T)
 
 
 @dataclass(frozen=True)
-class _Adjustment:
-    """An adjusted rig, its places sensor_from_board, ``noise`` (poses, 2) [px] and ``normal`` matrix (q, q)."""
-
-    rig: Rig
-    places: list[Transform]
-    noise: Floats
-    normal: Floats
-
-
-@dataclass(frozen=True)
-class Prior:
+class LensPrior:
     """Prior of the rig's parameters ``names``: ``rows`` (m, p) times them is ``values`` (m,) +- ``sigma``."""
 
     names: tuple[str, ...]
@@ -128,7 +131,7 @@ class Prior:
     sigma: Floats
 
 
-def rig_prior(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> Prior:
+def rig_prior(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> LensPrior:
     """Return the prior of any camera and projector: central principal point, square pixels, little distortion."""
     names = parameter_names(rig)
     rows, values, sigma = [], [], []
@@ -150,7 +153,7 @@ def rig_prior(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> Prior:
         known({f"{eye}.focal_x_px": 1.0, f"{eye}.focal_y_px": -1.0}, 0.0, _ASPECT * focal)
         for name, spread in _DISTORTION.items():
             known({f"{eye}.{name}": 1.0}, 0.0, spread)
-    return Prior(names, np.array(rows), np.array(values), np.array(sigma))
+    return LensPrior(names, np.array(rows), np.array(values), np.array(sigma))
 
 
 def _start(
@@ -159,161 +162,132 @@ def _start(
     """Return rig and poses by OpenCV, eye by eye: one focal length, central principal point, no distortion."""
     flags = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_USE_INTRINSIC_GUESS
     flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
-    found: dict[str, tuple[Floats, list[Transform]]] = {}
+    cameras, poses, reference = dict[str, Camera](), dict[str, list[Transform]](), next(iter(sizes))
     for eye, (width, height) in sizes.items():
         free = 0 if eye == "projector" else cv2.CALIB_FIX_PRINCIPAL_POINT
-        points = [board.corners[each.corners].astype(np.float32) for each in boards]
-        pixels = [each.pixels[eye].astype(np.float32).reshape(-1, 1, 2) for each in boards]
+        points = [board.corners[each.corners] for each in boards]
         tries = []
         for share in (0.6, 1.0, 1.6, 2.5):
             guess = np.array([[share * width, 0, (width - 1) / 2], [0, share * width, (height - 1) / 2], [0, 0, 1.0]])
-            tries.append(cv2.calibrateCamera(points, pixels, (width, height), guess, np.zeros(5), flags=flags | free))
-        _, matrix, _, turns, shifts = min(tries, key=lambda one: one[0])
-        found[eye] = (
-            np.asarray(matrix, np.float64),
-            [
-                Transform(Rotation.from_rotvec(turn.ravel()).as_matrix(), np.asarray(shift, np.float64).ravel())
-                for turn, shift in zip(turns, shifts, strict=True)
-            ],
-        )
-    reference = next(iter(sizes))
-    places = found[reference][1]
-    cameras = {}
-    for eye, (width, height) in sizes.items():
-        apart = [one @ other.inverse() for one, other in zip(places, found[eye][1], strict=True)]
-        turn = Rotation.from_matrix([each.rotation for each in apart]).mean().as_matrix()
-        place = Transform(turn, np.median([each.translation for each in apart], axis=0))
-        place = Transform.identity() if eye == reference else place
-        cameras[eye] = Camera(found[eye][0], np.zeros(5), width, height, place)
+            pixels, options = [each.pixels[eye] for each in boards], {"distCoeffs": np.zeros(5), "flags": flags | free}
+            tries.append(bundle.eye_start(points, pixels, (width, height), guess, **options))
+        _, matrix, _, poses[eye] = min(tries, key=lambda one: one[0])
+        place = Transform.identity() if eye == reference else bundle.second_eye(poses[reference], poses[eye])
+        cameras[eye] = Camera(matrix, np.zeros(5), width, height, place)
     projector = cameras.pop("projector", None)
-    return Rig(cameras, projector), places
+    return Rig(cameras, projector), poses[reference]
 
 
-def _adjusted(
-    rig: Rig,
-    places: list[Transform],
-    boards: Sequence[RecordedBoard],
-    board: Board,
-    noise: Floats,
-    prior: Prior,
-) -> tuple[Rig, list[Transform], Floats]:
-    """Minimise the weighted squares over rig and poses by Levenberg-Marquardt; also return the normal matrix (q, q)."""
-    count, damping = len(prior.names), 1e-3
-    cost, normal, gradient = _normal(rig, places, boards, board, noise, prior)
-    for _ in range(_MOST_STEPS):
-        scale = 1 / np.sqrt(np.diag(normal))
-        scaled = normal * np.outer(scale, scale)
-        step = scale * np.linalg.solve(scaled + damping * np.eye(len(scale)), scale * gradient)
-        tried_rig = moved(rig, prior.names, step[:count])
-        tried = [
-            Transform(Rotation.from_rotvec(turn[:3]).as_matrix() @ place.rotation, place.translation + turn[3:])
-            for turn, place in zip(step[count:].reshape(-1, 6), places, strict=True)
-        ]
-        new = _normal(tried_rig, tried, boards, board, noise, prior)
-        if new[0] > cost * (1 + 1e-12):
-            damping *= 4
-            if damping > _STUCK:
+@dataclass(frozen=True)
+class _Observations:
+    """A ``board`` and its corners as recorded at several poses."""
+
+    boards: Sequence[RecordedBoard]
+    board: Board
+
+    def residuals(self, rig: Rig, place: Transform, recorded: RecordedBoard) -> tuple[Floats, Floats, Floats]:
+        """Return derivatives of one pose's pixels, (n, eyes, 2, p + 6), (n, eyes, 2, 3), and residuals (n, 2 eyes)."""
+        optics, corners = all_eyes(rig), self.board.corners[recorded.corners]
+        jacobian, by_point = bundle.view_jacobian(optics, parameter_names(rig), place, corners)
+        at = place.points(corners)
+        left = np.concatenate([recorded.pixels[name] - eye.project(at) for name, eye in optics.items()], axis=1)
+        return jacobian, by_point, left
+
+    def whitened(self, rig: Rig, places: Sequence[Transform], noise: Floats) -> Iterator[_Whitened]:
+        """Yield what each pose contributes to an adjustment, at a noise (poses, 2) [px]."""
+        count = len(parameter_names(rig))
+        for number, (place, recorded, own) in enumerate(zip(places, self.boards, noise, strict=True)):
+            jacobian, by_point, left = self.residuals(rig, place, recorded)
+            view = bundle.BoardView(place, recorded.corners, *map(float, own))
+            covariance = bundle.observation_covariance(all_eyes(rig), by_point, view)
+            whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+            flat = np.einsum("nij,njk->nik", whiten, jacobian.reshape(len(left), -1, count + 6))
+            indices = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]
+            yield _Whitened(view, indices, flat, whiten, by_point, left)
+
+    def adjusted(
+        self, rig: Rig, places: list[Transform], noise: Floats, prior: LensPrior
+    ) -> tuple[Rig, list[Transform], Floats]:
+        """Minimise weighted squares over rig and poses by Levenberg-Marquardt; also return the normal matrix (q, q)."""
+        damping = 1e-3
+        cost, normal, gradient = self._normal(rig, places, noise, prior)
+        for _ in range(_MOST_STEPS):
+            scale = 1 / np.sqrt(np.diag(normal))
+            scaled = normal * np.outer(scale, scale)
+            step = scale * np.linalg.solve(scaled + damping * np.eye(len(scale)), scale * gradient)
+            tried_rig, tried = bundle.stepped(rig, places, prior.names, step)
+            new = self._normal(tried_rig, tried, noise, prior)
+            if new[0] > cost * (1 + 1e-12):
+                damping *= 4
+                if damping > _STUCK:
+                    return rig, places, normal
+                continue
+            gained = cost - new[0]
+            rig, places, damping = tried_rig, tried, max(damping / 3, 1e-12)
+            cost, normal, gradient = new
+            if gained < _SMALL_GAIN * cost and float(step @ normal @ step) < _SMALL_STEP:
                 return rig, places, normal
-            continue
-        gained = cost - new[0]
-        rig, places, damping = tried_rig, tried, max(damping / 3, 1e-12)
-        cost, normal, gradient = new
-        if gained < _SMALL_GAIN * cost and float(step @ normal @ step) < _SMALL_STEP:
-            return rig, places, normal
-    raise InputError(
-        "boards", "", f"an adjustment that does not converge in {_MOST_STEPS} steps", "poses that determine it"
-    )
+        found = f"an adjustment that does not converge in {_MOST_STEPS} steps"
+        raise InputError("boards", "", found, "poses that determine it")
+
+    def _normal(
+        self, rig: Rig, places: list[Transform], noise: Floats, prior: LensPrior
+    ) -> tuple[float, Floats, Floats]:
+        """Return weighted sum of squares, normal matrix (q, q) and gradient (q,) for the rig, then six of each pose."""
+        count = len(prior.names)
+        size = count + 6 * len(places)
+        normal, gradient = np.zeros((size, size)), np.zeros(size)
+        weighted = prior.rows / prior.sigma[:, None]
+        off = (prior.values - prior.rows @ parameter_values(rig, prior.names)) / prior.sigma
+        normal[:count, :count], gradient[:count] = weighted.T @ weighted, weighted.T @ off
+        cost = float(off @ off)
+        for pose in self.whitened(rig, places, noise):
+            flat = pose.jacobian.reshape(-1, count + 6)
+            white = np.einsum("nij,nj->ni", pose.whiten, pose.left).ravel()
+            normal[np.ix_(pose.indices, pose.indices)] += flat.T @ flat
+            gradient[pose.indices] += flat.T @ white
+            cost += float(white @ white)
+        return cost, normal, gradient
+
+    def noise(self, rig: Rig, places: list[Transform], normal: Floats) -> Floats:
+        """Return the noise of a camera's corner and the projector's part, (poses, 2), from residuals and freedom."""
+        out, optics = [], list(all_eyes(rig))
+        count = sum(2 * len(optics) * len(recorded.corners) for recorded in self.boards)
+        lost = count / max(count - len(normal), 1)
+        for place, recorded in zip(places, self.boards, strict=True):
+            _, by_point, left = self.residuals(rig, place, recorded)
+            camera, own = [], [np.zeros(1)]
+            for index, eye in enumerate(optics):
+                part = left[:, 2 * index : 2 * index + 2]
+                if eye == "projector":
+                    turned = bundle.homographies(by_point[:, 0], by_point[:, index], place)
+                    own = [part - np.einsum("nij,nj->ni", turned, left[:, :2])]
+                else:
+                    camera.append(part)
+            out.append([np.mean(np.concatenate(camera) ** 2), np.mean(np.concatenate(own) ** 2)])
+        return np.sqrt(np.array(out) * lost)
+
+    def covariance(self, rig: Rig, places: list[Transform], noise: Floats, normal: Floats, own_units: bool) -> Floats:
+        """Return the covariance of the rig's parameters (p, p) after an adjustment with a normal matrix (q, q)."""
+        count, (modes, sigma) = len(parameter_names(rig)), self.board.imperfections()
+        if own_units:
+            sigma = np.concatenate([[0.0], sigma[1:]])  # the first is the scale
+        shared = np.zeros((len(normal), len(modes)))
+        for pose in self.whitened(rig, places, noise):
+            moves = bundle.board_derivatives(pose.view.sensor_from_board, modes[:, pose.view.corners], pose.by_point)
+            moved = np.einsum("nij,njm->nim", pose.whiten, moves.reshape(len(pose.left), -1, len(modes)))
+            shared[pose.indices] += np.einsum("nip,nim->pm", pose.jacobian, moved)
+        inverse = bundle.inverse_of(normal)
+        spread = (inverse @ shared)[:count] * sigma
+        return np.asarray(inverse[:count, :count] + spread @ spread.T)
 
 
-def _normal(
-    rig: Rig,
-    places: list[Transform],
-    boards: Sequence[RecordedBoard],
-    board: Board,
-    noise: Floats,
-    prior: Prior,
-) -> tuple[float, Floats, Floats]:
-    """Return weighted sum of squares, normal matrix (q, q) and gradient (q,) for the rig, then six of each pose."""
-    count = len(prior.names)
-    size = count + 6 * len(places)
-    normal, gradient = np.zeros((size, size)), np.zeros(size)
-    weighted = prior.rows / prior.sigma[:, None]
-    off = (prior.values - prior.rows @ parameter_values(rig, prior.names)) / prior.sigma
-    normal[:count, :count], gradient[:count] = weighted.T @ weighted, weighted.T @ off
-    cost = float(off @ off)
-    for number, (place, recorded, own_noise) in enumerate(zip(places, boards, noise, strict=True)):
-        jacobian, by_point, left = _residuals(rig, place, recorded, board, prior.names)
-        whiten = _whitening(rig, place, recorded, by_point, own_noise)
-        flat = np.einsum("nij,njk->nik", whiten, jacobian.reshape(len(left), -1, count + 6)).reshape(-1, count + 6)
-        white = np.einsum("nij,nj->ni", whiten, left).ravel()
-        own = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]
-        normal[np.ix_(own, own)] += flat.T @ flat
-        gradient[own] += flat.T @ white
-        cost += float(white @ white)
-    return cost, normal, gradient
+class _Whitened(NamedTuple):
+    """One pose of the board: its parameters' ``indices``, whitened ``jacobian``, ``whiten`` (n, 2 eyes, 2 eyes)."""
 
-
-def _residuals(
-    rig: Rig, place: Transform, recorded: RecordedBoard, board: Board, names: tuple[str, ...]
-) -> tuple[Floats, Floats, Floats]:
-    """Return derivatives of the pixels of one pose, (n, eyes, 2, p + 6), (n, eyes, 2, 3), residuals (n, 2 eyes)."""
-    optics, corners = all_eyes(rig), board.corners[recorded.corners]
-    jacobian, by_point = view_jacobian(optics, names, place, corners)
-    at = place.points(corners)
-    left = np.concatenate([recorded.pixels[name] - eye.project(at) for name, eye in optics.items()], axis=1)
-    return jacobian, by_point, left
-
-
-def _whitening(rig: Rig, place: Transform, recorded: RecordedBoard, by_point: Floats, noise: Floats) -> Floats:
-    covariance = observation_covariance(all_eyes(rig), by_point, BoardView(place, recorded.corners, *map(float, noise)))
-    return np.linalg.inv(np.linalg.cholesky(covariance))
-
-
-def _noise(rig: Rig, places: list[Transform], boards: Sequence[RecordedBoard], board: Board, normal: Floats) -> Floats:
-    """Return the noise of a camera's corner and the projector's part, (poses, 2), from residuals and freedom."""
-    out, names, optics = [], parameter_names(rig), list(all_eyes(rig))
-    count = sum(2 * len(optics) * len(recorded.corners) for recorded in boards)
-    lost = count / max(count - len(normal), 1)
-    for place, recorded in zip(places, boards, strict=True):
-        _, by_point, left = _residuals(rig, place, recorded, board, names)
-        camera, own = [], [np.zeros(1)]
-        for index, eye in enumerate(optics):
-            part = left[:, 2 * index : 2 * index + 2]
-            if eye == "projector":
-                turned = homographies(by_point[:, 0], by_point[:, index], place)
-                own = [part - np.einsum("nij,nj->ni", turned, left[:, :2])]
-            else:
-                camera.append(part)
-        out.append([np.mean(np.concatenate(camera) ** 2), np.mean(np.concatenate(own) ** 2)])
-    return np.sqrt(np.array(out) * lost)
-
-
-def _covariance(
-    adjusted: _Adjustment, boards: Sequence[RecordedBoard], board: Board, source: str, own_units: bool
-) -> RigCovariance:
-    rig, places, noise, normal = adjusted.rig, adjusted.places, adjusted.noise, adjusted.normal
-    names = parameter_names(rig)
-    count = len(names)
-    modes, sigma = board.imperfections()
-    if own_units:
-        sigma = np.concatenate([[0.0], sigma[1:]])  # the first is the scale
-    shared = np.zeros((len(normal), len(modes)))
-    for number, (place, recorded, own_noise) in enumerate(zip(places, boards, noise, strict=True)):
-        jacobian, by_point, left = _residuals(rig, place, recorded, board, names)
-        whiten = _whitening(rig, place, recorded, by_point, own_noise)
-        shifts = np.einsum("ij,mnj->mni", place.rotation, modes[:, recorded.corners])
-        moves = np.einsum("neak,mnk->neam", by_point, shifts).reshape(len(left), -1, len(modes))
-        flat = np.einsum("nij,njk->nik", whiten, jacobian.reshape(len(left), -1, count + 6))
-        own = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]
-        shared[own] += np.einsum("nip,nim->pm", flat, np.einsum("nij,njm->nim", whiten, moves))
-    scale = 1 / np.sqrt(np.diag(normal))
-    inverse = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
-    spread = (inverse @ shared)[:count] * sigma
-    details: dict[str, str | float] = {
-        "board": str(board),
-        "poses": float(len(places)),
-        "corners": float(sum(len(b.corners) for b in boards)),
-        "corner_noise_px": float(noise[:, 0].max()),
-        "coordinate_noise_px": float(noise[:, 1].max()),
-    }
-    return RigCovariance(names, inverse[:count, :count] + spread @ spread.T, source, details)
+    view: bundle.BoardView
+    indices: list[int]
+    jacobian: Floats
+    whiten: Floats
+    by_point: Floats
+    left: Floats

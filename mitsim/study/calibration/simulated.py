@@ -14,15 +14,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Camera, Rig
-from mitsim.sensor.rig_parameters import distortion_names, moved, parameter_differences, parameter_names
+from mitsim.sensor.rig_parameters import distortion_names, parameter_differences, parameter_names
 from mitsim.sensor.rig_parameters import eyes as all_eyes
 from mitsim.sensor.transforms import Transform
+from mitsim.study.calibration import bundle
 from mitsim.study.calibration.board import Board
-from mitsim.study.calibration.bundle import BoardView, eye_jacobian, homographies, view_jacobian
 
 Floats = NDArray[np.float64]
 
@@ -43,7 +42,7 @@ class SimulatedCorners:
 
 
 def simulate_corners(
-    eyes: Mapping[str, Camera], board: Board, views: Sequence[BoardView], rng: np.random.Generator
+    eyes: Mapping[str, Camera], board: Board, views: Sequence[bundle.BoardView], rng: np.random.Generator
 ) -> SimulatedCorners:
     """Draw a board and the errors of all its corners, by :func:`mitsim.study.calibration.bundle.linearise`."""
     modes, sigma = board.imperfections()
@@ -55,8 +54,8 @@ def simulate_corners(
         for name, eye in eyes.items():
             own = view.camera_px * rng.standard_normal((len(points), 2))
             if name == "projector":  # read at the position of the corner found by the camera
-                first = eye_jacobian(next(iter(eyes.values())), points)[0]
-                turned = homographies(first, eye_jacobian(eye, points)[0], view.sensor_from_board)
+                first = bundle.eye_jacobian(next(iter(eyes.values())), points)[0]
+                turned = bundle.homographies(first, bundle.eye_jacobian(eye, points)[0], view.sensor_from_board)
                 own = np.einsum("nij,nj->ni", turned, errors[0])
                 own += view.coordinate_px * rng.standard_normal(own.shape)
             errors.append(own)
@@ -78,33 +77,23 @@ def estimate(rig: Rig, eyes: Mapping[str, Camera], corners: SimulatedCorners) ->
     """
     if any(eye.model == "fisheye" for eye in eyes.values()):
         raise InputError("--check", "", "a fisheye lens", "perspective lenses", "leave --check out")
-    points = [each.astype(np.float32) for each in corners.points]
-    started, poses = {}, {}
+    started, poses, reference = dict[str, Camera](), dict[str, list[Transform]](), next(iter(eyes))
     for name, eye in eyes.items():
         guess = eye.matrix.copy()
         guess[[0, 1], [0, 1]] *= _START_OFF
-        pixels = [each.astype(np.float32).reshape(-1, 1, 2) for each in corners.pixels[name]]
-        _, matrix, distortion, turns, shifts = cv2.calibrateCamera(
-            points,
-            pixels,
+        _, matrix, distortion, poses[name] = bundle.eye_start(
+            corners.points,
+            corners.pixels[name],
             (eye.width, eye.height),
             guess,
-            np.zeros(14 if len(eye.distortion) > 5 else 5),
+            distCoeffs=np.zeros(14 if len(eye.distortion) > 5 else 5),
             flags=_flags(eyes),
             criteria=_COARSE,
         )
-        found = np.asarray(distortion, np.float64).reshape(-1)
-        started[name] = replace(eye, matrix=np.asarray(matrix, np.float64), distortion=found)
-        poses[name] = [
-            Transform(Rotation.from_rotvec(turn.ravel()).as_matrix(), np.asarray(shift, np.float64).ravel())
-            for turn, shift in zip(turns, shifts, strict=True)
-        ]
-    reference = next(iter(eyes))
-    for name in list(eyes)[1:]:
-        apart = [one @ other.inverse() for one, other in zip(poses[reference], poses[name], strict=True)]
-        turn = Rotation.from_matrix([each.rotation for each in apart]).mean().as_matrix()
-        place = Transform(turn, np.median([each.translation for each in apart], axis=0))
-        started[name] = replace(started[name], sensor_from_camera=eyes[reference].sensor_from_camera @ place)
+        place = eye.sensor_from_camera
+        if name != reference:
+            place = eyes[reference].sensor_from_camera @ bundle.second_eye(poses[reference], poses[name])
+        started[name] = replace(eye, matrix=matrix, distortion=distortion, sensor_from_camera=place)
     places = [eyes[reference].sensor_from_camera @ pose for pose in poses[reference]]
     cameras = {name: started.get(name, camera) for name, camera in rig.cameras.items()}
     return _adjusted(replace(rig, cameras=cameras, projector=started.get("projector", rig.projector)), places, corners)
@@ -121,7 +110,7 @@ def _adjusted(rig: Rig, places: list[Transform], corners: SimulatedCorners) -> t
         size = count + 6 * len(places)
         normal, gradient = np.zeros((size, size)), np.zeros(size)
         for number, (place, board) in enumerate(zip(places, corners.points, strict=True)):
-            jacobian, _ = view_jacobian(optics, names, place, board)
+            jacobian, _ = bundle.view_jacobian(optics, names, place, board)
             at = place.points(board)
             left = np.stack([corners.pixels[name][number] - eye.project(at) for name, eye in optics.items()], axis=1)
             own = [*range(count), *range(count + 6 * number, count + 6 * number + 6)]
@@ -130,12 +119,7 @@ def _adjusted(rig: Rig, places: list[Transform], corners: SimulatedCorners) -> t
             gradient[own] += flat.T @ left.reshape(-1)
         scale = 1 / np.sqrt(np.diag(normal))
         step = scale * np.linalg.solve(normal * np.outer(scale, scale), scale * gradient)
-        rig = moved(rig, names, step[:count])
-        turns = step[count:].reshape(-1, 6)
-        places = [
-            Transform(Rotation.from_rotvec(turn[:3]).as_matrix() @ place.rotation, place.translation + turn[3:])
-            for turn, place in zip(turns, places, strict=True)
-        ]
+        rig, places = bundle.stepped(rig, places, names, step)
         # change of all observations in the step: root of the sum of squares [px]
         if float(step @ normal @ step) < _SMALL_STEP_PX**2:
             return rig, places
@@ -161,14 +145,25 @@ def coverage(
     rig: Rig,
     eyes: Mapping[str, Camera],
     board: Board,
-    views: Sequence[BoardView],
+    views: Sequence[bundle.BoardView],
     stated: Mapping[str, float],
     count: int,
     rng: np.random.Generator,
 ) -> Floats:
-    """Return errors over sigma of ``count`` simulated calibrations, (count, n), each from its own stream.
+    """Return errors over sigma of simulated calibrations, (count, n), each from its own stream.
 
-    ``stated`` is the sigma of the n parameters by their names.
+    Parameters
+    ----------
+    rig, eyes
+        Nominal rig, and those of its eyes that are calibrated, the reference camera first.
+    board, views
+        Board, and its poses with the noise of corners.
+    stated
+        Sigma of the n parameters, by their names.
+    count
+        Number of calibrations.
+    rng
+        Source of the streams.
     """
     names, sigma, rows = list(stated), np.array(list(stated.values())), []
     for stream in rng.spawn(count):

@@ -93,40 +93,24 @@ def _open_candidate(path: Path, file: StudyFile, given: str, ask: Ask | None) ->
     own = sensor.endswith(".toml")
     if not own and sensor not in presets():
         raise InputError("--sensors", "", sensor, f"{', '.join(presets())}, or a sensor TOML")
-    same = sensor == file.sensor and not map_name
-    table = (
-        file
-        if same
-        else file.model_copy(
-            update={
-                "sensor": str(Path(sensor).resolve()) if own else sensor,
-                "characterisation": CharacterisationTable(),
-            }
-        )
-    )
-    study, first = _open_or_error(path, table, map_name, ask)
-    if study is None and _has_distance(file) and not same:
+    tables = [file]
+    if sensor != file.sensor or map_name:
+        name = str(Path(sensor).resolve()) if own else sensor
+        changed = file.model_copy(update={"sensor": name, "characterisation": CharacterisationTable()})
         free = file.views.model_copy(update={"standoff_mm": None, "standoffs_mm": None})
-        study, _ = _open_or_error(path, table.model_copy(update={"views": free}), map_name, ask)
+        tables = [changed] if free == file.views else [changed, changed.model_copy(update={"views": free})]
+    study, errors = None, list[InputError]()
+    for table in tables:
+        try:
+            study = open_study(path, table, performance_map=map_name or None, ask=ask)
+            break
+        except InputError as error:
+            if Path(str(error.where)).name == Path(file.task).name:
+                raise  # an error in the task concerns every sensor
+            errors.append(error)
     if study is None:
-        assert first is not None
-        return Excluded(Path(sensor).stem, given, str(first))
+        return Excluded(Path(sensor).stem, given, str(errors[0]))
     if study.performance_map is None:
         reason = "its study has a campaign instead of a map: run it, and give its map as SENSOR=MAP"
         return Excluded(study.sensor.name, given, reason)
     return CandidateSensor(study.sensor.name, given, replace(study, path=path))
-
-
-def _has_distance(file: StudyFile) -> bool:
-    return file.views.standoff_mm is not None or file.views.standoffs_mm is not None
-
-
-def _open_or_error(
-    path: Path, file: StudyFile, map_name: str, ask: Ask | None
-) -> tuple[Study | None, InputError | None]:
-    try:
-        return open_study(path, file, performance_map=map_name or None, ask=ask), None
-    except InputError as error:
-        if Path(str(error.where)).name == Path(file.task).name:
-            raise  # an error in the task concerns every sensor
-        return None, error

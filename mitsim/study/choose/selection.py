@@ -27,6 +27,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from characterisation.files.atomic_io import write_json
 from characterisation.files.datasets import Schema, Variable, read_dataset
 from characterisation.files.errors import InputError
 from characterisation.statements.decision import demand, tolerance_of
@@ -38,10 +39,10 @@ from mitsim.running.executor import Executor
 from mitsim.running.progress import say
 from mitsim.study import StatementTable
 from mitsim.study.choose.candidates import CandidateSensor
-from mitsim.study.session import Session, StatedView
+from mitsim.study.session import Session
 from mitsim.study.virtual.plan import map_digest, trial_digest
 from mitsim.study.virtual.race import ALL, Raced, RaceRules
-from mitsim.study.virtual.stated import write_statement
+from mitsim.study.virtual.stated import StatedView, statement_document
 from mitsim.views.view_scores import screening_risk
 
 Floats = NDArray[np.float64]
@@ -49,11 +50,11 @@ Floats = NDArray[np.float64]
 #: demand by screening, relative to the limit of the decision rule, above which a sensor is not measured
 LARGEST_DEMAND = 3.0
 
-#: number of views raced for each measurement, trials of each view, and trials at the start of a statement
-SHORTLIST, RACE_TRIALS, FIRST_TRIALS = 3, 8, 24
+#: number of views raced for each measurement, and of trials of each of them
+SHORTLIST, RACE_TRIALS = 3, 8
 
-#: number of trials from which the 95 % interval follows from order statistics, for any distribution
-SURE_TRIALS = 80
+#: trials at the start of a statement
+FIRST_TRIALS = 24
 
 #: a measurement's own best view is stated if its risk in the race is below this fraction of the common view's risk
 _WORTH_STATING = 0.8
@@ -87,8 +88,25 @@ class SensorResult:
     @property
     def ratio(self) -> float:
         """Return the largest demand of the measurements, each from its best view; infinite if one is impossible."""
-        best = [math.inf if row is None else row[1] for row in self.best()] if self.stated else self.screened.tolist()
-        return max(best, default=math.inf)
+        return max(self.demands(), default=math.inf)
+
+    @property
+    def has_tolerances(self) -> bool:
+        """Return whether a measurement of the task has a tolerance."""
+        return any(one.tolerance is not None for one in self.session.study.task.measurements.values())
+
+    @property
+    def screened_demand(self) -> float:
+        """Return the largest screened demand; without tolerances the geometric mean, as no other scale is common."""
+        if self.has_tolerances:
+            return max(self.screened.tolist(), default=math.inf)
+        return float(np.exp(np.mean(np.log(self.screened)))) if np.isfinite(self.screened).all() else math.inf
+
+    def demands(self) -> list[float]:
+        """Return the demand of every measurement, each from its best view; infinite for an impossible one."""
+        if not self.stated:
+            return list(self.screened.tolist())
+        return [math.inf if row is None else row[1] for row in self.best()]
 
     def best(self) -> list[tuple[int, float, Statement] | None]:
         """Return view, demand and statement of least demand for each measurement; None without a value."""
@@ -116,7 +134,18 @@ def choose_sensor(
 ) -> list[SensorResult]:
     """Screen, race and state sensors; return them, best first.
 
-    After each sensor, ``report_results`` receives the results so far and whether they are final.
+    Parameters
+    ----------
+    candidates
+        Sensors, each with the study for it.
+    folder
+        Finished work is kept in a folder of it for each sensor.
+    minutes
+        Total time, shared among the sensors [min].
+    report_results
+        Receives the results so far, and whether they are final, after each sensor.
+    workers
+        Processes or cluster that make the trials; by default this process makes them.
     """
     end = time.monotonic() + 60 * minutes
     found = list[SensorResult]()
@@ -142,35 +171,24 @@ def choose_sensor(
 
 def _promising(found: list[SensorResult]) -> list[SensorResult]:
     """Return the sensors worth a virtual measurement, best first: at least one if any sensor can measure at all."""
-    tolerances = any(one.tolerance is not None for one in found[0].candidate.study.task.measurements.values())
-    order = sorted(found, key=lambda one: one.ratio if tolerances else _mean_demand(one))
-    least = 1.0 if tolerances else _mean_demand(order[0])
+    order = sorted(found, key=lambda one: one.screened_demand)
+    least = 1.0 if order[0].has_tolerances else order[0].screened_demand
     for place, one in enumerate(order):
-        worst = one.ratio if tolerances else _mean_demand(one)
+        worst = one.screened_demand
         one.unpromising = not math.isfinite(worst) or (place > 0 and worst > LARGEST_DEMAND * least)
     return [one for one in order if not one.unpromising]
 
 
-def _mean_demand(one: SensorResult) -> float:
-    """Return the geometric mean of the screened demands; without tolerances there is no other common scale."""
-    return float(np.exp(np.mean(np.log(one.screened)))) if np.isfinite(one.screened).all() else math.inf
-
-
 def _ordered(found: list[SensorResult]) -> list[SensorResult]:
-    return sorted(found, key=sort_key)
+    """Return measured sensors before screened ones, each by their worst measurement.
 
-
-def sort_key(one: SensorResult) -> tuple[bool, float]:
-    """Return the key that sorts measured sensors before screened ones, each by its worst measurement.
-
-    Without tolerances the key is the mean logarithm of the demands.
+    Without tolerances the order is by the mean logarithm of the demands.
     """
-    measurements = one.candidate.study.task.measurements.values()
-    tolerances = any(measurement.tolerance is not None for measurement in measurements)
-    if tolerances:
-        return not one.stated, one.ratio
-    rows = [math.inf if row is None else row[1] for row in one.best()] if one.stated else one.screened.tolist()
-    return not one.stated, float(np.mean(np.log(rows)))
+
+    def demand_of(one: SensorResult) -> float:
+        return one.ratio if one.has_tolerances else float(np.mean(np.log(one.demands())))
+
+    return sorted(found, key=lambda one: (not one.stated, demand_of(one)))
 
 
 def _screened(candidate: CandidateSensor, session: Session) -> SensorResult:
@@ -192,10 +210,7 @@ def _screened(candidate: CandidateSensor, session: Session) -> SensorResult:
     best = np.where(able, screening_risk(scores), np.inf).argmin(axis=1)
     least = np.take_along_axis(np.where(able, u, np.inf), best[:, None], axis=1)[:, 0]
     least = least * stated_shares(study.task)
-    demands = [
-        _screened_demand(study.task, name, float(size))
-        for name, size in zip(study.task.measurements, least, strict=True)
-    ]
+    demands = [_screened_demand(study.task, *row) for row in zip(study.task.measurements, least.tolist(), strict=True)]
     screened_view = scores["view"].values[best].astype(np.int64)
     return SensorResult(candidate, session, scores, np.array(demands), least, screened_view)
 
@@ -277,7 +292,7 @@ def _state(one: SensorResult, view: int, count: int) -> None:
 
 def _finish(one: SensorResult, view: int) -> None:
     """Write the statement of a view, and free the memory of the sensor."""
-    write_statement(one.session.folder / "statement.json", one.stated[view].document)
+    write_json(one.session.folder / "statement.json", statement_document(one.session, one.stated[view]))
     one.session.release()
     gc.collect()
 
@@ -286,14 +301,12 @@ def _say(found: list[SensorResult], done: str, end: float) -> None:
     """Print the progress and the leading sensor."""
     first = _ordered(found)[0]
     names = list(first.candidate.study.task.measurements)
-    stated = [math.inf if row is None else row[1] for row in first.best()]
-    rows: list[float] = stated if first.stated else first.screened.tolist()
+    rows = first.demands()
     worst = int(np.argmax(rows))
     by = "measured" if first.stated else "by the screening"
     measurement = first.candidate.study.task.measurements[names[worst]]
-    size = f"{rows[worst]:.2g}"
     unit = "times the limit" if measurement.tolerance else measurement.unit
-    demand_in_words = f"{size} {unit} ({names[worst]})"
+    demand_in_words = f"{rows[worst]:.2g} {unit} ({names[worst]})"
     left = max(0.0, end - time.monotonic())
     say(f"choose: {done}; {first.candidate.name} leads {by}, at worst {demand_in_words}; {left:.0f} s left")
 

@@ -12,9 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from characterisation.files.atomic_io import json_values
 from characterisation.statements.decision import WORDS, decide, tolerance_of
 from characterisation.statements.statement import Statement
-from characterisation.statements.verdict_words import Judged, result_in_words
+from characterisation.statements.verdict_words import result_in_words
 from mitsim.running.text_table import aligned
 from mitsim.running.version import __version__
 from mitsim.sensor.exposure import PlannedExposure
@@ -54,7 +55,12 @@ def document(
     if all(one.tolerance is None for one in named_measurements.values()):
         sensors = _relative(sensors)
     sensors = [one.model_copy(update={"words": words(one, named_measurements)}) for one in sensors]
-    sensors += [_excluded(one) for one in excluded]
+    sensors += [
+        SensorEntry(
+            name=one.name, given=one.given, status="excluded", why=one.reason, ratio=None, fits=0, words=one.reason
+        )
+        for one in excluded
+    ]
     return ChoiceDocument(
         schema_version=1,
         mitsim=__version__,
@@ -90,18 +96,13 @@ def words(one: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) 
             return "not every measurement can be made"
         least = f"{one.ratio:.2g} times the least uncertainty of all sensors at worst"
         return least if one.ratio > 1 else "the least uncertainty of all sensors in every measurement"
-    return _screened_words(verdicts) if one.status == "screened" else result_in_words(verdicts)
-
-
-def _screened_words(verdicts: Sequence[Judged]) -> str:
-    return f"by screening alone: {result_in_words(verdicts)}"
+    return "by screening alone: " * (one.status == "screened") + result_in_words(verdicts)
 
 
 def as_text(choice: ChoiceDocument) -> str:
     """Return the table of sensors and measurements, with a legend."""
     names = list(choice.measurements)
-    head = ("sensor", "fits", "worst", "capture", *names)
-    rows = [head]
+    rows: list[tuple[str, ...]] = [("sensor", "fits", "worst", "capture", *names)]
     for one in choice.sensors:
         if one.status == "excluded":
             continue
@@ -115,11 +116,10 @@ def as_text(choice: ChoiceDocument) -> str:
                 *(_cell(one.measurements[name], choice.measurements[name]) for name in names),
             )
         )
-    lines = aligned(rows)
-    lines.append("")
-    lines.append(
+    legend = (
         "cells: standard uncertainty, view, verdict; worst: demand of the decision rule, at most 1 if everything fits"
     )
+    lines = [*aligned(rows), "", legend]
     if any(one.status == "screened" for one in choice.sensors):
         lines.append(f"* by screening alone: its demand there is above {LARGEST_DEMAND:g}, or time was over")
     lines += [f"{one.name} is excluded: {one.why}" for one in choice.sensors if one.status == "excluded"]
@@ -135,12 +135,6 @@ def _cell(cell: CellEntry, measurement: ComparedMeasurement) -> str:
     return f"{cell.uncertainty:.2g} {measurement.unit} ({cell.view}) {_SIGNS[cell.verdict]}".rstrip()
 
 
-def _excluded(one: Excluded) -> SensorEntry:
-    return SensorEntry(
-        name=one.name, given=one.given, status="excluded", why=one.reason, ratio=None, fits=0, words=one.reason
-    )
-
-
 def _sensor(one: SensorResult) -> SensorEntry:
     study = one.candidate.study
     names = list(study.task.measurements)
@@ -148,13 +142,12 @@ def _sensor(one: SensorResult) -> SensorEntry:
     cells = {name: _stated(rows[m]) if one.stated else _screened(one, m, name) for m, name in enumerate(names)}
     views = list(dict.fromkeys([*one.stated, *(cell.view for cell in cells.values() if cell.view is not None)]))
     used = {cell.view for cell in cells.values()}
-    ratio = one.ratio
     return SensorEntry(
         name=one.candidate.name,
         given=one.candidate.given,
         status="stated" if one.stated else "screened",
         why="" if one.stated else "out by far" if one.unpromising else "time was over",
-        ratio=ratio if math.isfinite(ratio) else None,
+        ratio=json_values(one.ratio),
         words="",
         fits=sum(cell.verdict == "fits" and cell.by == "statement" for cell in cells.values()),
         poses=[_pose(study, number) for number in views if number in used or number == next(iter(one.stated), None)],
@@ -166,72 +159,51 @@ def _sensor(one: SensorResult) -> SensorEntry:
 
 def _stated(row: tuple[int, float, Statement] | None) -> CellEntry:
     if row is None:
-        return _NOTHING
+        return CellEntry()
     view, demand, one = row
-    decided = one.decided
-    interval = None if decided is None else _finite(decided.demand_interval)
-    return CellEntry(
+    cell = CellEntry(
         by="statement",
         view=view,
         uncertainty=one.standard_uncertainty,
         bias=one.bias,
         share_of_tolerance=one.share_of_tolerance,
         demand=demand,
-        demand_interval=interval,
         verdict=one.verdict,
-        fits_corrected=decided is not None and decided.fits_corrected,
-        accepted=None if decided is None else _interval(decided.accepted),
-        needed=None if decided is None else _number(decided.needed),
-        false_accept=None if decided is None else decided.false_accept,
-        false_reject=None if decided is None else decided.false_reject,
         trials=one.trials,
         without_value=one.without_value,
     )
-
-
-_NOTHING = CellEntry(
-    by="none",
-    view=None,
-    uncertainty=None,
-    bias=None,
-    share_of_tolerance=None,
-    demand=None,
-    demand_interval=None,
-    verdict="undecidable",
-    fits_corrected=False,
-    accepted=None,
-    needed=None,
-    false_accept=None,
-    false_reject=None,
-    trials=0,
-    without_value=1.0,
-)
+    decided = one.decided
+    if decided is None:
+        return cell
+    low, high = decided.demand_interval
+    return cell.model_copy(
+        update={
+            "demand_interval": (low, high) if math.isfinite(low) and high < 1e30 else None,
+            "fits_corrected": decided.fits_corrected,
+            "accepted": None if decided.accepted is None else tuple(json_values(decided.accepted)),
+            "needed": json_values(decided.needed),
+            "false_accept": decided.false_accept,
+            "false_reject": decided.false_reject,
+        }
+    )
 
 
 def _screened(found: SensorResult, m: int, name: str) -> CellEntry:
     """Return a cell from screening; its verdict is decided only if the demand exceeds :data:`LARGEST_DEMAND`."""
     u, tolerance = float(found.screened_u[m]), tolerance_of(found.candidate.study.task, name)
     if not math.isfinite(u):
-        return _NOTHING.model_copy(update={"verdict": "no tolerance"}) if tolerance is None else _NOTHING
-    decided = None if tolerance is None else decide(screened_errors(u), tolerance)
+        return CellEntry(verdict="no tolerance" if tolerance is None else "undecidable")
     demand = float(found.screened[m])
-    clear = decided is not None and demand > LARGEST_DEMAND
-    return CellEntry(
-        by="screening",
-        view=int(found.screened_view[m]),
-        uncertainty=u,
-        bias=None,
-        share_of_tolerance=None if tolerance is None else 1.96 * u / tolerance.size,
-        demand=demand,
-        demand_interval=None,
-        fits_corrected=False,
-        accepted=None,
-        false_accept=None,
-        false_reject=None,
-        trials=0,
-        verdict="no tolerance" if decided is None else decided.verdict if clear else "not decided",
-        needed=None if decided is None else _number(decided.needed),
-        without_value=0.0,
+    cell = CellEntry(by="screening", view=int(found.screened_view[m]), uncertainty=u, demand=demand, without_value=0.0)
+    if tolerance is None:
+        return cell.model_copy(update={"verdict": "no tolerance"})
+    decided = decide(screened_errors(u), tolerance)
+    return cell.model_copy(
+        update={
+            "share_of_tolerance": 1.96 * u / tolerance.size,
+            "verdict": decided.verdict if demand > LARGEST_DEMAND else "not decided",
+            "needed": json_values(decided.needed),
+        }
     )
 
 
@@ -248,9 +220,8 @@ def _relative(sensors: Sequence[SensorEntry]) -> list[SensorEntry]:
             name: cell if cell.demand is None else cell.model_copy(update={"demand": cell.demand / least[name]})
             for name, cell in one.measurements.items()
         }
-        ratios = [cell.demand for cell in cells.values()]
-        worst = None if any(ratio is None for ratio in ratios) else max(ratio for ratio in ratios if ratio is not None)
-        out.append(one.model_copy(update={"measurements": cells, "ratio": worst}))
+        worst = max(math.inf if cell.demand is None else cell.demand for cell in cells.values())
+        out.append(one.model_copy(update={"measurements": cells, "ratio": json_values(worst)}))
     return out
 
 
@@ -274,15 +245,3 @@ def capture_entry(sensor: Sensor, planned: PlannedExposure | None = None) -> Cap
     own = sensor.exposure.exposures(None, float(sensor.imager.full_well))
     exposures = own if planned is None else planned.exposures_s
     return CaptureEntry(images=images, exposures_s=list(exposures), seconds=images * float(np.sum(exposures)))
-
-
-def _interval(ends: tuple[float, float] | None) -> tuple[float | None, float] | None:
-    return None if ends is None else (_number(ends[0]), ends[1])
-
-
-def _finite(ends: tuple[float, float]) -> tuple[float, float] | None:
-    return ends if all(map(math.isfinite, ends)) and ends[1] < 1e30 else None
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None

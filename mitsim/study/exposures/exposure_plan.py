@@ -26,8 +26,11 @@ from numpy.typing import NDArray
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study.exposures.exposure_sweep import ExposureResult, FeatureResult
 
-#: ratio of neighbouring single exposures, and their largest ratio to the sensor's own exposure
-STEP, LARGEST_RATIO = math.sqrt(2.0), 64.0
+#: ratio of neighbouring single exposures
+STEP = math.sqrt(2.0)
+
+#: largest ratio of a single exposure to the sensor's own
+LARGEST_RATIO = 64.0
 
 #: least power of a projector in a plan [1]; *assumed*, since no maker of the presets states one
 LEAST_POWER = 0.1
@@ -120,11 +123,7 @@ def plan_exposures(
     # with half of the exposures, the greedy search finds other sets
     sets = [_greedy_sets(search, start, names, rules.most) for start in (full_power, full_power[::2])]
     first_limits = _measurable(_limits(list(search.known.values()), names))
-    for exposure in {
-        own,
-        *(one.exposure for one in _nearest(singles, first_limits)),
-        *(one for results in sets for one in results),
-    }:
+    for exposure in {own, *(one.exposure for one in _nearest(singles, first_limits)), *sets[0], *sets[1]}:
         decision(exposure)
     limits = _measurable(_limits(list(decision.known.values()), names))
     chosen, reached = (
@@ -188,7 +187,7 @@ def _sweep(
             if exposure.exposures_s[0] >= longest:
                 break
     unique = {one.exposure: one for one in found}
-    return sorted(unique.values(), key=_product)
+    return sorted(unique.values(), key=lambda one: one.exposure.seconds * one.exposure.power)
 
 
 def _feasible_exposure(seconds: float, shortest: float, longest: float, dimmable: bool) -> PlannedExposure | None:
@@ -199,19 +198,9 @@ def _feasible_exposure(seconds: float, shortest: float, longest: float, dimmable
     if seconds >= longest:
         return PlannedExposure((longest,))
     if seconds >= shortest:
-        return PlannedExposure((_rounded(seconds),))
+        return PlannedExposure((float(f"{seconds:.3g}"),))  # three digits, so that a user can type it in
     power = seconds / shortest
     return PlannedExposure((shortest,), float(f"{power:.2g}")) if dimmable and power >= LEAST_POWER else None
-
-
-def _rounded(seconds: float) -> float:
-    """Return an exposure [s] rounded to three significant digits, so that a user can type it in."""
-    return float(f"{seconds:.3g}")
-
-
-def _product(one: ExposureResult) -> float:
-    """Return total exposure times power [s]."""
-    return one.exposure.seconds * one.exposure.power
 
 
 def _greedy_sets(
@@ -225,15 +214,12 @@ def _greedy_sets(
     possible = {name: float(_union(singles, name).sum()) for name in names}
     recovered = [name for name in names if possible[name] > 0]
     for size in range(1, min(most, len(singles)) + 1):
-        unused = [one for one in singles if one not in chosen]
-        chosen.append(
-            max(
-                unused,
-                key=lambda one: min(
-                    (_union([*chosen, one], name).sum() / possible[name] for name in recovered), default=0.0
-                ),
-            )
-        )
+
+        def least_share(one: ExposureResult) -> float:
+            shares = (_union([*chosen, one], name).sum() / possible[name] for name in recovered)
+            return float(min(shares, default=0.0))
+
+        chosen.append(max((one for one in singles if one not in chosen), key=least_share))
         if size > 1:
             sets.append(_merged_set(chosen))
             search(sets[-1])
@@ -319,18 +305,13 @@ def _by_usefulness(
 ) -> list[tuple[float, ...]]:
     """Return sets of one, two and more of a plan's exposures; each adds the exposure that helps most."""
     remaining, chosen, out = list(exposure.exposures_s), list[float](), list[tuple[float, ...]]()
+
+    def shortage(seconds: float) -> tuple[float, float]:
+        return _shortage(search(PlannedExposure(tuple(sorted([*chosen, seconds])), exposure.power)), limits)
+
     while remaining:
-        if len(remaining) == 1:
-            best = remaining[0]
-        else:
-            best = min(
-                remaining,
-                key=lambda seconds: _shortage(
-                    search(PlannedExposure(tuple(sorted([*chosen, seconds])), exposure.power)), limits
-                ),
-            )
-        remaining.remove(best)
-        chosen.append(best)
+        chosen.append(remaining[0] if len(remaining) == 1 else min(remaining, key=shortage))
+        remaining.remove(chosen[-1])
         out.append(tuple(chosen))
     return out
 

@@ -95,9 +95,9 @@ class ExposureSweep:
     """
 
     def __init__(self, renderer: RenderedMeasurements, view: View) -> None:
-        world = replace(renderer.unknowns, varied=()).draw(Trial(0))
+        drawn = replace(renderer.unknowns, varied=()).draw(Trial(0))
         self.renderer, self.view = renderer, view
-        self.lit = renderer.lit(view, world)
+        self.lit = renderer.lit(view, drawn)
         self.possible = _possible_points(renderer, view)
         sensor = renderer.study.sensor
         # only the light of the projector is proportional to its power

@@ -10,23 +10,27 @@ import hashlib
 import math
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from characterisation.files.atomic_io import atomic_write, write_json
 from characterisation.files.checked_files import read_json_object
-from characterisation.files.documents import Document, validate
+from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from mitsim.running.progress import say
 from mitsim.running.text_table import aligned
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.study import ExposureTable, Study
+from mitsim.study import Study
 from mitsim.study.exposures.exposure_plan import ExposurePlan, PlanRules, plan_exposures
-from mitsim.study.exposures.exposure_sweep import ExposureResult, ExposureSweep
+from mitsim.study.exposures.exposure_sweep import ExposureResult, ExposureSweep, FeatureResult
+from mitsim.study.statement_file import PartialDocument
 from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.views import View
+
+if TYPE_CHECKING:
+    from mitsim.study.session import Session
 
 #: default exposure limits of a sensor file [s], which are not those of a device
 _NO_LIMITS = (1e-9, 1e3)
@@ -35,37 +39,36 @@ _NO_LIMITS = (1e-9, 1e3)
 PLAN_VERSION = 1
 
 
-class _StoredPlan(Document):
+class _StoredPlan(PartialDocument):
     """The keys of a stored plan that virtual measurements need."""
-
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
     digest: str
     exposures_s: list[float] = Field(min_length=1, max_length=7)
     power: float = Field(gt=0, le=1)
 
 
-def planned_for(renderer: RenderedMeasurements, view: View, digest: str, folder: Path) -> PlannedExposure:
-    """Return the exposures of a view's captures: those that the study gives in [exposure], or planned ones.
+def planned_for(session: Session, view: View) -> PlannedExposure | None:
+    """Return the exposures of a view: those of the study, or planned ones; None for the sensor's own rule.
 
-    A plan in ``folder`` with the same ``digest`` is used again. ``digest`` identifies everything but the exposures that
-    determines a trial.
+    A plan in the folder of the session is used again if all that determines a trial is the same.
 
     Raises
     ------
     InputError
-        If the sensor cannot take or merge the exposures of the study.
+        If the sensor cannot take or merge the exposures of the study, or measurements are drawn from a map, which holds
+        only for the exposure that it was made with.
     """
-    study = renderer.study
-    table = study.file.exposure
-    assert table is not None
+    study, table = session.study, session.study.file.exposure
+    if table is None:
+        return None
+    renderer = rendered(session.measurements)
     if table.exposures_s is not None:
         given = PlannedExposure(tuple(sorted(table.exposures_s)), table.power)
-        _check_given(study, given, table)
+        _check_given(study, given)
         return given
     rules = PlanRules(table.most, table.within)
-    path = plan_path(folder, view.number)
-    digest_of_plan = with_exposure(digest, None, asdict(rules))
+    path = session.folder / "exposures" / f"view_{view.number:04d}.json"
+    digest_of_plan = with_exposure(session.digest, None, asdict(rules))
     if path.exists():
         try:
             stored = validate(path, read_json_object(path), _StoredPlan)
@@ -113,31 +116,16 @@ def rendered(measurements: RenderedMeasurements | MappedMeasurements) -> Rendere
     return measurements
 
 
-def _check_given(study: Study, given: PlannedExposure, table: ExposureTable) -> None:
+def _check_given(study: Study, given: PlannedExposure) -> None:
     """Check that a sensor can take and merge the exposures of a study; raise an InputError if not."""
-    shortest, longest = study.sensor.exposure.limits_s
+    (shortest, longest), sensor = study.sensor.exposure.limits_s, study.sensor.name
     for seconds in given.exposures_s:
         if not shortest <= seconds <= longest:
-            raise InputError(
-                study.path,
-                "exposure.exposures_s",
-                f"{seconds:g} s",
-                f"{shortest:g} to {longest:g} s",
-                f"these are the limits of {study.sensor.name}",
-            )
+            allowed, hint = f"{shortest:g} to {longest:g} s", f"these are the limits of {sensor}"
+            raise InputError(study.path, "exposure.exposures_s", f"{seconds:g} s", allowed, hint)
     if len(given.exposures_s) > 1 and not study.sensor.merges_exposures:
-        raise InputError(
-            study.path,
-            "exposure.exposures_s",
-            f"{len(given.exposures_s)} exposures",
-            "one",
-            f"{study.sensor.name} cannot merge exposures",
-        )
-
-
-def plan_path(folder: Path, view: int) -> Path:
-    """Return the path of the plan of a view in a folder."""
-    return folder / "exposures" / f"view_{view:04d}.json"
+        several, hint = f"{len(given.exposures_s)} exposures", f"{sensor} cannot merge exposures"
+        raise InputError(study.path, "exposure.exposures_s", several, "one", hint)
 
 
 def with_exposure(digest: str, planned: PlannedExposure | None, more: Any = None) -> str:
@@ -185,37 +173,25 @@ def _number(value: float) -> float | None:
 def plan_table(plan: ExposurePlan) -> str:
     """Return a plan as a table of text: the exposures to set, and the result that each adds."""
     names = list(plan.own.features)
-    head = ("capture", "exposure [ms]", "power", *(f"{name}: points, F, u [um]" for name in names))
-    rows = [
-        head,
-        ("sensor's own", *_settings_text(plan.own.exposure), *(_feature_text(plan.own, name) for name in names)),
+    own = ", ".join(f"{1e3 * seconds:.3g}" for seconds in plan.own.exposure.exposures_s)
+    steps = [("sensor's own", own, plan.own.exposure.power, plan.own.features)]
+    for k, (seconds, result) in enumerate(plan.added, 1):
+        step_name = "1" if k == 1 else f"and {k}, merged"
+        steps.append((step_name, f"{1e3 * seconds:.3g}", plan.exposure.power, result.features))
+    rows = [("capture", "exposure [ms]", "power", *(f"{name}: points, F, u [um]" for name in names))]
+    rows += [
+        (step_name, exposure, f"{100 * power:.0f} %", *(_feature_text(features[name]) for name in names))
+        for step_name, exposure, power, features in steps
     ]
-    for k, (seconds, result) in enumerate(plan.added):
-        step_name = "1" if k == 0 else f"and {k + 1}, merged"
-        rows.append(
-            (
-                step_name,
-                f"{1e3 * seconds:.3g}",
-                f"{100 * plan.exposure.power:.0f} %",
-                *(_feature_text(result, name) for name in names),
-            )
-        )
-    limit = [
-        f"{one.points:.0f}  {one.fraction:.2f}  {1e3 * one.u:.1f}" if (one := plan.limits.get(name)) else "not reached"
-        for name in names
-    ]
-    rows.append(("limit", "", "", *limit))
-    return "\n".join(aligned(rows))
+    limits = [_feature_text(plan.limits[name]) if name in plan.limits else "not reached" for name in names]
+    return "\n".join(aligned([*rows, ("limit", "", "", *limits)]))
 
 
 def write_plan_csv(path: Path, plan: ExposurePlan) -> None:
     """Write a plan as a CSV file, with one row for each feature of each step."""
-    lines = ["step,exposure_ms,power,feature,points,fraction,u_mm"]
+    lines, power = ["step,exposure_ms,power,feature,points,fraction,u_mm"], plan.exposure.power
     steps = [("own", ";".join(f"{1e3 * one:.4g}" for one in plan.own.exposure.exposures_s), plan.own, 1.0)]
-    steps += [
-        (str(k), f"{1e3 * seconds:.4g}", result, plan.exposure.power)
-        for k, (seconds, result) in enumerate(plan.added, 1)
-    ]
+    steps += [(str(k), f"{1e3 * seconds:.4g}", result, power) for k, (seconds, result) in enumerate(plan.added, 1)]
     for step, exposure, result, power in steps:
         for name, one in result.features.items():
             u = f"{one.u:.4g}" if math.isfinite(one.u) else ""
@@ -246,11 +222,6 @@ def plan_in_words(plan: ExposurePlan) -> str:
     return text + (f"; too few points from this view at any exposure: {', '.join(plan.unseen)}" if plan.unseen else "")
 
 
-def _settings_text(planned: PlannedExposure) -> tuple[str, str]:
-    return ", ".join(f"{1e3 * one:.3g}" for one in planned.exposures_s), f"{100 * planned.power:.0f} %"
-
-
-def _feature_text(result: ExposureResult, name: str) -> str:
-    one = result.features[name]
+def _feature_text(one: FeatureResult) -> str:
     u = f"{1e3 * one.u:.1f}" if math.isfinite(one.u) else "-"
     return f"{one.points:.0f}  {one.fraction:.2f}  {u}"

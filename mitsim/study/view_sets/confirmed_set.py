@@ -26,12 +26,11 @@ from characterisation.statements.losses import losses
 from characterisation.statements.statement import Statement, statement
 from mitsim.running.progress import say, track
 from mitsim.running.text_table import aligned
-from mitsim.study import SetTable, Study
+from mitsim.study import SetTable
 from mitsim.study.exposures.planned import with_exposure
+from mitsim.study.session import Session
 from mitsim.study.view_sets.joined import JoinedMeasurements
-from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import digits
-from mitsim.study.virtual.trial_errors import errors_of_trials
 from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import SET_DAYS, Trial
 
@@ -72,19 +71,17 @@ class TriedSet:
         return max((_excess(found[name], limits[name]) for name in reachable), default=0.0)
 
 
-def confirmed_set(
-    study: Study, first: ViewSet, search: Search, renderer: RenderedMeasurements, digest: str, folder: Path
-) -> list[TriedSet]:
+def confirmed_set(session: Session, first: ViewSet, search: Search) -> list[TriedSet]:
     """Measure the first set, and sets for stricter limits until one keeps the limits.
 
     Returns all measured sets, the best last: the set that keeps all reachable limits, or the one of least excess.
     Trials in the folder are reused. Says of each set which limits it misses, and why no further set is tried.
     """
-    table = study.file.set
+    table = session.study.file.set
     assert table is not None
     chosen, searched, tried = first, dict(table.limits), list[TriedSet]()
     while True:
-        stated = state_set(study, chosen, renderer, digest, folder)
+        stated = state_set(session, chosen)
         tried.append(TriedSet(chosen, dict(searched), tuple(stated)))
         if tried[-1].excess(table.limits) <= 1:
             break
@@ -92,7 +89,7 @@ def confirmed_set(
         if len(tried) == MOST_SETS:
             say(f"no further set is tried: {MOST_SETS} sets were measured, the most that a run measures")
             break
-        found = _next_set(search, searched, stricter(searched, table.limits, chosen, stated), first, tried)
+        found = _next_set(search, stricter(tried[-1], table.limits), first, tried)
         if found is None:
             say(
                 f"no further set is tried: by the map, no set of other views is more accurate "
@@ -105,15 +102,16 @@ def confirmed_set(
 
 
 def _next_set(
-    search: Search, before: dict[str, float], strict: dict[str, float], first: ViewSet, tried: Sequence[TriedSet]
+    search: Search, strict: dict[str, float], first: ViewSet, tried: Sequence[TriedSet]
 ) -> tuple[ViewSet, dict[str, float]] | None:
     """Return a set that is not measured yet, with the limits of its search: the strictest that the map can keep.
 
-    ``before`` are the limits of the last search, ``strict`` those by what it missed. A limit that no set can keep is
-    taken back half of the way, in ratio, to the limit before. If the set is an old one, limits that were missed become
-    stricter by the least step. None if :data:`MOST_SEARCHES` searches find no new set.
+    ``strict`` are the limits by what the last search missed. A limit that no set can keep is taken back half of the
+    way, in ratio, to the limit before. If the set is an old one, limits that were missed become stricter by the least
+    step. None if :data:`MOST_SEARCHES` searches find no new set.
     """
-    limits, missed = dict(strict), [name for name in strict if strict[name] < before[name]]
+    limits, before = dict(strict), tried[-1].searched
+    missed = [name for name in strict if strict[name] < before[name]]
     for _ in range(MOST_SEARCHES):
         chosen = search(limits)
         lost = [name for name, once, now in zip(limits, first.feasible, chosen.feasible, strict=True) if once > now]
@@ -130,24 +128,20 @@ def _next_set(
 
 def _missed(tried: TriedSet, limits: dict[str, float]) -> str:
     """Return text such as ``radius missed, 1.3 times its limit``."""
-    found = {
-        one.measurement: _excess(one, limits[one.measurement]) for one in tried.stated if one.measurement in limits
-    }
-    words = [f"{name} missed, {ratio:.2g} times its limit" for name, ratio in found.items() if 1 < ratio < math.inf]
-    return "; ".join(words + [f"{name} without a value" for name, ratio in found.items() if ratio == math.inf])
+    stated = {one.measurement: one for one in tried.stated}
+    ratios = {name: _excess(one, limits[name]) for name, one in stated.items() if name in limits}
+    words = [f"{name} missed, {ratio:.2g} times its limit" for name, ratio in ratios.items() if 1 < ratio < math.inf]
+    return "; ".join(words + [f"{name} without a value" for name, ratio in ratios.items() if ratio == math.inf])
 
 
-def stricter(
-    searched: dict[str, float], limits: dict[str, float], chosen: ViewSet, stated: Sequence[Statement]
-) -> dict[str, float]:
+def stricter(tried: TriedSet, limits: dict[str, float]) -> dict[str, float]:
     """Return the limits for the next search: missed limits times the ratio of expected to measured uncertainty."""
-    out, found = dict(searched), {one.measurement: one for one in stated}
-    for name, expected, able in zip(limits, chosen.uncertainty.tolist(), chosen.feasible, strict=True):
-        one = found[name]
-        if not able or _excess(one, limits[name]) <= 1:
-            continue
-        optimism = _WITHOUT_VALUE if not one.root_mean_square > 0 else expected / one.root_mean_square
-        out[name] = min(limits[name] * optimism, _TIGHTENING * searched[name])
+    out, stated = dict(tried.searched), {one.measurement: one for one in tried.stated}
+    for name, expected, able in zip(limits, tried.chosen.uncertainty.tolist(), tried.chosen.feasible, strict=True):
+        error = stated[name].root_mean_square
+        if able and _excess(stated[name], limits[name]) > 1:
+            optimism = expected / error if error > 0 else _WITHOUT_VALUE
+            out[name] = min(limits[name] * optimism, _TIGHTENING * tried.searched[name])
     return out
 
 
@@ -155,24 +149,20 @@ def _excess(one: Statement, limit: float) -> float:
     return one.root_mean_square / limit if math.isfinite(one.root_mean_square) else math.inf
 
 
-def state_set(
-    study: Study, chosen: ViewSet, renderer: RenderedMeasurements, digest: str, folder: Path
-) -> list[Statement]:
-    """State every measurement from a set of views together, and reuse trials in the folder."""
-    table = study.file.set
-    assert table is not None
-    decided_by = with_exposure(
-        digest, None, ["set", list(chosen.views), table.joining, list(table.pose_known), _JOINING_VERSION]
-    )
-    trials = TrialFolder.of(folder / "set_trials" / decided_by, decided_by, study.task)
-    by_number = {view.number: view for view in study.views}
-    runner = JoinedMeasurements(renderer, [by_number[number] for number in chosen.views], table)
+def state_set(session: Session, chosen: ViewSet) -> list[Statement]:
+    """State every measurement from a set of views together, and reuse trials in the folder of the session."""
+    study, renderer, table = session.study, session.renderer, session.study.file.set
+    assert table is not None and renderer is not None  # clouds drawn from a map cannot be joined
+    what = ["set", list(chosen.views), table.joining, list(table.pose_known), _JOINING_VERSION]
+    decided_by = with_exposure(session.digest, None, what)
+    trials = TrialFolder.of(session.folder / "set_trials" / decided_by, decided_by, study.task)
+    runner = JoinedMeasurements(renderer, [study.view(number) for number in chosen.views], table)
     days = [SET_DAYS + k for k in range(table.trials)]
     missing = [day for day in days if Trial(day) not in trials.known(0)]
     for day, outcome in track(runner.run(missing), "confirm the set", len(missing)):
         trials.add(0, Trial(day), outcome)
     wanted = [Trial(day) for day in days]
-    found = errors_of_trials(study.task, trials, 0, wanted)
+    found = trials.errors_of_parts(0, wanted)
     return [
         replace(
             statement(name, asked.unit, found[m], tolerance_of(study.task, name)),
@@ -190,11 +180,9 @@ def tried_entries(tried: Sequence[TriedSet], limits: dict[str, float]) -> list[d
             "excess": json_values(one.excess(limits)),
             "searched": one.searched,
             "expected": dict(zip(limits, one.chosen.uncertainty.tolist(), strict=True)),
-            "found": {
-                each.measurement: json_values(each.root_mean_square)
-                for each in one.stated
-                if each.measurement in limits
-            },
+            "found": json_values(
+                {each.measurement: each.root_mean_square for each in one.stated if each.measurement in limits}
+            ),
         }
         for one in tried
     ]
@@ -220,47 +208,31 @@ def confirmed_entry(stated: Sequence[Statement]) -> dict[str, Any]:
     return out
 
 
-def write_set_csv(path: Path, table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> None:
+def write_set_csv(path: Path, table: SetTable, tried: TriedSet) -> None:
     """Write limit, expected and confirmed uncertainty of every measurement, one row each."""
-    expected = dict(zip(table.limits, chosen.uncertainty.tolist(), strict=True))
+
+    def text(value: float | None) -> str:
+        return "" if value is None or not math.isfinite(value) else f"{value:.4g}"
+
+    expected = dict(zip(table.limits, tried.chosen.uncertainty.tolist(), strict=True))
     lines = ["measurement,unit,limit,expected_uncertainty,trials,without_value,bias,uncertainty,low,high,verdict"]
-    for one in stated:
-        limit, u = table.limits.get(one.measurement), expected.get(one.measurement)
-        numbers = [one.bias, one.standard_uncertainty, *one.interval]
-        lines.append(
-            ",".join(
-                [
-                    one.measurement,
-                    one.unit,
-                    "" if limit is None else f"{limit:g}",
-                    "" if u is None else f"{u:.4g}",
-                    str(one.trials),
-                    f"{one.without_value:.4g}",
-                    *("" if not math.isfinite(number) else f"{number:.4g}" for number in numbers),
-                    one.verdict,
-                ]
-            )
-        )
+    for one in tried.stated:
+        limit = f"{table.limits[one.measurement]:g}" if one.measurement in table.limits else ""
+        counts = [text(expected.get(one.measurement)), str(one.trials), text(one.without_value)]
+        numbers = map(text, (one.bias, one.standard_uncertainty, *one.interval))
+        lines.append(",".join([one.measurement, one.unit, limit, *counts, *numbers, one.verdict]))
     with atomic_write(path) as file:
         file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def set_table(table: SetTable, chosen: ViewSet, stated: Sequence[Statement]) -> str:
+def set_table(table: SetTable, tried: TriedSet) -> str:
     """Return the set as a text table: limit, expected u, and bias and u from virtual measurements."""
-    expected = dict(zip(table.limits, chosen.uncertainty.tolist(), strict=True))
+    expected = dict(zip(table.limits, tried.chosen.uncertainty.tolist(), strict=True))
     rows = [("measurement", "unit", "limit", "expected u", "bias", "u", "no value", "limit kept")]
-    for one in stated:
-        limit, u = table.limits.get(one.measurement), expected.get(one.measurement)
-        rows.append(
-            (
-                one.measurement,
-                one.unit,
-                "-" if limit is None else f"{limit:g}",
-                "-" if u is None else f"{u:.2g}",
-                digits(one.bias),
-                digits(one.standard_uncertainty),
-                f"{100 * one.without_value:.0f} %",
-                "-" if limit is None else "yes" if one.root_mean_square <= limit else "no",
-            )
-        )
+    for one in tried.stated:
+        limit = table.limits.get(one.measurement)
+        kept = "-" if limit is None else "yes" if one.root_mean_square <= limit else "no"
+        wanted = ("-", "-") if limit is None else (f"{limit:g}", f"{expected[one.measurement]:.2g}")
+        numbers = digits(one.bias), digits(one.standard_uncertainty), f"{100 * one.without_value:.0f} %"
+        rows.append((one.measurement, one.unit, *wanted, *numbers, kept))
     return "\n".join(aligned(rows))

@@ -1,6 +1,6 @@
-"""Virtual measurements of a set of views: render every view in one random world, and measure the joined clouds.
+"""Virtual measurements of a set of views: render every view with one draw of the unknowns, and measure joined clouds.
 
-Signal chain: day -> world (calibration, finish, light, temperature and position of the part shared by all views; noise
+Signal chain: day -> draw (calibration, finish, light, temperature and position of the part shared by all views; noise
 and speckle fresh in each) -> a cloud of each view -> assumed pose of each view, with its error -> points of every
 feature in the part frame -> joining, by these poses or by best fit of all views to shapes they share -> measurement
 -> error of every measurement.
@@ -70,8 +70,8 @@ class JoinedMeasurements:
     def _measure_view(self, view: View, place: int, day: int) -> _MeasuredView:
         """Return the points of one view on one day; its ``place`` in the set is the number of its capture."""
         renderer, first = self.renderer, self.renderer.unknowns.draw(Trial(day))
-        world = replace(renderer.unknowns.draw(Trial(day, place)), placed=first.placed, assumed=first.assumed)
-        cloud, assumed = renderer.cloud_of(view, world)
+        drawn = replace(renderer.unknowns.draw(Trial(day, place)), placed=first.placed, assumed=first.assumed)
+        cloud, assumed = renderer.cloud_of(view, drawn)
         motion = motion_matrix(self._pose_error(place, day), self.centre) @ assumed.matrix()
         points = {}
         for name in renderer.study.task.shapes:

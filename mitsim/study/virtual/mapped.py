@@ -1,6 +1,6 @@
 """Virtual measurements from the map: clouds drawn by the talk's method, with the same unknowns as rendered ones.
 
-Signal chain: view and trial -> world (:mod:`mitsim.study.virtual.world`) -> F and sigma of every pixel from the map,
+Signal chain: view and trial -> draw (:mod:`mitsim.study.virtual.world`) -> F and sigma of every pixel from the map,
 with random errors and spread of the map -> P + R_N sigma V, with the measured correlation of neighbours, kept if R_U <
 F -> displacement of ideal points by the true calibration (:func:`mitsim.study.calibration.accuracy.measured_points`) ->
 path, temperature and form -> measurement at the assumed pose -> error of every measurement -> plus effects outside the
@@ -37,7 +37,7 @@ from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import displaced
 from mitsim.study.virtual.screening import screen
 from mitsim.study.virtual.trials import Outcome
-from mitsim.study.virtual.world import BEYOND, Unknowns, World
+from mitsim.study.virtual.world import BEYOND, DrawnValues, Unknowns
 from mitsim.views import View
 
 Floats = NDArray[np.float64]
@@ -80,26 +80,26 @@ class MappedMeasurements:
             self._predict({job.view.number: job.view for job in known})
         return one_ahead(known, self._take, self._finish)
 
-    def _take(self, job: Job) -> tuple[PointCloud, World, NDArray[np.int16], Surfaces | None]:
-        world = self.unknowns.draw(job.trial)
-        true, assumed = (motion.inverse() @ job.view.world_from_sensor for motion in (world.placed, world.assumed))
-        rng = np.random.default_rng(world.seed)
-        cloud = self.predictor.predict(self._scene(world.finish), true, rng, correlated=True)
+    def _take(self, job: Job) -> tuple[PointCloud, DrawnValues, NDArray[np.int16], Surfaces | None]:
+        drawn = self.unknowns.draw(job.trial)
+        true, assumed = (motion.inverse() @ job.view.world_from_sensor for motion in (drawn.placed, drawn.assumed))
+        rng = np.random.default_rng(drawn.seed)
+        cloud = self.predictor.predict(self._scene(drawn.finish), true, rng, correlated=True)
         labels = self.predictor.quick_labels(self.study.scene, assumed)
-        surfaces = self.predictor.surfaces(self.study.scene, assumed) if self._has_form and world.form else None
-        return cloud, world, labels, surfaces
+        surfaces = self.predictor.surfaces(self.study.scene, assumed) if self._has_form and drawn.form else None
+        return cloud, drawn, labels, surfaces
 
-    def _finish(self, drawing: tuple[PointCloud, World, NDArray[np.int16], Surfaces | None], job: Job) -> Outcome:
-        cloud, world, labels, surfaces = drawing
-        scene, assumed = self.study.scene, world.assumed.inverse() @ job.view.world_from_sensor
-        cloud = replace(cloud, points=moved_by_calibration(cloud, self.study.sensor, world))
-        points = displaced(cloud, world, assumed, scene.centre)
+    def _finish(self, drawing: tuple[PointCloud, DrawnValues, NDArray[np.int16], Surfaces | None], job: Job) -> Outcome:
+        cloud, drawn, labels, surfaces = drawing
+        scene, assumed = self.study.scene, drawn.assumed.inverse() @ job.view.world_from_sensor
+        cloud = replace(cloud, points=moved_by_calibration(cloud, self.study.sensor, drawn))
+        points = displaced(cloud, drawn, assumed, scene.centre)
         if surfaces is not None:
             form = self.unknowns.table.form.features
-            points = form_deviation(points, surfaces, scene, form, assumed, cloud.grid, world.form)
+            points = form_deviation(points, surfaces, scene, form, assumed, cloud.grid, drawn.form)
         labelled = replace(cloud, points=points, feature=labels, feature_names=scene.names)
         found = measure(labelled, self.study.task, assumed.inverse().matrix(), MINIMUM_POINTS, False)
-        return self._with_beyond(Outcome.of(found), job.view, world)
+        return self._with_beyond(Outcome.of(found), job.view, drawn)
 
     def _predict(self, views: dict[int, View]) -> None:
         """Compute and keep the predicted uncertainties of views."""
@@ -112,21 +112,21 @@ class MappedMeasurements:
         for view, row in zip(new, predicted.tolist(), strict=True):
             self._predicted[view.number] = dict(zip(scores["measurement"].values.tolist(), row, strict=True))
 
-    def _with_beyond(self, found: Outcome, view: View, world: World) -> Outcome:
+    def _with_beyond(self, found: Outcome, view: View, drawn: DrawnValues) -> Outcome:
         """Add effects outside the map; NaN if screening rates a measurement as impossible.
 
         An effect on a value that folds is a deviation in a random direction.
         """
         if self._beyond_sizes is None:
             return found
-        sizes = self._beyond_sizes.draw(np.random.default_rng(world.beyond), len(found.errors))
+        sizes = self._beyond_sizes.draw(np.random.default_rng(drawn.beyond), len(found.errors))
         predicted = self._predicted[view.number]
         added = {name: predicted[name] * float(size) for name, size in zip(found.errors, sizes, strict=True)}
         errors = {name: error + added[name] for name, error in found.errors.items()}
         deviations = {}
         for name, rows in found.deviations.items():
             folded = self._folded[name]
-            moved = folded.moved(np.reshape(rows, folded.shape), added[name], world.beyond)
+            moved = folded.moved(np.reshape(rows, folded.shape), added[name], drawn.beyond)
             errors[name] = folded.error(moved)
             deviations[name] = moved.ravel().tolist()
         impossible = {name: _NOT_PREDICTED for name in errors if not np.isfinite(predicted[name])}
@@ -162,8 +162,8 @@ def drawn_map(performance_map: PerformanceMap, unknowns: Unknowns, finish: int) 
     return PerformanceMap(data)
 
 
-def moved_by_calibration(cloud: PointCloud, sensor: Sensor, world: World) -> NDArray[np.float32]:
-    """Return points (H, W, 3) [mm] as the nominal calibration places them if the world's rig is the true one.
+def moved_by_calibration(cloud: PointCloud, sensor: Sensor, drawn: DrawnValues) -> NDArray[np.float32]:
+    """Return points (H, W, 3) [mm] as the nominal calibration places them if the drawn rig is the true one.
 
     Parameters of a time-of-flight path are excluded; :func:`mitsim.study.virtual.rendered.displaced` applies them.
     """
@@ -172,7 +172,7 @@ def moved_by_calibration(cloud: PointCloud, sensor: Sensor, world: World) -> NDA
     if len(points) < 4:
         return cloud.points
     some = points[:: max(1, len(points) // _POINTS)]
-    moves = measured_points(sensor, some, world.rig) - measured_points(sensor, some, sensor.rig)
+    moves = measured_points(sensor, some, drawn.rig) - measured_points(sensor, some, sensor.rig)
     fine = np.isfinite(moves).all(axis=1)
     if fine.sum() < 40:
         return cloud.points

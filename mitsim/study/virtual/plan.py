@@ -29,7 +29,7 @@ from mitsim.study.virtual.race import RaceRules
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.world import BEYOND, Unknowns
 
-#: part of the digest of a trial; increased if the same world gives a different measurement
+#: part of the digest of a trial; increased if the same draw gives a different measurement
 TRIAL_VERSION = 2
 
 #: keys of a task that concern the verdict, not the measurement
@@ -93,6 +93,19 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: 
 
     These are sensor, calibration, unknowns, task, views, the scene with its meshes and textures, and, for clouds drawn
     from the map, the map.
+
+    Parameters
+    ----------
+    study, unknowns
+        The study, and its unknowns prepared for drawing.
+    source
+        How trials are made: ``render`` or ``map``.
+    separate_light
+        Whether every trial renders all of its light.
+
+    See Also
+    --------
+    study_digest : Digest of everything that determines the results of a study.
     """
     file = study.file
     content = {
@@ -101,7 +114,8 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: 
         "source": source,
         "sensor": sensor_checksum(study.sensor),
         "unknowns": unknowns.table.model_dump(mode="json"),
-        "varied": _varied(unknowns, source),
+        # a rendered trial does not depend on effects outside the map
+        "varied": [group for group in unknowns.varied if group != BEYOND or source == "map"],
         "seed": unknowns.seed,
         "covariance": hashlib.sha256(unknowns.calibration.covariance.tobytes()).hexdigest(),
         "expansion": unknowns.expansion,
@@ -126,6 +140,19 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: 
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
-def _varied(unknowns: Unknowns, source: str) -> list[str]:
-    """Return the groups that a trial depends on; a rendered trial does not depend on effects outside the map."""
-    return [group for group in unknowns.varied if group != BEYOND or source == "map"]
+def study_digest(study: Study, trials: str) -> str:
+    """Return thirty-two hexadecimal digits of everything that determines the results of a study.
+
+    Studies with the same digest have the same results. No other study may use the results in a folder.
+    ``trials`` is the digest of its trials (:func:`trial_digest`), which covers sensor, scene
+    with its files, task, views and unknowns.
+    """
+    content = {
+        "trials": trials,
+        "file": study.file.model_dump(mode="json"),
+        "task": study.task.model_dump(mode="json"),
+        "series": [] if study.campaign is None else [one.name for one in study.campaign.series],
+        "campaign": None if study.campaign is None else study.campaign.file.model_dump(mode="json"),
+        "map": map_digest(study),
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:32]

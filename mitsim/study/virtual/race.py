@@ -1,6 +1,6 @@
 """Race: find the view that measures best, with virtual measurements of the promising views only.
 
-Signal chain: scores of all candidate views -> shortlist -> trials of every view on it, in the same worlds -> posterior
+Signal chain: scores of all candidate views -> shortlist -> trials of every view on it, with the same draws -> posterior
 of their risks (:mod:`characterisation.statements.selection`) -> more trials where the choice is open -> the best view
 of every measurement, and of all together.
 
@@ -21,6 +21,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.statements.selection import Standing, judge, posterior, sampled
+from characterisation.tasks.task_file import Task
 from mitsim.running.progress import say, say_progress, track
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
@@ -93,7 +94,7 @@ class Raced:
     """Result of a race.
 
     ``views`` (v,) are view numbers. ``standings`` are by measurement, with :data:`ALL` for all together. ``errors``
-    (measurement, v, world) are in the units of the task, NaN without a value, infinite if not tried. ``decided`` says
+    (measurement, v, trial) are in the units of the task, NaN without a value, infinite if not tried. ``decided`` says
     whether every leader reached the confidence.
     """
 
@@ -152,7 +153,19 @@ def prior_risk(u: Floats) -> Floats:
 def run_race(
     views: Sequence[View], scores: xr.Dataset, runner: TrialRunner, trials: TrialFolder, rules: RaceRules
 ) -> Raced:
-    """Race the views on the shortlist, and reuse trials in the folder."""
+    """Race the views on the shortlist, and reuse trials in the folder.
+
+    Parameters
+    ----------
+    views, scores
+        All candidate views, and their scores by the map.
+    runner
+        Makes the virtual measurements.
+    trials
+        Finished trials, to which those of the race are added.
+    rules
+        Shortlist, largest number of trials, and the end of the race.
+    """
     numbers = shortlist(scores, rules.shortlist)
     if not numbers:
         say("race: the map predicts that no view can make any measurement")
@@ -255,4 +268,50 @@ def _say_state(raced: Raced, counts: dict[int, int], rules: RaceRules, seconds: 
     say_progress(
         f"race: {sum(counts.values())} trials of {len(counts)} views; leads: view {raced.leader(ALL)} "
         f"({100 * best.confidence:.0f} % sure to be the best or within {100 * rules.margin:.0f} %); {state}{left}"
+    )
+
+
+def with_race(scores: xr.Dataset, raced: Raced) -> xr.Dataset:
+    """Add ``measured_risk``, ``trials`` and ``final_rank`` (measurement, view) from the race.
+
+    Measured views come first, by their risk; the others follow in the order of screening.
+    """
+    names = [str(name) for name in scores["measurement"].values]
+    places = {int(view): place for place, view in enumerate(scores["view"].values)}
+    shape = (len(names), scores.sizes["view"])
+    risk, count = np.full(shape, np.nan), np.zeros(shape, int)
+    columns = [places[int(view)] for view in raced.views]
+    if columns:
+        risk[:, columns] = [raced.standings[name].risk for name in names]
+        count[:, columns] = (~np.isinf(raced.errors)).sum(axis=2)
+    screened = scores["uncertainty_rank"].transpose("measurement", "view").values
+    order = np.lexsort((screened, np.where(np.isfinite(risk), risk, np.inf)), axis=1)
+    rank = np.empty(shape, int)
+    np.put_along_axis(rank, order, np.broadcast_to(np.arange(1, shape[1] + 1), shape), axis=1)
+    by = ("measurement", "view")
+    out = scores.copy()
+    name = "root mean square error of virtual measurements over the square root of the share with a value"
+    out["measured_risk"] = (by, risk, {"long_name": name, "units": "mm or deg"})
+    out["trials"] = (by, count, {"long_name": "virtual measurements of the race", "units": "1"})
+    out["final_rank"] = (by, rank, {"long_name": "rank by race, then by screening; 1 is best", "units": "1"})
+    return out
+
+
+def raced_errors(raced: Raced, task: Task) -> xr.Dataset:
+    """Return the errors of the race (measurement, view, repeat), NaN without a value; the best view comes first.
+
+    ``tried`` distinguishes a trial without a value from one that was not made.
+    """
+    order = np.argsort(raced.standings[ALL].risk, kind="stable") if len(raced.views) else np.empty(0, int)
+    tried = ~np.isinf(raced.errors[:, order])
+    errors = np.where(tried, raced.errors[:, order], np.nan)
+    dims = ("measurement", "view", "repeat")
+    nominal = np.array([one.nominal for one in task.measurements.values()])[:, None, None]
+    return xr.Dataset(
+        {
+            "error": (dims, errors, {"units": "mm or deg"}),
+            "value": (dims, errors + nominal, {"units": "mm or deg"}),
+            "tried": (dims, tried.astype(np.int8), {"units": "1"}),
+        },
+        coords={"measurement": list(task.measurements), "view": raced.views[order]},
     )

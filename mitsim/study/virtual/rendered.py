@@ -1,6 +1,6 @@
-"""Virtual measurements by rendering: one sensor and one part in any number of random worlds.
+"""Virtual measurements by rendering: one sensor and one part in any number of random draws.
 
-Signal chain: view and trial -> world (:mod:`mitsim.study.virtual.world`) -> images of the part by the *true* sensor:
+Signal chain: view and trial -> draw (:mod:`mitsim.study.virtual.world`) -> images of the part by the *true* sensor:
 direct light traced for every trial, interreflections rendered once for a view and finish, room light, power, exposure,
 noise -> cloud, decoded with the *nominal* calibration -> errors other than light: path, temperature and form of the
 part -> measurement at the assumed pose -> error of every measurement.
@@ -19,6 +19,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,7 @@ from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.virtual.form import form_deviation
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.trials import Outcome
-from mitsim.study.virtual.world import Trial, Unknowns, World, finish_deviation
+from mitsim.study.virtual.world import DrawnValues, Trial, Unknowns, finish_deviation
 from mitsim.views import View
 
 Floats = NDArray[np.float64]
@@ -57,7 +58,7 @@ _PLACEMENTS = 3.0
 
 @dataclass(frozen=True)
 class _SharedLight:
-    """Light of a view that is the same in all worlds of one finish: interreflections, and the light of the room."""
+    """Light of a view that is the same in all draws of one finish: interreflections, and the light of the room."""
 
     view: int
     finish: int
@@ -67,23 +68,23 @@ class _SharedLight:
 
 @dataclass(frozen=True)
 class TracedLight:
-    """Light of one world on the imagers of a view before exposure: one tracing serves any number of exposures.
+    """Light of one draw on the imagers of a view before exposure: one tracing serves any number of exposures.
 
     ``light`` is that of the projector at its nominal power, ``room`` all other light by camera, (h, w) [W / (mm^2 sr)]
-    each. ``sensor`` is the true sensor of the world. ``assumed`` is the assumed pose of the sensor.
+    each. ``sensor`` is the true sensor of the draw. ``assumed`` is the assumed pose of the sensor.
     """
 
     sensor: SimulatedSensor
     light: LightOnImagers
     room: dict[str, NDArray[np.float32]]
-    world: World
+    drawn: DrawnValues
     assumed: Transform
 
 
 @dataclass(frozen=True)
 class _Captured:
     capture: Capture
-    world: World
+    drawn: DrawnValues
     assumed: Transform
     surfaces: Surfaces | None
     labels: NDArray[np.int16]
@@ -132,63 +133,49 @@ class RenderedMeasurements:
     def _take(self, job: Job) -> _Captured:
         return self._captured(job.view, self.unknowns.draw(job.trial))
 
-    def cloud_of(self, view: View, world: World) -> tuple[PointCloud, Transform]:
-        """Return the labelled cloud of a view in a world, and the assumed pose of the sensor."""
-        captured = self._captured(view, world)
+    def cloud_of(self, view: View, drawn: DrawnValues) -> tuple[PointCloud, Transform]:
+        """Return the labelled cloud of a view for one draw, and the assumed pose of the sensor."""
+        captured = self._captured(view, drawn)
         return self._cloud(captured), captured.assumed
 
-    def measured(self, lit: TracedLight, planned: PlannedExposure | None) -> tuple[PointCloud, Outcome]:
-        """Return the labelled cloud of a world's light with planned exposures, and the outcome of its measurement.
-
-        The light is kept for other exposures.
-        """
-        captured = self._exposed(lit, planned, True)
-        cloud = self._cloud(captured)
-        return cloud, self._outcome(cloud, captured)
-
     def _finish(self, captured: _Captured, job: Job) -> Outcome:
-        return self._outcome(self._cloud(captured), captured)
+        cloud, part_from_world = self._cloud(captured), captured.assumed.inverse().matrix()
+        return Outcome.of(measure(cloud, self.study.task, part_from_world, MINIMUM_POINTS, False))
 
-    def _outcome(self, cloud: PointCloud, captured: _Captured) -> Outcome:
-        return Outcome.of(measure(cloud, self.study.task, captured.assumed.inverse().matrix(), MINIMUM_POINTS, False))
-
-    def _captured(self, view: View, world: World) -> _Captured:
-        return self._exposed(self.lit(view, world), self.planned, False)
-
-    def _exposed(self, lit: TracedLight, planned: PlannedExposure | None, keep: bool) -> _Captured:
-        world = lit.world
-        capture = self.exposed(lit, planned, world.seed, keep)
+    def _captured(self, view: View, drawn: DrawnValues) -> _Captured:
+        lit = self.lit(view, drawn)
+        capture = self.exposed(lit, self.planned, drawn.seed)
         labels = self.predictor.quick_labels(self.study.scene, lit.assumed)
-        surfaces = self.predictor.surfaces(self.study.scene, lit.assumed) if self._has_form and world.form else None
-        return _Captured(capture, world, lit.assumed, surfaces, labels)
+        surfaces = self.predictor.surfaces(self.study.scene, lit.assumed) if self._has_form and drawn.form else None
+        return _Captured(capture, drawn, lit.assumed, surfaces, labels)
 
-    def lit(self, view: View, world: World) -> TracedLight:
-        """Trace the light of a world in a view, which all of its exposures share."""
-        true, assumed = (motion.inverse() @ view.world_from_sensor for motion in (world.placed, world.assumed))
-        sensor = self.simulated.recalibrated(world.rig, world.unit)
-        scene = self._scene(world.finish)[0]
+    def lit(self, view: View, drawn: DrawnValues) -> TracedLight:
+        """Trace the light of one draw in a view, which all of its exposures share."""
+        true, assumed = (motion.inverse() @ view.world_from_sensor for motion in (drawn.placed, drawn.assumed))
+        sensor = self.simulated.recalibrated(drawn.rig, drawn.unit)
+        scene = self._scene(drawn.finish)[0]
         if self.separate_light:
-            shared = self._render_shared_light(sensor, true, view, world.finish, world.seed)
+            shared = self._render_shared_light(sensor, true, view, drawn.finish, drawn.seed)
         else:
-            shared = self._shared_with(view, world.finish)
-        light = sensor.light(scene, true, seed=world.seed, rendering=replace(self.rendering, indirect=shared.indirect))
-        return TracedLight(sensor, light, shared.room, world, assumed)
+            shared = self._shared_with(view, drawn.finish)
+        light = sensor.light(scene, true, seed=drawn.seed, rendering=replace(self.rendering, indirect=shared.indirect))
+        return TracedLight(sensor, light, shared.room, drawn, assumed)
 
     def exposed(self, lit: TracedLight, planned: PlannedExposure | None, seed: int, keep: bool = False) -> Capture:
         """Expose light as planned, or by the sensor's own rule; every ``seed`` gives another capture.
 
         Unless ``keep`` is true, the light is overwritten, since it may be large.
         """
-        world, known = lit.world, self.study.sensor.room is not None
-        power = world.power * (1.0 if planned is None else planned.power)
+        drawn, known = lit.drawn, self.study.sensor.room is not None
+        power = drawn.power * (1.0 if planned is None else planned.power)
         exposures = lit.light.exposures if planned is None else planned.exposures_s
         radiance = {name: images.copy() for name, images in lit.light.radiance.items()} if keep else lit.light.radiance
         for name, images in radiance.items():
             images *= np.float32(power)
             if not known:  # a known room is part of the traced light
-                images += lit.room[name] * np.float32(world.room)
+                images += lit.room[name] * np.float32(drawn.room)
         light = replace(
-            lit.light, radiance=radiance, exposures=tuple(seconds * world.exposure for seconds in exposures)
+            lit.light, radiance=radiance, exposures=tuple(seconds * drawn.exposure for seconds in exposures)
         )
         return replace(lit.sensor.expose(light, seed), rig=self.study.sensor.rig)
 
@@ -199,12 +186,11 @@ class RenderedMeasurements:
 
     def _cloud(self, captured: _Captured) -> PointCloud:
         scene, cloud = self.study.scene, self.unlabelled_cloud(captured.capture)
-        points = displaced(cloud, captured.world, captured.assumed, scene.centre)
+        points = displaced(cloud, captured.drawn, captured.assumed, scene.centre)
         if captured.surfaces is not None:
             form = self.unknowns.table.form.features
-            points = form_deviation(
-                points, captured.surfaces, scene, form, captured.assumed, cloud.grid, captured.world.form
-            )
+            seed = captured.drawn.form
+            points = form_deviation(points, captured.surfaces, scene, form, captured.assumed, cloud.grid, seed)
         return replace(cloud, points=points, feature=captured.labels, feature_names=scene.names)
 
     def _scene(self, finish: int) -> tuple[Scene, list[Floats]]:
@@ -214,25 +200,17 @@ class RenderedMeasurements:
             file, scene = self.study.file, self.study.scene
             if finish >= 0:
                 parameters = {name: str(value) for name, value in file.parameters.items()}
-                scene = load_scene(
-                    scene.where,
-                    self.study.sensor.wavelength_nm,
-                    parameters,
-                    lambda name: finish_deviation(self.unknowns, finish, name),
-                )
+                wavelength_nm = self.study.sensor.wavelength_nm
+                drawn = partial(finish_deviation, self.unknowns, finish)
+                scene = load_scene(scene.where, wavelength_nm, parameters, drawn)
             self._scenes[finish] = scene, directional_albedos(scene)
         return self._scenes[finish]
 
     def _shared_with(self, view: View, finish: int) -> _SharedLight:
-        if self._cached is not None and (self._cached.view, self._cached.finish) == (
-            view.number,
-            finish,
-        ):
-            return self._cached
-        self._cached = None  # release the memory first
-        self._cached = self._render_shared_light(
-            self.simulated, view.world_from_sensor, view, finish, self.unknowns.seed
-        )
+        if self._cached is None or (self._cached.view, self._cached.finish) != (view.number, finish):
+            self._cached = None  # release the memory first
+            pose, seed = view.world_from_sensor, self.unknowns.seed
+            self._cached = self._render_shared_light(self.simulated, pose, view, finish, seed)
         return self._cached
 
     def _render_shared_light(
@@ -265,7 +243,7 @@ _CUBE_CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (
 
 
 def displaced(
-    cloud: PointCloud, world: World, world_from_sensor: Transform, centre: Sequence[float] | Floats
+    cloud: PointCloud, drawn: DrawnValues, world_from_sensor: Transform, centre: Sequence[float] | Floats
 ) -> NDArray[np.float32]:
     """Return points (H, W, 3) [mm] of a cloud with the errors of the path length and the expansion of the part.
 
@@ -273,14 +251,14 @@ def displaced(
     """
     known = cloud.valid
     points = cloud.points[known].astype(float)
-    offset, scale = world.path
+    offset, scale = drawn.path
     if offset or scale:
         away = points - cloud.grid.origin
         length = np.linalg.norm(away, axis=-1, keepdims=True)
         points = cloud.grid.origin + away * (1 + scale + offset / length)
-    if world.expansion:
+    if drawn.expansion:
         middle = world_from_sensor.inverse().points(np.asarray(centre, float))
-        points = middle + (1 + world.expansion) * (points - middle)
+        points = middle + (1 + drawn.expansion) * (points - middle)
     out = cloud.points.copy()
     out[known] = points
     return out

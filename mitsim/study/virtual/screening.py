@@ -42,7 +42,16 @@ def screen(
 ) -> tuple[xr.Dataset, list[dict[InputQuantity, Any]]]:
     """Score all views of a study; see :func:`mitsim.views.view_scores.score_candidates`.
 
-    ``unknowns`` are those of the study, if the caller has prepared them: a calibration may take seconds to simulate.
+    Parameters
+    ----------
+    study
+        Part, task, sensor and views.
+    predictor
+        Of the sensor.
+    performance_map
+        F and sigma of the sensor.
+    unknowns
+        Those of the study, if the caller has prepared them: a calibration may take seconds to simulate.
     """
     effects = effects_of(study, study_unknowns(study) if unknowns is None else unknowns)
     return score_candidates(study.scene, study.task, study.views, predictor, performance_map, MINIMUM_POINTS, effects)

@@ -17,10 +17,8 @@ from itertools import groupby
 from pathlib import Path
 
 from mitsim.running.executor import Executor
-from mitsim.running.progress import say
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StudyFile, open_study
-from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.plan import rendering_of
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import RenderedMeasurements
@@ -45,7 +43,10 @@ class TrialOrder:
 
 
 class SpreadMeasurements:
-    """Virtual measurements that workers make."""
+    """Virtual measurements that workers make.
+
+    Workers prepare the study again for another ``digest``, which identifies everything that determines a trial.
+    """
 
     source = "render"
 
@@ -77,22 +78,6 @@ class SpreadMeasurements:
             row = tuple(some)
             for first in range(0, len(row), _IN_A_ROW):
                 yield row[first : first + _IN_A_ROW]
-
-
-def spread_over(
-    workers: Executor | None, measurements: RenderedMeasurements | MappedMeasurements, digest: str
-) -> RenderedMeasurements | MappedMeasurements | SpreadMeasurements:
-    """Return the given measurements, or workers that make them.
-
-    Workers prepare the study again for another ``digest``, which identifies everything that determines a trial. Clouds
-    from a map are always drawn in this process.
-    """
-    if workers is None:
-        return measurements
-    if not isinstance(measurements, RenderedMeasurements):
-        say("clouds are drawn from a map in this process, not by workers")
-        return measurements
-    return SpreadMeasurements(workers, measurements, digest)
 
 
 _prepared: dict[str, RenderedMeasurements] = {}

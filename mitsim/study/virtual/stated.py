@@ -1,6 +1,6 @@
 """State the uncertainty of every measurement from one view, with its budget.
 
-Signal chain: trials in worlds that were not used to choose the view -> the same trials with one group of unknowns
+Signal chain: trials with draws that were not used to choose the view -> the same trials with one group of unknowns
 redrawn -> :class:`characterisation.statements.statement.Statement` of every measurement -> ``statement.json``.
 """
 
@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
 
-from characterisation.files.atomic_io import json_values, write_json
-from characterisation.statements.budget import budget
+import numpy as np
+
+from characterisation.files.atomic_io import json_values
+from characterisation.statements.budget import BudgetLine, budget
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import common_losses, losses
 from characterisation.statements.one_sided import stated_errors
@@ -22,117 +23,107 @@ from characterisation.statements.verdict_words import Judged
 from mitsim.running.text_table import aligned
 from mitsim.running.version import __version__
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.study import StatementTable, Study
+from mitsim.study import StatementTable
+from mitsim.study.exposures.planned import with_exposure
 from mitsim.study.virtual.influences import influences
-from mitsim.study.virtual.race import Job, TrialRunner, complete
-from mitsim.study.virtual.trial_errors import errors_of_trials, stated_errors_of_trials
+from mitsim.study.virtual.mapped import MappedMeasurements
+from mitsim.study.virtual.race import Job, complete
 from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, STATEMENT_DAYS, Trial, Unknowns
 from mitsim.views import View
 
+if TYPE_CHECKING:
+    from mitsim.study.session import Session
 
-def state_view(
-    study: Study, view: View, runner: TrialRunner, trials: TrialFolder, unknowns: Unknowns, table: StatementTable
-) -> list[Statement]:
-    """State every measurement from one view, and reuse trials in the folder.
 
-    Worlds of the race are not used: they selected the view, and are biased in its favour.
+@dataclass(frozen=True)
+class StatedView:
+    """Statements of every measurement from one view.
+
+    ``planned`` are the exposures that they hold for, None for the sensor's own rule.
     """
+
+    view: View
+    statements: list[Statement]
+    planned: PlannedExposure | None
+
+
+def state_view(session: Session, view: View, table: StatementTable | None = None) -> StatedView:
+    """State every measurement from one view at its exposures, and reuse trials in the folder of the session.
+
+    Draws of the race are not used: they selected the view, and are biased in its favour. ``table`` replaces the
+    study's numbers of trials.
+    """
+    study, runner, trials, planned = session.study, session.runner, session.trials, session.exposures(view)
+    if planned is not None:
+        assert not isinstance(runner, MappedMeasurements)  # exposures() rejects a map
+        digest = with_exposure(session.digest, planned)
+        runner, trials = (
+            runner.exposed_as(planned),
+            TrialFolder.of(session.folder / "planned_trials", digest, study.task),
+        )
+    table = table or study.file.statement
     base = [Trial(STATEMENT_DAYS + k) for k in range(table.trials)]
     pairs = base[: min(table.pairs, table.trials)]
-    groups = budget_groups(unknowns, runner.source)
+    groups = budget_groups(session.unknowns, session.source)
     swapped = {group: [Trial(one.day, one.capture, group) for one in pairs] for group in groups}
     repeats = [Trial(one.day, one.capture + 1) for one in pairs]
     wanted = [*base, *repeats, *(trial for some in swapped.values() for trial in some)]
     complete(trials, runner, [Job(view, trial) for trial in wanted], f"state view {view.number}")
-    by_trial = errors_of_trials(study.task, trials, view.number, base)
-    second = stated_errors_of_trials(study.task, trials, view.number, repeats)
-    again = {group: stated_errors_of_trials(study.task, trials, view.number, some) for group, some in swapped.items()}
+    by_trial = trials.errors_of_parts(view.number, base)
+    second = trials.stated_errors(view.number, repeats)
+    again = {group: trials.stated_errors(view.number, some) for group, some in swapped.items()}
     out = []
     for m, (name, asked) in enumerate(study.task.measurements.items()):
-        found = stated_errors(by_trial[m])
-        known = found[[math.isfinite(error) for error in found]]
-        lines = (
-            budget(
-                found[: len(pairs)],
-                {group: errors[m] for group, errors in again.items()},
-                float(known.var(ddof=1)) if len(known) > 1 else None,
-            )
-            if pairs and len(known) > 1
-            else ()
-        )
+        errors = stated_errors(by_trial[m])
+        lines: tuple[BudgetLine, ...] = ()
+        known = errors[np.isfinite(errors)]
+        if pairs and len(known) > 1:
+            redrawn = {group: of_group[m] for group, of_group in again.items()}
+            lines = budget(errors[: len(pairs)], redrawn, float(known.var(ddof=1)))
         stated = statement(name, asked.unit, by_trial[m], tolerance_of(study.task, name), lines, second[m])
         out.append(replace(stated, losses=losses(trials.reasons(view.number, base, name))))
-    return out
+    return StatedView(view, out, planned)
 
 
 def budget_groups(unknowns: Unknowns, source: str) -> list[str]:
     """Return the groups of unknowns with a line in the budget: those that are drawn and can have an effect."""
     table = unknowns.table
-    idle = set()
+    idle = {"light", "unit"} if source == "map" else {BEYOND}
     if not any(size > 0 for size in table.form.features.values()):
         idle.add("form")
-    if source == "map":
-        idle |= {"light", "unit"}
-    else:
-        idle.add(BEYOND)
     if source != "map" and not any(table.finish.model_dump().values()):
         idle.add("finish")
     return [group for group in GROUPS if group in unknowns.varied and group not in idle]
 
 
-def statement_document(
-    study: Study,
-    view: View,
-    stated: Sequence[Statement],
-    unknowns: Unknowns,
-    source: str,
-    planned: PlannedExposure | None = None,
-) -> dict[str, Any]:
-    """Return the statement as JSON values; see docs/reference/formats/statement.md.
-
-    ``planned`` are its exposures, if they are not the sensor's own.
-    """
-    declared = influences(unknowns.table, source, study.file.measure.light_path_depth)
-    exposed = {} if planned is None else {"exposure": asdict(planned)}
+def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
+    """Return the statement as JSON values; see docs/reference/formats/statement.md."""
+    study, unknowns, view = session.study, session.unknowns, stated.view
+    declared = influences(unknowns.table, session.source, study.file.measure.light_path_depth)
+    exposed = {} if stated.planned is None else {"exposure": asdict(stated.planned)}
     return exposed | {
         "schema_version": 1,
         "mitsim": __version__,
         "study": str(study.path),
         "sensor": study.sensor.name,
-        "measured_by": source,
-        "map_source": _map_source(study),
+        "measured_by": session.source,
+        "map_source": "" if study.performance_map is None else study.performance_map.data.attrs.get("source", ""),
         "seed": study.file.seed,
         "view": view.number,
         "world_from_sensor": view.world_from_sensor.matrix().tolist(),
         "coverage_probability": 0.95,
         "calibration": unknowns.calibration.source,
         "unknowns": unknowns.table.model_dump(mode="json"),
-        "measurements": {one.measurement: _measurement(one) for one in stated},
+        "measurements": {one.measurement: _measurement(one) for one in stated.statements},
         "influences": [asdict(one) for one in declared],
     }
 
 
-def write_statement(path: str | Path, document: dict[str, Any]) -> None:
-    """Write ``statement.json`` completely or not at all."""
-    write_json(path, document)
-
-
 def statement_table(stated: Sequence[Statement]) -> str:
     """Return the statements as a text table."""
-    head = (
-        "measurement",
-        "unit",
-        "bias",
-        "u",
-        "95 % interval of the error",
-        "after correction",
-        "no value",
-        "most of it from",
-        "accepted readings",
-        "verdict",
-    )
-    rows = [head]
+    about_error = ("bias", "u", "95 % interval of the error", "after correction", "no value", "most of it from")
+    rows = [("measurement", "unit", *about_error, "accepted readings", "verdict")]
     for one in stated:
         largest = one.budget[0] if one.budget else None
         rows.append(
@@ -188,10 +179,6 @@ def _measurement(one: Statement) -> dict[str, Any]:
     known = math.isfinite(one.repeatability) and math.isfinite(one.standard_uncertainty)
     table["after_repeats"] = {str(n): one.after_repeats(n) for n in (1, 4, 16)} if known else {}
     return {key: json_values(value) for key, value in table.items()}
-
-
-def _map_source(study: Study) -> str:
-    return "" if study.performance_map is None else str(study.performance_map.data.attrs.get("source", ""))
 
 
 def digits(value: float) -> str:

@@ -5,7 +5,9 @@ are made. It is used only with the same digest; a file with another digest is mo
 is incomplete, because of a kill or a full disk, it is dropped and its trial is repeated.
 
 Of a value that folds, such as a zone, a trial keeps the deviations from nominal that it measured. A statement adds them
-to the deviation of a part at its limit (:mod:`mitsim.study.virtual.trial_errors`).
+to the deviation of a part at the limit of its tolerance, in a random direction
+(:mod:`characterisation.statements.one_sided`). The direction follows from the measurement and the day. So a repeat of a
+capture, and a trial with one group of unknowns drawn again, are about the same part.
 """
 
 from __future__ import annotations
@@ -13,19 +15,25 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, ValidationError
 
+from characterisation.files.atomic_io import json_values
+from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
-from characterisation.tasks.folded import folded_values
+from characterisation.statements.one_sided import OneSidedErrors, stated_errors
+from characterisation.tasks.folded import FoldedValue, folded_values
 from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from mitsim.study.virtual.world import GROUPS, Trial
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -50,8 +58,15 @@ class Outcome:
         )
 
 
-#: upper bound of days and captures, so that they fit into 64 bits
-_MOST_DAYS = 2**62
+class _KeptTrial(Document):
+    """A line of a file; ``errors`` are in the order of the measurements, None without a value."""
+
+    day: int = Field(ge=0, lt=2**62)  # of 64 bits, even where groups of unknowns are swapped
+    capture: int = Field(ge=0, lt=2**62)
+    swapped: Literal["", *GROUPS]  # type: ignore[valid-type]
+    errors: list[float | None]
+    reasons: dict[str, str] = Field(default_factory=dict)
+    deviations: dict[str, list[float | None]] = Field(default_factory=dict)
 
 
 class TrialFolder:
@@ -66,30 +81,23 @@ class TrialFolder:
     ) -> None:
         self.folder, self.digest, self.measurements = Path(folder), digest, tuple(measurements)
         self.folded = dict(folded or {})
+        self.folded_values: dict[str, FoldedValue] = {}
         self._known: dict[int, dict[Trial, Outcome]] = {}
 
     @classmethod
     def of(cls, folder: str | Path, digest: str, task: Task) -> TrialFolder:
         """Return the trials of a task in a folder."""
-        folded = {name: math.prod(one.shape) for name, one in folded_values(task).items()}
-        return cls(folder, digest, list(task.measurements), folded)
+        folded = folded_values(task)
+        counts = {name: math.prod(one.shape) for name, one in folded.items()}
+        trials = cls(folder, digest, list(task.measurements), counts)
+        trials.folded_values = folded
+        return trials
 
     def known(self, view: int) -> dict[Trial, Outcome]:
         """Return the finished trials of a view; the file is read once."""
         if view not in self._known:
             self._known[view] = self._read(view)
         return self._known[view]
-
-    def take_up(self, view: int, trials: Mapping[Trial, Outcome]) -> int:
-        """Add trials that are kept elsewhere, and return their number; they are not written again.
-
-        Trials without the deviations behind their values are left out.
-        """
-        known = self.known(view)
-        whole = {trial: outcome for trial, outcome in trials.items() if self._whole(outcome)}
-        for trial, outcome in whole.items():
-            known.setdefault(trial, outcome)
-        return len(whole)
 
     def add(self, view: int, trial: Trial, outcome: Outcome) -> None:
         """Keep a finished trial; it is on the disk when this function returns."""
@@ -100,12 +108,12 @@ class TrialFolder:
             "day": trial.day,
             "capture": trial.capture,
             "swapped": trial.swapped,
-            "errors": [_number(value) for value in values.values()],
+            "errors": json_values(list(values.values())),
         }
         if outcome.reasons:
             line["reasons"] = dict(outcome.reasons)
         if deviations:
-            line["deviations"] = {name: [_number(one) for one in some] for name, some in deviations.items()}
+            line["deviations"] = json_values(deviations)
         try:
             fresh = not path.exists()
             if fresh:
@@ -120,15 +128,36 @@ class TrialFolder:
             raise OSError(error.errno, error.strerror, str(path)) from None
         known[trial] = Outcome(values, dict(outcome.reasons), deviations)
 
-    def errors(self, view: int, trials: Sequence[Trial]) -> NDArray[np.float64]:
+    def errors(self, view: int, trials: Sequence[Trial]) -> Floats:
         """Return the errors (measurements, trials) of finished trials of a view."""
         known = self.known(view)
         return np.array([[known[trial].errors[name] for trial in trials] for name in self.measurements], float)
 
-    def deviations(self, view: int, trials: Sequence[Trial], measurement: str) -> NDArray[np.float64]:
+    def deviations(self, view: int, trials: Sequence[Trial], measurement: str) -> Floats:
         """Return the deviations (trials, k m) behind a value that folds; NaN in trials without a value."""
         known, none = self.known(view), [math.nan] * self.folded[measurement]
         return np.array([known[trial].deviations.get(measurement, none) for trial in trials], float)
+
+    def errors_of_parts(self, view: int, trials: Sequence[Trial]) -> list[Floats | OneSidedErrors]:
+        """Return the errors (n,) of finished trials of a view, for every measurement of the task in its order."""
+        plain = self.errors(view, trials)
+        return [
+            self._one_sided(self.folded_values[name], view, trials) if name in self.folded_values else plain[m]
+            for m, name in enumerate(self.measurements)
+        ]
+
+    def stated_errors(self, view: int, trials: Sequence[Trial]) -> Floats:
+        """Return the errors (measurements, n) of finished trials that a statement is about, NaN without a value.
+
+        Those of a value that folds are at the limit of its tolerance.
+        """
+        errors = self.errors_of_parts(view, trials)
+        return np.array([stated_errors(one) for one in errors], float).reshape(len(errors), len(trials))
+
+    def _one_sided(self, folded: FoldedValue, view: int, trials: Sequence[Trial]) -> OneSidedErrors:
+        vectors = self.deviations(view, trials, folded.name).reshape(len(trials), *folded.shape)
+        directions = np.array([folded.direction(trial.day) for trial in trials]).reshape(vectors.shape)
+        return OneSidedErrors(vectors, directions, folded.size, folded.limit, folded.fold)
 
     def reasons(self, view: int, trials: Sequence[Trial], measurement: str) -> list[str]:
         """Return the known reasons why a measurement has no value in finished trials of a view."""
@@ -170,34 +199,18 @@ class TrialFolder:
         return found
 
     def _entry(self, line: str) -> tuple[Trial, Outcome] | None:
-        table = _parsed(line)
         try:
-            trial = Trial(int(table["day"]), int(table["capture"]), str(table["swapped"]))
-            values = [math.nan if value is None else float(value) for value in table["errors"]]
-            reasons = {str(name): str(reason) for name, reason in table.get("reasons", {}).items()}
-            deviations = {
-                str(name): [math.nan if value is None else float(value) for value in some]
-                for name, some in table.get("deviations", {}).items()
-            }
-        except (
-            AttributeError,
-            TypeError,
-            KeyError,
-            ValueError,
-            OverflowError,
-        ):  # OverflowError: an integer of 400 digits
+            kept = _KeptTrial.model_validate(_parsed(line))
+        except ValidationError:
             return None
-        known = all(
-            math.isfinite(value) for value, listed in zip(values, table["errors"], strict=True) if listed is not None
-        )
-        if not known or len(values) != len(self.measurements) or trial.swapped not in ("", *GROUPS):
+        if len(kept.errors) != len(self.measurements):
             return None
-        if not (0 <= trial.day < _MOST_DAYS and 0 <= trial.capture < _MOST_DAYS):
-            return None
-        outcome = Outcome(dict(zip(self.measurements, values, strict=True)), reasons, deviations)
-        return (trial, outcome) if self._whole(outcome) else None
+        errors = dict(zip(self.measurements, _numbers(kept.errors), strict=True))
+        deviations = {name: _numbers(values) for name, values in kept.deviations.items()}
+        outcome = Outcome(errors, kept.reasons, deviations)
+        return (Trial(kept.day, kept.capture, kept.swapped), outcome) if self.is_whole(outcome) else None
 
-    def _whole(self, outcome: Outcome) -> bool:
+    def is_whole(self, outcome: Outcome) -> bool:
         """Return whether every value that folds has its deviations, and no infinite number is among them."""
         return all(
             len(outcome.deviations.get(name, ())) == count
@@ -207,8 +220,8 @@ class TrialFolder:
         )
 
 
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _numbers(values: Iterable[float | None]) -> list[float]:
+    return [math.nan if value is None else value for value in values]
 
 
 def _parsed(line: str) -> Any:

@@ -1,11 +1,11 @@
-"""Worlds: one random draw of all unknowns of a measurement.
+"""One random draw of all unknowns of a measurement.
 
 Signal chain: number of a trial -> a stream of random numbers for each group of unknowns -> true geometry of the sensor,
 finish, form, light, temperatures, pose of the part, and the seeds of all noise.
 
 There are two kinds of groups. All captures of one day share those in :data:`COMMON`, which therefore do not average out
 over repeated captures. Those in :data:`FRESH` are drawn for every capture. A trial states its day and its capture, and
-these alone determine its world, on every machine and in any order. Views are compared in the same worlds (common random
+these alone determine its draw, on every machine and in any order. Views are compared with the same draws (common random
 numbers).
 
 A trial may take one group from another stream (``swapped``). The two errors then differ by that group alone, which
@@ -50,20 +50,22 @@ FINISHES = 8
 #: number of successive days that share a finish, for the same reason
 FINISH_DAYS = 2
 
-#: first days of worlds whose finishes are not of the pool (they judge the choice of a view), of worlds of a statement,
-#: and of a set of views; the worlds of a race start at day 0
-OWN_FINISH_DAYS, STATEMENT_DAYS, SET_DAYS = 1 << 19, 1 << 20, 1 << 21
+#: Days of a race start at 0. First day of draws that judge the choice of a view; their finishes are not of the pool.
+OWN_FINISH_DAYS = 1 << 19
+
+#: first day of the draws of a statement
+STATEMENT_DAYS = 1 << 20
+
+#: first day of the draws of a set of views
+SET_DAYS = 1 << 21
 
 #: offset of the day of the streams from which ``swapped`` takes a group
 _ELSEWHERE = 1 << 32
 
-#: reference temperature of lengths [C], ISO 1
-REFERENCE_C = 20.0
-
 
 @dataclass(frozen=True)
 class Trial:
-    """Identifies a world: day, capture within the day, and the group that is redrawn ("" for none)."""
+    """Identifies a draw: day, capture within the day, and the group that is redrawn ("" for none)."""
 
     day: int
     capture: int = 0
@@ -71,7 +73,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class World:
+class DrawnValues:
     """All values that were drawn for one trial.
 
     ``rig`` is the sensor's true geometry. ``path`` is offset [mm] and scale [1] of a time-of-flight distance.
@@ -104,7 +106,7 @@ class Unknowns:
     ``table`` holds their sizes. ``rig`` is nominal. ``calibration`` is the covariance of the calibration, with the
     drift since then. ``expansion`` of the part is in 1/K. ``centre`` (3,) [mm] is the point about which the part
     rotates. Groups that are not in ``varied`` keep their best estimate. With ``pooled``, finishes come from a pool of
-    :data:`FINISHES`; else every world has its own. The days from :data:`OWN_FINISH_DAYS` on have
+    :data:`FINISHES`; else every draw has its own. The days from :data:`OWN_FINISH_DAYS` on have
     their own as well: they judge a choice that the pool made.
     """
 
@@ -118,8 +120,8 @@ class Unknowns:
     varied: tuple[str, ...] = GROUPS
     pooled: bool = True
 
-    def draw(self, trial: Trial) -> World:
-        """Draw the world of a trial."""
+    def draw(self, trial: Trial) -> DrawnValues:
+        """Draw the values of a trial."""
         table, streams = self.table, {group: self._stream(group, trial) for group in GROUPS}
         sensor_kelvin, part_kelvin = (
             streams["temperature"].standard_normal(2) * [table.temperature.sensor_kelvin, table.temperature.part_kelvin]
@@ -129,7 +131,7 @@ class Unknowns:
         names, values = self._geometry(streams["calibration"], float(sensor_kelvin))
         room, power, exposure = self._light(streams["light"])
         placed, assumed = self._poses(streams["pose"])
-        return World(
+        return DrawnValues(
             rig=moved(self.rig, names, values),
             path=path_error(names, values),
             finish=self._finish(streams["finish"], trial.day) if "finish" in self.varied else -1,

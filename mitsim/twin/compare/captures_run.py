@@ -25,11 +25,11 @@ from mitsim.capture.folder import read_capture, write_capture
 from mitsim.decode.cloud import decoder_settings
 from mitsim.running.numbers import NONE, rounded, two_digits
 from mitsim.running.progress import say
-from mitsim.sensor.preset import load_sensor, presets
-from mitsim.twin.compare.compare_captures import Comparison, Row, compare_captures
+from mitsim.twin.compare.compare_captures import ComparedRow, Comparison, compare_captures
 from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.compare.rebuild import check_technology, projector_was_on, rebuild
 from mitsim.twin.compare.specimen_patches import PATCH_PX, SpecimenPatches, reference_levels
+from mitsim.twin.finish.electrons import sensor_of
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask, specimen_place
 
@@ -56,9 +56,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class CaptureValidation:
-    """Result of the validation: the ``comparison``, its ``table`` and a ``preamble`` in Markdown, and both
-    ``sides``.
-    """
+    """The ``comparison`` of two captures, its ``table`` and a ``preamble`` in Markdown, and both ``sides``."""
 
     comparison: Comparison
     table: str
@@ -77,6 +75,23 @@ def validate_captures(
 ) -> CaptureValidation:
     """Compare a simulated capture with a real one, and write the numbers and the twin to a folder.
 
+    Parameters
+    ----------
+    real
+        Folder of the real capture, or of one of a maker's virtual camera.
+    simulated
+        Folder of the simulated capture; None rebuilds ``real`` with a sensor.
+    output
+        Folder for ``comparison.json`` and the twin.
+    sensor
+        Preset or sensor file of the twin; None is the preset that ``real`` names.
+    roi
+        Region of the reference image [px] that shows only the specimen; None is the plane of most points.
+    projector
+        ``on`` or ``off``; None is what the settings of ``real`` say.
+    seed
+        Of the twin's noise and of the bootstrap.
+
     Raises
     ------
     InputError
@@ -85,14 +100,12 @@ def validate_captures(
     """
     recorded = read_capture(real)
     if simulated is None and rendered_here(recorded):
-        raise InputError(
-            real,
-            "source",
-            "a simulation of mitsim",
+        allowed, hint = (
             "device, replay, or simulated by a maker's virtual camera",
             "name SIMULATED to compare two simulations",
         )
-    own = None if simulated is not None else load_sensor(_sensor(recorded, sensor, real))
+        raise InputError(real, "source", "a simulation of mitsim", allowed, hint)
+    own = None if simulated is not None else sensor_of(recorded, sensor, real)
     if own is not None:
         check_technology(recorded, own, str(real))  # before the capture is decoded
     settings, _ = decoder_settings(recorded)
@@ -100,20 +113,17 @@ def validate_captures(
     on = projector_was_on(recorded, cast(Literal["on", "off"] | None, projector), str(real))
     say(f"specimen: a plane at {_distance(place):.0f} mm, with {place.off_plane:.2g} mm rms deviation")
     if own is not None:
-        twin = rebuild(recorded, own, place, str(real), projector_on=on, seed=seed)
-        write_capture(twin.capture, output / "simulated", overwrite=True)
-        say(f"rebuilt: {output / 'simulated'}")
-        other, where = twin.capture, str(output / "simulated")
+        other, where = rebuild(recorded, own, place, str(real), projector_on=on, seed=seed), str(output / "simulated")
+        write_capture(other, output / "simulated", overwrite=True)
+        say(f"rebuilt: {where}")
     else:
         assert simulated is not None
         other, where = read_capture(simulated), str(simulated)
     comparison = compare_captures(recorded, other, place, settings, where, projector_on=on, seed=seed)
     table = comparison_table(comparison.rows, _whose(recorded))
     write_json(output / "comparison.json", comparison.numbers())
-    sides = (
-        _shown(_whose(recorded), recorded, place, comparison.real),
-        _shown("simulated", other, place, comparison.simulated),
-    )
+    shown = _shown(_whose(recorded), recorded, place, comparison.real)
+    sides = shown, _shown("simulated", other, place, comparison.simulated)
     return CaptureValidation(comparison, table, _preamble(recorded, other, place, comparison, real, on), sides)
 
 
@@ -127,7 +137,7 @@ def _whose(recorded: Capture) -> str:
     return "maker's simulation" if recorded.source == "simulated" else "real"
 
 
-def comparison_table(rows: tuple[Row, ...], first: str = "real") -> str:
+def comparison_table(rows: tuple[ComparedRow, ...], first: str = "real") -> str:
     """Return a Markdown table with a row for each quantity; ``first`` names the column of the given capture."""
     lines = [
         f"| quantity | unit | {first} | simulated | difference | u | margin | verdict |",
@@ -146,20 +156,11 @@ def comparison_table(rows: tuple[Row, ...], first: str = "real") -> str:
     return "\n".join(lines) + "\n"
 
 
-def _places(row: Row) -> int:
+def _places(row: ComparedRow) -> int:
     """Return the number of decimals that shows two digits of the uncertainty, 1 to 4."""
     if not row.uncertainty > 0:
         return 3
     return int(np.clip(1 - np.floor(np.log10(row.uncertainty)), 1, 4))
-
-
-def _sensor(real: Capture, sensor: str | None, where: Path) -> str:
-    if sensor is not None:
-        return sensor
-    if real.sensor in presets():
-        return real.sensor
-    allowed = f"one of {', '.join(presets())}, or the path of a .toml file"
-    raise InputError("--sensor", "", f"none, and {where} comes from {real.sensor}, which is not a preset", allowed)
 
 
 def _distance(place: Place) -> float:

@@ -28,6 +28,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.stats import wasserstein_distance
 
+from characterisation.files.atomic_io import json_values
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.decode.cloud import Geometry, Settings, capture_geometry
@@ -36,7 +37,7 @@ from mitsim.running.numbers import two_digits
 from mitsim.twin.compare.compared_quantities import QUANTITIES, Floats, Quantity
 from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.compare.rebuild import median_level
-from mitsim.twin.compare.specimen_patches import PATCH_PX, SpecimenPatches, run_length, specimen_patches
+from mitsim.twin.compare.specimen_patches import PATCH_PX, SpecimenPatches, contrast_window, specimen_patches
 from mitsim.twin.finish.place import Place
 
 Verdict = Literal["agrees", "differs", "not comparable", "does not apply"]
@@ -56,12 +57,9 @@ _SAME_PLANE = 0.02
 #: ratio to the difference below which an uncertainty is rounding, since all draws gave the same value
 _ROUNDING = 1e-9
 
-#: smallest and largest side of the window for local contrast [px], and the number of runs of the pattern in it
-_WINDOWS, _RUNS = (7, 31), 2.5
-
 
 @dataclass(frozen=True)
-class Row:
+class ComparedRow:
     """A quantity of both captures; ``uncertainty`` (k = 1) and ``margin`` of the difference are in its unit.
 
     ``why`` is the reason for the verdict. Unknown numbers are NaN; all are NaN if the quantity does not apply.
@@ -85,7 +83,7 @@ class Comparison:
     ``image_patches`` and ``cloud_patches`` are their numbers; ``window_px`` is the window of the contrast.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[ComparedRow, ...]
     image_patches: int
     cloud_patches: int
     window_px: int
@@ -99,19 +97,12 @@ class Comparison:
 
     def numbers(self) -> dict[str, Any]:
         """Return all rows for JSON; unknown numbers are null."""
-        rows = [
-            {
-                name: None if isinstance(value, float) and not np.isfinite(value) else value
-                for name, value in asdict(row).items()
-            }
-            for row in self.rows
-        ]
         return {
             "image_patches": self.image_patches,
             "cloud_patches": self.cloud_patches,
             "window_px": self.window_px,
             "draws": DRAWS,
-            "rows": rows,
+            "rows": [json_values(asdict(row)) for row in self.rows],
         }
 
 
@@ -148,8 +139,7 @@ def compare_captures(
         If the simulated capture has another camera, or its specimen is at another place, or the specimen is too small.
     """
     _check(real, simulated, where)
-    run = run_length(real, place)
-    window = int(np.clip(np.nan_to_num(_RUNS * run, nan=_WINDOWS[1]), *_WINDOWS)) // 2 * 2 + 1
+    window = contrast_window(real, place)
     geometry = capture_geometry(real, settings)
     seen = [
         specimen_patches(real, settings, geometry, place, window),
@@ -168,19 +158,10 @@ def compare_captures(
     for number, quantity in enumerate(QUANTITIES):
         if quantity.name in inapplicable:
             none, why = float("nan"), inapplicable[quantity.name]
-            rows.append(Row(quantity.name, quantity.unit, none, none, none, none, none, "does not apply", why))
+            rows.append(ComparedRow(quantity.name, quantity.unit, none, none, none, none, none, "does not apply", why))
             continue
-        row = _row(
-            quantity,
-            real_patches,
-            simulated_patches,
-            patches[quantity.of],
-            reasons,
-            np.random.default_rng([seed, number]),
-        )
-        # skip a status that occurs in neither
-        if row is not None:
-            rows.append(row)
+        rng = np.random.default_rng([seed, number])
+        rows += _row(quantity, real_patches, simulated_patches, patches[quantity.of], reasons, rng)
     return Comparison(tuple(rows), patches["image"], patches["cloud"], window, real_patches, simulated_patches)
 
 
@@ -223,14 +204,11 @@ def _check_place(real_patches: SpecimenPatches, simulated_patches: SpecimenPatch
 
 def _reasons_not_comparable(real: Capture, simulated: Capture, projector_on: bool) -> dict[str, str]:
     """Return the reasons why quantities cannot be compared, by name."""
-    reasons: dict[str, str] = dict(simulated.settings.get("rebuilt", {}).get("taken", {}))
-    if projector_on != (simulated.settings.get("projector_on") is not False):
-        off = "REAL" if not projector_on else "SIMULATED"
-        for quantity in QUANTITIES:
-            if quantity.needs_pattern:
-                reasons.setdefault(quantity.name, f"the projector was off in {off}")
-        reasons.setdefault(HISTOGRAMS, f"the projector was off in {off}")
-    return reasons
+    taken: dict[str, str] = simulated.settings.get("rebuilt", {}).get("taken", {})
+    if projector_on == (simulated.settings.get("projector_on") is not False):
+        return taken
+    names = [HISTOGRAMS, *(quantity.name for quantity in QUANTITIES if quantity.needs_pattern)]
+    return dict.fromkeys(names, f"the projector was off in {'SIMULATED' if projector_on else 'REAL'}") | taken
 
 
 def _inapplicable(capture: Capture, geometry: Geometry) -> dict[str, str]:
@@ -256,15 +234,16 @@ def _row(
     patches: int,
     reasons: Mapping[str, str],
     rng: np.random.Generator,
-) -> Row | None:
+) -> list[ComparedRow]:
+    """Return the row of a quantity; none for the share of a status that occurs in neither capture."""
     every = np.arange(patches)[None]
     real, simulated = (float(quantity.figure(seen, every)[0]) for seen in (real_patches, simulated_patches))
     if quantity.name.startswith("share") and not (real > 0 or simulated > 0):
-        return None
+        return []
     draws = rng.integers(0, patches, (DRAWS, patches))
-    off = quantity.figure(simulated_patches, draws) - quantity.figure(real_patches, draws)
-    off = off[np.isfinite(off)]
-    uncertainty = float(off.std(ddof=1)) if len(off) > DRAWS // 2 else float("nan")
+    drawn = quantity.figure(simulated_patches, draws) - quantity.figure(real_patches, draws)
+    drawn = drawn[np.isfinite(drawn)]
+    uncertainty = float(drawn.std(ddof=1)) if len(drawn) > DRAWS // 2 else float("nan")
     if uncertainty <= _ROUNDING * abs(simulated - real):
         uncertainty = 0.0
     margin = quantity.margin if np.isfinite(real) else float("nan")
@@ -273,7 +252,9 @@ def _row(
     verdict, why = _verdict(simulated - real, uncertainty, margin, reasons.get(quantity.name, ""))
     if verdict == "agrees" and quantity.factor > 1 and COVERAGE * uncertainty > _TOO_UNCERTAIN * abs(real):
         verdict, why = "not comparable", f"2 u is over {100 * _TOO_UNCERTAIN:.0f} % of it"
-    return Row(quantity.name, quantity.unit, real, simulated, simulated - real, uncertainty, margin, verdict, why)
+    return [
+        ComparedRow(quantity.name, quantity.unit, real, simulated, simulated - real, uncertainty, margin, verdict, why)
+    ]
 
 
 def _verdict(difference: float, uncertainty: float, margin: float, reason: str) -> tuple[Verdict, str]:
@@ -291,7 +272,7 @@ def _verdict(difference: float, uncertainty: float, margin: float, reason: str) 
 
 def _histogram_row(
     real_patches: SpecimenPatches, simulated_patches: SpecimenPatches, reasons: Mapping[str, str], seed: int
-) -> Row:
+) -> ComparedRow:
     """Return the row of Wasserstein's distance [DN] between the histograms of all pixels on the specimen."""
     counts = np.stack([real_patches.levels, simulated_patches.levels])
     distance = _distance(*counts.sum(axis=1))
@@ -305,7 +286,7 @@ def _histogram_row(
     uncertainty = float(np.percentile(exchanged, 95)) / COVERAGE
     margin = 0.05 * median_level(real_patches.levels.sum(axis=0))
     verdict, why = _verdict(distance, uncertainty, margin, reasons.get(HISTOGRAMS, ""))
-    return Row(HISTOGRAMS, "DN", float("nan"), float("nan"), distance, uncertainty, margin, verdict, why)
+    return ComparedRow(HISTOGRAMS, "DN", float("nan"), float("nan"), distance, uncertainty, margin, verdict, why)
 
 
 def _distance(one: Floats, other: Floats) -> float:

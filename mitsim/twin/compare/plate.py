@@ -24,8 +24,7 @@ from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import Sensor
 from mitsim.twin.compare.denoise import denoised
 from mitsim.twin.compare.plain_image import PlainImage
-from mitsim.twin.finish.bend import Bend
-from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.place import Bend, Place
 from mitsim.twin.finish.specimen import image_mask
 
 Floats = NDArray[np.float64]

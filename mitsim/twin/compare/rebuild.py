@@ -23,7 +23,7 @@ Not included: a print under dots, and objects around the specimen.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -40,7 +40,7 @@ from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
-from mitsim.twin.compare.plain_image import PlainImage, plain_image
+from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.compare.plate import REFLECTANCE, plate, printed, texture_of
 from mitsim.twin.finish.electrons import chip_of, linearised
 from mitsim.twin.finish.place import Place
@@ -55,14 +55,6 @@ SAMPLES = 16
 _SCALES, _BISECTIONS = (1e-4, 1e4), 18
 
 
-@dataclass(frozen=True)
-class Twin:
-    """A rebuilt capture: the simulated ``capture``, and the fitted ``power_times_reflectance`` [W]."""
-
-    capture: Capture
-    power_times_reflectance: float
-
-
 def check_technology(real: Capture, sensor: Sensor, where: str) -> None:
     """Raise an InputError if a sensor is of another technology than a recording."""
     if sensor.technology != real.technology:
@@ -72,7 +64,7 @@ def check_technology(real: Capture, sensor: Sensor, where: str) -> None:
 
 def rebuild(
     real: Capture, sensor: Sensor, place: Place, where: str, *, projector_on: bool = True, seed: int = 1
-) -> Twin:
+) -> Capture:
     """Simulate a real capture with a plane in place of its specimen.
 
     Parameters
@@ -117,7 +109,7 @@ def rebuild(
     if not projector_on:
         texture = texture_of(place, real.rig.cameras[name], electrons, light, name)
         light = lit(texture / texture.max())
-    scale = _scale(simulated, light, place, _Recording(real, name, plain, where), seed)
+    scale = _scale(simulated, light, place, real, where, seed)
     scaled = replace(light, radiance={key: values * np.float32(scale) for key, values in light.radiance.items()})
     capture = simulated.expose(scaled, seed)
     power = scale * sensor.projector.flux * REFLECTANCE
@@ -136,7 +128,7 @@ def rebuild(
         "off_plane_mm": place.off_plane,
         "taken": taken,
     }
-    return Twin(capture, power if projector_on else float("nan"))
+    return capture
 
 
 def like(real: Capture, sensor: Sensor, where: str) -> Sensor:
@@ -160,33 +152,17 @@ def like(real: Capture, sensor: Sensor, where: str) -> Sensor:
     if seconds is not None and seconds > 0:
         exposure = replace(exposure, rule=f"as recorded, {seconds:.3g} s", base_s=seconds, control=None, bracket=None)
     rig = replace(real.rig, projector=projector.optics)
-    return replace(
-        sensor,
-        rig=rig,
-        projector=projector,
-        pattern=pattern,
-        exposure=exposure,
-        ambient_image=False,
-    )
+    return replace(sensor, rig=rig, projector=projector, pattern=pattern, exposure=exposure, ambient_image=False)
 
 
-@dataclass(frozen=True)
-class _Recording:
-    """The ``capture`` to rebuild: its reference ``camera``, that camera's ``plain`` image, ``where`` in messages."""
+def _scale(
+    simulated: SimulatedSensor, light: LightOnImagers, place: Place, real: Capture, where: str, seed: int
+) -> float:
+    """Return the factor of the light, by bisection, with which the specimen's median level is the recorded one.
 
-    capture: Capture
-    camera: str
-    plain: PlainImage
-    where: str
-
-
-def _scale(simulated: SimulatedSensor, light: LightOnImagers, place: Place, recording: _Recording, seed: int) -> float:
-    """Factor of the light that makes the specimen's median level the recorded one, in the plain image; by bisection.
-
-    The levels are compared with their noise: where a pattern has two levels, few pixels are near the median, and noise
-    moves it.
+    Levels have their noise: where a pattern has two levels, few pixels are near the median, and noise moves it.
     """
-    real, name, plain, where = recording.capture, recording.camera, recording.plain, recording.where
+    name, plain = next(iter(real.rig.cameras)), plain_image(real)
     roi, there = light.rois[name], image_mask(place, real.rig.cameras[name], MARGIN_PX)
     if not there.any():
         raise InputError(
@@ -212,9 +188,7 @@ def _scale(simulated: SimulatedSensor, light: LightOnImagers, place: Place, reco
     low, high = _SCALES
     if too_bright(low) or not too_bright(high):
         flux = simulated.sensor.projector.flux
-        found = (
-            f"{flux:g} W, with which no reflectance of {low:g} to {high:g} times {REFLECTANCE} gives {wanted:.0f} DN"
-        )
+        found = f"{flux:g} W: no reflectance of {low:g} to {high:g} times {REFLECTANCE} gives {wanted:.0f} DN with it"
         allowed = f"a power near that of the device; the imager and exposure of {where}"
         raise InputError("--sensor", "projector.flux_w", found, allowed)
     for _ in range(_BISECTIONS):
@@ -246,10 +220,5 @@ def projector_was_on(real: Capture, given: Literal["on", "off"] | None, where: s
         return known
     if real.technology != "active_stereo" or real.source == "simulated":
         return True
-    raise InputError(
-        f"{where}/settings.json",
-        "projector_on",
-        "nothing",
-        "true or false",
-        "give --projector on or off, here or for mitsim import",
-    )
+    hint = "give --projector on or off, here or for mitsim import"
+    raise InputError(f"{where}/settings.json", "projector_on", "nothing", "true or false", hint)

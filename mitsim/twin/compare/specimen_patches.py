@@ -44,6 +44,9 @@ LEAST_ON, LEAST_POINTS = 0.5, 0.5
 #: smallest fraction of a patch's pixels with points for its row error, which is one number for the whole patch
 _LEAST_FOR_ROWS = 0.15
 
+#: limits of the window of local means [px], and its width in run lengths of the pattern
+_WINDOWS, _RUNS = (7, 31), 2.5
+
 _MAD_TO_SIGMA = 1.482602218505602
 
 
@@ -96,16 +99,14 @@ def specimen_patches(
     deviation = np.sqrt(np.maximum(uniform_filter(image**2, window_px) - mean**2, 0.0))
     across = (image[:, 1:] > mean[:, 1:]) != (image[:, :-1] > mean[:, :-1])
     finest = np.abs(finest_detail(image))
-    corners = _corners(on_image)
+    corners = patch_corners(on_image, PATCH_PX, LEAST_ON)
 
     def of_image(values: Floats) -> Floats:
         return _tiles(np.where(on_image, values, np.nan), corners)
 
     crossings = of_image(np.pad(across.astype(float), ((0, 0), (1, 0))))
     grid = geometry.grid
-    on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
-    cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(on_grid))
-    places = _corners(on_grid)
+    cloud, on_grid, places = _cloud_patches(capture, settings, geometry, place)
     status = _tiles(np.where(on_grid, cloud.status.astype(float), np.nan), places)
     points = np.where(on_grid[..., None], cloud.points, np.nan).astype(float) - grid.origin
     tiles = np.stack([_tiles(points[..., axis], places) for axis in range(3)], axis=-1)
@@ -143,14 +144,10 @@ def patch_rows(
 
     Also returns columns and rows of their middles in the right image.
     """
-    grid = geometry.grid
-    on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
-    cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(on_grid))
-    places = _corners(on_grid)
+    cloud, on_grid, places = _cloud_patches(capture, settings, geometry, place)
     valid = _tiles(np.where(on_grid, cloud.valid.astype(float), np.nan), places)
     known = np.nansum(valid, axis=-1) >= _LEAST_FOR_ROWS * np.isfinite(valid).sum(axis=-1)
-    local = (cloud.points.astype(float) - grid.origin) @ grid.rotation
-    off = _tiles(np.where(cloud.valid, geometry.rectification.disparity(local[..., 2]), np.nan), places)
+    off = _tiles(np.where(cloud.valid, _disparity(cloud, geometry), np.nan), places)
     disparity = np.full(len(places), np.nan)
     disparity[known] = np.nanmedian(off[known], axis=-1)
     middles = np.array(places, float).reshape(-1, 2) + (PATCH_PX - 1) / 2
@@ -158,34 +155,50 @@ def patch_rows(
     return errors, middles[:, 1] - disparity, middles[:, 0]
 
 
+def _cloud_patches(
+    capture: Capture, settings: Settings, geometry: Geometry, place: Place
+) -> tuple[PointCloud, NDArray[np.bool_], list[tuple[int, int]]]:
+    """Return the cloud of a specimen, its pixels (H, W) on the grid, and the corners of its patches."""
+    grid = geometry.grid
+    on_grid = on_specimen(place, grid.origin, grid.rays(), grid.angular_pitch, MARGIN_PX)
+    cloud = capture_cloud(capture, settings, geometry, roi=Roi.around(on_grid))
+    return cloud, on_grid, patch_corners(on_grid, PATCH_PX, LEAST_ON)
+
+
+def _disparity(cloud: PointCloud, geometry: StereoGeometry) -> Floats:
+    """Return the disparity (H, W) [px] of the points of a cloud."""
+    local = (cloud.points.astype(float) - geometry.grid.origin) @ geometry.grid.rotation
+    return np.asarray(geometry.rectification.disparity(local[..., 2]))
+
+
 def reference_levels(capture: Capture) -> NDArray[np.unsignedinteger[Any]]:
     """Return the plain image (H, W) [DN] of the reference camera."""
     return plain_image(capture).of(next(iter(capture.images.values())))
 
 
-def run_length(capture: Capture, place: Place) -> float:
-    """Return the mean run [px] of bright and dark pixels in the specimen's rows; NaN without changes.
+def contrast_window(capture: Capture, place: Place) -> int:
+    """Return the odd side [px] of a window for local means, in which several dots of any size lie.
 
-    The threshold is the mean of 31 px. The result determines the window for local means, so that a window contains
-    several dots of any size.
+    It is 2.5 times the mean run of bright and dark pixels in the specimen's rows. The threshold is the mean of 31 px.
     """
     image = reference_levels(capture).astype(float)
-    bright = image > uniform_filter(image, 31)
+    bright = image > uniform_filter(image, _WINDOWS[1])
     there = image_mask(place, capture.rig.reference, MARGIN_PX)[:, 1:]
     changes = np.count_nonzero((bright[:, 1:] != bright[:, :-1]) & there)
-    return float(np.count_nonzero(there) / changes) if changes else float("nan")
+    run = float(np.count_nonzero(there) / changes) if changes else float(_WINDOWS[1])
+    return int(np.clip(_RUNS * run, *_WINDOWS)) // 2 * 2 + 1
 
 
-def _corners(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the upper left pixels (row, column) of adjacent patches with enough of their pixels in a mask."""
+def patch_corners(mask: NDArray[np.bool_], side: int, least: float) -> list[tuple[int, int]]:
+    """Return the upper left pixels (row, column) of adjacent square patches, at least a share ``least`` in a mask."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return []
     return [
         (row, column)
-        for row in range(int(rows[0]), int(rows[-1]) - PATCH_PX + 2, PATCH_PX)
-        for column in range(int(columns[0]), int(columns[-1]) - PATCH_PX + 2, PATCH_PX)
-        if mask[row : row + PATCH_PX, column : column + PATCH_PX].mean() >= LEAST_ON
+        for row in range(int(rows[0]), int(rows[-1]) - side + 2, side)
+        for column in range(int(columns[0]), int(columns[-1]) - side + 2, side)
+        if mask[row : row + side, column : column + side].mean() >= least
     ]
 
 
@@ -239,11 +252,9 @@ def _row_errors(
     if capture.technology == "structured_light" or not isinstance(geometry, StereoGeometry):
         return out  # stripes along the rows do not identify a row
     left, right = (stack[0].astype(float) for stack in list(capture.images.values())[:2])
-    local = (cloud.points.astype(float) - geometry.grid.origin) @ geometry.grid.rotation
-    disparity = geometry.rectification.disparity(local[..., 2])
-    for index, (row, column) in enumerate(places):
-        if not known[index]:
-            continue
+    disparity = _disparity(cloud, geometry)
+    for index in np.flatnonzero(known):
+        row, column = places[index]
         rows, columns = np.nonzero(cloud.valid[row : row + PATCH_PX, column : column + PATCH_PX])
         rows, columns = rows + row, columns + column
         out[index] = row_error(left, right, geometry, rows, columns, disparity[rows, columns])

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import fourier_gaussian
 from scipy.optimize import brentq
 
-from mitsim.twin.finish.observation import Floats, View
+from mitsim.twin.finish.observation import CouponView, Floats
 from mitsim.twin.finish.white_coupon import WhiteCouponRenderer, coupon_roi
 
 #: largest blur [px]
@@ -43,7 +43,7 @@ class Dots:
     power: float
 
 
-def compare_dots(view: View, renderer: WhiteCouponRenderer) -> Dots:
+def compare_dots(view: CouponView, renderer: WhiteCouponRenderer) -> Dots:
     """Compare the dots of a view with those of the first frame of the sensor's own pattern.
 
     ``view`` comes from :func:`~mitsim.twin.finish.observation.observe` with the pattern ``level``, so that its ``unit``
@@ -82,7 +82,7 @@ def compare_dots(view: View, renderer: WhiteCouponRenderer) -> Dots:
     )
 
 
-def _strength(view: View, values: Floats, noise: Floats, pairs: NDArray[np.int64]) -> tuple[float, float]:
+def _strength(view: CouponView, values: Floats, noise: Floats, pairs: NDArray[np.int64]) -> tuple[float, float]:
     """Return the variance V inside the blocks, and G / V, both without ``noise``, the variance of each pixel (N,)."""
     off = values - view.means(values)[view.block]
     # the mean of a block uses one degree of freedom
@@ -93,7 +93,7 @@ def _strength(view: View, values: Floats, noise: Floats, pairs: NDArray[np.int64
     return variance, difference / variance
 
 
-def _neighbours(view: View) -> NDArray[np.int64]:
+def _neighbours(view: CouponView) -> NDArray[np.int64]:
     """Return the indices (2, K) of neighbouring pixels in one block."""
     low_row, low_column = view.rows.min(), view.columns.min()
     index = np.full((view.rows.max() - low_row + 2, view.columns.max() - low_column + 2), -1)

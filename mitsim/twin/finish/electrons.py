@@ -13,6 +13,7 @@ the first knee of a companding curve, and with a gamma, a grey level is wider th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from mitsim.capture.capture import Capture
 from mitsim.sensor.image_formation import converter
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise
+from mitsim.sensor.preset import Sensor, load_sensor, presets
 
 Floats = NDArray[np.float64]
 
@@ -49,10 +51,18 @@ class PixelNoise:
 
 
 def pixel_noise(imager: Imager, chip: Imager, count: int, exposure_s: float, ambient: bool) -> PixelNoise:
-    """Return the noise of the mean of ``count`` images of one exposure [s].
+    """Return the noise of the mean of several images of one exposure; shot noise of the scene's own light is neglected.
 
-    With ``ambient``, an image with the projector off is subtracted. Its read noise adds, and the fixed pattern cancels.
-    The shot noise of the scene's own light is neglected. ``chip`` is the imager with the capture's number of bits.
+    Parameters
+    ----------
+    imager
+        Source of the noise.
+    chip
+        The imager with the capture's number of bits (:func:`chip_of`).
+    count, exposure_s
+        Number of images, and their exposure [s].
+    ambient
+        Whether an image with the projector off is subtracted. Its read noise adds, and the fixed pattern cancels.
     """
     per_image = 1.0 / count + (1.0 if ambient else 0.0)
     level = 1.0 / chip.gain  # e- of a grey level
@@ -76,6 +86,20 @@ def linearised(levels: NDArray[np.unsignedinteger[Any]] | Floats, chip: Imager) 
         return np.asarray((values - chip.black_level) / chip.gain)
     share = np.clip((values - chip.black_level) / (chip.full_scale - chip.black_level), 0.0, None)
     return np.asarray(chip.full_well * share**chip.gamma)
+
+
+def sensor_of(capture: Capture, name: str | None, where: str | Path) -> Sensor:
+    """Return the sensor of a name or file, by default the preset that a capture names.
+
+    Raises
+    ------
+    InputError
+        If the capture names none.
+    """
+    if name is None and capture.sensor not in presets():
+        found = f"none, and {where} comes from {capture.sensor}, which is not a preset"
+        raise InputError("--sensor", "", found, f"one of {', '.join(presets())}, or the path of a .toml file")
+    return load_sensor(capture.sensor if name is None else name)
 
 
 def chip_of(capture: Capture, imager: Imager, where: str) -> Imager:

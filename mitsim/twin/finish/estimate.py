@@ -28,7 +28,7 @@ from scipy.optimize import least_squares, nnls
 
 from characterisation.files.errors import InputError
 from mitsim.twin.finish.finish import LOG_ALPHA_RANGE, MetalFinish
-from mitsim.twin.finish.observation import Floats, View
+from mitsim.twin.finish.observation import CouponView, Floats
 from mitsim.twin.finish.problem import FIRST_GRAIN, Problem, Residual
 
 #: number of alphas in the scan
@@ -42,7 +42,7 @@ FEWEST_BLOCKS = 12
 
 
 @dataclass(frozen=True)
-class Parameter:
+class FittedQuantity:
     """A fitted quantity: its value, and its standard uncertainties from covariance and jackknife."""
 
     value: float
@@ -68,10 +68,10 @@ class Fit:
     - ``residuals`` by view.
     """
 
-    log_power: Parameter
-    log_alpha: Parameter | None
-    wide_angle: Parameter | None
-    ambient: Parameter | None
+    log_power: FittedQuantity
+    log_alpha: FittedQuantity | None
+    wide_angle: FittedQuantity | None
+    ambient: FittedQuantity | None
     reduced_chi_square: float
     blocks: int
     pixels: int
@@ -81,7 +81,7 @@ class Fit:
     residuals: tuple[Residual, ...] = field(repr=False)
 
 
-def fit_views(views: Sequence[View], finish: MetalFinish | None, where: str = "captures") -> Fit:
+def fit_views(views: Sequence[CouponView], finish: MetalFinish | None, where: str = "captures") -> Fit:
     """Fit alpha, the power and the wide-angle share of a coupon to its views.
 
     ``finish`` is the metal and process of the coupon, None for a diffuse sheet. Messages name ``where``.
@@ -94,13 +94,9 @@ def fit_views(views: Sequence[View], finish: MetalFinish | None, where: str = "c
     problem = Problem(views, finish)
     if problem.count < FEWEST_BLOCKS:
         whole = sum(view.whole for view in views)
-        raise InputError(
-            where,
-            "images",
-            f"{problem.count} of {whole} blocks on the coupon free of saturation",
-            f"{FEWEST_BLOCKS} or more",
-            "shorter exposures, other poses, or smaller blocks",
-        )
+        free = f"{problem.count} of {whole} blocks on the coupon free of saturation"
+        hint = "shorter exposures, other poses, or smaller blocks"
+        raise InputError(where, "images", free, f"{FEWEST_BLOCKS} or more", hint)
     every = np.ones(problem.count, bool)
     values = _first(problem, every)
     grain = 0.0
@@ -114,15 +110,13 @@ def fit_views(views: Sequence[View], finish: MetalFinish | None, where: str = "c
     results, slopes = problem.results(values)
     by_covariance = np.sqrt(np.einsum("ik,kl,il->i", slopes, covariance, slopes))
     by_jackknife = _jackknife(problem, values, variance)
-    found = [
-        Parameter(float(v), float(c), float(j)) for v, c, j in zip(results, by_covariance, by_jackknife, strict=True)
-    ]
-    metal = finish is not None
+    rows = np.stack([results, by_covariance, by_jackknife], axis=1).tolist()
+    fitted, metal = [FittedQuantity(*row) for row in rows], finish is not None
     return Fit(
-        found[0],
-        found[1] if metal else None,
-        found[2] if metal else None,
-        found[-1] if problem.lit_room else None,
+        fitted[0],
+        fitted[1] if metal else None,
+        fitted[2] if metal else None,
+        fitted[-1] if problem.lit_room else None,
         chi_square,
         problem.count,
         len(problem.unit),

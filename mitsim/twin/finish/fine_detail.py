@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 FINEST = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)
 
 #: median of chi-square with one degree of freedom
-_MEDIAN_SQUARE = 0.45493642311957283
+MEDIAN_SQUARE = 0.45493642311957283
 
 #: largest number of bins of equal count by local mean, and least number of pixels for each
 _BINS, _PIXELS_PER_BIN = 8, 400
@@ -51,7 +51,7 @@ def level_variances(image: Floats, mask: NDArray[np.bool_]) -> tuple[Floats, Flo
     where = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, bins - 1)
     used = [index for index in range(bins) if (where == index).sum() >= min(_PIXELS_PER_BIN, len(level)) // 4]
     levels = np.array([float(np.median(level[where == index])) for index in used])
-    variances = np.array([float(np.median(square[where == index])) / _MEDIAN_SQUARE for index in used])
+    variances = np.array([float(np.median(square[where == index])) / MEDIAN_SQUARE for index in used])
     counts = np.array([float((where == index).sum()) for index in used])
     return levels, variances, counts
 

@@ -28,7 +28,6 @@ from scipy import ndimage
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
-from mitsim.sensor.camera import Camera
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.preset import Sensor
@@ -47,7 +46,7 @@ _UNLIT = 1e-3
 
 
 @dataclass(frozen=True)
-class View:
+class CouponView:
     """A coupon in the images of one camera at one exposure: N pixels in ``size`` blocks.
 
     - ``capture``: index of the capture; ``name``: its name in messages; ``camera``; ``exposure_s`` [s].
@@ -126,7 +125,7 @@ def observe(
     *,
     pattern: Pattern,
     lit_room: bool = False,
-) -> list[View]:
+) -> list[CouponView]:
     """Return the view of a coupon by every camera at every exposure.
 
     Parameters
@@ -162,21 +161,40 @@ def observe(
             raise InputError(
                 where, "images", f"{len(stack)} of {name}", f"as many at each of {len(exposures)} exposures"
             )
-        camera = sensor.rig.cameras[name]
-        roi = coupon_roi(camera, place)
+        roi = coupon_roi(sensor.rig.cameras[name], place)
         white = renderer.white(place, name, roi, pattern)
-        loss = renderer.corner_loss(name)
-        region = _CouponRegion.of(camera, place, sensor, roi, capture.decoding.read_out.get(name), white, loss)
-        each = len(stack) // len(exposures)
-        shown = stack[:, *roi.slices]
+        region = _CouponRegion.of(place, sensor, name, roi, white, capture.decoding.read_out.get(name))
+        loss, each = renderer.corner_loss(name), len(stack) // len(exposures)
         for number, seconds in enumerate(exposures):
-            images = shown[number * each : (number + 1) * each]
+            images = stack[number * each : (number + 1) * each, *roi.slices]
             chip = chip_of(capture, sensor.imager, where)
-            noise = pixel_noise(sensor.imager, chip, each - ambient, float(seconds), ambient)
-            blocks = _Blocks.of(region, images, chip, block_px)
-            lit, dark = (images[:-1], images[-1]) if ambient else (images, None)
-            frames = _Frames(lit, dark, chip, float(seconds), float(seconds) if lit_room and not ambient else 0.0)
-            views.append(_view(coupon_capture, name, region, blocks, frames, noise))
+            blocks = _Blocks.of(region.inside, images, chip, block_px)
+            rows, columns = blocks.rows, blocks.columns
+            levels = linearised(images[:, rows, columns], chip)
+            room_s = float(seconds) if lit_room and not ambient else 0.0
+            illumination = np.ones(len(rows)) if loss is None else loss[roi.slices][rows, columns].astype(float)
+            views.append(
+                CouponView(
+                    coupon_capture.index,
+                    where,
+                    name,
+                    float(seconds),
+                    columns + roi.left,
+                    rows + roi.top,
+                    blocks.block,
+                    block_px,
+                    blocks.grid,
+                    levels[:-1].mean(axis=0) - levels[-1] if ambient else levels.mean(axis=0),
+                    white[rows, columns] * float(seconds),
+                    illumination * room_s,
+                    region.toward(region.camera_centre, rows, columns),
+                    region.toward(region.projector_centre, rows, columns),
+                    pixel_noise(sensor.imager, chip, each - ambient, float(seconds), ambient),
+                    blocks.whole,
+                    place,
+                    "" if blocks.whole else _why_no_block(region, place, block_px),
+                )
+            )
     return views
 
 
@@ -186,33 +204,25 @@ class _CouponRegion:
 
     - ``inside`` (h, w): pixels on the coupon, inside its edge.
     - ``points`` (h, w, 3) [mm]: where the view rays meet the plane, in the frame of the coupon.
-    - ``white`` (h, w) [e-/s] of a white coupon; ``loss`` (h, w) [1]: relative illumination of the lens.
+    - ``white`` (h, w) [e-/s] of a white coupon.
     - ``camera_centre``, ``projector_centre`` (3,) [mm]: centres of camera and projector, in the frame of the coupon.
     """
 
-    roi: Roi
     inside: NDArray[np.bool_]
     points: Floats
     white: Floats
-    loss: Floats
     camera_centre: Floats
     projector_centre: Floats
 
     @classmethod
     def of(
-        cls,
-        camera: Camera,
-        place: Place,
-        sensor: Sensor,
-        roi: Roi,
-        read_out: Roi | None,
-        white: Floats,
-        corner_loss: NDArray[np.float32] | None,
+        cls, place: Place, sensor: Sensor, name: str, roi: Roi, white: Floats, read_out: Roi | None
     ) -> _CouponRegion:
         """Intersect the view rays of a region with the plane of the coupon, and select the pixels inside its edge.
 
-        ``read_out`` is the region that the camera read out, None for the whole image.
+        ``read_out`` is the region that the camera ``name`` read out, None for the whole image.
         """
+        camera = sensor.rig.cameras[name]
         pose = place.world_from_sensor
         centre, projector_centre = pose.points(camera.centre), pose.points(sensor.projector.optics.centre)
         columns, rows = roi.pixels()
@@ -228,8 +238,7 @@ class _CouponRegion:
         if read_out is not None:
             inside &= (columns >= read_out.left) & (columns < read_out.right)
             inside &= (rows >= read_out.top) & (rows < read_out.bottom)
-        loss = np.ones(white.shape) if corner_loss is None else corner_loss[rows, columns].astype(float)
-        return cls(roi, inside, points, white, loss, centre, projector_centre)
+        return cls(inside, points, white, centre, projector_centre)
 
     def toward(self, centre: Floats, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
         """Return unit directions (N, 3) from the points of pixels toward a ``centre`` (3,) [mm]."""
@@ -241,83 +250,30 @@ class _CouponRegion:
 class _Blocks:
     """The pixels of a region that are compared: ``rows``, ``columns`` (N,) in it, ``block`` (N,), ``grid`` (B, 2).
 
-    ``width``: side of a block [px]; ``whole``: number of blocks on the coupon, saturated ones included.
+    ``whole``: number of blocks on the coupon, saturated ones included.
     """
 
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
     block: NDArray[np.int64]
     grid: NDArray[np.int64]
-    width: int
     whole: int
 
     @classmethod
-    def of(cls, region: _CouponRegion, images: NDArray[np.unsignedinteger[Any]], chip: Imager, width: int) -> _Blocks:
+    def of(cls, inside: NDArray[np.bool_], images: NDArray[Any], chip: Imager, width: int) -> _Blocks:
         """Group the pixels on the coupon in blocks of ``width`` px, without saturated blocks and their neighbours."""
-        rows, columns = np.nonzero(region.inside)
-        shape = tuple(-(-size // width) for size in region.inside.shape)
+        rows, columns = np.nonzero(inside)
+        shape = tuple(-(-size // width) for size in inside.shape)
         number = (rows // width) * shape[1] + columns // width
         held = np.bincount(number, minlength=shape[0] * shape[1]) >= _BLOCK_SHARE * width**2
-        bright_rows, bright_columns = np.nonzero((images >= chip.full_scale).any(axis=0) & region.inside)
+        bright_rows, bright_columns = np.nonzero((images >= chip.full_scale).any(axis=0) & inside)
         saturated = np.zeros(shape, bool)
         saturated[bright_rows // width, bright_columns // width] = True
         used = held & ~ndimage.binary_dilation(saturated, np.ones((3, 3), bool)).ravel()
         kept = used[number]
         labels, block = np.unique(number[kept], return_inverse=True)
         grid = np.stack(np.divmod(labels, shape[1]), axis=1)
-        return cls(rows[kept], columns[kept], block.reshape(-1), grid, width, int(held.sum()))
-
-
-@dataclass(frozen=True)
-class _Frames:
-    """A region of the images of one camera at one exposure.
-
-    - ``lit`` (F, h, w) [DN]; ``dark`` (h, w) [DN]: image with the projector off, None without one.
-    - ``chip``: imager with the capture's number of bits.
-    - ``seconds``: exposure [s]; ``room_seconds``: exposure to light of the room that must be fitted [s], 0 without it.
-    """
-
-    lit: NDArray[np.unsignedinteger[Any]]
-    dark: NDArray[np.unsignedinteger[Any]] | None
-    chip: Imager
-    seconds: float
-    room_seconds: float
-
-    def electrons(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
-        """Return the mean photo-electrons (N,) [e-] of pixels, minus those of the dark image."""
-        mean = linearised(self.lit[:, rows, columns], self.chip).mean(axis=0)
-        return np.asarray(mean if self.dark is None else mean - linearised(self.dark[rows, columns], self.chip))
-
-
-def _view(
-    coupon_capture: CouponCapture,
-    camera: str,
-    region: _CouponRegion,
-    blocks: _Blocks,
-    frames: _Frames,
-    noise: PixelNoise,
-) -> View:
-    rows, columns, place = blocks.rows, blocks.columns, coupon_capture.place
-    return View(
-        coupon_capture.index,
-        coupon_capture.where,
-        camera,
-        frames.seconds,
-        columns + region.roi.left,
-        rows + region.roi.top,
-        blocks.block,
-        blocks.width,
-        blocks.grid,
-        frames.electrons(rows, columns),
-        region.white[rows, columns] * frames.seconds,
-        region.loss[rows, columns] * frames.room_seconds,
-        region.toward(region.camera_centre, rows, columns),
-        region.toward(region.projector_centre, rows, columns),
-        noise,
-        blocks.whole,
-        place,
-        "" if blocks.whole else _why_no_block(region, place, blocks.width),
-    )
+        return cls(rows[kept], columns[kept], block.reshape(-1), grid, int(held.sum()))
 
 
 def _why_no_block(region: _CouponRegion, place: Place, width: int) -> str:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.twin.finish.finish import MetalFinish
-from mitsim.twin.finish.observation import Floats, View
+from mitsim.twin.finish.observation import CouponView, Floats
 
 #: grain for the initial weights
 FIRST_GRAIN = 0.1
@@ -35,7 +35,7 @@ FIRST_GRAIN = 0.1
 class Residual:
     """Block means of one view [e-]: ``measured``, ``predicted`` and ``sigma`` (size,); ``pixels``: predicted pixels."""
 
-    view: View
+    view: CouponView
     measured: Floats = field(repr=False)
     predicted: Floats = field(repr=False)
     sigma: Floats = field(repr=False)
@@ -73,7 +73,7 @@ class Problem:
     if there is any.
     """
 
-    def __init__(self, views: Sequence[View], finish: MetalFinish | None) -> None:
+    def __init__(self, views: Sequence[CouponView], finish: MetalFinish | None) -> None:
         self.views, self.finish = list(views), finish
         self.starts = np.cumsum([0, *(view.size for view in self.views)])
         self.count = int(self.starts[-1])

@@ -19,18 +19,19 @@ import numpy as np
 from characterisation.files.atomic_io import json_values
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
+from mitsim.capture.calibration import calibration_table
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.maps.campaign.coupons import CouponRecipe, load_sample
 from mitsim.running.progress import say, track
 from mitsim.scene.light_transport.ambient import has_emitters
-from mitsim.sensor.camera import Rig
 from mitsim.sensor.pattern import DotPattern
-from mitsim.sensor.preset import Sensor, load_sensor, presets
+from mitsim.sensor.preset import Sensor
 from mitsim.twin.finish.dots import Dots, compare_dots
-from mitsim.twin.finish.estimate import Fit, Parameter, fit_views
+from mitsim.twin.finish.electrons import sensor_of
+from mitsim.twin.finish.estimate import Fit, FittedQuantity, fit_views
 from mitsim.twin.finish.finish import MetalFinish, metal_finish
-from mitsim.twin.finish.observation import CouponCapture, View, observe
+from mitsim.twin.finish.observation import CouponCapture, CouponView, observe
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.problem import Residual
 from mitsim.twin.finish.specimen import place_of
@@ -92,12 +93,12 @@ class CouponFit:
     @property
     def rms_dn(self) -> float:
         """Root mean square residual of all blocks [DN]."""
-        return _pooled([(r.view.size, r.rms_dn) for r in self.fit.residuals])
+        return _pooled(self.fit.residuals, "rms_dn")
 
     @property
     def rms_in_noise(self) -> float:
         """Root mean square residual of all blocks in standard deviations of a block's noise [1]."""
-        return _pooled([(r.view.size, r.rms_in_noise) for r in self.fit.residuals])
+        return _pooled(self.fit.residuals, "rms_in_noise")
 
     @property
     def worst(self) -> Residual:
@@ -180,7 +181,8 @@ def fit_captures(
         raise InputError("CAPTURES", "", "none", "one capture folder or more")
     if len({path.resolve() for path in captures}) < len(captures):
         raise InputError("CAPTURES", "", "a folder twice", "each capture once", "the same noise twice is not a repeat")
-    chosen, first = _sensor(captures[0], sensor), read_capture(captures[0])
+    first = read_capture(captures[0])
+    chosen = sensor_of(first, sensor, captures[0])
     path = scene or _own_scene(first, captures[0])
     recipe = CouponRecipe(str(path), tuple(sorted((parameters or {}).items())), chosen.wavelength_nm)
     sample = load_sample(recipe)
@@ -189,18 +191,21 @@ def fit_captures(
     metal = None if finish.name == DIFFUSE else metal_finish(finish, chosen.wavelength_nm, str(path))
     block = block_px or (KNOWN_BLOCK_PX if pattern_is_known(first, chosen) else UNKNOWN_BLOCK_PX)
 
-    views: list[View] = []
+    views: list[CouponView] = []
     dots: list[Dots] = []
     places: list[Place] = []
-    rig_and_renderer: tuple[Rig, WhiteCouponRenderer] | None = None
-    unknown = False
+    renderer, calibration, unknown = (
+        WhiteCouponRenderer(with_rig(chosen, first.rig)),
+        calibration_table(first.rig),
+        False,
+    )
     for index, folder in enumerate(track(list(captures), "captures", len(captures))):
         capture = read_capture(folder)
         if capture.sensor != first.sensor:
             raise InputError(folder, "sensor", capture.sensor, f"{first.sensor}, as in {captures[0]}")
-        if rig_and_renderer is None or not _same(rig_and_renderer[0], capture.rig):
-            rig_and_renderer = capture.rig, WhiteCouponRenderer(with_rig(chosen, capture.rig))
-        renderer, known = rig_and_renderer[1], pattern_is_known(capture, chosen)
+        if calibration_table(capture.rig) != calibration:
+            renderer, calibration = WhiteCouponRenderer(with_rig(chosen, capture.rig)), calibration_table(capture.rig)
+        known = pattern_is_known(capture, chosen)
         unknown |= not known
         place = place_of(capture, renderer.sensor, (sample.width, sample.height), str(folder), roi)
         lit = capture.source != "simulated" or has_emitters(sample.scene)
@@ -212,13 +217,9 @@ def fit_captures(
         places.append(place)
     if not sum(view.whole for view in views):
         why = "; ".join(dict.fromkeys(f"{view.camera} of {view.name}: {view.why_no_block}" for view in views[:4]))
-        raise InputError(
-            "captures",
-            "images",
-            f"no block of {block} px on the coupon: {why}",
-            "a coupon in the images",
-            "give the region of the image that shows it: --window",
-        )
+        none = f"no block of {block} px on the coupon: {why}"
+        hint = "give the region of the image that shows it: --window"
+        raise InputError("captures", "images", none, "a coupon in the images", hint)
     say(f"fitting {sum(len(view.block) for view in views)} pixels in {sum(view.size for view in views)} blocks")
     return CouponFit(
         chosen,
@@ -234,48 +235,15 @@ def fit_captures(
     )
 
 
-def _sensor(folder: Path, name: str | None) -> Sensor:
-    if name is not None:
-        return load_sensor(name)
-    own = read_capture(folder).sensor
-    if own not in presets():
-        raise InputError(
-            folder / "capture.json",
-            "sensor",
-            own,
-            f"one of {', '.join(presets())}",
-            "give the preset or the sensor file: --sensor",
-        )
-    return load_sensor(own)
-
-
 def _own_scene(capture: Capture, folder: Path) -> Path:
     named = capture.settings.get("scene")
     if isinstance(named, str) and Path(named).is_file():
         return Path(named)
-    found = repr(named) if named else "nothing"
-    raise InputError(
-        folder / "settings.json",
-        "scene",
-        found,
-        "an existing scene file",
-        "give the scene of the coupon: --scene scenes/coupon/coupon.xml",
-    )
+    found, hint = repr(named) if named else "nothing", "give the scene of the coupon: --scene scenes/coupon/coupon.xml"
+    raise InputError(folder / "settings.json", "scene", found, "an existing scene file", hint)
 
 
-def _same(first: Rig, second: Rig) -> bool:
-    """Return whether two rigs have the same cameras at the same poses."""
-    if list(first.cameras) != list(second.cameras):
-        return False
-    return all(
-        np.array_equal(a.matrix, b.matrix)
-        and np.array_equal(a.distortion, b.distortion)
-        and np.array_equal(a.sensor_from_camera.matrix(), b.sensor_from_camera.matrix())
-        for a, b in zip(first.cameras.values(), second.cameras.values(), strict=True)
-    )
-
-
-def _exponential(parameter: Parameter | None) -> tuple[float, float]:
+def _exponential(parameter: FittedQuantity | None) -> tuple[float, float]:
     """Return value and standard uncertainty of a quantity whose logarithm was fitted."""
     if parameter is None:
         return math.nan, math.nan
@@ -283,25 +251,17 @@ def _exponential(parameter: Parameter | None) -> tuple[float, float]:
     return value, value * parameter.uncertainty
 
 
-def _uncertain(pair: tuple[float, float], parameter: Parameter | None) -> dict[str, Any]:
+def _uncertain(pair: tuple[float, float], parameter: FittedQuantity | None) -> dict[str, Any]:
     relative = (math.nan, math.nan) if parameter is None else (parameter.by_covariance, parameter.by_jackknife)
-    return {
-        "value": pair[0],
-        "uncertainty": pair[1],
-        "relative_by_covariance": relative[0],
-        "relative_by_jackknife": relative[1],
-    }
+    names = ("value", "uncertainty", "relative_by_covariance", "relative_by_jackknife")
+    return dict(zip(names, (*pair, *relative), strict=True))
 
 
-def _linear(parameter: Parameter | None) -> dict[str, Any] | None:
+def _linear(parameter: FittedQuantity | None) -> dict[str, Any] | None:
     if parameter is None:
         return None
-    return {
-        "value": parameter.value,
-        "uncertainty": parameter.uncertainty,
-        "by_covariance": parameter.by_covariance,
-        "by_jackknife": parameter.by_jackknife,
-    }
+    names = ("value", "uncertainty", "by_covariance", "by_jackknife")
+    return {name: getattr(parameter, name) for name in names}
 
 
 def _view_numbers(residual: Residual) -> dict[str, Any]:
@@ -321,6 +281,7 @@ def _view_numbers(residual: Residual) -> dict[str, Any]:
     }
 
 
-def _pooled(parts: list[tuple[int, float]]) -> float:
-    known = [(size, rms) for size, rms in parts if size]
+def _pooled(residuals: Sequence[Residual], name: str) -> float:
+    """Return the root mean square of a property of residuals, weighted by their numbers of blocks."""
+    known = [(residual.view.size, getattr(residual, name)) for residual in residuals if residual.view.size]
     return math.sqrt(sum(size * rms**2 for size, rms in known) / sum(size for size, _ in known))

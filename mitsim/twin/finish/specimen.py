@@ -2,7 +2,7 @@
 
 Signal chain: capture -> cloud, from its own decoder -> plane of the points in the image region that the user gave, or
 of most points (:mod:`mitsim.twin.finish.place`) -> its outline, and the bend of its points
-(:mod:`mitsim.twin.finish.bend`) -> pixels and view rays that meet it.
+(:mod:`mitsim.twin.finish.place`) -> pixels and view rays that meet it.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
-from mitsim.twin.finish.bend import Bend, fit_bend
-from mitsim.twin.finish.place import Place, found_place, known_place, plane_points
+from mitsim.twin.finish.place import Bend, Place, fit_bend, found_place, known_place, plane_points
 
 Floats = NDArray[np.float64]
 
@@ -121,10 +120,19 @@ def specimen_place(capture: Capture, settings: Settings, roi: Roi | None, where:
 
 
 def place_of(capture: Capture, sensor: Sensor, size: tuple[float, float], where: str, roi: Roi | None = None) -> Place:
-    """Return the place of the coupon of this ``size`` (width, height) [mm] in a capture.
+    """Return the place of a coupon in a capture.
 
-    It follows from ``roi``, the image region that shows the coupon; otherwise from the capture's pose; otherwise from
-    the plane of its cloud. Messages name ``where``.
+    Parameters
+    ----------
+    capture, sensor
+        Capture of the coupon, and the sensor whose decoder and imager it is read with.
+    size
+        Width and height of the coupon [mm].
+    where
+        Name of the capture in messages.
+    roi
+        Image region that shows the coupon. Without it the place follows from the capture's pose, otherwise from the
+        plane of its cloud.
 
     Raises
     ------
@@ -152,10 +160,22 @@ def _bend_of(place: Place, points: Floats) -> Bend | None:
 
 
 def on_specimen(place: Place, origin: Floats, rays: Floats, pitch: float, margin_px: float) -> NDArray[np.bool_]:
-    """Return which view rays meet the specimen, at least a margin [px] inside its outline.
+    """Return which view rays meet the specimen, (...), at least a margin inside its outline.
 
-    ``rays`` (..., 3) are unit vectors in the sensor frame, with their ``origin`` (3,) [mm]. ``pitch`` is the angle
-    between neighbouring rays [rad].
+    Parameters
+    ----------
+    place
+        Plane and outline of the specimen.
+    origin, rays
+        Common origin (3,) [mm] and unit vectors (..., 3) of the rays, in the sensor frame.
+    pitch
+        Angle between neighbouring rays [rad].
+    margin_px
+        Margin [px].
+
+    See Also
+    --------
+    image_mask : The same for the pixels of a camera.
     """
     points, reach, cosine = feet_of(place.world_from_sensor, origin, rays)
     down = cosine > GRAZING

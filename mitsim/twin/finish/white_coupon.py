@@ -24,7 +24,6 @@ from mitsim.scene.light_transport.projector_light import ProjectedPatterns
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
-from mitsim.sensor.projector import Projector
 from mitsim.sensor.roi import roi_around
 from mitsim.twin.finish.place import Place
 
@@ -64,20 +63,18 @@ class WhiteCouponRenderer:
     def _one(self, pattern: Pattern) -> ProjectedPatterns:
         projector = self.sensor.projector
         frames = self.sensor.patterns()
-        sent = projector.emit(frames[:1]) if pattern == "first" else _mean_sent(frames, projector)
+        if pattern == "first":
+            sent = projector.emit(frames[:1])
+        else:
+            total = np.zeros(frames.shape[1:])
+            for frame in frames:  # summed one by one to save memory
+                total += projector.emit(frame)
+            sent = np.asarray(total[None] / len(frames), np.float32)
         if pattern == "level":
             sent = np.full_like(sent, sent.mean())
         values = (sent - projector.black_level) / (1.0 - projector.black_level)
         values = np.clip(values, 0.0, 1.0) ** (1.0 / projector.gamma)
         return ProjectedPatterns(values.astype(np.float32), projector)
-
-
-def _mean_sent(frames: NDArray[np.float32], projector: Projector) -> NDArray[np.float32]:
-    """Return the mean light (1, H, W) of frames (P, H, W), summed one by one to save memory."""
-    total = np.zeros(frames.shape[1:])
-    for frame in frames:
-        total += projector.emit(frame)
-    return np.asarray(total[None] / len(frames), np.float32)
 
 
 def pattern_is_known(capture: Capture, sensor: Sensor) -> bool:

@@ -1,7 +1,7 @@
 """Estimate a projector's depth of focus and aperture from one capture of stripes.
 
 Signal chain: decoded points -> depth in front of the projector, block by block -> modulation of stripes by width ->
-blur s [projector px] of every block (:func:`mitsim.twin.sensor.stripes.modulation`) -> least squares on
+blur s [projector px] of every block (:func:`modulation`) -> least squares on
 
     s^2(z) = s_0^2 + (a f |1/z - 1/z_f| / 4)^2
 
@@ -21,12 +21,17 @@ from scipy.optimize import least_squares
 
 from mitsim.decode.cloud import capture_cloud, decoder_settings
 from mitsim.twin.sensor.input_captures import InputCapture
-from mitsim.twin.sensor.modulation import fitted_blur
 
 Floats = NDArray[np.float64]
 
-#: side of a block [px]; least share of decoded pixels; largest relative spread of depths and of white levels [1]
-_BLOCK_PX, _LEAST_SHARE, _DEEP, _EVEN = 32, 0.15, 0.025, 0.12
+#: terms of the series
+_HARMONICS = np.arange(1, 40, 2)
+
+#: side of a block [px], and least share of its pixels that are decoded
+_BLOCK_PX, _LEAST_SHARE = 32, 0.15
+
+#: largest relative spread of depths and of white levels in a block [1]
+_DEEP, _EVEN = 0.025, 0.12
 
 #: least white minus black [DN of 8 bit]; below, rounding raises the modulation of fine stripes
 _LEAST_DN = 50.0
@@ -36,6 +41,30 @@ _WIDEST_PX, _FEWEST, _PARTS = 40.0, 60, 20
 
 #: blur residual [px] beyond which a block loses weight as an outlier
 _SOFT_PX = 0.1
+
+
+def modulation(blur: float, width: Floats) -> Floats:
+    """Return the mean modulation of stripes of a width (...) [px] after a Gaussian blur [px], 1 for sharp ones.
+
+        mean |on - off| / (white - black) = (8 / pi^2) sum over odd n of exp(-pi^2 s^2 n^2 / (2 w^2)) / n^2
+
+    with s the standard deviation of the blur and w the width of a stripe: the Fourier series of a square wave after a
+    Gaussian blur. The reflectance of a print cancels in the ratio.
+    """
+    w = np.asarray(width, float)[..., None]
+    fall = np.exp(-((np.pi * blur * _HARMONICS / w) ** 2) / 2)
+    return np.asarray((fall / _HARMONICS**2).sum(axis=-1) / (1.0 / _HARMONICS**2).sum())
+
+
+def fitted_blur(width: Floats, ratio: Floats) -> float:
+    """Return the blur [px] of stripes of widths (n,) [px] with a modulation (n,).
+
+    The fit allows a common loss of modulation, which light scattered far by the lenses causes.
+    """
+    found = least_squares(
+        lambda x: x[1] * modulation(float(x[0]), width) - ratio, [1.0, 0.9], bounds=([0.05, 0.3], [20.0, 1.0])
+    )
+    return float(found.x[0])
 
 
 @dataclass(frozen=True)

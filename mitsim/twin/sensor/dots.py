@@ -20,26 +20,22 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from characterisation.files.errors import InputError
-from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor
-from mitsim.twin.compare.specimen_patches import run_length
+from mitsim.twin.compare.specimen_patches import contrast_window
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
 from mitsim.twin.sensor.estimate import scaled, unscaled
-from mitsim.twin.sensor.figures import TERMS, Field, field_figures
+from mitsim.twin.sensor.figures import TERMS, SpecimenField, field_figures
 from mitsim.twin.sensor.moments import MomentFit, Prior, match_moments
-from mitsim.twin.sensor.parameters import CORNER_BLUR, SMOOTHING, Parameter, room_parameters, with_room
+from mitsim.twin.sensor.parameters import CORNER_BLUR, FLUX, SMOOTHING, Parameter, room_parameters, with_room
 from mitsim.twin.sensor.specimen_simulator import SpecimenSimulator
 
 Floats = NDArray[np.float64]
 
 #: side of a patch [px], and the least number of patches of a capture
 PATCH_PX, FEWEST_PATCHES = 40, 8
-
-#: limits of the window of local means [px], and its width in run lengths of the pattern: as `mitsim compare`
-_WINDOWS, _RUNS = (7, 31), 2.5
 
 _ALONE = ("crossings", "sharpness", "noise in the dark half", "noise in the bright half", "grain")
 
@@ -101,7 +97,7 @@ def with_values(sensor: Sensor, parameters: Sequence[Parameter], theta: Floats) 
 
 @dataclass(frozen=True)
 class DotDraws:
-    """Simulated dots that a fit compares with: how many ``number``, their ``seed``, and patches of ``patch_px``."""
+    """Simulated dots that a fit compares with: their ``number`` and ``seed``, in patches of ``patch_px``."""
 
     number: int = 3
     seed: int = 1
@@ -139,12 +135,12 @@ def fit_dots(
     """
     name, camera = next(iter(capture.rig.cameras.items()))
     seed, patch_px = draws.seed, draws.patch_px
-    field = Field.of(camera, image_mask(place, camera, MARGIN_PX if patch_px >= PATCH_PX else 2.0), patch_px)
+    field = SpecimenField.of(camera, image_mask(place, camera, MARGIN_PX if patch_px >= PATCH_PX else 2.0), patch_px)
     if len(field.corners) < FEWEST_PATCHES:
         seen = f"{len(field.corners)} patches of {patch_px} px of it"
         raise InputError(where, "specimen", seen, f"{FEWEST_PATCHES} or more", "a larger --window, or a nearer view")
-    roi = Roi(field.column, field.row, *field.mask.shape[::-1])
-    window = int(np.clip(np.nan_to_num(_RUNS * run_length(capture, place), nan=_WINDOWS[1]), *_WINDOWS)) // 2 * 2 + 1
+    roi = field.roi
+    window = contrast_window(capture, place)
     black = sensor.imager.black_level
     real = field_figures(capture.images[name][0][roi.slices].astype(float), field, window, black)
     simulator = SpecimenSimulator(sensor, place, roi)
@@ -160,7 +156,7 @@ def fit_dots(
     names = [(figure, term) for figure in ("level", "contrast") for term in terms]
     names += [(alone, "1") for alone in _ALONE]
     spatial, count = np.array([term != "1" for _, term in names]), len(names)
-    if any(parameter is CORNER_BLUR for parameter in own):
+    if CORNER_BLUR in own:
         names += [("sharpness", term) for term in terms if term != "1"]
         spatial = np.append(spatial, np.zeros(len(names) - len(spatial), bool))
     wanted, covariance = real.of(names)
@@ -170,12 +166,11 @@ def fit_dots(
         return field_figures(levels.astype(float), field, window, black).of(names)
 
     start = np.array([parameter.get(sensor) for parameter in own])
-    for index, parameter in enumerate(own):
-        if parameter.key == "projector.flux_w":
-            start[index] += wanted[0] - simulate(start, 0)[0][0]
+    if FLUX in own:
+        start[own.index(FLUX)] += wanted[0] - simulate(start, 0)[0][0]
     found = match_moments(wanted, covariance, simulate, _prior(own, start), draws.number, where)
     uneven = 0.0
-    if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)) and spatial.sum() > 0:
+    if _misses(found) and spatial.sum() > 0:
         off = wanted - np.mean([simulate(found.values, number)[0] for number in range(draws.number)], axis=0)
         excess = float(np.mean(off[spatial] ** 2 - np.diag(covariance)[spatial]))
         uneven = float(np.sqrt(max(excess, 0.0)))
@@ -188,7 +183,7 @@ def fit_dots(
         if settled and not dropped:
             break
         # without it no parameter explains the variation of sharpness
-        if any(parameter is CORNER_BLUR for parameter in dropped):
+        if CORNER_BLUR in dropped:
             names, spatial = names[:count], spatial[:count]
             wanted, covariance = real.of(names)
             covariance = covariance + np.diag(np.where(spatial, uneven**2, 0.0))
@@ -198,10 +193,13 @@ def fit_dots(
         again = _prior(own, start, found.values[kept])
         found = match_moments(wanted, covariance, simulate, again, draws.number, f"{where}, once more")
         settled = True
-    if found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)):
-        wider = found.covariance * found.chi_square / max(found.freedom, 1)
-        found = replace(found, covariance=wider)
+    if _misses(found):
+        found = replace(found, covariance=found.covariance * found.chi_square / max(found.freedom, 1))
     return DotsFit(sensor, tuple(own), found, len(field.corners), uneven, tuple(undetermined))
+
+
+def _misses(found: MomentFit) -> bool:
+    return bool(found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)))
 
 
 def _is_determined(found: MomentFit, index: int, parameter: Parameter) -> bool:

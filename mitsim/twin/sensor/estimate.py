@@ -38,7 +38,7 @@ def unscaled(value: float, scale: Scale) -> float:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class FittedKey:
     """A fitted number: ``key`` in the sensor file, ``value``, standard ``uncertainty`` on its ``scale``, ``unit``.
 
     ``captures`` that determine it, and the method ``method``. Noise determines the inverse of the full well, so that
@@ -82,7 +82,7 @@ def combined(values: Sequence[float], uncertainties: Sequence[float]) -> tuple[f
     return float((weight * x).sum() / weight.sum()), float(weight.sum() ** -0.5)
 
 
-def pooled(estimates: Sequence[Estimate]) -> list[Estimate]:
+def pooled(estimates: Sequence[FittedKey]) -> list[FittedKey]:
     """Combine estimates of the same key, in the order in which the keys first occur."""
     out = []
     for key in dict.fromkeys(one.key for one in estimates):

@@ -19,7 +19,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from characterisation.region_of_interest import Roi
 from mitsim.sensor.camera import Camera
+from mitsim.twin.compare.specimen_patches import patch_corners
 from mitsim.twin.finish.fine_detail import finest_detail
 
 Floats = NDArray[np.float64]
@@ -55,40 +57,28 @@ class FieldFigures:
 
 
 @dataclass(frozen=True)
-class Field:
-    """Pixels of a camera's image window that show the specimen, divided into patches.
+class SpecimenField:
+    """Pixels of a camera's image window ``roi`` that show the specimen, divided into patches.
 
-    - ``column``, ``row`` of the window's first pixel.
     - ``mask`` (h, w): pixels of the specimen; ``patch_px``: side of a patch.
     - ``corners`` (P, 2): rows and columns of the patches in the window.
     - ``basis`` (P, 6): the :data:`TERMS` at the patch centres. x and y are slopes of the view ray from the centre of
       the specimen, over their largest value. All terms but the first have zero mean.
     """
 
-    column: int
-    row: int
+    roi: Roi
     mask: NDArray[np.bool_]
     patch_px: int
     corners: NDArray[np.int64]
     basis: Floats
 
     @classmethod
-    def of(cls, camera: Camera, mask: NDArray[np.bool_], patch_px: int, least_share: float = 0.8) -> Field:
+    def of(cls, camera: Camera, mask: NDArray[np.bool_], patch_px: int, least_share: float = 0.8) -> SpecimenField:
         """Divide the specimen's pixels (H, W) of a camera into patches with at least ``least_share`` on it."""
-        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        row, column = (int(rows[0]), int(columns[0])) if len(rows) else (0, 0)
-        window_mask = mask[row : rows[-1] + 1, column : columns[-1] + 1] if len(rows) else np.zeros((0, 0), bool)
-        corners = np.array(
-            [
-                (top, left)
-                for top in range(0, window_mask.shape[0] - patch_px + 1, patch_px)
-                for left in range(0, window_mask.shape[1] - patch_px + 1, patch_px)
-                if window_mask[top : top + patch_px, left : left + patch_px].mean() >= least_share
-            ]
-        ).reshape(-1, 2)
-        return cls(
-            column, row, window_mask, patch_px, corners, _basis(camera, corners + np.array([row, column]), patch_px)
-        )
+        roi = Roi.around(mask) or Roi(0, 0, 0, 0)
+        corners = np.array(patch_corners(mask, patch_px, least_share), int).reshape(-1, 2)
+        basis = _basis(camera, corners, patch_px)
+        return cls(roi, mask[roi.slices], patch_px, corners - [roi.top, roi.left], basis)
 
     def patches(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return the values (P, patch_px^2) of an image's window (h, w) in every patch."""
@@ -107,7 +97,7 @@ def _basis(camera: Camera, corners: NDArray[np.int64], patch_px: int) -> Floats:
     return np.column_stack([np.ones(len(x)), terms - terms.mean(axis=0)])
 
 
-def field_figures(levels: Floats, field: Field, window_px: int, black: float = 0.0) -> FieldFigures:
+def field_figures(levels: Floats, field: SpecimenField, window_px: int, black: float = 0.0) -> FieldFigures:
     """Return the features of an image's window (h, w) [DN] over the field.
 
     ``window_px``: side of the window of local means, several run lengths of the pattern wide. ``black`` [DN] is
@@ -126,7 +116,7 @@ def field_figures(levels: Floats, field: Field, window_px: int, black: float = 0
     return FieldFigures(coefficients, np.kron(whole, spread), len(table))
 
 
-def patch_figures(image: Floats, field: Field, window_px: int) -> Floats:
+def patch_figures(image: Floats, field: SpecimenField, window_px: int) -> Floats:
     """Return the logarithms (P, 7) of the features of every patch."""
     mean = uniform_filter(image, window_px)
     deviation = np.sqrt(np.maximum(uniform_filter(image**2, window_px) - mean**2, 0.0))

@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
 from characterisation.files.errors import InputError
@@ -39,6 +40,11 @@ class InputCapture:
         """Return the folder as text."""
         return str(self.folder)
 
+    @property
+    def image(self) -> NDArray[Any]:
+        """Return the first image (H, W) [DN] of the reference camera."""
+        return np.asarray(next(iter(self.capture.images.values()))[0])
+
 
 def read_input_captures(
     folders: Sequence[Path], off: Sequence[Path], dark: Sequence[Path], sensor: Sensor
@@ -65,8 +71,7 @@ def read_input_captures(
         if not capture.images:
             raise InputError(folder, "images", "none", "a capture with images")
         stated_kind: Kind = "off" if capture.settings.get("projector_on") is False else "on"
-        if capture.settings.get("dark") is True:
-            stated_kind = "dark"
+        stated_kind = "dark" if capture.settings.get("dark") is True else stated_kind
         input_captures.append(InputCapture(folder, capture, given_kind or stated_kind))
     return input_captures
 
@@ -76,7 +81,7 @@ def repeats(input_captures: Sequence[InputCapture]) -> list[list[InputCapture]]:
     groups: list[list[InputCapture]] = []
     for source in input_captures:
         for group in groups:
-            if group[0].kind == source.kind and same_light(group[0].capture, source.capture):
+            if group[0].kind == source.kind and _same_light(group[0], source):
                 group.append(source)
                 break
         else:
@@ -84,14 +89,13 @@ def repeats(input_captures: Sequence[InputCapture]) -> list[list[InputCapture]]:
     return groups
 
 
-def same_light(one: Capture, other: Capture) -> bool:
+def _same_light(one: InputCapture, other: InputCapture) -> bool:
     """Return whether the first images of two captures differ by noise alone."""
-    first, second = (next(iter(capture.images.values()))[0].astype(float) for capture in (one, other))
-    if first.shape != second.shape or one.bits != other.bits:
+    if one.image.shape != other.image.shape or one.capture.bits != other.capture.bits:
         return False
-    if one.decoding.exposure_s != other.decoding.exposure_s:
+    if one.capture.decoding.exposure_s != other.capture.decoding.exposure_s:
         return False
-    off = first - second
+    off = one.image.astype(float) - other.image.astype(float)
     noise = float(np.abs(finest_detail(off)).mean()) * np.sqrt(np.pi / 2)
     smooth = float(np.sqrt(np.mean(uniform_filter(off, _MEAN_PX) ** 2)))
     return bool(smooth < _FACTOR * noise / _MEAN_PX + _ROUNDING_DN)

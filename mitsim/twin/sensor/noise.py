@@ -20,10 +20,10 @@ from mitsim.sensor.point_spread import point_spread
 from mitsim.sensor.preset import Sensor
 from mitsim.twin.compare.denoise import denoised
 from mitsim.twin.finish.electrons import linearised
-from mitsim.twin.finish.fine_detail import FINEST, finest_detail
+from mitsim.twin.finish.fine_detail import FINEST, MEDIAN_SQUARE, finest_detail
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
-from mitsim.twin.sensor.estimate import Estimate, Undetermined
+from mitsim.twin.sensor.estimate import FittedKey, Undetermined
 from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.photon_transfer import (
     Repeats,
@@ -47,7 +47,11 @@ _SMOOTHINGS, _SURE = (0.05, 3.0), 3.0
 #: share of the specimen's pixels away from edges of the print, above which the noise is estimated from these alone
 _LEAST_QUIET = 0.2
 
-_EVERY_SOURCE = "imager.dsnu_e", "imager.prnu"
+#: parts of the noise that one image of a light does not separate
+UNSEPARATED = tuple(
+    Undetermined(f"imager.{key}", 0.0, "repeats of one pose; until then read_noise_e and full_well_e include it")
+    for key in ("dsnu_e", "prnu", "row_noise_e", "column_pattern_e")
+)
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class ImagerFit:
     """The fitted ``imager``, ``estimates`` of its numbers, undetermined numbers, and whether its noise is ``known``."""
 
     imager: Imager
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[FittedKey, ...]
     undetermined: tuple[Undetermined, ...]
     known: bool
 
@@ -71,7 +75,8 @@ def fit_imager(groups: list[list[InputCapture]], sensor: Sensor, places: dict[st
     imager, curve = _with_curve(imager, groups, sensor)
     estimates += curve
     if repeated:
-        line = repeated_line([_repeats(group, _specimen_mask(group[0], places)) for group in repeated], imager)
+        masked = [(_images(group), _specimen_mask(group[0], places)) for group in repeated]
+        line = repeated_line([Repeats.of(images, mask, _PIXELS) for images, mask in masked], imager)
         if line is not None:
             names = tuple(source.name for group in repeated for source in group)
             imager, found = _with_line(imager, line, names, "photon transfer of repeats")
@@ -82,13 +87,13 @@ def fit_imager(groups: list[list[InputCapture]], sensor: Sensor, places: dict[st
             found_one = _from_one_image(group[0], imager, places)
             if found_one is not None:
                 imager, found = found_one
-                determined_by = "repeats of one pose; until then read_noise_e and full_well_e include it"
-                undetermined = [
-                    Undetermined(key, 0.0, determined_by)
-                    for key in (*_EVERY_SOURCE, "imager.row_noise_e", "imager.column_pattern_e")
-                ]
-                return ImagerFit(imager, (*estimates, *found), tuple(undetermined), True)
+                return ImagerFit(imager, (*estimates, *found), UNSEPARATED, True)
     return ImagerFit(imager, tuple(estimates), (), False)
+
+
+def without_fixed_pattern(imager: Imager) -> Imager:
+    """Return the imager without fixed pattern and row noise, which one image does not separate from other noise."""
+    return replace(imager, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0)
 
 
 def smoothing_of(
@@ -149,7 +154,7 @@ def _specimen_mask(source: InputCapture, places: dict[str, Place]) -> NDArray[np
     return image_mask(places[source.name], camera, MARGIN_PX)
 
 
-def _with_curve(imager: Imager, groups: list[list[InputCapture]], sensor: Sensor) -> tuple[Imager, list[Estimate]]:
+def _with_curve(imager: Imager, groups: list[list[InputCapture]], sensor: Sensor) -> tuple[Imager, list[FittedKey]]:
     """Return the imager with the knee of its curve, if one image shows it; only stereo sensor files may have one.
 
     The whole image is used: a curve belongs to the imager, whatever it sees. Black and saturated pixels are left out.
@@ -157,47 +162,48 @@ def _with_curve(imager: Imager, groups: list[list[InputCapture]], sensor: Sensor
     if sensor.technology != "active_stereo" or imager.companding or imager.gamma != 1:
         return imager, []
     for source in (group[0] for group in groups if group[0].kind == "off"):
-        image = next(iter(source.capture.images.values()))[0]
+        image = source.image
         levels, mask = image.astype(float), (image > 0) & (image < imager.full_scale)
         knee = first_knee(levels, mask, imager)
         if knee is not None:
             method = f"noise by level of one image: the first knee, {knee.slope:g} times as steep beyond it"
-            knee_estimate = Estimate("imager.companding_dn", knee.level, knee.uncertainty, "DN", (source.name,), method)
+            knee_estimate = FittedKey(
+                "imager.companding_dn", knee.level, knee.uncertainty, "DN", (source.name,), method
+            )
             return replace(imager, companding=knee.companding(imager.bits)), [knee_estimate]
     return imager, []
 
 
-def _repeats(group: list[InputCapture], mask: NDArray[np.bool_]) -> Repeats:
-    """Return the first image of every repeat."""
-    images = np.stack([next(iter(source.capture.images.values()))[0] for source in group])
-    return Repeats.of(images, mask, _PIXELS)
+def _images(group: list[InputCapture]) -> NDArray[np.unsignedinteger]:
+    """Return the first images (n, H, W) of captures."""
+    return np.stack([source.image for source in group])
 
 
-def _with_black_level(imager: Imager, dark: list[list[InputCapture]]) -> tuple[Imager, Estimate]:
+def _with_black_level(imager: Imager, dark: list[list[InputCapture]]) -> tuple[Imager, FittedKey]:
     input_captures = [source for group in dark for source in group]
-    levels = [float(next(iter(source.capture.images.values()))[0].mean()) for source in input_captures]
-    image = next(iter(input_captures[0].capture.images.values()))[0]
-    value, spread = float(np.mean(levels)), float(image.std() / np.sqrt(image.size * len(input_captures)))
+    image = input_captures[0].image
+    value = float(np.mean([float(source.image.mean()) for source in input_captures]))
+    spread = float(image.std() / np.sqrt(image.size * len(input_captures)))
     names = tuple(source.name for source in input_captures)
-    estimate = Estimate("imager.black_level_dn", value, spread, "DN", names, "mean grey level in the dark")
+    estimate = FittedKey("imager.black_level_dn", value, spread, "DN", names, "mean grey level in the dark")
     return replace(imager, black_level=value), estimate
 
 
 def _with_line(
     imager: Imager, line: TransferLine, names: tuple[str, ...], method: str
-) -> tuple[Imager, list[Estimate]]:
+) -> tuple[Imager, list[FittedKey]]:
     (well, well_u), (read, read_u) = line.full_well(imager), line.read_noise()
     return replace(imager, full_well=well, read_noise=read, row_noise=0.0), [
-        Estimate("imager.full_well_e", well, well_u, "e-", names, method),
-        Estimate("imager.read_noise_e", read, read_u, "e-", names, method),
+        FittedKey("imager.full_well_e", well, well_u, "e-", names, method),
+        FittedKey("imager.read_noise_e", read, read_u, "e-", names, method),
     ]
 
 
 def _with_fixed(
     imager: Imager, before: Imager, repeated: list[list[InputCapture]], places: dict[str, Place]
-) -> tuple[Imager, list[Estimate], list[Undetermined]]:
+) -> tuple[Imager, list[FittedKey], list[Undetermined]]:
     """Estimate DSNU from dark repeats, PRNU from repeats in uniform light."""
-    estimates: list[Estimate] = []
+    estimates: list[FittedKey] = []
     undetermined = [Undetermined("imager.row_noise_e", 0.0, "the mean of rows in the dark; read_noise_e includes it")]
     for kind, key, determined_by in (
         ("dark", "imager.dsnu_e", "repeats in the dark"),
@@ -208,52 +214,37 @@ def _with_fixed(
             undetermined.append(Undetermined(key, before.dsnu if kind == "dark" else before.prnu, determined_by))
             continue
         group = groups[0]
-        images = np.stack([next(iter(source.capture.images.values()))[0] for source in group])
-        level, variance, spread = fixed_variance(images, _specimen_mask(group[0], places), imager)
+        level, variance, spread = fixed_variance(_images(group), _specimen_mask(group[0], places), imager)
         if kind == "off":
             variance -= imager.dsnu**2
         root = float(np.sqrt(max(variance, 0.0)))
         spread_root = spread / (2 * root) if root > 0 else float(np.sqrt(spread))
-        scale = 1.0 if kind == "dark" else level
-        names = tuple(source.name for source in group)
-        estimates.append(
-            Estimate(
-                key,
-                root / scale,
-                spread_root / scale,
-                "e-" if kind == "dark" else "1",
-                names,
-                "finest detail of the mean of repeats",
-            )
-        )
+        scale, unit = (1.0, "e-") if kind == "dark" else (level, "1")
+        names, method = tuple(source.name for source in group), "finest detail of the mean of repeats"
+        estimates.append(FittedKey(key, root / scale, spread_root / scale, unit, names, method))
         imager = replace(imager, dsnu=root) if kind == "dark" else replace(imager, prnu=root / scale)
     return imager, estimates, undetermined
 
 
 def _from_one_image(
     source: InputCapture, imager: Imager, places: dict[str, Place]
-) -> tuple[Imager, list[Estimate]] | None:
-    image, mask = next(iter(source.capture.images.values()))[0], _specimen_mask(source, places)
+) -> tuple[Imager, list[FittedKey]] | None:
+    image, mask = source.image, _specimen_mask(source, places)
     names, method = (source.name,), "finest detail of one image by level, including its fixed pattern"
     estimates = []
-    bare = replace(imager, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0)
+    bare = without_fixed_pattern(imager)
     smoothing, spread = smoothing_of(image, mask)
     quiet = quiet_pixels(image.astype(float), denoised(image.astype(float), mask), mask)
     mask = quiet if quiet.mean() > _LEAST_QUIET * mask.mean() else mask
     gain = 1.0
     if smoothing > max(_SURE * spread, 0.2):
         bare, gain = replace(bare, smoothing_px=smoothing), fine_gain(smoothing)
-        estimates.append(
-            Estimate(
-                "imager.smoothing_px", smoothing, spread, "px", names, "correlation of neighbours in finest detail"
-            )
-        )
+        by_neighbours = "correlation of neighbours in finest detail"
+        estimates.append(FittedKey("imager.smoothing_px", smoothing, spread, "px", names, by_neighbours))
     line = one_image_line(image, mask, imager)
     if line is not None:
-        line = TransferLine(
-            line.offset / gain, line.slope / gain, line.covariance / gain**2, line.bins, line.chi_square
-        )
-        line = line.not_negative()
+        scaled = replace(line, offset=line.offset / gain, slope=line.slope / gain, covariance=line.covariance / gain**2)
+        line = scaled.not_negative()
         if line.full_well(imager)[1] < 0.3 * line.full_well(imager)[0] and line.offset >= 0:
             found, from_line = _with_line(bare, line, names, method)
             return found, [*estimates, *from_line]
@@ -261,13 +252,15 @@ def _from_one_image(
     electrons = linearised(image, imager)
     level = float(np.median(electrons[mask]))
     fine = finest_detail(electrons)
-    variance = float(np.median(fine[mask] ** 2)) / 0.45493642311957283
+    variance = float(np.median(fine[mask] ** 2)) / MEDIAN_SQUARE
     variance = (variance - float(widths(np.array(float(np.median(image[mask]))), imager)) ** 2 / 12) / gain
     relative = float(np.sqrt(2 / (mask.sum() * 0.37 * independent_share())))
     read = imager.read_noise
     if variance > level + 1.0:
         value = float(np.sqrt(variance - level))
-        estimates.append(Estimate("imager.read_noise_e", value, relative * variance / (2 * value), "e-", names, method))
+        estimates.append(
+            FittedKey("imager.read_noise_e", value, relative * variance / (2 * value), "e-", names, method)
+        )
         return replace(bare, read_noise=value), estimates
     if variance <= 0:
         return None
@@ -275,7 +268,7 @@ def _from_one_image(
     share = level / (level + read**2)
     kappa = variance * share / level
     well = imager.full_well / kappa
-    estimates.append(Estimate("imager.full_well_e", well, relative * well, "e-", names, method))
+    estimates.append(FittedKey("imager.full_well_e", well, relative * well, "e-", names, method))
     value = float(np.sqrt(variance * (1 - share))) / kappa
-    estimates.append(Estimate("imager.read_noise_e", value, relative * value, "e-", names, method))
+    estimates.append(FittedKey("imager.read_noise_e", value, relative * value, "e-", names, method))
     return replace(bare, full_well=well, read_noise=value), estimates

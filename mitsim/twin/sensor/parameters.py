@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -52,48 +53,64 @@ class Parameter:
     determined_by: str = ""
 
 
-#: full well [e-], and read noise as a share of it, whose varied quantity is 1
-_WELL, _READ = 15_000.0, 3e-3
+#: full well whose varied quantity is 1 [e-]
+_WELL = 15_000.0
+
+#: read noise, as a share of the full well, whose varied quantity is 1
+_READ = 3e-3
 
 
 def _log(value: float) -> float:
     return float(np.log(max(value, 1e-9)))
 
 
+#: varied quantity of a number in the file, and its inverse
+_TRANSFORMS: dict[str, tuple[Callable[[float], float], Callable[[float], float]]] = {
+    "square": (lambda value: value**2, lambda x: float(np.sqrt(max(x, 0.0)))),
+    "logarithm": (_log, lambda x: float(np.exp(x))),
+    "share": (lambda value: value, lambda x: float(np.clip(x, 0, 1))),
+}
+
+
+def _number(key: str, unit: str, transform: str, **about: Any) -> Parameter:
+    """Return the parameter of a number that is varied alone; ``key`` is its place in :class:`Sensor` too."""
+    table, _, name = key.partition(".")
+    varied, inverse = _TRANSFORMS[transform]
+
+    def read(sensor: Sensor) -> float:
+        return float(getattr(getattr(sensor, table), name))
+
+    def put(sensor: Sensor, x: float) -> Sensor:
+        owner, change = getattr(sensor, table), {name: inverse(x)}
+        changed = owner.model_copy(update=change) if table == "pattern" else replace(owner, **change)
+        return replace(sensor, **{table: changed})
+
+    return Parameter(key, unit, read, lambda sensor: varied(read(sensor)), put, **about)
+
+
+def _with_room_level(room: RoomTable | None, ratio: float) -> RoomTable | None:
+    return None if room is None else room.model_copy(update={"irradiance_w_mm2": room.irradiance_w_mm2 * ratio})
+
+
 def _with_full_well(sensor: Sensor, x: float) -> Sensor:
     """Set the full well and keep grey levels: power, room and read noise scale with it."""
     chip, ratio = sensor.imager, _WELL / max(x, 1e-3) / sensor.imager.full_well
-    projector, room = replace(sensor.projector, flux=sensor.projector.flux * ratio), sensor.room
-    if room is not None:
-        room = room.model_copy(update={"irradiance_w_mm2": room.irradiance_w_mm2 * ratio})
+    projector = replace(sensor.projector, flux=sensor.projector.flux * ratio)
     chip = replace(chip, full_well=chip.full_well * ratio, read_noise=chip.read_noise * ratio)
-    return replace(sensor, imager=chip, projector=projector, room=room)
+    return replace(sensor, imager=chip, projector=projector, room=_with_room_level(sensor.room, ratio))
 
 
 def _with_flux(sensor: Sensor, x: float) -> Sensor:
     """Set the power and keep the ratio of the room's light to it."""
-    projector, room = sensor.projector, sensor.room
+    projector = sensor.projector
     ratio = float(np.exp(x)) * sensor.imager.full_well / projector.flux
-    if room is not None:
-        room = room.model_copy(update={"irradiance_w_mm2": room.irradiance_w_mm2 * ratio})
+    room = _with_room_level(sensor.room, ratio)
     return replace(sensor, projector=replace(projector, flux=projector.flux * ratio), room=room)
-
-
-def _with_corner(sensor: Sensor, x: float) -> Sensor:
-    return replace(sensor, projector=replace(sensor.projector, corner_illumination=float(np.exp(x))))
-
-
-def _with_black_level(sensor: Sensor, x: float) -> Sensor:
-    return replace(sensor, projector=replace(sensor.projector, black_level=float(np.clip(x, 0, 1))))
 
 
 def _with_read_noise(sensor: Sensor, x: float) -> Sensor:
     chip = sensor.imager
     return replace(sensor, imager=replace(chip, read_noise=_READ * float(np.sqrt(max(x, 0.0))) * chip.full_well))
-
-
-def _with_smoothing(sensor: Sensor, x: float) -> Sensor:
-    return replace(sensor, imager=replace(sensor.imager, smoothing_px=float(np.sqrt(max(x, 0.0)))))
 
 
 def _with_corner_blur(sensor: Sensor, x: float) -> Sensor:
@@ -113,9 +130,9 @@ FULL_WELL = Parameter(
     lambda sensor: sensor.imager.full_well,
     lambda sensor: _WELL / sensor.imager.full_well,
     _with_full_well,
-    1.0,
-    0.05,
-    0.02,
+    spread=1.0,
+    step=0.05,
+    low=0.02,
     scale="inverse",
     determined_by="repeats of one pose",
 )
@@ -126,24 +143,10 @@ READ_NOISE = Parameter(
     lambda sensor: sensor.imager.read_noise,
     lambda sensor: (sensor.imager.read_noise / sensor.imager.full_well / _READ) ** 2,
     _with_read_noise,
-    3.0,
-    0.1,
-    0.0,
-    scale="linear",
+    spread=3.0,
+    step=0.1,
+    low=0.0,
     determined_by="a capture in the dark",
-)
-
-SMOOTHING = Parameter(
-    "imager.smoothing_px",
-    "px",
-    lambda sensor: sensor.imager.smoothing_px,
-    lambda sensor: sensor.imager.smoothing_px**2,
-    _with_smoothing,
-    0.7,
-    0.05,
-    0.0,
-    4.0,
-    determined_by="repeats of one pose",
 )
 
 FLUX = Parameter(
@@ -152,24 +155,10 @@ FLUX = Parameter(
     lambda sensor: sensor.projector.flux,
     lambda sensor: _log(sensor.projector.flux / sensor.imager.full_well),
     _with_flux,
-    4.0,
-    0.1,
+    spread=4.0,
+    step=0.1,
     scale="inverse",
     determined_by="a capture with the projector on",
-)
-
-PROJECTOR_CORNER = Parameter(
-    "projector.corner_illumination",
-    "1",
-    lambda sensor: sensor.projector.corner_illumination,
-    lambda sensor: _log(sensor.projector.corner_illumination),
-    _with_corner,
-    1.0,
-    0.15,
-    -4.6,
-    0.0,
-    scale="logarithm",
-    determined_by="a capture of a sheet that fills the field",
 )
 
 CORNER_BLUR = Parameter(
@@ -178,60 +167,46 @@ CORNER_BLUR = Parameter(
     _corner_blur,
     lambda sensor: _corner_blur(sensor) ** 2 - sensor.imager.blur_px**2,
     _with_corner_blur,
-    4.0,
-    0.3,
-    0.0,
-    25.0,
+    spread=4.0,
+    step=0.3,
+    low=0.0,
+    high=25.0,
     determined_by="a capture of a sheet that fills the field, projector on",
 )
 
-BLACK_LEVEL = Parameter(
-    "projector.black_level",
+SMOOTHING = _number(
+    "imager.smoothing_px", "px", "square", spread=0.7, step=0.05, low=0.0, high=4.0, determined_by="repeats of one pose"
+)
+
+PROJECTOR_CORNER = _number(
+    "projector.corner_illumination",
     "1",
-    lambda sensor: sensor.projector.black_level,
-    lambda sensor: sensor.projector.black_level,
-    _with_black_level,
-    0.5,
-    0.05,
-    0.0,
-    0.95,
-    determined_by="a capture with the projector off",
+    "logarithm",
+    spread=1.0,
+    step=0.15,
+    low=-4.6,
+    high=0.0,
+    scale="logarithm",
+    determined_by="a capture of a sheet that fills the field",
+)
+
+_OFF = "a capture with the projector off"
+
+BLACK_LEVEL = _number(
+    "projector.black_level", "1", "share", spread=0.5, step=0.05, low=0.0, high=0.95, determined_by=_OFF
 )
 
 
 def pattern_parameters(sensor: Sensor) -> list[Parameter]:
     """Return the parameters of a pattern of dots: their size and sharpness."""
+    determined_by = "a capture with the projector on, of an even sheet"
+    sizes: dict[type, list[str]] = {RandomDots: ["run_length_px"], DiffractionSpots: ["cell_px", "spot_px"]}
+    size: dict[str, Any] = {"spread": 0.7, "step": 0.05, "scale": "logarithm", "determined_by": determined_by}
+    out = [_number(f"pattern.{name}", "px", "logarithm", **size) for name in sizes.get(type(sensor.pattern), ())]
     if isinstance(sensor.pattern, RandomDots):
-        return [_of_pattern("run_length_px", False, 0.7, 0.05), _of_pattern("blur_px", True, 3.0, 0.2)]
-    if isinstance(sensor.pattern, DiffractionSpots):
-        return [_of_pattern("cell_px", False, 0.7, 0.05), _of_pattern("spot_px", False, 0.7, 0.05)]
-    return []
-
-
-def _of_pattern(field: str, squared: bool, spread: float, step: float) -> Parameter:
-    def read(sensor: Sensor) -> float:
-        return float(getattr(sensor.pattern, field))
-
-    def put(sensor: Sensor, x: float) -> Sensor:
-        value = float(np.sqrt(max(x, 0.0))) if squared else float(np.exp(x))
-        assert isinstance(sensor.pattern, RandomDots | DiffractionSpots)  # see pattern_parameters
-        return replace(sensor, pattern=sensor.pattern.model_copy(update={field: value}))
-
-    def get(sensor: Sensor) -> float:
-        return read(sensor) ** 2 if squared else _log(read(sensor))
-
-    return Parameter(
-        f"pattern.{field}",
-        "px",
-        read,
-        get,
-        put,
-        spread,
-        step,
-        0.0 if squared else -np.inf,
-        scale="linear" if squared else "logarithm",
-        determined_by="a capture with the projector on, of an even sheet",
-    )
+        blur: dict[str, Any] = {"spread": 3.0, "step": 0.2, "low": 0.0, "determined_by": determined_by}
+        out.append(_number("pattern.blur_px", "px", "square", **blur))
+    return out
 
 
 #: keys of the room's light, in the order of the terms of its irradiance
@@ -256,7 +231,7 @@ def room_parameters(unit: float) -> list[Parameter]:
             step,
             0.02 if index == 0 else -np.inf,
             scale="inverse" if index == 0 else "linear",
-            determined_by="a capture with the projector off",
+            determined_by=_OFF,
         )
         for index, (key, spread, step) in enumerate(zip(ROOM_KEYS, spreads, steps, strict=True))
     ]

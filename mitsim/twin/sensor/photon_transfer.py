@@ -49,16 +49,11 @@ _MEDIAN_EFFICIENCY = 0.37
 
 @dataclass(frozen=True)
 class TransferLine:
-    """Variance of the noise v = ``offset`` + ``slope`` mu in file electrons, their ``covariance`` (2, 2).
-
-    ``bins``: number of fitted bins; ``chi_square`` of the fit.
-    """
+    """Variance of the noise v = ``offset`` + ``slope`` mu in file electrons, their ``covariance`` (2, 2)."""
 
     offset: float
     slope: float
     covariance: Floats
-    bins: int
-    chi_square: float
 
     def full_well(self, imager: Imager) -> tuple[float, float]:
         """Return the full well [e-] and its standard uncertainty."""
@@ -165,11 +160,6 @@ def fixed_variance(
     return level, total - temporal / len(images), float(np.sqrt(spread**2 + left))
 
 
-def with_noise(imager: Imager, full_well: float, read_noise: float, dsnu: float, prnu: float) -> Imager:
-    """Return the imager with the fitted noise."""
-    return replace(imager, full_well=full_well, read_noise=read_noise, dsnu=dsnu, prnu=prnu)
-
-
 def _bins(
     mean: Floats, variance: Floats, level: Floats, freedom: int, chip: Imager
 ) -> list[tuple[float, float, float]]:
@@ -207,5 +197,4 @@ def _line(rows: list[tuple[float, float, float]]) -> TransferLine | None:
         spread = spread * (expected / before) ** 2
     if not slope > 0:
         return None
-    chi_square = float(((v - offset - slope * mu) ** 2 / spread).sum())
-    return TransferLine(float(offset), float(slope), np.asarray(covariance), len(mu), chi_square)
+    return TransferLine(float(offset), float(slope), np.asarray(covariance))

@@ -25,8 +25,7 @@ others are not looked for. Levels beyond the brightest pixel are unknown; the cu
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,18 +35,26 @@ from scipy.special import ndtr
 
 from mitsim.sensor.imager import Imager
 from mitsim.twin.compare.denoise import denoised
-from mitsim.twin.finish.fine_detail import FINEST, finest_detail, noise_of_levels
+from mitsim.twin.finish.fine_detail import FINEST, MEDIAN_SQUARE, finest_detail, noise_of_levels
 from mitsim.twin.sensor.photon_transfer import independent_share
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: side of a tile and its rim, which the weights reach [px]; largest number of tiles, least number with quiet pixels
-_TILE_PX, _RIM_PX, _TILES, _FEWEST = 32, 2, 120, 8
+#: side of a tile and its rim, which the weights reach [px]
+_TILE_PX, _RIM_PX = 32, 2
 
-#: slope beyond a knee; steps of its level [DN], coarse and fine; fine steps to either side of a coarse level, and of a
-#: level that is known, and as many at most
-_SLOPE, _COARSE_DN, _STEP_DN, _AROUND, _BESIDE_IT, _FARTHEST = 0.5, 3.0, 0.5, 4, 1, 20
+#: largest number of tiles, and least number with quiet pixels
+_TILES, _FEWEST = 120, 8
+
+#: slope beyond a knee; chips compand by steps of two
+_SLOPE = 0.5
+
+#: steps of a knee's level, coarse and fine [DN]
+_COARSE_DN, _STEP_DN = 3.0, 0.5
+
+#: fine steps to either side of a coarse level, of a level that is known, and as many at most
+_AROUND, _BESIDE_IT, _FARTHEST = 4, 1, 20
 
 #: how far a level's own share of the light begins under the knee of the file [DN]
 _ROUNDED_DOWN_DN = 0.5
@@ -69,9 +76,6 @@ _QUIET, _LARGEST = 0.5, 4.0
 
 #: squares of the weights of finest detail along an axis (32, 36): of the pixels of a tile and its rim, for those within
 _WEIGHTS = sum(np.eye(_TILE_PX, _TILE_PX + 2 * _RIM_PX, at) * weight for at, weight in enumerate(FINEST**2))
-
-#: median of chi-square with one degree of freedom
-_MEDIAN_SQUARE = 0.45493642311957283
 
 
 @dataclass(frozen=True)
@@ -171,19 +175,21 @@ def _least(tiles: _Tiles, middle: float, slope: float, around: int) -> float:
     return float(middle + (best + float(np.clip(aside, -1, 1))) * _STEP_DN)
 
 
-@dataclass(frozen=True)
 class _Tiles:
-    """Tiles (n, 36, 36) of an image without noise, which of their pixels are used, and these pixels' squared detail.
+    """Tiles (n, 36, 36) of an image without noise, which pixels are used, their squared detail, and that of the print.
 
-    ``rising`` (n * 36 * 36,) are the indices of the pixels by rising level.
+    ``rising`` (n * 36 * 36,) are the indices of the pixels by rising level, ``ranks`` (n, 36, 36) the places of the
+    pixels in this order. ``used`` are indices of pixels among those of the tiles without their rims.
     """
 
-    clean: Floats
-    rising: NDArray[np.intp]
-    inside: Mask
-    square: Floats
-    own: Floats
-    black: float
+    def __init__(self, clean: Floats, inside: Mask, square: Floats, own: Floats, black: float) -> None:
+        self.clean, self.inside, self.square, self.own, self.black = clean, inside, square, own, black
+        self.rising = np.argsort(clean, axis=None)
+        self.rising_levels = clean.reshape(-1)[self.rising]
+        ranks = np.empty(clean.size, np.intp)
+        ranks[self.rising] = np.arange(clean.size)
+        self.ranks = ranks.reshape(clean.shape)
+        self.used = np.flatnonzero(inside[:, _RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX])
 
     @classmethod
     def of(cls, image: Floats, clean: Floats, quiet: Mask, black: float) -> _Tiles | None:
@@ -198,52 +204,14 @@ class _Tiles:
             return None
         some = some[:: int(np.ceil(len(some) / _TILES))]
         levels, square, own = (_cut(one, side)[some] for one in (clean, finest_detail(image), finest_detail(clean)))
-        return cls(
-            levels,
-            np.argsort(levels, axis=None),
-            inside[some],
-            square[inside[some]] ** 2,
-            own[inside[some]] ** 2,
-            black,
-        )
-
-    @cached_property
-    def median_square(self) -> float:
-        """Median squared detail."""
-        return float(np.median(self.square))
-
-    @cached_property
-    def excess(self) -> Floats:
-        """Squared detail less that of rounding and of the print."""
-        return self.square - 1 / 12 - self.own
-
-    @cached_property
-    def median_level(self) -> float:
-        """Median level [DN]."""
-        return float(np.median(self.clean))
-
-    @cached_property
-    def rising_levels(self) -> Floats:
-        """Levels of all pixels [DN], rising."""
-        return self.clean.reshape(-1)[self.rising]
-
-    @cached_property
-    def ranks(self) -> NDArray[np.intp]:
-        """Place of every pixel (n, 36, 36) among the rising levels."""
-        ranks = np.empty(self.clean.size, np.intp)
-        ranks[self.rising] = np.arange(len(ranks))
-        return ranks.reshape(self.clean.shape)
-
-    @cached_property
-    def used(self) -> NDArray[np.intp]:
-        """Indices of the pixels that are used, among all pixels of the tiles without their rims."""
-        return np.flatnonzero(self.inside[:, _RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX])
+        inside = inside[some]
+        return cls(levels, inside, square[inside] ** 2, own[inside] ** 2, black)
 
     def away_from(self, level: float) -> _Tiles:
         """The tiles without pixels near a level: a curve that is flat there only is no knee."""
         far = np.abs(self.clean - level) > _NEAR_DN
         kept = far[self.inside]
-        return replace(self, inside=self.inside & far, square=self.square[kept], own=self.own[kept])
+        return _Tiles(self.clean, self.inside & far, self.square[kept], self.own[kept], self.black)
 
     def best(self, knee: float, slope: float) -> Floats:
         """-2 log likelihood (n,) of the tiles with the best a and b of all of them."""
@@ -251,13 +219,15 @@ class _Tiles:
 
     def fitted(self, knee: float, slope: float) -> Floats:
         """The a and b of all tiles, by weighted least squares."""
-        middle = self.median_square / _MEDIAN_SQUARE
-        numbers, variance = np.array([0.0, middle / max(self.median_level, 1.0)]), np.full_like(self.square, middle)
+        middle = float(np.median(self.square)) / MEDIAN_SQUARE
+        numbers = np.array([0.0, middle / max(float(np.median(self.clean)), 1.0)])
+        variance, excess = np.full_like(self.square, middle), self.square - 1 / 12 - self.own
         for _ in range(3):
-            maps = self._maps(knee, slope, numbers)
+            shares = self._shares(knee, slope, numbers)
+            maps = np.stack([_of_neighbours(share).take(self.used) for share in shares])
             for _ in range(2):
                 weight = (self.square < _LARGEST**2 * variance) / variance**2
-                numbers = _two(maps, self.excess, weight)
+                numbers = _two(maps, excess, weight)
                 variance = np.maximum(numbers @ maps, 1e-3) + 1 / 12 + self.own
         return numbers
 
@@ -294,10 +264,6 @@ class _Tiles:
         without = bend.sum(axis=0) - bend
         moved = np.linalg.solve(without, (slopes - slopes.mean(axis=0))[..., None])[:, 0, 0] * _STEP_DN
         return float(np.sqrt((len(moved) - 1) * moved.var()))
-
-    def _maps(self, knee: float, slope: float, numbers: Floats) -> Floats:
-        """Return the factors (2, N) of a and b in every used pixel."""
-        return np.stack([_of_neighbours(one).take(self.used) for one in self._shares(knee, slope, numbers)])
 
     def _shares(self, knee: float, slope: float, numbers: Floats) -> tuple[Floats, Floats]:
         """Return the factors (n, 36, 36) of a and b in every pixel alone."""

@@ -20,8 +20,8 @@ from mitsim.twin.compare.rebuild import like
 from mitsim.twin.finish.electrons import chip_of, linearised
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
-from mitsim.twin.sensor.estimate import Estimate
-from mitsim.twin.sensor.figures import Field
+from mitsim.twin.sensor.estimate import FittedKey
+from mitsim.twin.sensor.figures import SpecimenField
 from mitsim.twin.sensor.input_captures import InputCapture
 from mitsim.twin.sensor.parameters import ROOM_KEYS
 
@@ -35,24 +35,24 @@ class RoomFit:
     """Six ``terms`` of the irradiance [W/mm^2], and the estimates of the file's numbers."""
 
     terms: tuple[float, ...]
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[FittedKey, ...]
 
 
 def fit_room(input_captures: list[InputCapture], sensor: Sensor, places: dict[str, Place]) -> RoomFit | None:
     """Fit the light of the room to captures with the projector off; None if none shows enough of a sheet."""
     rows, values = [], []
     for source in input_captures:
-        name, camera = next(iter(source.capture.rig.cameras.items()))
+        camera = source.capture.rig.reference
         own = like(source.capture, sensor, source.name)
         if own.exposure.base_s is None:
             continue
         chip = chip_of(source.capture, sensor.imager, source.name)
-        electrons = linearised(source.capture.images[name][0], chip)
+        electrons = linearised(source.image, chip)
         loss = camera_illumination(sensor.imager.corner_illumination, camera)
         scale = electrons_per_radiance(sensor.imager, sensor.wavelength_nm, own.exposure.base_s) * REFLECTANCE / np.pi
         irradiance = electrons / scale / (1.0 if loss is None else loss)
-        field = Field.of(camera, image_mask(places[source.name], camera, MARGIN_PX), _PATCH_PX)
-        corners = field.corners + np.array([field.row, field.column])
+        field = SpecimenField.of(camera, image_mask(places[source.name], camera, MARGIN_PX), _PATCH_PX)
+        corners = field.corners + np.array([field.roi.top, field.roi.left])
         if not len(corners):
             continue
         middles = corners[:, ::-1] + (_PATCH_PX - 1) / 2
@@ -79,14 +79,6 @@ def fit_room(input_captures: list[InputCapture], sensor: Sensor, places: dict[st
             value = found[index] / found[0]
             gradient[index], gradient[0] = 1 / found[0], -value / found[0]
         spread = float(np.sqrt(gradient @ covariance @ gradient))
-        estimates.append(
-            Estimate(
-                f"room.{ROOM_KEYS[index]}",
-                float(value),
-                spread,
-                "W/mm^2" if index == 0 else "1",
-                names,
-                "level with the projector off",
-            )
-        )
+        key, unit = f"room.{ROOM_KEYS[index]}", "W/mm^2" if index == 0 else "1"
+        estimates.append(FittedKey(key, float(value), spread, unit, names, "level with the projector off"))
     return RoomFit(tuple(float(term) for term in terms), tuple(estimates))

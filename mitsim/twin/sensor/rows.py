@@ -13,8 +13,6 @@ mounts are the same.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,24 +29,25 @@ _FEWEST, _CLIP = 6, 3.0
 _MAD_TO_SIGMA = 1.482602218505602
 
 
-@dataclass(frozen=True)
-class Rows:
-    """Rotations [mrad] of the second camera with standard uncertainties; ``mean`` row error [px] and ``patches``."""
+def row_turns(
+    capture: Capture, settings: Settings, place: Place, prior: tuple[float, float]
+) -> dict[str, tuple[float, float]]:
+    """Return the rotations of a pair's second camera [mrad] with standard uncertainties, from its row errors.
 
-    row_mrad: tuple[float, float]
-    roll_mrad: tuple[float, float]
-    mean: tuple[float, float]
-    patches: int
+    ``row_mrad`` is that about its x axis, ``roll_mrad`` its roll; none for too few patches or no pair.
 
-
-def row_turns(capture: Capture, settings: Settings, place: Place, prior: tuple[float, float]) -> Rows | None:
-    """Return the rotation of a pair's second camera from its row errors; None for too few patches or no pair.
-
-    ``prior`` contains the standard deviations [mrad] of rotation and roll before the measurement.
+    Parameters
+    ----------
+    capture, settings
+        Capture of a pair of cameras, and the settings of its decoder.
+    place
+        Pose and extent of the specimen.
+    prior
+        Standard deviations of rotation and roll before the measurement [mrad].
     """
     geometry = capture_geometry(capture, settings)
     if not isinstance(geometry, StereoGeometry) or capture.technology == "structured_light":
-        return None
+        return {}
     errors, columns, rows = patch_rows(capture, settings, geometry, place)
     focal, matrix = float(geometry.rectification.matrix_right[0, 0]), geometry.rectification.matrix_right
     x, y = (columns - matrix[0, 2]) / focal, (rows - matrix[1, 2]) / focal
@@ -56,18 +55,12 @@ def row_turns(capture: Capture, settings: Settings, place: Place, prior: tuple[f
     design = focal * 1e-3 * np.column_stack([1 + y**2, -x])
     for _ in range(3):
         if known.sum() < _FEWEST:
-            return None
+            return {}
         found, covariance, rest = _line(design[known], errors[known], np.array(prior))
         off = errors - design @ found
         known &= np.abs(off) <= _CLIP * max(_MAD_TO_SIGMA * float(np.median(np.abs(rest))), 1e-3)
     spread = np.sqrt(np.diag(covariance))
-    mean = float(errors[known].mean())
-    return Rows(
-        (float(found[0]), float(spread[0])),
-        (float(found[1]), float(spread[1])),
-        (mean, float(errors[known].std(ddof=1) / np.sqrt(known.sum()))),
-        int(known.sum()),
-    )
+    return {name: (float(found[k]), float(spread[k])) for k, name in enumerate(("row_mrad", "roll_mrad"))}
 
 
 def _line(design: Floats, values: Floats, prior: Floats) -> tuple[Floats, Floats, Floats]:

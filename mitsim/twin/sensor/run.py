@@ -3,8 +3,7 @@
 Signal chain: captures, sorted (:mod:`mitsim.twin.sensor.input_captures`) -> repeats and dark captures: photon transfer
 (:mod:`mitsim.twin.sensor.photon_transfer`) -> projector off: light of the room (:mod:`mitsim.twin.sensor.room`) ->
 dots: the remaining parameters (:mod:`mitsim.twin.sensor.dots`) -> row errors (:mod:`mitsim.twin.sensor.rows`) ->
-several captures combined (:mod:`mitsim.twin.sensor.estimate`) -> the sensor file
-(:mod:`mitsim.twin.sensor.sensor_text`).
+several captures combined (:mod:`mitsim.twin.sensor.estimate`) -> the sensor file (:mod:`mitsim.twin.sensor.write`).
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.decode.cloud import decoder_settings
 from mitsim.running.progress import say
-from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor, load_sensor
@@ -29,9 +27,9 @@ from mitsim.twin.compare.rebuild import like
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import specimen_place
 from mitsim.twin.sensor.dots import DotDraws, DotsFit, fit_dots
-from mitsim.twin.sensor.estimate import Estimate, Undetermined, combined, pooled, scaled, unscaled
+from mitsim.twin.sensor.estimate import FittedKey, Undetermined, pooled
 from mitsim.twin.sensor.input_captures import InputCapture, read_input_captures, repeats
-from mitsim.twin.sensor.noise import ImagerFit, fit_imager
+from mitsim.twin.sensor.noise import UNSEPARATED, ImagerFit, fit_imager, without_fixed_pattern
 from mitsim.twin.sensor.parameters import (
     BLACK_LEVEL,
     CORNER_BLUR,
@@ -44,7 +42,7 @@ from mitsim.twin.sensor.parameters import (
     pattern_parameters,
 )
 from mitsim.twin.sensor.room import RoomFit, fit_room
-from mitsim.twin.sensor.rows import Rows, row_turns
+from mitsim.twin.sensor.rows import row_turns
 from mitsim.twin.sensor.stripes import fit_stripes
 
 Floats = NDArray[np.float64]
@@ -56,15 +54,12 @@ _MISFIT = 10.0
 
 @dataclass(frozen=True)
 class SensorFit:
-    """Result of a fit: ``estimates``, undetermined numbers (``undetermined``), and the fits of every capture."""
+    """Result of a fit: ``estimates``, and numbers that no capture determines (``undetermined``)."""
 
     sensor: Sensor = field(repr=False)
     input_captures: tuple[InputCapture, ...] = field(repr=False)
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[FittedKey, ...]
     undetermined: tuple[Undetermined, ...]
-    dots: dict[str, DotsFit] = field(repr=False)
-    places: dict[str, Place] = field(repr=False)
-    rows: dict[str, Rows] = field(repr=False)
 
 
 def fit_sensor(
@@ -104,40 +99,31 @@ def fit_sensor(
         f"{len(input_captures)} captures: "
         + ", ".join(f"{g[0].name} {g[0].kind}" + (f" x {len(g)}" if len(g) > 1 else "") for g in groups)
     )
-    places: dict[str, Place] = {}
-    for group in groups:
-        if group[0].kind != "dark":
-            places[group[0].name] = _place(group[0], roi)
+    lit = [group[0] for group in groups if group[0].kind != "dark"]
+    off_captures, on_captures = ([source for source in lit if source.kind == kind] for kind in ("off", "on"))
+    places = {source.name: _place(source, roi) for source in lit}
     imager = fit_imager(groups, base, places)
     estimates = list(imager.estimates)
     base = replace(base, imager=imager.imager)
-    lit = [group[0] for group in groups if group[0].kind == "off"]
-    room = fit_room(lit, base, places) if lit and any(group[0].kind == "on" for group in groups) else None
+    room = fit_room(off_captures, base, places) if off_captures and on_captures else None
     estimates += room.estimates if room is not None else []
-    dots = _dots([g[0] for g in groups if g[0].kind == "on"], base, places, imager, room, seed, draws)
+    dots = _dots(on_captures, base, places, imager, room, DotDraws(draws, seed))
     shared, undetermined = _combined_estimates(dots, base, imager, room)
     estimates += shared
     if isinstance(base.pattern, LightCode):
-        coded: list[Estimate] = []
-        for source in (group[0] for group in groups if group[0].kind == "on"):
+        coded: list[FittedKey] = []
+        for source in on_captures:
             own = replace(like(source.capture, base, source.name), imager=base.imager)
-            coded += fit_stripes(source, own, places[source.name])[1]
+            coded += fit_stripes(source, own, places[source.name])
         estimates += pooled(coded)
-    rows = {}
-    for group in groups:
-        if group[0].kind != "dark":
-            settings, _ = decoder_settings(group[0].capture)
-            found = row_turns(group[0].capture, settings, places[group[0].name], _assumed_deviations(chosen))
-            if found is not None:
-                rows[group[0].name] = found
-    estimates += _turn_estimates(rows)
-    return SensorFit(base, tuple(input_captures), tuple(estimates), tuple(undetermined), dots, places, rows)
-
-
-def _assumed_deviations(sensor: Sensor) -> tuple[float, float]:
-    """Standard deviations [mrad] of the second camera's turn about x and of its roll, by the sensor's unknowns."""
-    own = sensor.unknowns.calibration
-    return own.row_mrad, own.roll_mrad
+    turned, assumed, method = list[FittedKey](), chosen.unknowns.calibration, "row errors over the field"
+    for source in lit:
+        settings, _ = decoder_settings(source.capture)
+        turns = row_turns(source.capture, settings, places[source.name], (assumed.row_mrad, assumed.roll_mrad))
+        for key, pair in turns.items():
+            turned.append(FittedKey(f"misalignment.{key}", *pair, "mrad", (source.name,), method))
+    estimates += pooled(turned)
+    return SensorFit(base, tuple(input_captures), tuple(estimates), tuple(undetermined))
 
 
 def sensor_path(name: str | Path) -> Path:
@@ -173,8 +159,7 @@ def _dots(
     places: dict[str, Place],
     imager: ImagerFit,
     room: RoomFit | None,
-    seed: int,
-    draws: int,
+    draws: DotDraws,
 ) -> dict[str, DotsFit]:
     if not isinstance(base.pattern, DotPattern):
         return {}
@@ -185,84 +170,40 @@ def _dots(
     out = {}
     for source in input_captures:
         sensor = replace(like(source.capture, base, source.name), imager=base.imager, room=base.room)
-        if not imager.known:  # one image cannot separate the fixed pattern from noise
-            sensor = replace(sensor, imager=_without_fixed(sensor.imager))
-        out[source.name] = fit_dots(
-            source.capture,
-            _check_exposure(sensor, source),
-            places[source.name],
-            parameters,
-            source.name,
-            room=None if room is None else room.terms,
-            draws=DotDraws(draws, seed),
-        )
-        fit = out[source.name].moment_fit
+        if not imager.known:
+            sensor = replace(sensor, imager=without_fixed_pattern(sensor.imager))
+        place, terms = places[source.name], None if room is None else room.terms
+        sensor = _check_exposure(sensor, source)
+        found = fit_dots(source.capture, sensor, place, parameters, source.name, room=terms, draws=draws)
+        out[source.name], fit = found, found.moment_fit
         say(
-            f"{source.name}: {out[source.name].patches} patches, chi-square {fit.chi_square:.1f} of "
-            f"{fit.freedom}, unevenness beyond the model {100 * out[source.name].uneven:.1f} %"
+            f"{source.name}: {found.patches} patches, chi-square {fit.chi_square:.1f} of {fit.freedom}, "
+            f"unevenness beyond the model {100 * found.uneven:.1f} %"
         )
         if fit.chi_square > _MISFIT * max(fit.freedom, 1):
             say(f"{source.name}: no parameters reproduce these dots with the file's pattern; the best fit is used")
     return out
 
 
-def _without_fixed(imager: Imager) -> Imager:
-    return replace(imager, dsnu=0.0, prnu=0.0, column_pattern=0.0, row_noise=0.0)
-
-
 def _combined_estimates(
     dots: dict[str, DotsFit], base: Sensor, imager: ImagerFit, room: RoomFit | None
-) -> tuple[list[Estimate], list[Undetermined]]:
+) -> tuple[list[FittedKey], list[Undetermined]]:
     """Combine the estimates of all captures of dots key by key, and list the keys that none determines."""
-    estimates: list[Estimate] = []
+    estimates: list[FittedKey] = []
     undetermined: list[Undetermined] = list(imager.undetermined)
-    by_key: dict[str, list[tuple[str, Parameter, float, float, bool]]] = {}
+    parameters: dict[str, Parameter] = {}
     for name, fit in dots.items():
         values, spreads = fit.in_file_units()
-        for parameter, value, spread in zip(fit.parameters, values, spreads, strict=True):
-            by_key.setdefault(parameter.key, []).append((name, parameter, float(value), float(spread), True))
-        for parameter in fit.undetermined:
-            by_key.setdefault(parameter.key, []).append((name, parameter, 0.0, 0.0, False))
-    for key, rows in by_key.items():
-        parameter = rows[0][1]
-        some = [row for row in rows if row[4]]
-        if not some:
-            undetermined.append(Undetermined(key, parameter.read(base), parameter.determined_by))
-            continue
-        middle, spread = combined([scaled(row[2], parameter.scale) for row in some], [row[3] for row in some])
-        estimates.append(
-            Estimate(
-                key,
-                unscaled(middle, parameter.scale),
-                spread,
-                parameter.unit,
-                tuple(row[0] for row in some),
-                "figures of the dots over the field",
-                parameter.scale,
-            )
-        )
+        for parameter, value, spread in zip(fit.parameters, values.tolist(), spreads.tolist(), strict=True):
+            method = "figures of the dots over the field"
+            estimates.append(FittedKey(parameter.key, value, spread, parameter.unit, (name,), method, parameter.scale))
+        parameters |= {parameter.key: parameter for parameter in (*fit.parameters, *fit.undetermined)}
+    known = {one.key for one in estimates}
+    undetermined += [
+        Undetermined(p.key, p.read(base), p.determined_by) for p in parameters.values() if p.key not in known
+    ]
     if not imager.known and dots:
-        for key, value in (
-            ("imager.dsnu_e", 0.0),
-            ("imager.prnu", 0.0),
-            ("imager.row_noise_e", 0.0),
-            ("imager.column_pattern_e", 0.0),
-        ):
-            undetermined.append(
-                Undetermined(key, value, "repeats of one pose; until then read_noise_e and full_well_e include it")
-            )
+        undetermined += UNSEPARATED
     if room is None and dots:
-        undetermined.append(
-            Undetermined("projector.black_level", base.projector.black_level, "a capture with the projector off")
-        )
-    return estimates, undetermined
-
-
-def _turn_estimates(rows: dict[str, Rows]) -> list[Estimate]:
-    out = []
-    for key in ("row_mrad", "roll_mrad"):
-        pairs = [getattr(found, key) for found in rows.values()]
-        if pairs:
-            value, spread = combined([p[0] for p in pairs], [p[1] for p in pairs])
-            out.append(Estimate(f"misalignment.{key}", value, spread, "mrad", tuple(rows), "row errors over the field"))
-    return out
+        undetermined.append(Undetermined(BLACK_LEVEL.key, BLACK_LEVEL.read(base), BLACK_LEVEL.determined_by))
+    return pooled(estimates), undetermined

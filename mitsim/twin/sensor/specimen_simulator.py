@@ -47,13 +47,16 @@ class SpecimenSimulator:
     def __init__(self, sensor: Sensor, place: Place, roi: Roi) -> None:
         name, camera = next(iter(sensor.rig.cameras.items()))
         self.name, self.camera, self.place = name, camera, place
-        self.roi = _wider(roi, camera.width, camera.height)
+        left, top = max(roi.left - MARGIN_PX, 0), max(roi.top - MARGIN_PX, 0)
+        right, bottom = min(roi.right + MARGIN_PX, camera.width), min(roi.bottom + MARGIN_PX, camera.height)
+        self.roi = Roi.between(left, top, right, bottom)
         self.inner = Roi(roi.left - self.roi.left, roi.top - self.roi.top, roi.width, roi.height).slices
         self._scene: Scene = plate(place, sensor, None)
         self._kept: dict[Any, NDArray[np.float32]] = {}
         self._room: NDArray[np.float32] | None = None
         self._device: SimulatedSensor | None = None
-        self._slopes = _slopes(self.camera, self.roi)
+        rays = camera.rays_to_fold(np.stack(self.roi.pixels(), axis=-1).astype(float))
+        self._directions = np.asarray(camera.sensor_from_camera.directions(rays))
         self._loss = lru_cache(maxsize=1)(self._corner_loss)  # of the light of the room and that of the projector
 
     def levels(self, sensor: Sensor, seed: int, *, projector_on: bool = True) -> NDArray[Any]:
@@ -81,7 +84,7 @@ class SpecimenSimulator:
             return np.zeros((self.roi.height, self.roi.width), np.float32)
         if self._room is None:
             self._room = np.float32(REFLECTANCE / np.pi) * np.ones((self.roi.height, self.roi.width), np.float32)
-        irradiance = sensor.room_irradiance(self._slopes)
+        irradiance = sensor.room_irradiance(self._directions)
         return self._through(sensor, np.asarray(self._room * irradiance, np.float32))
 
     def _through(self, sensor: Sensor, image: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -96,15 +99,8 @@ class SpecimenSimulator:
     def _lit(self, sensor: Sensor, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the light of the projector at 1 W before the lens, and the gain of speckle behind it."""
         projector = replace(sensor.projector, flux=1.0)
-        key = (
-            str(sensor.pattern),
-            projector.black_level,
-            projector.gamma,
-            projector.aperture_mm,
-            projector.focus_mm,
-            projector.corner_illumination,
-            seed,
-        )
+        names = ("black_level", "gamma", "aperture_mm", "focus_mm", "corner_illumination")
+        key = (str(sensor.pattern), *(getattr(projector, name) for name in names), seed)
         if key not in self._kept:
             while len(self._kept) >= _KEPT:
                 self._kept.pop(next(iter(self._kept)))
@@ -126,14 +122,9 @@ class SpecimenSimulator:
             rng = np.random.default_rng(np.random.SeedSequence([seed, 2]))
             speckle = draw_speckle(self._scene, one, self.camera, simulated.pixel_rays(self.name), pose, self.roi, rng)
             still = None if speckle is None else replace(speckle, gain=np.ones_like(speckle.gain))
+            rendering = Rendering(samples=_SAMPLES, depth=1)
             radiance = simulated.radiance(
-                self._scene,
-                pose,
-                self.name,
-                Rendering(samples=_SAMPLES, depth=1),
-                seed=seed,
-                roi=self.roi,
-                speckle=still,
+                self._scene, pose, self.name, rendering, seed=seed, roi=self.roi, speckle=still
             )[0]
             gain = np.ones_like(radiance) if speckle is None else np.asarray(speckle.gain, np.float32)
             self._kept[key] = np.stack([radiance, gain])
@@ -149,13 +140,3 @@ class SpecimenSimulator:
         other.sensor = one
         other.patterns = ProjectedPatterns(one.patterns(), one.projector)
         return other
-
-
-def _wider(roi: Roi, width: int, height: int) -> Roi:
-    left, top = max(roi.left - MARGIN_PX, 0), max(roi.top - MARGIN_PX, 0)
-    return Roi.between(left, top, min(roi.right + MARGIN_PX, width), min(roi.bottom + MARGIN_PX, height))
-
-
-def _slopes(camera: Any, roi: Roi) -> Floats:
-    rays = camera.rays_to_fold(np.stack(roi.pixels(), axis=-1).astype(float))
-    return np.asarray(camera.sensor_from_camera.directions(rays))

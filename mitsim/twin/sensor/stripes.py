@@ -2,8 +2,8 @@
 
 Signal chain: images of the code -> white and black -> line of black over white through all pixels of the print: black
 level of the imager, share of light without a pattern -> finest detail of both by level: full well, read noise ->
-difference of stripes on and off, by width: blur (:mod:`mitsim.twin.sensor.modulation`); if it changes with depth, the
-projector's focus and aperture (:mod:`mitsim.twin.sensor.defocus`).
+difference of stripes on and off, by width: blur; if it changes with depth, the projector's focus and aperture
+(:mod:`mitsim.twin.sensor.defocus`).
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from mitsim.sensor.transforms import Transform
 from mitsim.twin.finish.electrons import linearised
 from mitsim.twin.finish.place import Place
 from mitsim.twin.finish.specimen import MARGIN_PX, image_mask
-from mitsim.twin.sensor.defocus import Defocus, fit_defocus
-from mitsim.twin.sensor.estimate import Estimate
+from mitsim.twin.sensor.defocus import Defocus, fit_defocus, fitted_blur
+from mitsim.twin.sensor.estimate import FittedKey
 from mitsim.twin.sensor.input_captures import InputCapture
-from mitsim.twin.sensor.modulation import fitted_blur
+from mitsim.twin.sensor.noise import without_fixed_pattern
 from mitsim.twin.sensor.photon_transfer import one_image_line
 
 Floats = NDArray[np.float64]
@@ -42,7 +42,7 @@ _UNSATURATED, _SURE = 0.97, 2.0
 
 
 @dataclass(frozen=True)
-class Stripes:
+class StripeImages:
     """White, black and pairs of stripes of a capture's first camera [DN]; ``widths`` of the stripes [projector px].
 
     ``pairs`` (n, 2, H, W): on and off; ``across``: whether the stripes are along the columns.
@@ -55,7 +55,7 @@ class Stripes:
     across: NDArray[np.bool_]
 
 
-def stripes_of(source: InputCapture) -> Stripes | None:
+def stripes_of(source: InputCapture) -> StripeImages | None:
     """Extract the stripes of a capture; None if it has no stripes with their inverse.
 
     The brightest and the darkest of the stripes replace a missing white or black image.
@@ -80,36 +80,32 @@ def stripes_of(source: InputCapture) -> Stripes | None:
     every = np.array(pairs, float)
     white = images[names.index("white")].astype(float) if "white" in names else every.max(axis=(0, 1))
     black = images[names.index("black")].astype(float) if "black" in names else every.min(axis=(0, 1))
-    return Stripes(white, black, every, np.array(widths), np.array(across))
+    return StripeImages(white, black, every, np.array(widths), np.array(across))
 
 
-def fit_stripes(source: InputCapture, sensor: Sensor, place: Place) -> tuple[Sensor, list[Estimate]]:
+def fit_stripes(source: InputCapture, sensor: Sensor, place: Place) -> list[FittedKey]:
     """Fit one capture of stripes; the sensor must have the capture's own cameras and exposure."""
     seen = stripes_of(source)
     if seen is None:
-        return sensor, []
+        return []
     camera = source.capture.rig.reference
     mask = image_mask(place, camera, MARGIN_PX)
     full = 2**source.capture.bits - 1
     clear = mask & (maximum_filter(seen.white, 3) < _UNSATURATED * full)
     spread = maximum_filter(seen.white, _EVEN_PX) - minimum_filter(seen.white, _EVEN_PX)
     even = clear & (spread < np.maximum(_EVEN_SHARE * seen.white, 4.0))
-    estimates: list[Estimate] = []
-    sensor, first = _levels(source, sensor, seen, even)
-    estimates += first
-    sensor, second = _noise(source, sensor, seen, even)
-    estimates += second
-    sensor, third = _blur(source, sensor, place, seen, even)
-    return sensor, estimates + third
+    imager, levels = _levels(source, sensor.imager, seen, even)
+    imager, noise = _noise(source, imager, seen, even)
+    return levels + noise + _blur(source, imager, place, seen, even)
 
 
 def _levels(
-    source: InputCapture, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]
-) -> tuple[Sensor, list[Estimate]]:
+    source: InputCapture, imager: Imager, seen: StripeImages, even: NDArray[np.bool_]
+) -> tuple[Imager, list[FittedKey]]:
     """Estimate the imager's black level and the light without a pattern from the line of black over white."""
     white, black = seen.white[even], seen.black[even]
     if len(white) < 500 or np.percentile(white, 95) < 2 * np.percentile(white, 5):
-        return sensor, []
+        return imager, []
     rows, columns = np.nonzero(even)
     block = (rows // _BLOCK_PX) * 10_000 + columns // _BLOCK_PX
     lines = []
@@ -121,51 +117,44 @@ def _levels(
     spread = np.sqrt(19 / 20 * ((np.array(lines) - np.mean(lines, axis=0)) ** 2).sum(axis=0))
     slope, intercept = float(whole[0]), float(whole[1])
     # black = level + slope (white - level)
-    level = intercept / (1 - slope)
+    level, share = max(intercept / (1 - slope), 0.0), float(np.clip(slope, 0.0, 0.95))
     method, names = "line of the black image over the white one through the print", (source.name,)
-    imager = replace(sensor.imager, black_level=max(level, 0.0))
-    estimates = [
-        Estimate("imager.black_level_dn", max(level, 0.0), float(spread[1]) / (1 - slope), "DN", names, method)
+    room = method + "; includes the room"
+    return replace(imager, black_level=level), [
+        FittedKey("imager.black_level_dn", level, float(spread[1]) / (1 - slope), "DN", names, method),
+        FittedKey("projector.black_level", share, float(spread[0]), "1", names, room),
     ]
-    share = float(np.clip(slope, 0.0, 0.95))
-    estimates.append(
-        Estimate("projector.black_level", share, float(spread[0]), "1", names, method + "; includes the room")
-    )
-    return replace(sensor, imager=imager, projector=replace(sensor.projector, black_level=share)), estimates
 
 
 def _noise(
-    source: InputCapture, sensor: Sensor, seen: Stripes, even: NDArray[np.bool_]
-) -> tuple[Sensor, list[Estimate]]:
-    line = one_image_line(seen.white.astype(np.uint16), even, sensor.imager)
+    source: InputCapture, imager: Imager, seen: StripeImages, even: NDArray[np.bool_]
+) -> tuple[Imager, list[FittedKey]]:
+    line = one_image_line(seen.white.astype(np.uint16), even, imager)
     if line is None:
-        return sensor, []
-    (well, well_u), (read, read_u) = line.full_well(sensor.imager), line.read_noise()
+        return imager, []
+    (well, well_u), (read, read_u) = line.full_well(imager), line.read_noise()
     method, names = "finest detail of the white image by level, including its fixed pattern", (source.name,)
-    chip: Imager = replace(
-        sensor.imager, full_well=well, read_noise=read, dsnu=0.0, prnu=0.0, row_noise=0.0, column_pattern=0.0
-    )
-    return replace(sensor, imager=chip), [
-        Estimate("imager.full_well_e", well, well_u / well**2, "e-", names, method, "inverse"),
-        Estimate("imager.read_noise_e", read, read_u, "e-", names, method),
+    return replace(without_fixed_pattern(imager), full_well=well, read_noise=read), [
+        FittedKey("imager.full_well_e", well, well_u / well**2, "e-", names, method, "inverse"),
+        FittedKey("imager.read_noise_e", read, read_u, "e-", names, method),
     ]
 
 
 def _blur(
-    source: InputCapture, sensor: Sensor, place: Place, seen: Stripes, even: NDArray[np.bool_]
-) -> tuple[Sensor, list[Estimate]]:
+    source: InputCapture, chip: Imager, place: Place, seen: StripeImages, even: NDArray[np.bool_]
+) -> list[FittedKey]:
     """Estimate the blur of camera and projector together from the modulation of stripes of every width, by blocks."""
-    chip = sensor.imager
-    depth = linearised(seen.white, chip) - linearised(seen.black, chip)
+    white, black = linearised(seen.white, chip), linearised(seen.black, chip)
+    depth = white - black
     usable = even & (seen.white - seen.black > _LEAST_DN)
     if usable.sum() < 500:
-        return sensor, []
-    off = np.abs(linearised(seen.pairs[:, 0], chip) - linearised(seen.pairs[:, 1], chip))
+        return []
     scales = _pixels_per_stripe(source, place)
     pairs = np.stack([linearised(seen.pairs[:, side], chip) for side in (0, 1)], axis=1)
-    focus = fit_defocus(source, linearised(seen.white, chip), linearised(seen.black, chip), pairs, seen.widths)
+    off = np.abs(pairs[:, 0] - pairs[:, 1])
+    focus = fit_defocus(source, white, black, pairs, seen.widths)
     if focus is not None and focus.aperture_mm > _SURE * np.sqrt(focus.covariance[1, 1]):
-        return _with_focus(source, sensor, focus, float(np.mean(scales)))
+        return _focus(source, focus, float(np.mean(scales)))
     values = []
     rows, columns = np.nonzero(usable)
     block = (rows // _BLOCK_PX) * 10_000 + columns // _BLOCK_PX
@@ -178,34 +167,25 @@ def _blur(
         ratio = off[:, *own].mean(axis=1) / depth[own].mean()
         values.append(fitted_blur(width[fine], ratio[fine]))
     if len(values) < 4:
-        return sensor, []
-    blur = float(np.median(values))
+        return []
+    blur, names = min(float(np.median(values)), 5.0), (source.name,)
     spread = 1.2533 * float(np.std(values, ddof=1)) / np.sqrt(len(values))
-    estimate = Estimate(
-        "imager.blur_px",
-        min(blur, 5.0),
-        spread,
-        "px",
-        (source.name,),
-        "modulation of stripes by width, including the projector's blur",
-    )
-    projector = replace(sensor.projector, aperture_mm=0.0)
-    return replace(sensor, imager=replace(chip, blur_px=min(blur, 5.0)), projector=projector), [
-        estimate,
-        Estimate("projector.aperture_mm", 0.0, 0.0, "mm", (source.name,), "imager.blur_px includes its blur"),
+    method = "modulation of stripes by width, including the projector's blur"
+    return [
+        FittedKey("imager.blur_px", blur, spread, "px", names, method),
+        FittedKey("projector.aperture_mm", 0.0, 0.0, "mm", names, "imager.blur_px includes its blur"),
     ]
 
 
-def _with_focus(source: InputCapture, sensor: Sensor, focus: Defocus, scale: float) -> tuple[Sensor, list[Estimate]]:
-    """Return the sensor with the fitted focus; one projector pixel is ``scale`` camera pixels."""
+def _focus(source: InputCapture, focus: Defocus, scale: float) -> list[FittedKey]:
+    """Return the estimates of a focus; one projector pixel is ``scale`` camera pixels."""
     spread, names = np.sqrt(np.diag(focus.covariance)), (source.name,)
     method = "modulation of stripes by width and depth"
     blur = min(focus.still_px * scale, 5.0)
-    projector = replace(sensor.projector, aperture_mm=focus.aperture_mm, focus_mm=focus.focus_mm)
-    return replace(sensor, imager=replace(sensor.imager, blur_px=blur), projector=projector), [
-        Estimate("imager.blur_px", blur, float(spread[0]) * scale, "px", names, method + ", independent of depth"),
-        Estimate("projector.aperture_mm", focus.aperture_mm, float(spread[1]), "mm", names, method),
-        Estimate("projector.focus_mm", focus.focus_mm, float(spread[2]), "mm", names, method),
+    return [
+        FittedKey("imager.blur_px", blur, float(spread[0]) * scale, "px", names, method + ", independent of depth"),
+        FittedKey("projector.aperture_mm", focus.aperture_mm, float(spread[1]), "mm", names, method),
+        FittedKey("projector.focus_mm", focus.focus_mm, float(spread[2]), "mm", names, method),
     ]
 
 
