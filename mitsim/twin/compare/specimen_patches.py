@@ -143,6 +143,17 @@ def patch_rows(
     """Return row errors (Q,) [px] of the patches of a pair's cloud.
 
     Also returns columns and rows of their middles in the right image.
+
+    Parameters
+    ----------
+    capture
+        Capture of a flat specimen.
+    settings
+        Settings of its decoder.
+    geometry
+        Rectified geometry of its pair of cameras.
+    place
+        Pose and extent of the specimen.
     """
     cloud, on_grid, places = _cloud_patches(capture, settings, geometry, place)
     valid = _tiles(np.where(on_grid, cloud.valid.astype(float), np.nan), places)
