@@ -232,7 +232,7 @@ def standings(
     trials
         Folder of the trials.
     counts
-        Number of trials to use, by number of a view; trials that are not in the folder count as failures.
+        Number of trials that are used, by number of a view.
     rules
         Margin and confidence of the decision.
     """

@@ -139,7 +139,7 @@ def printed(
     name
         Name of the camera in ``light``.
     plain
-        The images that show the specimen without a pattern.
+        The images whose largest level is the plain image.
 
     See Also
     --------

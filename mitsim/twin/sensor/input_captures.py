@@ -58,7 +58,7 @@ def read_input_captures(
     off
         Captures with the projector off.
     dark
-        Captures with covered lenses.
+        Captures without any light.
     sensor
         Sensor whose technology the captures must have.
 
