@@ -101,6 +101,8 @@ def time_of_flight_geometry(rig: Rig, camera_name: str, near_mm: float, far_mm: 
 
     Parameters
     ----------
+    rig, camera_name
+        The rig, and the name of its camera.
     near_mm, far_mm
         Range of depths along the camera's axis [mm].
 
@@ -238,6 +240,8 @@ def joint_path(
     ----------
     phase, variance
         (F, H, W) phases [rad] of the frequencies of ``code``, and their variances by noise [rad^2].
+    code
+        Frequencies of the modulation.
     systematic_rad
         Standard deviation of the systematic phase error [rad], which is added to the noise in the weights.
 

@@ -82,6 +82,10 @@ def run_study(
 
     Parameters
     ----------
+    study
+        Study to run.
+    folder
+        Folder of the run; created if it does not exist.
     minutes
         Time limit of the race [min]; it replaces the limit in the study.
     workers

@@ -304,6 +304,12 @@ def decode_gray_fringes(
         period after period, the longest first.
     coded_axis, fringes
         Axis and stripes of the Gray code, and periods and shifts of the fringes.
+    settings
+        Limits of the decoder.
+    full_scale
+        Value of a saturated pixel [DN].
+    imager
+        As for :func:`mitsim.decode.structured_light.phase_shift.decode_phase_shift`.
     """
     axis, extent, stripe = coded_axis.axis, coded_axis.extent, coded_axis.stripe
     used = [index for index, role in enumerate(image_roles) if role.kind == "phase" and role.axis == axis]

@@ -115,6 +115,10 @@ def measured(capture: Capture, shot: Shot, geometry: Geometry, sensor: Sensor, k
 
     Parameters
     ----------
+    capture
+        Capture of the coupon.
+    shot
+        The shot that the capture belongs to.
     geometry
         That of the rig of ``sensor``.
     sensor
@@ -155,6 +159,8 @@ def coupon_cloud(capture: Capture, coupon: Coupon, geometry: Geometry, sensor: S
 
     Parameters
     ----------
+    capture
+        Capture of the coupon.
     coupon
         At its pose in the sensor frame.
     geometry

@@ -252,6 +252,8 @@ class Predictor:
 
         Parameters
         ----------
+        scene
+            Scene with the shapes.
         ideal, labels
             Points of the view, and the shapes (H, W) that the pixels show.
         fraction, sigma

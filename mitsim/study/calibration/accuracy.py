@@ -140,6 +140,8 @@ def accuracy(
         All eyes that the decoder uses, the reference camera first.
     covariance
         From which ``draws`` rigs are drawn.
+    draws
+        Number of rigs.
     rng
         Source of the draws; each has its own stream.
     """

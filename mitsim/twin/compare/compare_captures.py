@@ -123,6 +123,8 @@ def compare_captures(
 
     Parameters
     ----------
+    real, simulated
+        The two captures.
     place
         Pose and extent of the specimen in the real capture's sensor frame; its pixels are evaluated in both captures.
     settings
@@ -132,6 +134,8 @@ def compare_captures(
     projector_on
         State of the projector in the real capture. If only one of the captures has a pattern, quantities that need one
         are not comparable.
+    seed
+        Selects the draws of the bootstrap.
 
     Raises
     ------

@@ -69,12 +69,18 @@ def rebuild(
 
     Parameters
     ----------
+    real
+        Recorded capture.
     sensor
         Supplies projector, pattern and imager in place of those of the device.
     place
         Pose and extent of the specimen, from :func:`mitsim.twin.finish.specimen.specimen_place`.
+    where
+        Name of the recorded capture in messages.
     projector_on
         If false, the plate has the texture that the reference camera recorded, and even light.
+    seed
+        Selects the noise of the simulation.
 
     Raises
     ------

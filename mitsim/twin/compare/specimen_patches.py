@@ -88,6 +88,12 @@ def specimen_patches(
 
     Parameters
     ----------
+    capture
+        Capture of a flat specimen.
+    settings
+        Settings of its decoder.
+    geometry
+        Geometry of its decoder.
     place
         Pose and extent of the specimen, in the sensor frame of the capture.
     window_px

@@ -82,6 +82,8 @@ def fit_defocus(source: InputCapture, white: Floats, black: Floats, pairs: Float
 
     Parameters
     ----------
+    source
+        Capture of a code with stripes.
     white, black
         (H, W) images of full light and of no light, linear in light.
     pairs

@@ -84,6 +84,10 @@ def fit_sensor(
         Folders of captures with the projector off, and with all light off.
     roi
         Region of the first camera's image that shows the specimen, in all of them; all that is flat if left out.
+    seed
+        Selects the noise of the simulations.
+    draws
+        Number of simulations to average.
 
     Raises
     ------
