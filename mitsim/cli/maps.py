@@ -69,18 +69,16 @@ def make(
     """
     start(variant)
     from characterisation.files.documents import read_toml
-    from mitsim.capture.simulated.simulate import SimulatedSensor
     from mitsim.maps.campaign.acquire import (
-        coupon_residuals,
         found_shots,
         found_source,
         in_turn,
         out_of_range,
-        simulated_source,
     )
     from mitsim.maps.campaign.live import live_source, place_by_place, plan_live
     from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
     from mitsim.maps.campaign.run import measure_captures, run_campaign
+    from mitsim.maps.use import simulate_campaign
     from mitsim.report.figures import write_map_figures
     from mitsim.report.findings import spread_in_words
     from mitsim.running.progress import say
@@ -107,16 +105,7 @@ def make(
         with live_source(live, mount) as take:
             performance_map = run_campaign(plan, place_by_place(in_turn(take, plan)), output)
     else:
-        workers = requested_workers(scheduler, processes)
-        simulated = SimulatedSensor(plan.sensor)
-        coupon_residuals(simulated, plan)
-        if workers is None:
-            source = in_turn(simulated_source(simulated, plan.file.samples_per_pixel), plan)
-        else:
-            from mitsim.maps.campaign.orders import worker_source
-
-            source = worker_source(workers, plan)
-        performance_map = run_campaign(plan, source, output)
+        performance_map = simulate_campaign(plan, output, requested_workers(scheduler, processes))
     if compact is not None:
         performance_map.save(compact, compact=True)
     write_map_figures(performance_map, output)
