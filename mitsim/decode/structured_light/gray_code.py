@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.grey_levels import MeasuredNoise, check_full_scale, grey_level_variance
+from mitsim.decode.grey_levels import MeasuredNoise, grey_level_variance
 from mitsim.decode.structured_light.phase_shift import (
     Fringes,
     fit_phases,
@@ -34,10 +34,9 @@ from mitsim.decode.structured_light.unwrapping import UnwrappingPath, beat_cycle
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis, Role
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, axes, check_stack, gray_offset, roles, stripes
 
 #: kinds of images that determine the stripe
-_STRIPE_IMAGES = ("white", "black", "gray", "gray_inverse")
+STRIPE_IMAGES = ("white", "black", "gray", "gray_inverse")
 
 
 @dataclass(frozen=True)
@@ -134,57 +133,6 @@ def decode_stripes(
     return Stripes(number, neighbour, multiple | (np.abs(number_change) > 1), contrast)
 
 
-def decode_gray_code(
-    stack: NDArray[np.generic],
-    code: GrayCode,
-    width: int,
-    height: int,
-    settings: DecoderSettings,
-    *,
-    full_scale: float,
-    interpolate: bool = False,
-) -> dict[Axis, ProjectorCoordinate]:
-    """Decode the images of a Gray code.
-
-    Parameters
-    ----------
-    stack
-        (P, H, W) raw images [DN] of one camera, in the order of :func:`mitsim.sensor.light_code.roles`.
-    code, settings
-        The code, and the limits of the decoder.
-    width, height
-        Size of the projector [px].
-    full_scale
-        Value of a saturated pixel [DN].
-    interpolate
-        Interpolate columns between the edges of their stripes (:mod:`mitsim.decode.structured_light.stripe_edges`).
-
-    Returns
-    -------
-    dict
-        A coordinate for each axis of the code: the centre of the stripe, or the edge between two. ``sigma`` is stripe /
-        sqrt(12), the standard deviation of a uniform distribution over the stripe.
-
-    Raises
-    ------
-    InputError
-        If the stack does not fit the code.
-    """
-    image_roles = roles(code, width, height)
-    check_stack(stack, image_roles)
-    check_full_scale(stack, full_scale)
-    saturated = stack.max(axis=0) >= full_scale
-    out: dict[Axis, ProjectorCoordinate] = {}
-    for axis in axes(code):
-        extent = width if axis == "columns" else height
-        decoded = decode_stripes(stack, image_roles, axis, settings.bit_share)
-        coded = CodedAxis(axis, extent, stripes(code, extent)[1], gray_offset(code, extent))
-        out[axis] = stripe_coordinate(decoded, coded, saturated, settings, full_scale)
-        if interpolate and axis == "columns":
-            out[axis] = interpolated_columns(out[axis], decoded, stack, image_roles, coded)
-    return out
-
-
 def interpolated_columns(
     coordinate: ProjectorCoordinate,
     decoded: Stripes,
@@ -238,43 +186,6 @@ def stripes_outside(number: NDArray[np.unsignedinteger], coded: CodedAxis) -> ND
     """Return whether stripes (...), by their numbers, lie beyond the projector's first or last pixel."""
     start = number * coded.stripe - coded.offset  # from the projector's edge
     return np.asarray((start >= coded.extent) | (start + coded.stripe <= 0))
-
-
-def decode_gray_code_phase_shift(
-    stack: NDArray[np.generic],
-    code: GrayCodePhaseShift,
-    width: int,
-    height: int,
-    settings: DecoderSettings,
-    *,
-    full_scale: float,
-    imager: Imager | MeasuredNoise | None = None,
-) -> ProjectorCoordinate:
-    """Decode a Gray code for the order of the fringe, and phase shifting for the position in it.
-
-    ``stack`` (P, H, W) [DN]; ``width`` and ``height`` of the projector [px]; ``full_scale`` [DN]; ``imager`` as for
-    :func:`mitsim.decode.structured_light.phase_shift.decode_phase_shift`.
-
-    Raises
-    ------
-    InputError
-        If the stack does not fit the code, or gamma has fewer than five steps and neither white nor black.
-    """
-    image_roles = roles(code, width, height)
-    check_stack(stack, image_roles)
-    check_full_scale(stack, full_scale)
-    extent = width if code.axis == "columns" else height
-    shift = np.array([role.shift for role in image_roles if role.kind == "phase"])
-    fringes = Fringes((code.period_px,), (shift,), code.mean, code.contrast)
-    return decode_gray_fringes(
-        stack,
-        image_roles,
-        CodedAxis(code.axis, extent, stripes(code, extent)[1]),
-        fringes,
-        settings,
-        full_scale=full_scale,
-        imager=imager,
-    )
 
 
 def decode_gray_fringes(
@@ -338,7 +249,7 @@ def decode_gray_fringes(
     coded = [
         image
         for image, role in zip(stack, image_roles, strict=True)
-        if role.axis in (axis, None) and role.kind in _STRIPE_IMAGES
+        if role.axis in (axis, None) and role.kind in STRIPE_IMAGES
     ]
     for image in coded:
         saturated |= (image >= full_scale) & undecided
