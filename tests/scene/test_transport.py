@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from two_rays import triangulate
+from benchmarks.two_rays import triangulate
 
 from characterisation.features.fits import fit_sphere
 from characterisation.region_of_interest import Roi
