@@ -11,22 +11,19 @@ quarter of the pixels one period off, and all are valid.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsim.decode.checks.code_lines import CodeLines
 from mitsim.decode.structured_light.gray_code import decode_stripes
 from mitsim.decode.structured_light.phase_shift import fit_phases
-from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis, Origin, Role, Wave, offset_in_pixels, origin_shift
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, LightCode
 
-Levels = NDArray[np.unsignedinteger[Any]]
 Floats = NDArray[np.float64]
 
 #: least number of edges, and least share of the changes of a stripe's number that are by one: along a surface one bit
@@ -73,18 +70,9 @@ class Edges:
         return self.by_one >= _BY_ONE
 
 
-def stripe_edges(
-    lines: Sequence[Levels],
-    code: LightCode,
-    image_roles: list[Role],
-    axis: Axis,
-    settings: DecoderSettings,
-    full_scale: float,
-) -> Edges | None:
-    """Return the fringes at the edges of Gray stripes; None if the axis has no Gray bits or no fringes.
-
-    ``lines``: images (P, n, W) of rows, and (P, H, m) of columns [DN].
-    """
+def stripe_edges(images: CodeLines, axis: Axis) -> Edges | None:
+    """Return the fringes at the edges of Gray stripes; None if the axis has no Gray bits or no fringes."""
+    code, image_roles, full_scale = images.code, images.image_roles, images.full_scale
     gray = [role for role in image_roles if role.kind == "gray" and role.axis == axis]
     phases = [i for i, role in enumerate(image_roles) if role.kind == "phase" and role.axis == axis]
     if isinstance(code, GrayCode) or not gray or not phases:
@@ -93,13 +81,13 @@ def stripe_edges(
     periods = sorted({image_roles[i].index for i in phases})
     numbers = [[i for i in phases if image_roles[i].index == index] for index in periods]
     shifts = [np.array([image_roles[i].shift for i in each]) for each in numbers]
-    threshold = settings.minimum_modulation_dn * full_scale / 255
+    threshold = images.settings.minimum_modulation_dn * full_scale / 255
     found: list[tuple[Floats, Floats, Floats, Floats]] = []
-    for way, part in enumerate(lines):
+    for way, part in enumerate(images.lines):
         fitted = fit_phases(np.concatenate([part[each] for each in numbers]), shifts)
         white_minus_black = fitted.modulation[-1] / np.float32(code.contrast)
         middle = fitted.offset + np.float32(0.5 - code.mean) * white_minus_black
-        decoded = decode_stripes(part, image_roles, axis, settings.bit_share, (middle, white_minus_black))
+        decoded = decode_stripes(part, image_roles, axis, images.settings.bit_share, (middle, white_minus_black))
         clear = (decoded.number == decoded.neighbour) & (fitted.modulation.min(axis=0) > threshold)
         clear &= part[phases].max(axis=0) < full_scale
         number, turns = decoded.number.astype(float), fitted.phase.astype(float) / (2 * np.pi)
@@ -181,11 +169,12 @@ CHANGES = sorted(
 )
 
 
-def origin_in_words(edges: Edges, code: LightCode, image_roles: list[Role], axis: Axis, extent: int) -> str:
+def origin_in_words(edges: Edges, images: CodeLines, axis: Axis) -> str:
     """Return a warning if fringes and Gray code of an axis do not count from one origin, or not in one direction.
 
-    ``extent`` of the projector along the axis [px]. "" if they agree, or the edges do not tell.
+    "" if they agree, or the edges do not tell.
     """
+    code, image_roles = images.code, images.image_roles
     every = described(code, image_roles, axis)
     if not edges.bits_fit or edges.cycles.shape[1] < _ENOUGH:
         return ""
@@ -210,7 +199,7 @@ def origin_in_words(edges: Edges, code: LightCode, image_roles: list[Role], axis
     )
     start = f"the fringes and the Gray code of the {axis} do not count from one origin"
     if change != Change():
-        offset = _fitting_offset(edges, every, image_roles, axis, extent)
+        offset = _fitting_offset(edges, every, image_roles, axis, images.extent(axis))
         if offset is not None:
             return f"{start}: they fit if the Gray code has offset_px = {offset} in [pattern]"
     if change is None or any(each.unusual(edges, f, n) for each, f, n in zip(measured, every, needed, strict=True)):
