@@ -14,7 +14,6 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.decode import coded_images
-from mitsim.decode.checks import code_lines
 from mitsim.decode.checks.checked_cloud import checked_cloud
 from mitsim.decode.checks.rig_sanity import measured_row_error, row_error_warnings
 from mitsim.decode.checks.sanity import code_findings, row_error_in_words
@@ -397,7 +396,7 @@ def test_cloud_and_checks_decode_the_images_once(monkeypatch, paired):
         stacks.append(stack.shape)
         return decode_coordinates(stack, *rest, **options)
 
-    for module in (coded_images, decoder, two_cameras, code_lines):
+    for module in (coded_images, decoder, two_cameras):
         monkeypatch.setattr(module, "decode_coordinates", counted)
     decoded = checked_cloud(capture, settings, None)
     assert stacks == [stack.shape for stack in capture.images.values()]
