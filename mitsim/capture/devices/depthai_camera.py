@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import MissingEnvironmentError
 from mitsim.capture.devices.depthai_settings import DepthaiSettings, configuration, configure
-from mitsim.capture.devices.device_error import DeviceError
-from mitsim.capture.devices.open_camera import check_open
+from mitsim.capture.devices.device_error import DeviceError, check_open
 
 Image = NDArray[np.unsignedinteger[Any]]
 

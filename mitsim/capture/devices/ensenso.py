@@ -28,9 +28,8 @@ from pydantic import Field
 
 from characterisation.files.documents import Document
 from characterisation.files.errors import MissingEnvironmentError
-from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.device_error import DeviceError, check_open
 from mitsim.capture.devices.ensenso_faults import fault_of, no_library
-from mitsim.capture.devices.open_camera import check_open
 
 Value = bool | int | float | str
 Images = NDArray[np.unsignedinteger[Any]]

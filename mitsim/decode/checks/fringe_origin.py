@@ -50,7 +50,7 @@ _OTHER_ORIGIN: dict[Origin, Origin] = {"edge": "pixel", "pixel": "edge"}
 
 
 @dataclass(frozen=True)
-class Edges:
+class StripeEdges:
     """Fringes at the edges of Gray stripes along one axis.
 
     - ``by_one``: share of the changes of the stripe's number that are by one [1]; NaN if there are few.
@@ -70,7 +70,7 @@ class Edges:
         return self.by_one >= _BY_ONE
 
 
-def stripe_edges(images: CodeLines, axis: Axis) -> Edges | None:
+def stripe_edges(images: CodeLines, axis: Axis) -> StripeEdges | None:
     """Return the fringes at the edges of Gray stripes; None if the axis has no Gray bits or no fringes."""
     code, image_roles, full_scale = images.code, images.image_roles, images.full_scale
     gray = [role for role in image_roles if role.kind == "gray" and role.axis == axis]
@@ -103,7 +103,7 @@ def stripe_edges(images: CodeLines, axis: Axis) -> Edges | None:
         found.append((change[change != 0], position[at_edge], middle_cycles[:, at_edge], (step * change)[:, at_edge]))
     changes, positions, cycles, rises = (np.concatenate(each, axis=-1) for each in zip(*found, strict=True))
     enough = len(changes) >= _ENOUGH
-    return Edges(
+    return StripeEdges(
         float(np.mean(np.abs(changes) == 1)) if enough else float("nan"),
         positions,
         cycles,
@@ -112,7 +112,7 @@ def stripe_edges(images: CodeLines, axis: Axis) -> Edges | None:
 
 
 @dataclass(frozen=True)
-class Fringes:
+class DescribedFringes:
     """Fringes of one period as the sensor file describes them: ``period`` [px] and ``shifts`` (N,) delta [rad]."""
 
     period: float
@@ -122,7 +122,7 @@ class Fringes:
 
 
 @dataclass(frozen=True)
-class Change:
+class FringeChange:
     """A change of the description of fringes: other ``wave``, ``at``, sign or order of the shifts, or 180 deg more."""
 
     wave: bool = False
@@ -136,7 +136,7 @@ class Change:
         """Return a weighted number of mistakes that the change corrects, to choose the simplest of those that fit."""
         return self.wave + self.reverse + 1.1 * self.negated + 2.0 * self.half_turn
 
-    def shifts(self, fringes: Fringes) -> Floats:
+    def shifts(self, fringes: DescribedFringes) -> Floats:
         """Return the shifts delta (N,) [rad] after the change."""
         wave = _OTHER_WAVE[fringes.wave] if self.wave else fringes.wave
         at = _OTHER_ORIGIN[fringes.at] if self.at else fringes.at
@@ -144,7 +144,7 @@ class Change:
         listed = (-listed if self.negated else listed)[:: -1 if self.reverse else 1]
         return np.asarray(listed + origin_shift(wave, at, fringes.period) + np.pi * self.half_turn)
 
-    def in_words(self, fringes: Fringes) -> str:
+    def in_words(self, fringes: DescribedFringes) -> str:
         """Return what to write in the sensor file."""
         parts = [
             (self.reverse, "the shifts in the reverse order"),
@@ -162,14 +162,14 @@ class Change:
 #: all changes of a description, the simplest first
 CHANGES = sorted(
     (
-        Change(wave=wave, negated=negated, reverse=reverse, half_turn=half_turn)
+        FringeChange(wave=wave, negated=negated, reverse=reverse, half_turn=half_turn)
         for wave, negated, reverse, half_turn in product((False, True), repeat=4)
     ),
     key=lambda change: change.mistakes,
 )
 
 
-def origin_in_words(edges: Edges, images: CodeLines, axis: Axis) -> str:
+def origin_in_words(edges: StripeEdges, images: CodeLines, axis: Axis) -> str:
     """Return a warning if fringes and Gray code of an axis do not count from one origin, or not in one direction.
 
     "" if they agree, or the edges do not tell.
@@ -180,7 +180,7 @@ def origin_in_words(edges: Edges, images: CodeLines, axis: Axis) -> str:
         return ""
     forward = edges.rising > 0.5
     measured = [
-        Deviation.of(edges.position, fringes.period, cycles if forward else -cycles)
+        PhaseDeviation.of(edges.position, fringes.period, cycles if forward else -cycles)
         for fringes, cycles in zip(every, edges.cycles, strict=True)
     ]
     if min(each.length for each in measured) < _CONCENTRATED:
@@ -198,7 +198,7 @@ def origin_in_words(edges: Edges, images: CodeLines, axis: Axis) -> str:
         None,
     )
     start = f"the fringes and the Gray code of the {axis} do not count from one origin"
-    if change != Change():
+    if change != FringeChange():
         offset = _fitting_offset(edges, every, image_roles, axis, images.extent(axis))
         if offset is not None:
             return f"{start}: they fit if the Gray code has offset_px = {offset} in [pattern]"
@@ -210,7 +210,7 @@ def origin_in_words(edges: Edges, images: CodeLines, axis: Axis) -> str:
         )
         return f"{start}: they fit if the fringes of the {axis} have about {fitting}"
     change = replace(change, at=_half_a_pixel_off(edges, every, measured, needed))
-    if change == Change():
+    if change == FringeChange():
         return ""
     if change.reverse or change.negated:
         start = f"in the {axis}, the fringes move in the other direction than the Gray code"
@@ -222,10 +222,10 @@ def origin_in_words(edges: Edges, images: CodeLines, axis: Axis) -> str:
     return f'{start}: they fit if {where}, in a [pattern] of kind = "image_sequence"'
 
 
-def described(code: LightCode, image_roles: list[Role], axis: Axis) -> list[Fringes]:
+def described(code: LightCode, image_roles: list[Role], axis: Axis) -> list[DescribedFringes]:
     """Return the fringes of an axis as the sensor file describes them, from the longest period on."""
     groups = code.fringes(axis) if isinstance(code, ImageSequence) else []
-    out: list[Fringes] = []
+    out: list[DescribedFringes] = []
     for index in sorted({role.index for role in image_roles if role.kind == "phase" and role.axis == axis}):
         own = [role for role in image_roles if (role.kind, role.axis, role.index) == ("phase", axis, index)]
         wave: Wave = "cosine"
@@ -234,12 +234,12 @@ def described(code: LightCode, image_roles: list[Role], axis: Axis) -> list[Frin
             wave, at = groups[index].wave, groups[index].at
         elif not isinstance(code, ImageSequence | GrayCode):
             wave, at = code.wave, code.at
-        out.append(Fringes(own[0].period, np.array([role.shift for role in own]), wave, at))
+        out.append(DescribedFringes(own[0].period, np.array([role.shift for role in own]), wave, at))
     return out
 
 
 @dataclass(frozen=True)
-class Deviation:
+class PhaseDeviation:
     """Phase at the edges less that of their coordinate.
 
     ``cycles``: circular mean [cycles]. ``length`` of the mean of the unit vectors [1].
@@ -249,7 +249,7 @@ class Deviation:
     length: float
 
     @classmethod
-    def of(cls, position: Floats, period: float, cycles: Floats) -> Deviation:
+    def of(cls, position: Floats, period: float, cycles: Floats) -> PhaseDeviation:
         """Measure the deviation of ``cycles`` (n,) at edges ``position`` (n,) [px] of fringes of ``period`` [px]."""
         mean = np.mean(np.exp(2j * np.pi * (cycles - position / period)))
         return cls(float(np.angle(mean) / (2 * np.pi)), float(np.abs(mean)))
@@ -259,11 +259,11 @@ class Deviation:
         """Return the deviation from the nearest quarter turn [cycles]."""
         return self.cycles - round(4 * self.cycles) / 4
 
-    def error(self, edges: Edges) -> float:
+    def error(self, edges: StripeEdges) -> float:
         """Return the standard error of the mean [cycles]; of n angles it is sqrt(-2 ln length / n)."""
         return float(np.sqrt(-2 * np.log(self.length) / edges.position.size)) / (2 * np.pi)
 
-    def unusual(self, edges: Edges, fringes: Fringes, shifts: Floats) -> bool:
+    def unusual(self, edges: StripeEdges, fringes: DescribedFringes, shifts: Floats) -> bool:
         """Return whether neither another wave nor half a pixel nor the projector's gamma explains the deviation."""
         allowed = _UNUSUAL / fringes.period + 5 * self.error(edges) + gamma_error(edges, fringes.period, shifts)
         return abs(self.quarters_removed) > allowed
@@ -280,7 +280,9 @@ def _degrees(shifts: Floats) -> list[int]:
     return [int(each) % 360 for each in np.rint(np.degrees(shifts))]
 
 
-def _fitting_offset(edges: Edges, every: list[Fringes], image_roles: list[Role], axis: Axis, extent: int) -> str | None:
+def _fitting_offset(
+    edges: StripeEdges, every: list[DescribedFringes], image_roles: list[Role], axis: Axis, extent: int
+) -> str | None:
     """Return another usual offset of the Gray code with which it fits the fringes as they are described, or None.
 
     A whole number of quarter periods explains the same edges. It is the fringes that are then said to be wrong.
@@ -293,7 +295,7 @@ def _fitting_offset(edges: Edges, every: list[Fringes], image_roles: list[Role],
             continue
         position = edges.position + stated - offset
         deviations = [
-            Deviation.of(position, fringes.period, cycles).cycles
+            PhaseDeviation.of(position, fringes.period, cycles).cycles
             for fringes, cycles in zip(every, edges.cycles, strict=True)
         ]
         quarters = [4 * (offset - stated) / fringes.period for fringes in every]
@@ -302,7 +304,7 @@ def _fitting_offset(edges: Edges, every: list[Fringes], image_roles: list[Role],
     return None
 
 
-def gamma_error(edges: Edges, period: float, shifts: Floats) -> float:
+def gamma_error(edges: StripeEdges, period: float, shifts: Floats) -> float:
     """Return the largest mean phase error at the edges that the gamma of a projector causes [cycles].
 
     (1 + cos x)^gamma has harmonics c_n with c_(n+1) / c_n = (gamma - n) / (gamma + n + 1), by the binomial series. Of N
@@ -319,7 +321,9 @@ def gamma_error(edges: Edges, period: float, shifts: Floats) -> float:
     return common * ratio / (2 * np.pi)
 
 
-def _half_a_pixel_off(edges: Edges, every: list[Fringes], measured: list[Deviation], needed: list[Floats]) -> bool:
+def _half_a_pixel_off(
+    edges: StripeEdges, every: list[DescribedFringes], measured: list[PhaseDeviation], needed: list[Floats]
+) -> bool:
     """Return whether the edges show that the fringes count from the other of edge and pixel."""
     for fringes, deviation, shifts in zip(every, measured, needed, strict=True):
         error = deviation.error(edges) + gamma_error(edges, fringes.period, shifts)

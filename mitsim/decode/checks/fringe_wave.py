@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decode.checks.code_lines import CodeLines
-from mitsim.decode.checks.fringe_origin import CHANGES, Change, described
+from mitsim.decode.checks.fringe_origin import CHANGES, FringeChange, described
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.image_sequence import FringeImages, ImageSequence
 from mitsim.sensor.light_code import GrayCode, LightCode, roles
@@ -71,7 +71,7 @@ def wave_in_words(lines: CodeLines, axis: Axis) -> str:
     words = f"the fringes of the {axis} fit if they have {change.in_words(described(code, lines.image_roles, axis)[0])}"
     kind = (
         ""
-        if isinstance(code, ImageSequence) or change == Change(wave=True)
+        if isinstance(code, ImageSequence) or change == FringeChange(wave=True)
         else ', in a [pattern] of kind = "image_sequence"'
     )
     return f"{words}{kind}: their phases contradict one another, or jump from end to end of the projector"
@@ -118,7 +118,7 @@ def has_jump(values: Floats, lit: NDArray[np.bool_], extent: int) -> NDArray[np.
     return np.asarray(jump.any(axis=1))
 
 
-def with_change(code: LightCode, size: tuple[int, int], axis: Axis, change: Change) -> ImageSequence:
+def with_change(code: LightCode, size: tuple[int, int], axis: Axis, change: FringeChange) -> ImageSequence:
     """Return the code as a sequence in which the fringes of an axis have another description."""
     every = described(code, roles(code, *size), axis)
     changed = [

@@ -40,7 +40,7 @@ STRIPE_IMAGES = ("white", "black", "gray", "gray_inverse")
 
 
 @dataclass(frozen=True)
-class Stripes:
+class DecodedStripes:
     """Decoded bits of one axis, (H, W) each.
 
     ``number`` of the stripe, uint16. ``neighbour``: number with the undecided bit inverted, else the same number.
@@ -82,7 +82,7 @@ def decode_stripes(
     axis: Axis,
     bit_share: float,
     middle_contrast: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None,
-) -> Stripes:
+) -> DecodedStripes:
     """Decode the Gray bits of one axis.
 
     Parameters
@@ -130,12 +130,12 @@ def decode_stripes(
     neighbour = binary_of_gray(np.bitwise_xor(gray, weak_bits))
     number_change = number.astype(np.int32) - neighbour
     multiple = (weak_bits & (weak_bits - np.uint16(1))) != 0
-    return Stripes(number, neighbour, multiple | (np.abs(number_change) > 1), contrast)
+    return DecodedStripes(number, neighbour, multiple | (np.abs(number_change) > 1), contrast)
 
 
 def interpolated_columns(
     coordinate: ProjectorCoordinate,
-    decoded: Stripes,
+    decoded: DecodedStripes,
     stack: NDArray[np.generic],
     image_roles: list[Role],
     coded: CodedAxis,
@@ -161,7 +161,7 @@ def interpolated_columns(
 
 
 def stripe_coordinate(
-    decoded: Stripes,
+    decoded: DecodedStripes,
     coded: CodedAxis,
     saturated: NDArray[np.bool_],
     settings: DecoderSettings,
@@ -267,7 +267,7 @@ def _unwrapping_of_fringes(fringes: Fringes, stripe: float) -> UnwrappingPath:
         return unwrapping_path(fringes.periods, fringes.steps, stripe)
 
 
-def _centre(decoded: Stripes, coded: CodedAxis) -> NDArray[np.float64]:
+def _centre(decoded: DecodedStripes, coded: CodedAxis) -> NDArray[np.float64]:
     """Return the centre of the stripe, or the edge to its neighbour [projector px]."""
     centre = decoded.number.astype(np.float64) + decoded.neighbour
     centre += 1
