@@ -107,7 +107,7 @@ def test_contrast_is_heeded(pairs):
 
     def valid(*options):
         lines = run("decode", pairs / "capture", "-o", pairs / "cloud.ply", *options).output.splitlines()
-        return sum(int(line.split("\t")[1]) for line in lines if line.startswith("valid\t"))
+        return sum(int(line.split("\t")[1].split()[0]) for line in lines if line.startswith("valid\t"))
 
     assert valid() > 10 * (1 + valid("--contrast", "200"))
     assert "an odd number" in str(run("decode", pairs / "capture", "-o", pairs / "a", "--block", "4", code=1).exception)
