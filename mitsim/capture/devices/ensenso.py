@@ -19,7 +19,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from types import TracebackType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -161,9 +160,7 @@ class EnsensoCamera:
     def __enter__(self) -> EnsensoCamera:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _item(self, path: str) -> Any:
