@@ -8,8 +8,6 @@ Signal chain: scene XML and shapes, task, findings of ``mitsim check`` -> one se
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import tomllib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -18,13 +16,12 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jinja2 import Environment, FileSystemLoader
-from markupsafe import Markup
 
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 from characterisation.tasks.definitions import DEFINITIONS
+from mitsim.report.templates import joined_script, rendered, script_content
 from mitsim.report.view_clouds import box_around, fewer_triangles, packed
 from mitsim.report.view_data import COLOURS, as_json
 from mitsim.scene.authoring.check import Finding, TaskFeatures
@@ -69,27 +66,15 @@ def author_page(about: Authored, served: str = "") -> str:
     InputError
         If the scene was not read from a file, or has more than :data:`MOST_FACES` shapes.
     """
-    script = page_script()
-    policy = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
     data = page_data(about, served)
-    return environment.get_template("author_page.html.j2").render(
-        data=as_json(data),
-        script=Markup(script),
-        policy=f"sha256-{policy}",
-        title=data["name"],
-        served=bool(served),
-        metals=list(CONSTANTS),
-        processes=list(PROCESSES),
-    )
-
-
-def page_script() -> str:
-    """Return the one script of the page."""
-    parts = [(Path(__file__).parent / name).read_text(encoding="utf-8") for name in SCRIPTS]
-    return "(() => {\n'use strict';\n" + "\n".join(parts) + "})();\n"
+    content = {
+        "data": as_json(data),
+        "title": data["name"],
+        "served": bool(served),
+        "metals": list(CONSTANTS),
+        "processes": list(PROCESSES),
+    }
+    return rendered("author_page.html.j2", content | script_content(joined_script(SCRIPTS)))
 
 
 def page_data(about: Authored, served: str) -> dict[str, Any]:

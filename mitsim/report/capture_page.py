@@ -16,7 +16,7 @@ from characterisation.files.atomic_io import atomic_write
 from characterisation.plots.style import BLUE, FIELD, VERMILION, drawing
 from characterisation.point_cloud import Status
 from mitsim.report.cloud_figures import REASONS
-from mitsim.report.style import write_png
+from mitsim.report.style import colour_scale, write_png
 from mitsim.running.numbers import percent
 from mitsim.twin.compare.captures_run import Shown
 
@@ -72,8 +72,7 @@ def capture_figure(real: Shown, simulated: Shown) -> Figure:
             for one in (image, field):
                 one.set_xticks([])
                 one.set_yticks([])
-        bar = figure.colorbar(drawn, ax=axes[1].tolist(), label="residual along V [mm]", extend="both", pad=0.01)
-        bar.outline.set_visible(False)  # type: ignore[operator]
+        colour_scale(figure, drawn, axes[1].tolist(), "residual along V [mm]")
         _histograms(axes[2, 0], sides)
         _statuses(axes[2, 1], sides)
     return figure

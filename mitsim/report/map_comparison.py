@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
-from characterisation.plots.discs import disc, disc_view, noise_limits
+from characterisation.plots.discs import disc, disc_image, disc_view, noise_limits
 from characterisation.plots.style import NOISE, SEQUENTIAL, drawing
 from mitsim.report.figures import colour_bar, matt_to_shiny
 from mitsim.running.numbers import finish_name
@@ -58,22 +58,13 @@ def comparison_figure(
         grid = np.asarray(figure.subplots(len(maps), len(samples), squeeze=False))
         for number, (one, row) in enumerate(zip(maps, grid, strict=True)):
             place = nearest_distance(one, distance_mm)
-            half_cell = float(one.data["a"][1] - one.data["a"][0]) / 2
-            reach = float(one.data["a"][-1]) + half_cell
             for sample, axes in zip(samples, row, strict=True):
-                rim = disc(axes, 2 * math.sin(_LARGEST / 2))
                 index = _index(one, sample)
-                if index is not None:
-                    shown = axes.imshow(
-                        np.ma.masked_invalid(one.data[variable].values[index, place]),
-                        norm=norm,
-                        cmap=colours,
-                        origin="lower",
-                        extent=(-reach, reach, -reach, reach),
-                        interpolation="none",
-                        zorder=1,
-                    )
-                    shown.set_clip_path(rim)
+                if index is None:
+                    disc(axes, 2 * math.sin(_LARGEST / 2))
+                else:
+                    values = one.data[variable].values[index, place]
+                    disc_image(axes, values, one.data["a"].values, _LARGEST).set(norm=norm, cmap=colours)
                 disc_view(axes, _LARGEST, labelled=number == 0)
                 if number == 0:
                     axes.set_title(finish_name(*sample).replace(", ", "\n"), fontsize=8)

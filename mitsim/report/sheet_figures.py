@@ -8,18 +8,17 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
-from characterisation.plots.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing
+from characterisation.plots.style import BLUE, INK, MUTED, VERMILION, drawing
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
 from mitsim.capture.picture import STRETCH_EXPONENT
 from mitsim.maps.data_sheet import DataSheet, Recovery
-from mitsim.report.cloud_figures import REASONS
+from mitsim.report.cloud_figures import REASONS, draw_status
 from mitsim.report.style import plain_log
 from mitsim.running.numbers import two_digits
 from mitsim.sensor.preset_covariance import preset_covariance
@@ -75,8 +74,6 @@ def residual_figure(sheets: Sequence[DataSheet]) -> Figure:
 
 def gallery_figure(sensor: str, gallery: Sequence[tuple[str, Capture, PointCloud]]) -> Figure:
     """Draw the reference camera's brightened image of each finish, and beside it the status of each pixel."""
-    colours = ListedColormap([REASONS[status][1] for status in Status])
-    steps = BoundaryNorm(np.arange(len(Status) + 1) - 0.5, len(Status))
     with drawing():
         figure = Figure((3.3 * len(gallery), 5.6), layout="constrained")
         grid = np.asarray(figure.subplots(2, len(gallery), squeeze=False))
@@ -88,8 +85,7 @@ def gallery_figure(sensor: str, gallery: Sequence[tuple[str, Capture, PointCloud
             shown = np.clip((image - low) / max(high - low, 1e-9), 0, 1) ** STRETCH_EXPONENT
             upper.imshow(shown, cmap="gray", vmin=0, vmax=1)
             upper.set_title(finish)
-            lower.imshow(np.ma.masked_equal(cloud.status[cut], Status.NO_SURFACE), cmap=colours, norm=steps)
-            lower.set_facecolor(FIELD)
+            draw_status(lower, cloud.status[cut])
             present |= set(np.unique(cloud.status[cut]).tolist())
             for axes in (upper, lower):
                 axes.set_xticks([])
