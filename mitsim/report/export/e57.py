@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from characterisation.files.atomic_io import atomic_write_named
 from mitsim.report.export.cloud_points import COVARIANCE, CloudPoints
 from mitsim.report.export.cloud_writers import about
 from mitsim.report.export.needed import needed
+from mitsim.report.export.run_scene import quaternion
 from mitsim.running.version import __version__
 from mitsim.sensor.transforms import Transform
 
@@ -53,19 +53,10 @@ def _write_scan(image: Any, libe57: Any, name: str, points: CloudPoints, pose: T
     if pose is not None:
         scan.set("pose", _pose(file, libe57, pose))
     if len(table):
-        scan.set(
-            "indexBounds",
-            _bounds(
-                file,
-                libe57.IntegerNode,
-                libe57,
-                {"row": table["row"], "column": table["col"], "return": np.zeros(1, int)},
-            ),
-        )
-        scan.set(
-            "cartesianBounds",
-            _bounds(file, libe57.FloatNode, libe57, {axis: table[axis].astype(float) for axis in "xyz"}),
-        )
+        indices = {"row": table["row"], "column": table["col"], "return": np.zeros(1, int)}
+        axes = {axis: table[axis].astype(float) for axis in "xyz"}
+        scan.set("indexBounds", _bounds(file, libe57.IntegerNode, libe57, indices))
+        scan.set("cartesianBounds", _bounds(file, libe57.FloatNode, libe57, axes))
     single = libe57.E57_SINGLE
     prototype, buffers = libe57.StructureNode(file), libe57.VectorSourceDestBuffer()
     arrays: list[NDArray[Any]] = []  # libe57 keeps only pointers
@@ -92,15 +83,15 @@ def _write_scan(image: Any, libe57: Any, name: str, points: CloudPoints, pose: T
 
 
 def _pose(file: Any, libe57: Any, pose: Transform) -> Any:
-    x, y, z, w = Rotation.from_matrix(pose.rotation).as_quat(canonical=True)
+    x, y, z, w = quaternion(pose)
     out = libe57.StructureNode(file)
-    for key, values in (
-        ("rotation", {"w": w, "x": x, "y": y, "z": z}),
-        ("translation", dict(zip("xyz", pose.translation / 1000, strict=True))),
+    for key, names, values in (
+        ("rotation", "wxyz", (w, x, y, z)),
+        ("translation", "xyz", (pose.translation / 1000).tolist()),
     ):
         node = libe57.StructureNode(file)
-        for name, value in values.items():
-            node.set(name, libe57.FloatNode(file, float(value)))
+        for name, value in zip(names, values, strict=True):
+            node.set(name, libe57.FloatNode(file, value))
         out.set(key, node)
     return out
 

@@ -17,6 +17,7 @@ from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.task_reading import read_task
+from mitsim.report.export.run_scene import view_pose
 from mitsim.running.version import __version__
 from mitsim.sensor.transforms import Transform
 from mitsim.study import StudyFile
@@ -93,11 +94,7 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
     view = run.statement.view
     results = tuple(_result(name, task, run.statement.measurements[name], view) for name in task.measurements)
     numbers = run.about.view_sets[0].views if run.about.view_sets else [view]
-    known = [int(number) for number in run.scores["view"].values]
-    poses = run.scores["world_from_sensor"].values
-    plan = tuple(
-        (number, Transform.from_matrix(poses[known.index(number)]), tuple(task.measurements)) for number in numbers
-    )
+    plan = tuple((number, view_pose(run, number), tuple(task.measurements)) for number in numbers)
     return RunResults(results, task, run.about.sensor, run.about.study, run.statement.measured_by, plan)
 
 

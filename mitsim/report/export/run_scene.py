@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from characterisation.cloud_files import read_ply
 from characterisation.files.checked_files import read_json_object
@@ -60,29 +61,24 @@ def read_run_scene(folder: str | Path, views: str = "best") -> RunScene:
         If the folder is not a run, or a view does not exist.
     """
     run = read_run(folder)
-    known = [int(number) for number in run.scores["view"].values]
-    chosen = chosen_views(run, views)
-    poses = run.scores["world_from_sensor"].values
     shown = []
-    for number in chosen:
+    for number in chosen_views(run, views):
         clouds = {kind: _read_own(run, kind, number) for kind in KINDS if run.has(_cloud_name(kind, number))}
         best_of = tuple(name for name, best in run.about.leaders.items() if best == number)
-        pose = Transform.from_matrix(poses[known.index(number)])
-        shown.append(ShownView(number, pose, clouds, best_of))
+        shown.append(ShownView(number, view_pose(run, number), clouds, best_of))
     grids = [cloud.grid for view in shown for cloud in view.clouds.values()]
     if not grids and run.clouds:
         grids = [run.predicted(run.clouds[0]).grid]
     return RunScene(run.part(), tuple(shown), grids[0] if grids else None, run.about.sensor)
 
 
-def chosen_views(run: Run, views: str) -> list[int]:
-    """Return the view numbers selected by ``best``, ``all`` or a list of numbers, ascending.
+def view_pose(run: Run, number: int) -> Transform:
+    """Return the pose of the sensor in the part frame [mm] for a view of a run."""
+    return Transform.from_matrix(run.scores["world_from_sensor"].sel(view=number).values)
 
-    Raises
-    ------
-    InputError
-        If the selection is none of these, or a view does not exist.
-    """
+
+def chosen_views(run: Run, views: str) -> list[int]:
+    """Return the view numbers selected by ``best``, or as in :func:`numbers_of`, ascending."""
     known = [int(number) for number in run.scores["view"].values]
     if views == "best":
         with_cloud = [number for number in known if any(run.has(_cloud_name(kind, number)) for kind in KINDS)]
@@ -146,6 +142,12 @@ def frustum(grid: ViewGrid, depth: float) -> tuple[NDArray[np.float64], list[tup
     corners = [(x[0], y[0], 1.0), (x[1], y[0], 1.0), (x[1], y[1], 1.0), (x[0], y[1], 1.0)]
     places = depth * np.array([(0.0, 0.0, 0.0), *corners])
     return places, [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
+
+
+def quaternion(pose: Transform) -> tuple[float, float, float, float]:
+    """Return the rotation of a pose as a unit quaternion x, y, z, w with w >= 0."""
+    x, y, z, w = Rotation.from_matrix(pose.rotation).as_quat(canonical=True).tolist()
+    return x, y, z, w
 
 
 def sensor_from_grid(grid: ViewGrid) -> Transform:
