@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from characterisation.files.errors import InputError
-from mitsim.cli.options import Group, Variant, check_file, check_folder, start
+from mitsim.cli.options import Group, Variant, ViewOfPoses, check_file, check_folder, start
 
 if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
@@ -35,9 +35,9 @@ def cloud(
     cloud: Annotated[Path, typer.Argument(help="PLY file that mitsim wrote.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(CLOUD_SUFFIXES)}.")],
     pose: Annotated[
-        Path | None,
-        typer.Option(help="JSON file with world_from_sensor: pose.json of a capture, or statement.json of a run."),
+        Path | None, typer.Option(help="Pose of the sensor: pose.json, statement.json, or poses.json with --view.")
     ] = None,
+    view: ViewOfPoses = None,
     frame: Annotated[
         str, typer.Option("--in", help="Frame of the points in PLY and PCD: sensor, or part (needs --pose).")
     ] = "sensor",
@@ -52,14 +52,14 @@ def cloud(
     from mitsim.report.export.cloud_writers import write_cloud_pcd, write_cloud_ply
     from mitsim.report.export.e57 import write_e57
     from mitsim.report.export.ros_bag import Stamped, write_mcap
-    from mitsim.report.export.run_scene import read_pose
     from mitsim.running.progress import say
+    from mitsim.study.task_measurement import read_pose
 
     suffix = _suffix(output, CLOUD_SUFFIXES)
     for option, given, allowed in (("--in", frame, ("sensor", "part")), ("--unit", unit, ("mm", "m"))):
         if given not in allowed:
             raise InputError(option, "", repr(given), " or ".join(allowed))
-    known = None if pose is None else read_pose(pose)
+    known = None if pose is None else read_pose(pose, view)
     if frame == "part" and known is None:
         raise InputError("--in", "", "part, without --pose", "a JSON file with the sensor's pose", "give --pose FILE")
     read = read_ply(cloud)

@@ -49,6 +49,13 @@ Clouds = Annotated[
         help="Point clouds (.ply, .pcd, .npy, .mat, .xyz), capture folders (decoded first), or folders of either.",
     ),
 ]
+PoseFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="Pose of the sensor: pose.json, statement.json, or poses.json with --view; default: that of the capture."
+    ),
+]
+ViewOfPoses = Annotated[int | None, typer.Option(min=0, help="Number of the view in poses.json.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")]
 DecodedAs = Annotated[str | None, typer.Option(help="Decode captures with the settings of this sensor.")]
 Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are reused.")]
@@ -131,6 +138,13 @@ def start(variant: str | None) -> None:
     from mitsim.scene import backend
 
     backend.activate(variant)
+
+
+def check_no_workers(scheduler: str | None, processes: int, allowed: str, hint: str) -> None:
+    """Check that neither ``--scheduler`` nor ``--processes`` asks for workers, for the reason in ``hint``."""
+    if scheduler is not None or processes != 1:
+        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
+        raise InputError(option, "", given, allowed, hint)
 
 
 def requested_workers(scheduler: str | None, processes: int) -> Executor | None:

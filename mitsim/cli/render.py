@@ -20,6 +20,7 @@ from mitsim.cli.options import (
     Target,
     Variant,
     check_folder,
+    check_no_workers,
     definitions,
     pose_of,
     requested_workers,
@@ -86,9 +87,8 @@ def render(
             "both --position and --many" if many else "neither --position nor --many",
             "one of them: a position, or a plan",
         )
-    if (scheduler is not None or processes != 1) and many is None:
-        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
-        raise InputError(option, "", given, "only with --many", "a single capture runs in this process")
+    if many is None:
+        check_no_workers(scheduler, processes, "only with --many", "a single capture runs in this process")
     start(variant)
     if many is not None:
         from mitsim.sensor.noise_sources import Noise
@@ -116,21 +116,9 @@ def render(
     loaded = interface.load_scene(scene, chosen, definitions(define), deviation=moved)
     pose = pose_of(position, target, roll, chosen)
     defined = tuple(sorted(definitions(define).items()))
-    digest = Job(
-        chosen,
-        str(scene),
-        defined,
-        moved,
-        "",
-        0,
-        pose,
-        seed,
-        samples,
-        depth,
-        Noise.parse(noise),
-        truth,
-        origin_of(scene, chosen, definitions(define)),
-    ).digest()
+    origin, sources = origin_of(scene, chosen, definitions(define)), Noise.parse(noise)
+    settings = (pose, seed, samples, depth, sources, truth)
+    digest = Job(chosen, str(scene), defined, moved, "", 0, *settings, origin).digest()
     remove_partial_beside(output)
     if digest_of(output, "render") == digest:
         read_capture(output)
@@ -143,11 +131,9 @@ def render(
     residual = render_residual(simulated, loaded, pose, first, Rendering(samples, depth), seed=seed)
     capture.settings["render_residual"] = asdict(residual) if isfinite(residual.noise) else None
     blind = [name if name == "projector" else f"camera {name}" for name in sees_nothing(loaded, chosen.rig, pose)]
-    unseen = (
-        [f"no pixel of the {', '.join(blind)} shows the part: check --position, --target and --roll"] if blind else []
-    )
-    if unseen:
-        capture.settings["warnings"] = [*capture.settings.get("warnings", []), *unseen]
+    if blind:
+        unseen = f"no pixel of the {', '.join(blind)} shows the part: check --position, --target and --roll"
+        capture.settings["warnings"] = [*capture.settings.get("warnings", []), unseen]
     capture.settings["deviation"] = asdict(moved)
     capture.settings["render"] = {"digest": digest}
     known = {}
@@ -159,8 +145,8 @@ def render(
         finishes = [one for one in loaded.finishes if one and one.scatter]
         for source in dict.fromkeys(f"{one}: {one.scatter.provenance}" for one in finishes if one.scatter):
             say(source)
-    for warning in unseen:
-        say(f"warning: {warning}")
+    if blind:
+        say(f"warning: {unseen}")
     say(f"{residual}" + (f"; over {LIMIT}: increase --samples" if residual.worst > LIMIT else ""))
     say(f"capture: {output}")
 

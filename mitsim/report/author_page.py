@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +110,7 @@ def page_data(about: Authored, served: str) -> dict[str, Any]:
 
 def findings_data(found: Sequence[Finding]) -> list[dict[str, str]]:
     """Return the findings for the script."""
-    return [{"severity": one.severity, "about": one.about, "what": one.what, "advice": one.advice} for one in found]
+    return [asdict(one) for one in found]
 
 
 def _definition(kind: Any) -> dict[str, Any]:

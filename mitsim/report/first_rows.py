@@ -109,13 +109,13 @@ class RowValues:
             nominal=exact(self.nominal, self.unit),
             tolerance=tolerance_words(self.tolerance, self.nominal, self.unit),
             bias=_signed(self.bias, self.unit),
-            uncertainty=_quantity(self.uncertainty, self.unit),
-            needed=_quantity(self.needed, self.unit),
+            uncertainty=quantity(self.uncertainty, self.unit),
+            needed=quantity(self.needed, self.unit),
             share=NONE if self.share is None else _share(self.share),
             share_interval="" if limit is None else _interval(self.demand_interval, limit),
             share_limit="" if limit is None else percent(limit),
             accepted=accepted_words(self.accepted, self.unit, size),
-            false_accept=NONE if self.false_accept is None else percent(self.false_accept),
+            false_accept=percent(self.false_accept),
             without_value=percent(self.without_value),
             limited=self.limited,
             points="" if self.points is None or not math.isfinite(self.points) else count(round(self.points)),
@@ -192,7 +192,3 @@ def _signed(value: float | None, unit: str) -> str:
     if value is None:
         return NONE
     return ("+" if value > 0 else MINUS if value < 0 else "") + quantity(abs(value), unit)
-
-
-def _quantity(value: float | None, unit: str) -> str:
-    return NONE if value is None else quantity(value, unit)

@@ -16,7 +16,6 @@ finish returns:
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from characterisation.tasks.covariance import LEAST_CHANCE
@@ -91,8 +90,7 @@ def _set_words(run: Run, entry: ViewSetEntry) -> dict[str, Any]:
         u = entry.uncertainty.get(name)
         reach = "" if entry.feasible.get(name, True) else ": not reached, even with all views together"
         lines.append(
-            f"{name}: {quantity(math.nan if u is None else u, unit)}, limit {quantity(limit, unit)}{reach}"
-            + _confirmed_words(entry, name)
+            f"{name}: {quantity(u, unit)}, limit {quantity(limit, unit)}{reach}" + _confirmed_words(entry, name)
         )
     minimal = "proven" if entry.exact else "not proven: a smaller set may exist"
     return {

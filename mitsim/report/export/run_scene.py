@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from characterisation.cloud_files import read_ply
-from characterisation.files.checked_files import read_json_object
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, ViewGrid
 from mitsim.sensor.transforms import Transform
@@ -104,32 +103,6 @@ def numbers_of(views: str, known: Sequence[int]) -> list[int]:
     if unknown := [number for number in chosen if number not in known]:
         raise InputError("--views", "", unknown[0], allowed)
     return chosen
-
-
-def read_pose(path: str | Path) -> Transform:
-    """Read ``world_from_sensor``, 4 x 4 by rows [mm], from a JSON file: ``pose.json``, ``statement.json``.
-
-    Raises
-    ------
-    InputError
-        If there is none, or it is not a rigid motion.
-    """
-    allowed = "world_from_sensor, 4 x 4 by rows, rigid [mm]"
-    try:
-        table = read_json_object(Path(path), f"JSON with {allowed}")
-        matrix = np.array(table["world_from_sensor"], float)
-    except InputError:
-        raise
-    except (ValueError, TypeError) as error:
-        raise InputError(path, "", f"a file that cannot be read ({error})", f"JSON with {allowed}") from None
-    except KeyError:
-        raise InputError(path, "world_from_sensor", "nothing", allowed) from None
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError(path, "world_from_sensor", table["world_from_sensor"], allowed)
-    turn = matrix[:3, :3]
-    if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
-        raise InputError(path, "world_from_sensor", "a matrix that is not a rotation", allowed)
-    return Transform.from_matrix(matrix)
 
 
 def frustum(grid: ViewGrid, depth: float) -> tuple[NDArray[np.float64], list[tuple[int, int]]]:
