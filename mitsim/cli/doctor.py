@@ -91,18 +91,11 @@ def _renderer() -> list[MachineFinding]:
     out = []
     for candidate in backend.find_llvm():
         detail = f"{candidate.version or 'unknown version'}, {candidate.origin}: {candidate.path}"
-        if candidate.usable:
-            out.append(MachineFinding("libLLVM", "ok", detail))
-        else:
-            out.append(
-                MachineFinding("libLLVM", "absent", f"{detail}: not used, {candidate.fault}", _library_fix(candidate))
-            )
+        unused = ("absent", f"{detail}: not used, {candidate.fault}", _library_fix(candidate))
+        out.append(MachineFinding("libLLVM", *(("ok", detail) if candidate.usable else unused)))
     devices = backend.cuda_devices()
-    out.append(
-        MachineFinding("GPU", "ok", f"{devices} CUDA device(s)")
-        if devices
-        else MachineFinding("GPU", "absent", "no CUDA device: rendering runs on the CPU")
-    )
+    no_device = MachineFinding("GPU", "absent", "no CUDA device: rendering runs on the CPU")
+    out.append(MachineFinding("GPU", "ok", f"{devices} CUDA device(s)") if devices else no_device)
     try:
         variant = backend.choose_variant()
     except MissingEnvironmentError as error:

@@ -96,13 +96,13 @@ def run(
     from mitsim.report.export.gltf import write_glb
     from mitsim.report.export.rerun_recording import write_rrd
     from mitsim.report.export.ros_bag import Stamped, write_mcap
-    from mitsim.report.export.run_scene import labelled_scans, read_run_scene
+    from mitsim.report.export.run_scene import read_run_scene
     from mitsim.report.export.usd import write_usd
     from mitsim.running.progress import say
 
     suffix = _suffix(output, RUN_SUFFIXES)
     scene = read_run_scene(folder, views)
-    scans = labelled_scans(scene)
+    scans = [(view, kind, cloud_points(one)) for view in scene.views for kind, one in view.clouds.items()]
     if suffix in (".mcap", ".e57") and not scans:
         raise InputError("--views", "", f"{views}: none of these views has a cloud", "views with clouds", "see clouds/")
     check_file(output)
@@ -111,20 +111,13 @@ def run(
     elif suffix == ".rrd":
         write_rrd(scene, output, folder.resolve().name)
     elif suffix == ".e57":
-        write_e57([(name, cloud_points(one), view.part_from_sensor) for name, one, view in scans], output)
+        write_e57([(f"{view.name}_{kind}", points, view.part_from_sensor) for view, kind, points in scans], output)
     elif suffix == ".mcap":
-        write_mcap(
-            [
-                Stamped(
-                    f"/{view.name}/{name.removeprefix(view.name + '_')}",
-                    f"{view.name}_optical",
-                    cloud_points(one),
-                    view.part_from_sensor,
-                )
-                for name, one, view in scans
-            ],
-            output,
-        )
+        stamped = [
+            Stamped(f"/{view.name}/{kind}", f"{view.name}_optical", points, view.part_from_sensor)
+            for view, kind, points in scans
+        ]
+        write_mcap(stamped, output)
     else:
         write_usd(scene, output)
     say(f"run: {output}: {len(scene.views)} views, {len(scans)} clouds")

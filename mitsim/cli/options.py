@@ -170,13 +170,13 @@ def pose_of(position: tuple[float, float, float], target: tuple[float, float, fl
     return look_at(position, target, roll_deg=roll, sensor=sensor)
 
 
-def definitions(given: list[str] | None) -> dict[str, str]:
-    """Return the values of -D by name."""
+def definitions(given: list[str] | None, option: str = "-D", allowed: str = "name=value") -> dict[str, str]:
+    """Return the values of a repeatable option by name; ``allowed`` describes its form in an error."""
     out = {}
     for item in given or []:
         name, mark, value = item.partition("=")
         if not mark or not name:
-            raise InputError("-D", "", repr(item), "name=value")
+            raise InputError(option, "", repr(item), allowed)
         out[name] = value
     return out
 

@@ -37,7 +37,7 @@ _KINDS = {
 
 
 @dataclass(frozen=True)
-class Row:
+class ResultRow:
     """One measurement in the short table, as texts; ``colour`` of its verdict.
 
     ``about`` says what is measured. ``share`` of the tolerance with its ``share_interval`` and the largest
@@ -99,11 +99,11 @@ class RowValues:
             return None
         return self.share / self.demand
 
-    def texts(self) -> Row:
+    def texts(self) -> ResultRow:
         """Return the row of the table, as texts."""
         limit = self.share_limit
         size = _size(self.tolerance)
-        return Row(
+        return ResultRow(
             name=self.name,
             about=self.about,
             nominal=exact(self.nominal, self.unit),

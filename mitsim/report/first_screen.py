@@ -17,7 +17,7 @@ from markupsafe import Markup
 from numpy.typing import ArrayLike
 
 from characterisation.statements.verdict_words import OFTEN, Judged, fits_all, losses_in_words, result_in_words
-from mitsim.report.first_rows import Row, RowValues, measured_words
+from mitsim.report.first_rows import ResultRow, RowValues, measured_words
 from mitsim.report.placement_figure import face_verdicts, placement_figure
 from mitsim.report.pose_texts import pose_of_view, pose_words
 from mitsim.report.set_words import with_sets
@@ -43,7 +43,7 @@ class FirstScreen:
 
     words: str
     tone: Tone
-    rows: list[Row]
+    rows: list[ResultRow]
     picture: Picture | None
     poses: list[tuple[str, ArrayLike]]
     verdicts: dict[str, str]
@@ -140,7 +140,7 @@ def of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None) -> FirstSc
     )
 
 
-def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[Row]:
+def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[ResultRow]:
     """Return the rows for the measurements of one sensor."""
     return [
         RowValues(
@@ -160,7 +160,7 @@ def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[Row]:
     ]
 
 
-def _run_row(run: Run, view_scores: xr.Dataset, name: str, one: StatedMeasurement) -> Row:
+def _run_row(run: Run, view_scores: xr.Dataset, name: str, one: StatedMeasurement) -> ResultRow:
     """Return the row of a measurement of a run; ``view_scores`` are the scores of the stated view."""
     entry, decision = run.about.measurements.get(name), one.decision
     limit = feature = ""

@@ -55,7 +55,7 @@ class ShownCloud:
 
 
 @dataclass(frozen=True)
-class Box:
+class CoordinateRaster:
     """Raster of coordinates: ``origin`` (3,) [mm] of step 0, and the ``step`` [mm] along all axes."""
 
     origin: Floats
@@ -66,14 +66,14 @@ class Box:
         return np.clip(np.rint((points - self.origin) / self.step), 0, LAST_STEP).astype("<u2")
 
 
-def box_around(clouds: Iterable[Floats]) -> Box:
+def box_around(clouds: Iterable[Floats]) -> CoordinateRaster:
     """Return the raster that encloses all points (n, 3) [mm]."""
     known = [places for places in clouds if len(places)]
     if not known:
-        return Box(np.zeros(3), 1.0)
+        return CoordinateRaster(np.zeros(3), 1.0)
     low = np.min([places.min(axis=0) for places in known], axis=0)
     high = np.max([places.max(axis=0) for places in known], axis=0)
-    return Box(low, max(float((high - low).max()), 1e-6) / LAST_STEP)
+    return CoordinateRaster(low, max(float((high - low).max()), 1e-6) / LAST_STEP)
 
 
 def choose_clouds(scores: xr.Dataset, available: Sequence[int], first: Sequence[int]) -> list[int]:
@@ -127,7 +127,7 @@ def noise_ends(clouds: Mapping[int, ShownCloud]) -> tuple[float, float] | None:
     return (float(low), float(high)) if high > low else (float(low) / 1.1, float(low) * 1.1)
 
 
-def packed_cloud(cloud: ShownCloud, box: Box, ends: tuple[float, float] | None) -> str:
+def packed_cloud(cloud: ShownCloud, box: CoordinateRaster, ends: tuple[float, float] | None) -> str:
     """Return base64 of planes x, y, z (steps of the box), noise (0 to 254, log of ``ends`` [mm]), feature."""
     noise = np.full(len(cloud.sigma), UNKNOWN, np.uint8)
     if ends is not None:
@@ -138,7 +138,7 @@ def packed_cloud(cloud: ShownCloud, box: Box, ends: tuple[float, float] | None) 
     return packed(box.steps(cloud.points).T.tobytes() + noise.tobytes() + feature.tobytes())
 
 
-def packed_part(mesh: trimesh.Trimesh, box: Box) -> dict[str, Any]:
+def packed_part(mesh: trimesh.Trimesh, box: CoordinateRaster) -> dict[str, Any]:
     """Return the part for the page: ``vertices`` (planes x, y, z), ``normals`` (times 127), ``triangles`` (uint16).
 
     ``shown`` is the number of triangles on the page, ``count`` that of the part.

@@ -262,12 +262,9 @@ def _write_frame(frame: Frame, place: Path, number: int, scale: float, tables: d
             (place / f"{path}.png").write_bytes(encode_png(np.ascontiguousarray(image)))
     pose, key = frame.camera_from_part, str(number)
     turn, shift = pose.rotation.ravel().tolist(), pose.translation.tolist()
-    tables["camera"][key] = {
-        "cam_K": _matrix(frame.grid),
-        "depth_scale": scale,
-        "cam_R_w2c": turn,
-        "cam_t_w2c": shift,
-    }
+    grid = frame.grid
+    matrix = [grid.fx, 0.0, grid.cx, 0.0, grid.fy, grid.cy, 0.0, 0.0, 1.0]
+    tables["camera"][key] = {"cam_K": matrix, "depth_scale": scale, "cam_R_w2c": turn, "cam_t_w2c": shift}
     numbers = range(1, len(frame.masks) + 1)  # BOP counts objects from 1
     tables["gt"][key] = [{"cam_R_m2c": turn, "cam_t_m2c": shift, "obj_id": number} for number in numbers]
     tables["gt_info"][key] = [_info(silhouette, visible, counts > 0) for silhouette, visible in frame.masks]
@@ -293,20 +290,9 @@ def _box(mask: NDArray[np.bool_]) -> list[int]:
     return [int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)]
 
 
-def _matrix(grid: ViewGrid) -> list[float]:
-    return [grid.fx, 0.0, grid.cx, 0.0, grid.fy, grid.cy, 0.0, 0.0, 1.0]
-
-
 def _camera_file(grid: ViewGrid, scale: float) -> dict[str, Any]:
-    return {
-        "cx": grid.cx,
-        "cy": grid.cy,
-        "depth_scale": scale,
-        "fx": grid.fx,
-        "fy": grid.fy,
-        "height": grid.height,
-        "width": grid.width,
-    }
+    axes = {"cx": grid.cx, "cy": grid.cy, "depth_scale": scale, "fx": grid.fx, "fy": grid.fy}
+    return axes | {"height": grid.height, "width": grid.width}
 
 
 def _write_models(folder: Path, objects: Sequence[Scene]) -> None:

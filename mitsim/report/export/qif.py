@@ -34,7 +34,7 @@ from mitsim.report.export.qif_document import (
     transform,
     zone,
 )
-from mitsim.report.export.results import Result, RunResults
+from mitsim.report.export.results import ExpectedResult, RunResults
 from mitsim.running.version import __version__
 
 NAMESPACE = "http://qifstandards.org/xsd/qif3"
@@ -223,7 +223,7 @@ def _results(ids: Ids, found: RunResults) -> Element:
     return element("MeasurementResults", content, id=number)
 
 
-def _measurement(ids: Ids, found: RunResults, one: Result) -> Element:
+def _measurement(ids: Ids, found: RunResults, one: ExpectedResult) -> Element:
     kind = characteristic(found.task, found.task.measurements[one.measurement])
     numbers = {
         "bias": one.bias,

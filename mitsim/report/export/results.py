@@ -1,7 +1,7 @@
 """Tabulate the results of a run: the expectation of every measurement from the chosen view; as CSV and JSON.
 
-Signal chain: ``run.json``, ``statement.json``, task -> a :class:`Result` for every measurement -> CSV, JSON, or QIF
-(:mod:`mitsim.report.export.qif`).
+Signal chain: ``run.json``, ``statement.json``, task -> an :class:`ExpectedResult` for every measurement -> CSV, JSON or
+QIF (:mod:`mitsim.report.export.qif`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mitsim.study.statement_file import StatedMeasurement
 
 
 @dataclass(frozen=True)
-class Result:
+class ExpectedResult:
     """Expected result of one measurement, in its ``unit`` (mm or deg); missing numbers are None.
 
     ``expected`` is the mean value for a perfect part, nominal + ``bias``. ``low`` to ``high`` contain 95 % of the
@@ -56,7 +56,7 @@ class Result:
 class RunResults:
     """Results of a run, its task, and the views of its plan: number, pose and measurements of each."""
 
-    results: tuple[Result, ...]
+    results: tuple[ExpectedResult, ...]
     task: Task
     sensor: str
     study: str
@@ -105,7 +105,7 @@ def write_results_csv(found: RunResults, path: str | Path) -> None:
         asdict(one) | {"features": " ".join(one.features), "tolerance": _in_a_field(one.tolerance)}
         for one in found.results
     ]
-    writer = csv.DictWriter(out, list(Result.__dataclass_fields__), lineterminator="\n")
+    writer = csv.DictWriter(out, list(ExpectedResult.__dataclass_fields__), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     with atomic_write(path) as file:
@@ -139,10 +139,10 @@ def write_results_json(found: RunResults, path: str | Path) -> None:
     )
 
 
-def _result(name: str, task: Task, stated: StatedMeasurement, view: int) -> Result:
+def _result(name: str, task: Task, stated: StatedMeasurement, view: int) -> ExpectedResult:
     asked = task.measurements[name]
     low, high = (None if end is None else asked.nominal + end for end in stated.interval)
-    return Result(
+    return ExpectedResult(
         name,
         asked.kind,
         asked.features,

@@ -42,7 +42,7 @@ _GIMBAL = 1 - 1e-12
 
 
 @dataclass(frozen=True)
-class Target:
+class RobotTarget:
     """A named pose of the tool in the part frame [mm]: ``name`` of letters, digits and underscores."""
 
     name: str
@@ -55,10 +55,10 @@ class RobotFormat:
 
     what: str
     suffix: str
-    write: Callable[[Sequence[Target], str], str]
+    write: Callable[[Sequence[RobotTarget], str], str]
 
 
-def read_targets(folder: str | Path, views: str = "best") -> tuple[list[Target], str]:
+def read_targets(folder: str | Path, views: str = "best") -> tuple[list[RobotTarget], str]:
     """Return the targets of a run's views, or of a folder of ``mitsim study score``; and the name of their tool.
 
     Parameters
@@ -86,7 +86,7 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[Target],
         chosen = sorted({*(about.view_sets[0].views if about.view_sets else about.leaders.values())})
     else:
         chosen = numbers_of(views, list(known))
-    return [Target(f"view_{number:04d}", poses[number]) for number in chosen], tool
+    return [RobotTarget(f"view_{number:04d}", poses[number]) for number in chosen], tool
 
 
 def kuka_numbers(pose: Transform) -> NDArray[np.float64]:
@@ -100,7 +100,7 @@ def kuka_numbers(pose: Transform) -> NDArray[np.float64]:
     return np.array([*pose.translation, *np.degrees([a, b, c])])
 
 
-def rapid_module(targets: Sequence[Target], tool: str) -> str:
+def rapid_module(targets: Sequence[RobotTarget], tool: str) -> str:
     r"""Return a RAPID module of robtargets, with the part frame as work object.
 
     Configurations are 0 and external axes are unused: ``ConfL\Off`` and ``ConfJ\Off`` let the controller choose.
@@ -118,7 +118,7 @@ def rapid_module(targets: Sequence[Target], tool: str) -> str:
     return "\n".join([*lines, "ENDMODULE", ""])
 
 
-def krl_data(targets: Sequence[Target], tool: str) -> str:
+def krl_data(targets: Sequence[RobotTarget], tool: str) -> str:
     """Return a KRL data list of FRAMEs, with the part frame as base."""
     lines = [
         "DEFDAT mitsim_views PUBLIC",
@@ -132,7 +132,7 @@ def krl_data(targets: Sequence[Target], tool: str) -> str:
     return "\n".join([*lines, "ENDDAT", ""])
 
 
-def urscript(targets: Sequence[Target], tool: str) -> str:
+def urscript(targets: Sequence[RobotTarget], tool: str) -> str:
     """Return URScript poses, with the part frame as feature; ``pose_trans(part, view_0012)`` is a pose in the base."""
     lines = [
         f"# poses of the {tool} in the part frame; m, rotation vector in rad",
@@ -144,7 +144,7 @@ def urscript(targets: Sequence[Target], tool: str) -> str:
     return "\n".join([*lines, ""])
 
 
-def moveit_poses(targets: Sequence[Target], tool: str) -> str:
+def moveit_poses(targets: Sequence[RobotTarget], tool: str) -> str:
     """Return YAML of ``PoseStamped`` by name, in the frame ``part``; no exponents, which YAML 1.1 reads as text."""
     lines = [f"# poses of the {tool} in the part frame; m, quaternion x y z w", f"tool: {tool}", "poses:"]
     for one in targets:

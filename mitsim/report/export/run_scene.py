@@ -128,11 +128,6 @@ def sensor_from_grid(grid: ViewGrid) -> Transform:
     return Transform(grid.rotation, grid.origin)
 
 
-def labelled_scans(scene: RunScene) -> Sequence[tuple[str, PointCloud, ShownView]]:
-    """Return all clouds of all views, each with a name such as ``view_0012_predicted``."""
-    return [(f"{view.name}_{kind}", cloud, view) for view in scene.views for kind, cloud in view.clouds.items()]
-
-
 def _cloud_name(kind: str, number: int) -> str:
     return f"clouds/{kind}_{number:04d}.ply"
 
