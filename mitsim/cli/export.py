@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from characterisation.files.errors import InputError
-from mitsim.cli.options import Group, Variant, ViewOfPoses, check_file, check_folder, start
+from mitsim.cli.options import Group, MapFile, Variant, ViewOfPoses, check_file, check_folder, start
 
 if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
@@ -181,9 +181,7 @@ def targets(
 
 @app.command("map")
 def map_(
-    map_file: Annotated[
-        str, typer.Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")
-    ],
+    map_file: MapFile,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
     sensor: Annotated[
         str,

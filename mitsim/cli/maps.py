@@ -11,6 +11,7 @@ from characterisation.files.errors import InputError
 from mitsim.cli.devices import mount
 from mitsim.cli.options import (
     Defines,
+    MapFile,
     Out,
     OutCloud,
     Position,
@@ -195,9 +196,7 @@ def predict(
 
 
 def validate(
-    map_file: Annotated[
-        Path, typer.Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")
-    ],
+    map_file: MapFile,
     campaign: Annotated[Path, typer.Argument(help="Campaign TOML file with the coupons to capture.")],
     output: Out,
     sensor: SensorOption = "ensenso-n10",

@@ -49,6 +49,14 @@ Clouds = Annotated[
         help="Point clouds (.ply, .pcd, .npy, .mat, .xyz), capture folders (decoded first), or folders of either.",
     ),
 ]
+MapFile = Annotated[str, typer.Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")]
+ObjectWindow = Annotated[
+    tuple[int, int, int, int] | None,
+    typer.Option(
+        metavar="COLUMN ROW WIDTH HEIGHT",
+        help="Window of the first camera's image that shows the object [px]; default: the whole image.",
+    ),
+]
 PoseFile = Annotated[
     Path | None,
     typer.Option(

@@ -70,8 +70,7 @@ def capture_figure(real: Shown, simulated: Shown) -> Figure:
             drawn = field.imshow(side.residual, cmap="RdBu_r", vmin=-reach, vmax=reach)
             field.set_facecolor(FIELD)
             for one in (image, field):
-                one.set_xticks([])
-                one.set_yticks([])
+                one.set(xticks=[], yticks=[])
         colour_scale(figure, drawn, axes[1].tolist(), "residual along V [mm]")
         _histograms(axes[2, 0], sides)
         _statuses(axes[2, 1], sides)
@@ -90,9 +89,7 @@ def _histograms(axes: Axes, sides: tuple[Shown, Shown]) -> None:
             axes.stairs(density, edges, fill=True, color=BLUE, alpha=0.45, label=label)
         else:
             axes.stairs(density, edges, color=VERMILION, label=label)
-    axes.set_xlim(0, float(edges[-1]))
-    axes.set_xlabel("grey level on the specimen [DN]")
-    axes.set_ylabel("density [1/DN]")
+    axes.set(xlim=(0, float(edges[-1])), xlabel="grey level on the specimen [DN]", ylabel="density [1/DN]")
     axes.legend(loc="upper right")
 
 
@@ -108,6 +105,5 @@ def _statuses(axes: Axes, sides: tuple[Shown, Shown]) -> None:
             start += share
     axes.set_yticks([0, 1], ["real", "simulated"])
     axes.invert_yaxis()
-    axes.set_xlim(0, 1)
-    axes.set_xlabel("share of the specimen's pixels [1]")
+    axes.set(xlim=(0, 1), xlabel="share of the specimen's pixels [1]")
     axes.legend(loc="upper center", bbox_to_anchor=(0.45, -0.24), ncols=1, fontsize=7.5)

@@ -98,8 +98,7 @@ def strip_figure(maps: Sequence[PerformanceMap]) -> Figure:
         for sample, top, bottom in zip(samples, upper, lower, strict=True):
             top.set_title(finish_name(*sample).replace(", ", "\n"), fontsize=8)
             top.set_ylim(-0.03, 1.03)
-            bottom.set_xscale("log")
-            bottom.set_yscale("log")
+            bottom.set(xscale="log", yscale="log")
             if not any(np.isfinite(line.get_ydata()).any() for each in lower for line in each.lines):
                 # matplotlib finds no limits if no map has a noise
                 bottom.set_ylim(*noise_limits(maps[0].data["ray_noise_std"].values))

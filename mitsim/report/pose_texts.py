@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from mitsim.running.numbers import SPACE, rounded
 from mitsim.study.choice_document import PoseEntry
 from mitsim.study.run_folder import Run
@@ -10,7 +12,8 @@ from mitsim.study.run_folder import Run
 def pose_of_view(run: Run, view: int) -> PoseEntry:
     """Return the pose of a candidate view of a run."""
     here = run.scores.sel(view=view)
-    numbers = {name: float(here[name]) for name in ("azimuth_deg", "elevation_deg", "roll_deg", "standoff_mm")}
+    names = ("azimuth_deg", "elevation_deg", "roll_deg", "standoff_mm")
+    numbers: dict[str, Any] = {name: float(here[name]) for name in names}
     return PoseEntry.model_construct(view=view, world_from_sensor=here["world_from_sensor"].values.tolist(), **numbers)
 
 

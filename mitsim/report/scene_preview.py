@@ -121,8 +121,7 @@ def _from_sensor(axes: Axes, colours: list[str], sensor: Sensor, visible: Visibl
         rows, columns = ((np.arange(count) - 1) * _STEP for count in region.shape)
         axes.contour(columns, rows, region, [0.5], colors=INK, linewidths=0.9, linestyles=style)
     height, width = visible.shape.shape
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     bare(axes)
     seen = visible.shape >= 0
     if seen.any():
@@ -161,8 +160,7 @@ def _from_above(
     image = _painted(shape, front, lit, colours, np.ones(size, bool))
     axes.imshow(image, extent=window, interpolation="antialiased", zorder=0)
     _outline(axes, facts, sensor, pose, window)
-    axes.set_xlim(left, right)
-    axes.set_ylim(bottom, top)
+    axes.set(xlim=(left, right), ylim=(bottom, top))
     bare(axes)
     length = round_length(0.3 * (right - left))
     place = (left + 0.04 * (right - left), bottom + 0.045 * (top - bottom))

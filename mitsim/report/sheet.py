@@ -114,7 +114,9 @@ class _Column:
 
     def put(self, left: float, text: str, **style: Any) -> None:
         """Write one line at a distance [in] from the left edge."""
-        self.figure.text(left / _WIDTH, self.place / _HEIGHT, text, **{"fontsize": 8.5, "va": "top"} | style)
+        style.setdefault("fontsize", 8.5)
+        style.setdefault("va", "top")
+        self.figure.text(left / _WIDTH, self.place / _HEIGHT, text, **style)
 
     def write(
         self,

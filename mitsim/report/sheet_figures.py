@@ -41,9 +41,7 @@ def noise_figure(sheets: Sequence[DataSheet]) -> Figure:
                 axes.loglog(
                     known.distance_mm, known.sigma_mm, color=VERMILION, lw=1.1, label=_short(known.source), **mark
                 )  # type: ignore[arg-type]
-            axes.set_title(sheet.sensor.name)
-            axes.set_xlabel("distance [mm]")
-            axes.set_ylabel("sigma along V [mm]")
+            axes.set(title=sheet.sensor.name, xlabel="distance [mm]", ylabel="sigma along V [mm]")
             largest = np.nanmax([*spread, *(s for known in sheet.sensor.published_noise for s in known.sigma_mm)])
             axes.set_ylim(max(axes.get_ylim()[0], largest / 300), 2.5 * largest)
             _plain_ticks(axes, distance)
@@ -64,9 +62,7 @@ def residual_figure(sheets: Sequence[DataSheet]) -> Figure:
             axes.hist(found.values, bins=np.linspace(-reach, reach, 91).tolist(), density=True, color=BLUE, alpha=0.75)
             x = np.linspace(-reach, reach, 200)
             axes.plot(x, np.exp(-0.5 * (x / spread) ** 2) / (spread * math.sqrt(2 * math.pi)), color=INK, lw=0.9)
-            axes.set_yticks([])
-            axes.set_xlabel("residual along V [mm]")
-            axes.set_title(f"{sheet.sensor.name}, {found.distance:.0f} mm")
+            axes.set(yticks=[], xlabel="residual along V [mm]", title=f"{sheet.sensor.name}, {found.distance:.0f} mm")
             label = f"kurtosis {found.excess_kurtosis:+.2f}\n{found.independent} independent: p = {found.p_normal:.2g}"
             axes.text(0.02, 0.97, label, transform=axes.transAxes, va="top", fontsize=7, color=MUTED)
     return figure
@@ -88,8 +84,7 @@ def gallery_figure(sensor: str, gallery: Sequence[tuple[str, Capture, PointCloud
             draw_status(lower, cloud.status[cut])
             present |= set(np.unique(cloud.status[cut]).tolist())
             for axes in (upper, lower):
-                axes.set_xticks([])
-                axes.set_yticks([])
+                axes.set(xticks=[], yticks=[])
         figure.suptitle(sensor, fontsize=10)
         legend = [Patch(facecolor=REASONS[Status(s)][1], label=REASONS[Status(s)][0]) for s in sorted(present)]
         figure.legend(handles=legend, loc="outside lower center", ncols=3, handlelength=1.1)

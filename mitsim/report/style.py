@@ -85,7 +85,9 @@ def write_png(figure: Figure, path: Path, dpi: int = _DPI) -> Path:
 
 def colour_scale(figure: Figure, shown: Any, axes: Any, label: str, **options: Any) -> Colorbar:
     """Add a colour scale without a frame, for values that may lie beyond its ends unless ``extend`` says otherwise."""
-    bar = figure.colorbar(shown, ax=axes, label=label, **{"extend": "both", "pad": 0.01} | options)
+    options.setdefault("extend", "both")
+    options.setdefault("pad", 0.01)
+    bar = figure.colorbar(shown, ax=axes, label=label, **options)
     bar.outline.set_visible(False)  # type: ignore[operator]
     return bar
 

@@ -143,17 +143,27 @@ def packed_part(mesh: trimesh.Trimesh, box: CoordinateRaster) -> dict[str, Any]:
 
     ``shown`` is the number of triangles on the page, ``count`` that of the part.
     """
-    vertices, triangles = fewer_triangles(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64))
-    merged = trimesh.Trimesh(vertices, triangles, process=True)
-    shaded = trimesh.graph.smooth_shade(merged, angle=CREASE)
-    normals = np.rint(127 * np.asarray(shaded.vertex_normals)).astype(np.int8)
+    shaded = smoothly_shaded(mesh)
     return {
         "vertices": packed(box.steps(np.asarray(shaded.vertices)).T.tobytes()),
-        "normals": packed(normals.T.tobytes()),
+        "normals": packed_normals(np.asarray(shaded.vertex_normals)),
         "triangles": packed(np.asarray(shaded.faces).astype("<u2").tobytes()),
         "shown": len(shaded.faces),
         "count": len(mesh.faces),
     }
+
+
+def smoothly_shaded(mesh: trimesh.Trimesh, most: int = MOST_TRIANGLES) -> trimesh.Trimesh:
+    """Return a surface with at most ``most`` triangles and vertex normals that are smooth except at creases."""
+    vertices, triangles = fewer_triangles(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64), most)
+    merged = trimesh.Trimesh(vertices, triangles, process=True)
+    shaded: trimesh.Trimesh = trimesh.graph.smooth_shade(merged, angle=CREASE)
+    return shaded
+
+
+def packed_normals(normals: Floats) -> str:
+    """Return base64 of unit normals (n, 3): planes x, y, z, times 127."""
+    return packed(np.rint(127 * normals).astype(np.int8).T.tobytes())
 
 
 def fewer_triangles(

@@ -9,12 +9,12 @@ from xml.etree.ElementTree import Element
 
 from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
-from characterisation.tasks.definitions import DEFINITIONS
+from characterisation.tasks.definitions import DEFINITIONS, MeasurementKind
 from characterisation.tasks.task_file import Measurement, Nominal, Task
 from mitsim.sensor.transforms import Transform
 
 #: QIF's characteristics by kind of measurement; sizes of a sphere have other names
-CHARACTERISTICS = {
+CHARACTERISTICS: dict[MeasurementKind, str] = {
     "intersection_distance": "DistanceBetween",
     "axis_distance": "DistanceBetween",
     "point_distance": "DistanceBetween",
