@@ -168,9 +168,8 @@ def targets(
         raise InputError("--robot", "", repr(robot), ", ".join(ROBOT_FORMATS))
     target_format = ROBOT_FORMATS[robot]
     if output.suffix.lower() != target_format.suffix:
-        raise InputError(
-            "--output", "", output.name, f"a name that ends in {target_format.suffix}: {target_format.what}"
-        )
+        allowed = f"a name that ends in {target_format.suffix}: {target_format.what}"
+        raise InputError("--output", "", output.name, allowed)
     found, tool = read_targets(folder, views)
     check_file(output)
     with atomic_write(output) as file:

@@ -77,13 +77,9 @@ class Request:
         results = measure_windows(cloud, self.plan)
         if self.plates:
             if given.capture is None or not given.capture.images:
-                raise InputError(
-                    given.path,
-                    "",
-                    "a cloud without images",
-                    "a capture folder, whose images show the dots",
-                    "give the capture folder, which the command decodes: mitsim measure CAPTURE --dots ...",
-                )
+                allowed = "a capture folder, whose images show the dots"
+                hint = "give the capture folder, which the command decodes: mitsim measure CAPTURE --dots ..."
+                raise InputError(given.path, "", "a cloud without images", allowed, hint)
             image = image_on_grid(given.capture, cloud.grid)
             for name, plate in self.plates.items():
                 results += measure_plate(name, plate, cloud, image)

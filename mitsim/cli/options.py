@@ -149,7 +149,15 @@ def start(variant: str | None) -> None:
 
 
 def check_no_workers(scheduler: str | None, processes: int, allowed: str, hint: str) -> None:
-    """Check that neither ``--scheduler`` nor ``--processes`` asks for workers, for the reason in ``hint``."""
+    """Check that no options ask for workers.
+
+    Parameters
+    ----------
+    scheduler, processes
+        Values of ``--scheduler`` and ``--processes``.
+    allowed, hint
+        Where workers are allowed, and why only there.
+    """
     if scheduler is not None or processes != 1:
         option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
         raise InputError(option, "", given, allowed, hint)
@@ -167,7 +175,17 @@ def requested_workers(scheduler: str | None, processes: int) -> Executor | None:
 
 
 def pose_of(position: tuple[float, float, float], target: tuple[float, float, float], roll: float, sensor: Any) -> Any:
-    """Return ``world_from_sensor`` of a sensor whose reference camera is at a position and looks at a target."""
+    """Return ``world_from_sensor``.
+
+    Parameters
+    ----------
+    position, target
+        Position of the reference camera, and the point that it looks at [mm].
+    roll
+        Rotation about the view axis [deg].
+    sensor
+        The sensor.
+    """
     import numpy as np
 
     from mitsim.sensor.poses import look_at
@@ -212,13 +230,8 @@ def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
     if not (folder / last).exists():
         return
     if not overwrite:
-        raise InputError(
-            "--output",
-            "",
-            f"{folder}, a finished run",
-            "a folder without one",
-            "to repeat the run, add --overwrite (it reuses finished trials); to rewrite its page, use mitsim report",
-        )
+        hint = "to repeat the run, add --overwrite (it reuses finished trials); to rewrite its page, use mitsim report"
+        raise InputError("--output", "", f"{folder}, a finished run", "a folder without one", hint)
     (folder / last).unlink()
 
 

@@ -81,12 +81,8 @@ def render(
     Example: mitsim render scenes/two_pillars/two_pillars.xml --position 0 -400 300 -o captures/first
     """
     if (position is None) == (many is None):
-        raise InputError(
-            "--position",
-            "",
-            "both --position and --many" if many else "neither --position nor --many",
-            "one of them: a position, or a plan",
-        )
+        found = "both --position and --many" if many else "neither --position nor --many"
+        raise InputError("--position", "", found, "one of them: a position, or a plan")
     if many is None:
         check_no_workers(scheduler, processes, "only with --many", "a single capture runs in this process")
     start(variant)

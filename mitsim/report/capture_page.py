@@ -34,7 +34,14 @@ PICTURE = "side_by_side.png"
 def write_capture_page(folder: Path, preamble: str, table: str, real: Shown, simulated: Shown) -> Path:
     """Write ``index.md`` and its picture into a folder, and return the path of the page.
 
-    ``preamble`` and ``table`` are Markdown.
+    Parameters
+    ----------
+    folder
+        Folder to write, which exists.
+    preamble, table
+        Texts of the page, in Markdown.
+    real, simulated
+        Data of the specimen in the two captures.
     """
     write_png(capture_figure(real, simulated), folder / PICTURE, dpi=_DPI)
     page = folder / "index.md"

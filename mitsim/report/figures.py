@@ -90,7 +90,19 @@ def _map_figure(
 def colour_bar(
     figure: Figure, grid: NDArray[np.object_], norm: Normalize, colours: str | Colormap, label: str, extend: str
 ) -> None:
-    """Add one labelled colour scale below all axes of a figure."""
+    """Add one labelled colour scale below all axes of a figure.
+
+    Parameters
+    ----------
+    figure, grid
+        The figure, and its axes.
+    norm, colours
+        Scale of the values, and name of the colours.
+    label
+        Quantity and unit.
+    extend
+        Ends beyond which values lie: ``neither``, ``both`` or ``max``.
+    """
     mappable, below = ScalarMappable(norm=norm, cmap=colours), {"location": "bottom", "aspect": 45, "shrink": 0.75}
     bar = colour_scale(figure, mappable, grid.ravel().tolist(), label, extend=extend, pad=0.03, **below)
     if isinstance(norm, LogNorm):

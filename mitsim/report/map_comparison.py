@@ -139,13 +139,9 @@ def check_distance(maps: Sequence[PerformanceMap], distance_mm: float) -> None:
         if not near <= distance_mm <= far:
             outside.append(f"{sensor_name(one)} from {near:g} to {far:g} mm")
     if outside:
-        raise InputError(
-            "--distance",
-            "",
-            f"{distance_mm:g} mm",
-            f"a distance that all maps cover; {', '.join(outside)}",
-            "omit those maps, or omit --distance to draw each map in the middle of its range",
-        )
+        allowed = f"a distance that all maps cover; {', '.join(outside)}"
+        hint = "omit those maps, or omit --distance to draw each map in the middle of its range"
+        raise InputError("--distance", "", f"{distance_mm:g} mm", allowed, hint)
 
 
 def sensor_name(one: PerformanceMap) -> str:

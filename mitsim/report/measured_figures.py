@@ -39,7 +39,19 @@ def distance_figure(cloud: PointCloud, windows: Mapping[str, Roi]) -> Figure:
 def difference_figure(
     difference: NDArray[np.float64], found: Difference, windows: Mapping[str, Roi], part: Roi | None = None
 ) -> Figure:
-    """Draw the signed difference [mm] of every pixel, in the whole image or a part, and its histogram."""
+    """Draw the signed difference of every pixel, in the whole image or a part, and its histogram.
+
+    Parameters
+    ----------
+    difference
+        (H, W) [mm], NaN where a pixel has no counterpart.
+    found
+        Distribution of the difference.
+    windows
+        Windows to outline [px], by name.
+    part
+        Part of the image that is shown [px]; None for all of it.
+    """
     part = part or Roi.whole(difference.shape[1], difference.shape[0])
     known = difference[np.isfinite(difference)]
     reach = float(np.percentile(np.abs(known), _PERCENTILE)) if len(known) else 1.0

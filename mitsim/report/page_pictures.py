@@ -54,10 +54,11 @@ def map_pictures(run: Run) -> Iterator[tuple[str, Picture]]:
     yield "Fraction of points recovered", _picture(figures.fraction_figure(performance_map), alt, caption)
 
     low, high = noise_limits(performance_map.data["ray_noise_std"].values)
-    medians = [findings.median_noise(performance_map, i, middle, math.radians(45)) for i in order]
+    medians = [findings.median_noise(performance_map, i, middle) for i in order]
     noises = [f"{two_digits(s)} mm on {name}" for s, name in zip(medians, names, strict=True) if math.isfinite(s)]
     caption = (
-        f"Dark means little noise. At {distances[middle]:g} mm and up to 45° of incidence the median of σ is "
+        f"Dark means little noise. At {distances[middle]:g} mm and up to {findings.NOISE_UP_TO_DEG:g}° of incidence the "
+        f"median of σ is "
         f"{listed(noises) or 'not known'} (logarithmic colours from the {NOISE_PERCENTILES[0]}nd to the "
         f"{NOISE_PERCENTILES[1]}th percentile, {two_digits(low)} to {two_digits(high)} mm)."
     )

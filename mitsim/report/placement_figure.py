@@ -87,7 +87,23 @@ def placement_figure(
 def draw_placement(
     figure: FigureBase, geometry: SceneGeometry, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]
 ) -> None:
-    """Draw into a figure or subfigure, about 1.9 times as wide as high; see :func:`placement_figure`."""
+    """Draw a part with a sensor at each pose into a figure.
+
+    Parameters
+    ----------
+    figure
+        Figure or subfigure, about 1.9 times as wide as high.
+    geometry
+        Triangles of the part, and eyes of the sensor [mm].
+    poses
+        Label and part_from_sensor (4, 4) [mm] of each pose; the first sensor is drawn in full.
+    verdicts
+        Verdict of each feature, a key of :data:`VERDICTS`.
+
+    See Also
+    --------
+    placement_figure : The same as a figure of its own.
+    """
     matrices = [np.asarray(pose, float) for _, pose in poses]
     with drawing():
         middle = _middle(geometry)

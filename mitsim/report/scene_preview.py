@@ -53,7 +53,19 @@ def preview_figure(
     visible: VisibleSurfaces,
     first: Sequence[str] = (),
 ) -> Figure:
-    """Draw both views with their legend; shapes named in ``first`` get the first colours, then the largest."""
+    """Draw both views with their legend.
+
+    Parameters
+    ----------
+    scene, facts
+        The loaded scene, and its shapes.
+    sensor, pose
+        The sensor, and world_from_sensor [mm].
+    visible
+        What the reference camera's pixels see.
+    first
+        Names of the shapes that get the first colours; the largest of the others follow.
+    """
     colours = _colours(facts, first)
     with drawing():
         camera = sensor.rig.reference

@@ -84,7 +84,19 @@ def write_png(figure: Figure, path: Path, dpi: int = _DPI) -> Path:
 
 
 def colour_scale(figure: Figure, shown: Any, axes: Any, label: str, **options: Any) -> Colorbar:
-    """Add a colour scale without a frame, for values that may lie beyond its ends unless ``extend`` says otherwise."""
+    """Add a colour scale without a frame, for values that may lie beyond its ends.
+
+    Parameters
+    ----------
+    figure, axes
+        The figure, and the axes beside which the scale lies.
+    shown
+        Image or other artist with the colours.
+    label
+        Quantity and unit.
+    options
+        Further arguments of :meth:`matplotlib.figure.Figure.colorbar`.
+    """
     options.setdefault("extend", "both")
     options.setdefault("pad", 0.01)
     bar = figure.colorbar(shown, ax=axes, label=label, **options)

@@ -93,7 +93,17 @@ def choose_clouds(scores: xr.Dataset, available: Sequence[int], first: Sequence[
 
 
 def shown_cloud(cloud: PointCloud, part_from_sensor: Floats, features: Sequence[str], most: int) -> ShownCloud:
-    """Return at most ``most`` points of a cloud, evenly over its pixels; ``part_from_sensor`` (4, 4)."""
+    """Return points of a cloud, evenly over its pixels.
+
+    Parameters
+    ----------
+    cloud, part_from_sensor
+        The cloud, and the pose of its sensor, (4, 4) [mm].
+    features
+        Names of the features of the task.
+    most
+        Largest number of points.
+    """
     valid, stride = cloud.valid, 1.0
     rows, columns = np.nonzero(valid)
     while len(rows) > most:

@@ -118,24 +118,32 @@ def objects_of(names: Sequence[str], patterns: Sequence[str]) -> list[tuple[str,
     """
     if not patterns:
         return [tuple(names)]
-    found = [tuple(fnmatch.filter(names, pattern)) for pattern in patterns]
-    for pattern, shapes in zip(patterns, found, strict=True):
+    objects = [tuple(fnmatch.filter(names, pattern)) for pattern in patterns]
+    for pattern, shapes in zip(patterns, objects, strict=True):
         if not shapes:
             raise InputError("--object", "", repr(pattern), f"a pattern of shapes: {', '.join(names)}")
-    every = [name for shapes in found for name in shapes]
+    every = [name for shapes in objects for name in shapes]
     for name in every:
         if every.count(name) > 1:
-            both = [pattern for pattern, shapes in zip(patterns, found, strict=True) if name in shapes]
-            raise InputError(
-                "--object", "", f"{' and '.join(both)}, which both have {name}", "objects without common shapes"
-            )
-    return found
+            both = [pattern for pattern, shapes in zip(patterns, objects, strict=True) if name in shapes]
+            found = f"{' and '.join(both)}, which both have {name}"
+            raise InputError("--object", "", found, "objects without common shapes")
+    return objects
 
 
 def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train", patterns: Sequence[str] = ()) -> int:
     """Write a data set atomically, with one BOP scene for each finish, and return the number of images.
 
-    ``patterns`` assign shapes to objects (:func:`objects_of`).
+    Parameters
+    ----------
+    sources
+        Captures, as :func:`find_sources` returns them.
+    output
+        Folder to write.
+    split
+        Name of the split: train, val or test.
+    patterns
+        Patterns of the shapes of each object (:func:`objects_of`).
 
     Raises
     ------
@@ -181,7 +189,14 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
 def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: str | Path) -> tuple[Frame, float]:
     """Decode a capture onto the pixels of a pinhole for BOP; also return the scale of its depth images [mm].
 
-    ``objects`` are parts of the scene (:meth:`mitsim.scene.load.Scene.only`).
+    Parameters
+    ----------
+    capture, where
+        The capture, and its folder for errors.
+    scene
+        The scene that was rendered.
+    objects
+        Parts of the scene (:meth:`mitsim.scene.load.Scene.only`).
 
     Raises
     ------

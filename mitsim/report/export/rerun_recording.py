@@ -22,7 +22,7 @@ from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 from characterisation.files.atomic_io import atomic_write_named
-from characterisation.point_cloud import PointCloud, Status
+from characterisation.point_cloud import Status
 from mitsim.report.cloud_figures import REASONS
 from mitsim.report.export.cloud_points import cloud_points
 from mitsim.report.export.gltf import FRUSTUM_MM
@@ -83,7 +83,7 @@ def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None
         points = cloud_points(cloud)
         stream.log(
             f"{place}/{kind}",
-            rerun.Points3D(points.points, colors=_colours(cloud), radii=-1.5),
+            rerun.Points3D(points.points, colors=_colours(points.sigma), radii=-1.5),
             rerun.AnyValues(
                 sigma=points.sigma.astype(np.float32), covariance=points.covariance.astype(np.float32).ravel()
             ),
@@ -91,9 +91,8 @@ def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None
         )
 
 
-def _colours(cloud: PointCloud) -> NDArray[np.uint8]:
+def _colours(sigma: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Return colours (n, 3) by ln sigma from its 2nd to its 98th percentile; grey where it is unknown."""
-    sigma = np.full(int(cloud.valid.sum()), np.nan) if cloud.sigma is None else cloud.sigma[cloud.valid].astype(float)
     out = np.tile(np.array(_UNKNOWN, np.uint8), (len(sigma), 1))
     known = np.isfinite(sigma) & (sigma > 0)
     if known.any():

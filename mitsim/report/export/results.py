@@ -102,8 +102,8 @@ def write_results_csv(found: RunResults, path: str | Path) -> None:
     """Write one row for every measurement; missing numbers are empty fields."""
     out = io.StringIO()
     rows = [
-        asdict(one) | {"features": " ".join(one.features), "tolerance": _in_a_field(one.tolerance)}
-        for one in found.results
+        asdict(result) | {"features": " ".join(result.features), "tolerance": _in_a_field(result.tolerance)}
+        for result in found.results
     ]
     writer = csv.DictWriter(out, list(ExpectedResult.__dataclass_fields__), lineterminator="\n")
     writer.writeheader()
@@ -163,18 +163,11 @@ def _result(name: str, task: Task, stated: StatedMeasurement, view: int) -> Expe
 
 
 def _task_path(run: Run) -> Path:
+    hint = "give the task: --task FILE"
     study = Path(run.about.study)
     if not study.is_file():
-        raise InputError(
-            run.folder / "run.json",
-            "study",
-            f"{study}, which does not exist",
-            "a readable study",
-            "give the task: --task FILE",
-        )
+        raise InputError(run.folder / "run.json", "study", f"{study}, which does not exist", "a readable study", hint)
     path = study.parent / read_toml(study, StudyFile).task
     if not path.is_file():
-        raise InputError(
-            study, "task", f"{path}, which does not exist", "a readable task", "give the task: --task FILE"
-        )
+        raise InputError(study, "task", f"{path}, which does not exist", "a readable task", hint)
     return path
