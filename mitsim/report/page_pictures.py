@@ -57,8 +57,8 @@ def map_pictures(run: Run) -> Iterator[tuple[str, Picture]]:
     medians = [findings.median_noise(performance_map, i, middle) for i in order]
     noises = [f"{two_digits(s)} mm on {name}" for s, name in zip(medians, names, strict=True) if math.isfinite(s)]
     caption = (
-        f"Dark means little noise. At {distances[middle]:g} mm and up to {findings.NOISE_UP_TO_DEG:g}° of incidence the "
-        f"median of σ is "
+        f"Dark means little noise. At {distances[middle]:g} mm and up to {findings.NOISE_UP_TO_DEG:g}° of incidence "
+        f"the median of σ is "
         f"{listed(noises) or 'not known'} (logarithmic colours from the {NOISE_PERCENTILES[0]}nd to the "
         f"{NOISE_PERCENTILES[1]}th percentile, {two_digits(low)} to {two_digits(high)} mm)."
     )
