@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -12,6 +11,7 @@ from characterisation.files.errors import InputError
 from mitsim.cli.devices import mount
 from mitsim.cli.options import (
     Defines,
+    MapFile,
     Out,
     OutCloud,
     Position,
@@ -27,6 +27,7 @@ from mitsim.cli.options import (
     asking,
     check_file,
     check_folder,
+    check_no_workers,
     definitions,
     pose_of,
     print_reasons,
@@ -34,12 +35,8 @@ from mitsim.cli.options import (
     start,
 )
 
-
-class Noise(StrEnum):
-    """Correlation of the errors of neighbouring predicted points."""
-
-    INDEPENDENT = "independent"
-    CORRELATED = "correlated"
+#: what workers are allowed with, and why
+_ONE_AT_A_TIME = ("not with a [device]", "a device takes one capture at a time")
 
 
 def make(
@@ -88,9 +85,8 @@ def make(
         raise InputError("--scheduler", "", scheduler, "not with --captures", "existing captures need no cluster")
     file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
     live = None if file.device is None else plan_live(campaign, file, chosen)
-    if live is not None and (scheduler is not None or processes != 1):
-        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
-        raise InputError(option, "", given, "not with a [device]", "a device takes one capture at a time")
+    if live is not None:
+        check_no_workers(scheduler, processes, *_ONE_AT_A_TIME)
     plan = plan_campaign(campaign, file, chosen) if live is None else live.campaign
     check_folder(output)
     if compact is not None:
@@ -143,7 +139,6 @@ def compare(
     if distance is not None:
         check_distance(loaded, distance)
     check_folder(output)
-    output.mkdir(parents=True, exist_ok=True)
     write_png(comparison_figure(loaded, "fraction", distance), output / "compare_fraction.png", dpi=62)
     write_png(comparison_figure(loaded, "noise", distance), output / "compare_noise.png", dpi=62)
     write_png(strip_figure(loaded), output / "compare_strip.png", dpi=80)
@@ -161,8 +156,9 @@ def predict(
     roll: Roll = 0.0,
     sensor: SensorOption = "ensenso-n10",
     noise: Annotated[
-        Noise, typer.Option(help="Errors of neighbouring points: independent, or correlated as measured in the map.")
-    ] = Noise.INDEPENDENT,
+        Literal["independent", "correlated"],
+        typer.Option(help="Errors of neighbouring points: independent, or correlated as measured in the map."),
+    ] = "independent",
     seed: Seed = 1,
     define: Defines = None,
     yes: Yes = False,
@@ -181,7 +177,7 @@ def predict(
     performance_map = read_map(map_file, chosen)
     loaded = load_scene(scene, chosen, definitions(define))
     pose = pose_of(position, target, roll, chosen)
-    correlated = noise is Noise.CORRELATED
+    correlated = noise == "correlated"
     cloud = maps.predict(loaded, chosen, performance_map, pose, seed=seed, correlated=correlated, ask=asking(yes))
     check_file(output)
     write_cloud(cloud, output)
@@ -189,9 +185,7 @@ def predict(
 
 
 def validate(
-    map_file: Annotated[
-        Path, typer.Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")
-    ],
+    map_file: MapFile,
     campaign: Annotated[Path, typer.Argument(help="Campaign TOML file with the coupons to capture.")],
     output: Out,
     sensor: SensorOption = "ensenso-n10",
@@ -244,9 +238,8 @@ def validate(
     path = map_path(map_file)
     performance_map = PerformanceMap.load(path)
     file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
-    if file.device is not None and (scheduler is not None or processes != 1):
-        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
-        raise InputError(option, "", given, "not with a [device]", "a device takes one capture at a time")
+    if file.device is not None:
+        check_no_workers(scheduler, processes, *_ONE_AT_A_TIME)
     live = None if file.device is None else held_out_live(campaign, file, chosen, performance_map)
     plan = held_out_campaign(campaign, chosen, performance_map) if live is None else live.campaign
     shots = held_out_shots(plan, poses, seed)
