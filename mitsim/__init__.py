@@ -17,6 +17,7 @@ from mitsim.running.version import __version__ as __version__
 #: name -> module that defines it
 _NAMES = {
     "BudgetLine": "characterisation.statements.budget",
+    "CampaignFile": "mitsim.maps.campaign.plan",
     "Capture": "mitsim.capture.capture",
     "InputError": "characterisation.files.errors",
     "MissingEnvironmentError": "characterisation.files.errors",
@@ -27,9 +28,11 @@ _NAMES = {
     "Sensor": "mitsim.sensor.preset",
     "Statement": "characterisation.statements.statement",
     "Study": "mitsim.study",
+    "StudyFile": "mitsim.study",
     "Task": "characterisation.tasks.task_file",
     "Transform": "mitsim.sensor.transforms",
     "Truth": "mitsim.capture.simulated.truth",
+    "characterise": "mitsim.maps.use",
     "decode": "mitsim.decode.captures",
     "label": "mitsim.study.task_measurement",
     "load_scene": "mitsim.decode.captures",
@@ -43,6 +46,7 @@ _NAMES = {
     "read_cloud": "mitsim.decode.captures",
     "read_task": "characterisation.tasks.task_reading",
     "render": "mitsim.decode.captures",
+    "run_study": "mitsim.study.run",
     "score": "mitsim.study.session",
     "statement": "mitsim.study.session",
     "triangulate": "mitsim.decode.own_code",
@@ -72,18 +76,21 @@ if TYPE_CHECKING:
         write_cloud,
     )
     from mitsim.decode.own_code import triangulate
-    from mitsim.maps.use import performance_map, predict
+    from mitsim.maps.campaign.plan import CampaignFile
+    from mitsim.maps.use import characterise, performance_map, predict
     from mitsim.scene.load import Scene
     from mitsim.sensor.poses import look_at
     from mitsim.sensor.preset import Sensor
     from mitsim.sensor.transforms import Transform
-    from mitsim.study import Study
+    from mitsim.study import Study, StudyFile
     from mitsim.study.reading import open_study
+    from mitsim.study.run import run_study
     from mitsim.study.session import score, statement
     from mitsim.study.task_measurement import label, measure
 
 __all__ = [
     "BudgetLine",
+    "CampaignFile",
     "Capture",
     "InputError",
     "MissingEnvironmentError",
@@ -94,9 +101,11 @@ __all__ = [
     "Sensor",
     "Statement",
     "Study",
+    "StudyFile",
     "Task",
     "Transform",
     "Truth",
+    "characterise",
     "decode",
     "label",
     "load_scene",
@@ -110,6 +119,7 @@ __all__ = [
     "read_cloud",
     "read_task",
     "render",
+    "run_study",
     "score",
     "statement",
     "triangulate",

@@ -131,17 +131,7 @@ def calibration_table(rig: Rig) -> dict[str, Any]:
     return {
         "cameras": [_camera_table(name, camera) for name, camera in rig.cameras.items()],
         "projector": None if rig.projector is None else _camera_table("projector", rig.projector),
-        "rectification": None
-        if pair is None
-        else {
-            "matrix_left": _rows(pair.matrix_left),
-            "matrix_right": _rows(pair.matrix_right),
-            "rotation_left": _rows(pair.rotation_left),
-            "rotation_right": _rows(pair.rotation_right),
-            "baseline": float(pair.baseline),
-            "width": int(pair.width),
-            "height": int(pair.height),
-        },
+        "rectification": None if pair is None else {key: np.asarray(each).tolist() for key, each in vars(pair).items()},
     }
 
 
@@ -155,21 +145,13 @@ def pose_table(pose: Transform | None, covariance: NDArray[np.float64] | None = 
 
 def rig_of(document: CalibrationDocument) -> Rig:
     """Return the rig that a calibration document describes."""
-    pair = document.rectification
+    pair: dict[str, Any] = {}
+    for key, value in document.rectification or ():
+        pair[key] = np.array(value) if isinstance(value, tuple) else value
     return Rig(
         cameras={camera.name: _camera(camera) for camera in document.cameras},
         projector=None if document.projector is None else _camera(document.projector),
-        rectification=None
-        if pair is None
-        else Rectification(
-            matrix_left=np.array(pair.matrix_left),
-            matrix_right=np.array(pair.matrix_right),
-            rotation_left=np.array(pair.rotation_left),
-            rotation_right=np.array(pair.rotation_right),
-            baseline=pair.baseline,
-            width=pair.width,
-            height=pair.height,
-        ),
+        rectification=Rectification(**pair) if pair else None,
     )
 
 

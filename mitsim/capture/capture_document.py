@@ -12,8 +12,9 @@ from typing import Any, Literal
 from pydantic import Field
 
 from characterisation.files.documents import Document, Name
+from mitsim.capture.capture import Source
 
-#: version that is written. Version 1, without derived maps and units, can still be read
+#: version that is written and read
 SCHEMA_VERSION = 2
 FRAME = "opencv: x right, y down, z forward, pixel centres at integers"
 UNITS = {"length": "mm", "pixel_value": "DN", "angle_in_files": "deg"}
@@ -48,10 +49,10 @@ class CaptureDocument(Document):
     See :func:`characterisation.files.checked_files.content_checksum`.
     """
 
-    schema_version: Literal[1, 2]
+    schema_version: Literal[2]
     sensor: Name
     technology: str
-    source: str
+    source: Source
     serial: str
     bits: int = Field(ge=1, le=16)
     units: dict[str, str]

@@ -31,7 +31,7 @@ from characterisation.files.checked_files import content_checksum, is_inside, re
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from mitsim.capture.calibration import CalibrationDocument, PoseDocument, rig_of
-from mitsim.capture.capture import DERIVED_UNITS, SOURCES, Capture
+from mitsim.capture.capture import DERIVED_UNITS, Capture
 from mitsim.capture.capture_document import SCHEMA_VERSION, CaptureDocument, FileEntry
 from mitsim.capture.decoding import read_settings
 from mitsim.capture.npy import decode_npy
@@ -181,13 +181,10 @@ def read_capture(folder: str | Path) -> Capture:
             )
         check_image(image, stack, document.bits, folder / entry.path)
         stack.append(image)
-    source = next((known for known in SOURCES if known == document.source), None)
-    if source is None:
-        raise InputError(where, "source", document.source, " | ".join(SOURCES))
     return Capture(
         sensor=document.sensor,
         technology=document.technology,
-        source=source,
+        source=document.source,
         rig=rig,
         images={name: np.stack(stack) for name, stack in images.items() if stack},
         bits=document.bits,
@@ -264,8 +261,6 @@ def _read_index(folder: Path) -> tuple[CaptureDocument, Path]:
             where, "schema_version", version, f"up to {SCHEMA_VERSION}", "update mitsim to read this capture"
         )
     document = validate(where, table, CaptureDocument)
-    if document.source not in SOURCES:
-        raise InputError(where, "source", repr(document.source), " | ".join(SOURCES))
     if document.checksum != content_checksum(table):
         raise InputError(where, "checksum", "content that differs from what was written", "an unchanged file")
     return document, where

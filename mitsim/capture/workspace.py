@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from characterisation.cloud_files import WrittenFrame
 from characterisation.files.errors import InputError
+from mitsim.capture.calibration import RigidRows
 from mitsim.capture.capture import Capture
 from mitsim.sensor.transforms import Transform
 
@@ -20,6 +21,8 @@ from mitsim.sensor.transforms import Transform
 FRAMES = ("sensor", "workspace")
 
 _KEY = "sensor_from_workspace"
+
+_RIGID = TypeAdapter(RigidRows)
 
 
 def written_frame(capture: Capture, frame: str, where: str | Path) -> WrittenFrame | None:
@@ -40,17 +43,11 @@ def written_frame(capture: Capture, frame: str, where: str | Path) -> WrittenFra
     if stored is None:
         raise InputError(where, f"settings.{_KEY}", "none: no workspace is known", allowed, hint)
     try:
-        matrix = np.asarray(stored, float)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    rigid = matrix.shape == (4, 4) and bool(np.isfinite(matrix).all()) and matrix[3].tolist() == [0, 0, 0, 1]
-    if rigid:
-        rotation = matrix[:3, :3]
-        rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-6 and bool(np.linalg.det(rotation) > 0)
-    if not rigid:
+        matrix = _RIGID.validate_python(stored)
+    except ValidationError:
         raise InputError(
             where, f"settings.{_KEY}", "a matrix that is not a rigid transform", allowed, "import the recording again"
-        )
+        ) from None
     target = ascii(str(capture.settings.get("link_target") or "workspace")[:80])  # one line of the header
     name = f"of the workspace {target} of the device's Link"
     return WrittenFrame(name, Transform.from_matrix(matrix).inverse().matrix())

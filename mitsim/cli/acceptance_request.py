@@ -7,9 +7,8 @@ each window -> figures of each cloud, and those of all clouds together (:mod:`ch
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +28,7 @@ from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.result import Result, failed
 from characterisation.tasks.windows import LEAST_POINTS, window_points, window_slices
-from mitsim.cli.measure_request import check_unique, parse_numbers, parse_window
-
-Value = TypeVar("Value")
+from mitsim.cli.measure_request import parse_window
 
 _PLANE = "NAME, NAME=DISTANCE or NAME=COLUMN,ROW,WIDTH,HEIGHT[,DISTANCE]"
 _SPHERE = "NAME=DIAMETER or NAME=COLUMN,ROW,WIDTH,HEIGHT,DIAMETER"
@@ -62,26 +59,22 @@ def read_artefacts(planes: Sequence[str], spheres: Sequence[str], spacings: Sequ
     """
     targets: dict[str, tuple[Roi | None, float | None]] = {}
     for text in planes:
-        name, numbers = parse_numbers("--plane", text, (0, 1, 4, 5), _PLANE)
-        check_unique("--plane", name, targets)
-        known = _checked_length("--plane", text, numbers.pop(), _PLANE) if len(numbers) in (1, 5) else None
-        targets[name] = parse_window("--plane", text, numbers, _PLANE), known
+        name, window, distance = parse_window("--plane", text, (0, 1, 4, 5), _PLANE, targets)
+        targets[name] = window, None if distance is None else _checked_length("--plane", text, distance, _PLANE)
     balls: dict[str, tuple[Roi | None, float]] = {}
     for text in spheres:
-        name, numbers = parse_numbers("--sphere", text, (1, 5), _SPHERE)
-        check_unique("--sphere", name, {**targets, **balls})
-        diameter = _checked_length("--sphere", text, numbers.pop(), _SPHERE)
-        balls[name] = parse_window("--sphere", text, numbers, _SPHERE), diameter
+        name, window, diameter = parse_window("--sphere", text, (1, 5), _SPHERE, {**targets, **balls})
+        balls[name] = window, _checked_length("--sphere", text, diameter, _SPHERE)
     pairs = []
     for text in spacings:
         first, _, rest = text.partition(",")
-        second, _, distance = rest.partition(",")
+        second, _, last = rest.partition(",")
         for name in (first, second):
             if name not in balls:
                 allowed = f"{_SPACING}, {', '.join(balls) or 'each a --sphere'}"
                 raise InputError("--spacing", "", repr(text), allowed, nearest(name, list(balls)))
         try:
-            value = float(distance)
+            value = float(last)
         except ValueError:
             raise InputError("--spacing", "", repr(text), _SPACING) from None
         pairs.append((first, second, _checked_length("--spacing", text, value, _SPACING)))
@@ -113,21 +106,22 @@ def cloud_figures(cloud: PointCloud, artefacts: Artefacts, baseline_mm: float | 
     for name, (window, diameter) in artefacts.spheres.items():
         points = window_points(window, cloud, name)
         count = cloud.status[window_slices(window, cloud, name)].size
-        error = _value_or_reason(probing_error, points, diameter)
-        for label, field in ((f"{name} form error PF", "form"), (f"{name} size error PS", "size")):
-            if isinstance(error, str):
-                out.append(failed(label, "mm", error, len(points), count))
-            else:
-                uncertainty = form_error_uncertainty(points, error.centre) if field == "form" else math.nan
-                out.append(_result(label, "mm", getattr(error, field), uncertainty, len(points), count))
+        labels = f"{name} form error PF", f"{name} size error PS"
+        try:
+            error = probing_error(points, diameter)
+        except InputError as unfit:
+            out += [failed(label, "mm", str(unfit), len(points), count) for label in labels]
+            continue
+        uncertainty = form_error_uncertainty(points, error.centre)
+        out.append(_result(labels[0], "mm", error.form, uncertainty, len(points), count))
+        out.append(Result(labels[1], "mm", error.size, points=len(points), points_given=count))
     for first, second, distance in artefacts.spacings:
         one, other = (window_points(artefacts.spheres[name][0], cloud, name) for name in (first, second))
-        label = f"{first}-{second} spacing error SD"
-        found = _value_or_reason(sphere_spacing_error, one, other, distance)
-        count = len(one) + len(other)
-        out.append(
-            failed(label, "mm", found, count) if isinstance(found, str) else Result(label, "mm", found, points=count)
-        )
+        label, count = f"{first}-{second} spacing error SD", len(one) + len(other)
+        try:
+            out.append(Result(label, "mm", sphere_spacing_error(one, other, distance), points=count))
+        except InputError as unfit:
+            out.append(failed(label, "mm", str(unfit), count))
     return out
 
 
@@ -215,13 +209,6 @@ def _result(name: str, unit: str, value: float, uncertainty: float, points: int,
     return Result(name, unit, value, uncertainty, "fit" if math.isfinite(uncertainty) else "none", points, count)
 
 
-def _value_or_reason(function: Callable[..., Value], *arguments: Any) -> Value | str:
-    try:
-        return function(*arguments)
-    except InputError as error:
-        return str(error)
-
-
 def _perpendicular_plane(cloud: PointCloud, distance: float) -> Coupon:
     """Return the plane perpendicular to the optical axis of the cloud's grid at a distance [mm]."""
     axes = cloud.grid.rotation
@@ -234,7 +221,7 @@ def _mask(cloud: PointCloud, inside: tuple[slice, slice]) -> NDArray[np.bool_]:
     return mask
 
 
-def _checked_length(option: str, text: str, value: float, allowed: str) -> float:
-    if not 0 < value < 1e6:
+def _checked_length(option: str, text: str, value: float | None, allowed: str) -> float:
+    if value is None or not 0 < value < 1e6:
         raise InputError(option, "", repr(text), f"{allowed}, lengths over 0 mm")
     return value

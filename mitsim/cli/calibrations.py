@@ -61,7 +61,7 @@ def calibrate(
 
     known = list(Drift().numbers())
     terms = {}
-    for name, value in definitions(drift).items():
+    for name, value in definitions(drift, "--drift", "NAME=VALUE").items():
         if name not in known:
             raise InputError("--drift", "", repr(name), ", ".join(known), nearest(name, known))
         try:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from characterisation.files.errors import InputError
-from mitsim.cli.options import Out, Seed, Variant, check_folder, start
+from mitsim.cli.options import ObjectWindow, Out, Seed, Variant, check_folder, start
 
 
 def compare(
@@ -26,13 +26,7 @@ def compare(
     sensor: Annotated[
         str | None, typer.Option(help="Sensor to simulate, a preset or TOML file; default: the one that REAL names.")
     ] = None,
-    window: Annotated[
-        tuple[int, int, int, int] | None,
-        typer.Option(
-            metavar="COLUMN ROW WIDTH HEIGHT",
-            help="Window of the first camera's image that shows the object [px]; default: the whole image.",
-        ),
-    ] = None,
+    window: ObjectWindow = None,
     projector: Annotated[
         str | None,
         typer.Option(

@@ -8,7 +8,7 @@ import os
 import platform
 import subprocess
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Literal
 
 from characterisation.files.errors import MissingEnvironmentError
@@ -62,7 +62,7 @@ assert abs(float(dr.sum(dr.minimum(dr.arange(mi.Float, 8), 3.0))[0]) - 18.0) < 1
 
 
 @dataclass(frozen=True)
-class Finding:
+class MachineFinding:
     """One line of the report. ``absent`` things are optional; ``missing`` ones stop mitsim from working."""
 
     what: str
@@ -71,57 +71,43 @@ class Finding:
     fix: str = ""
 
 
-def examine() -> list[Finding]:
+def examine() -> list[MachineFinding]:
     """Check everything that mitsim needs or can use."""
     return [*_software(), *_renderer(), *_optional()]
 
 
-def findings_as_json(findings: list[Finding]) -> list[dict[str, str]]:
-    """Return the findings as values for JSON."""
-    return [asdict(finding) for finding in findings]
-
-
-def _software() -> list[Finding]:
+def _software() -> list[MachineFinding]:
     out = [
-        Finding("mitsim", "ok", __version__),
-        Finding("python", "ok", f"{platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores"),
+        MachineFinding("mitsim", "ok", __version__),
+        MachineFinding("python", "ok", f"{platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores"),
     ]
     for name in _PACKAGES:
-        version = _version(name)
-        if version:
-            out.append(Finding(name, "ok", version))
-        else:
-            out.append(Finding(name, "missing", "not installed", f"pip install {name}"))
+        missing = MachineFinding(name, "missing", "not installed", f"pip install {name}")
+        out.append(MachineFinding(name, "ok", version) if (version := _version(name)) else missing)
     return out
 
 
-def _renderer() -> list[Finding]:
+def _renderer() -> list[MachineFinding]:
     out = []
-    candidates = backend.find_llvm()
-    for candidate in candidates:
+    for candidate in backend.find_llvm():
         detail = f"{candidate.version or 'unknown version'}, {candidate.origin}: {candidate.path}"
-        if candidate.usable:
-            out.append(Finding("libLLVM", "ok", detail))
-        else:
-            out.append(Finding("libLLVM", "absent", f"{detail}: not used, {candidate.fault}", _library_fix(candidate)))
+        unused = ("absent", f"{detail}: not used, {candidate.fault}", _library_fix(candidate))
+        out.append(MachineFinding("libLLVM", *(("ok", detail) if candidate.usable else unused)))
     devices = backend.cuda_devices()
-    out.append(
-        Finding("GPU", "ok", f"{devices} CUDA device(s)")
-        if devices
-        else Finding("GPU", "absent", "no CUDA device: rendering runs on the CPU")
-    )
+    no_device = MachineFinding("GPU", "absent", "no CUDA device: rendering runs on the CPU")
+    out.append(MachineFinding("GPU", "ok", f"{devices} CUDA device(s)") if devices else no_device)
     try:
         variant = backend.choose_variant()
     except MissingEnvironmentError as error:
-        return [*out, Finding("renderer", "missing", "no Mitsuba variant can run", str(error))]
+        return [*out, MachineFinding("renderer", "missing", "no Mitsuba variant can run", str(error))]
     # in a separate process: a library that aborts ends its process
     trial = subprocess.run(
         [sys.executable, "-c", _TRIAL, variant], capture_output=True, text=True, timeout=300, check=False
     )
     if trial.returncode == 0:
-        return [*out, Finding("renderer", "ok", f"{variant}, a trial kernel ran")]
+        return [*out, MachineFinding("renderer", "ok", f"{variant}, a trial kernel ran")]
     reason = (trial.stderr.strip().splitlines() or [f"it ended with code {trial.returncode}"])[-1]
-    return [*out, Finding("renderer", "missing", f"{variant} failed: {reason}", backend.HELP)]
+    return [*out, MachineFinding("renderer", "missing", f"{variant} failed: {reason}", backend.HELP)]
 
 
 def _library_fix(candidate: backend.Llvm) -> str:
@@ -131,15 +117,15 @@ def _library_fix(candidate: backend.Llvm) -> str:
     return ""
 
 
-def _optional() -> list[Finding]:
+def _optional() -> list[MachineFinding]:
     out = []
     for name, use in _OPTIONAL.items():
         version = _version(name)
         fix = "" if version else _FIXES.get(name, f"pip install {name}")
-        out.append(Finding(name, "ok" if version else "absent", f"{version or 'not installed'}: for {use}", fix))
+        out.append(MachineFinding(name, "ok" if version else "absent", f"{version or 'not installed'}: for {use}", fix))
     library = ctypes.util.find_library("NxLib64")
     detail = library or "not installed: only for live Ensenso cameras; recordings are read without it"
-    out.append(Finding("NxLib", "ok" if library else "absent", detail))
+    out.append(MachineFinding("NxLib", "ok" if library else "absent", detail))
     return out
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from characterisation.files.errors import InputError
-from mitsim.cli.options import Group, Variant, check_file, check_folder, start
+from mitsim.cli.options import Group, MapFile, Variant, ViewOfPoses, check_file, check_folder, start
 
 if TYPE_CHECKING:
     from characterisation.point_cloud import PointCloud
@@ -35,9 +35,9 @@ def cloud(
     cloud: Annotated[Path, typer.Argument(help="PLY file that mitsim wrote.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(CLOUD_SUFFIXES)}.")],
     pose: Annotated[
-        Path | None,
-        typer.Option(help="JSON file with world_from_sensor: pose.json of a capture, or statement.json of a run."),
+        Path | None, typer.Option(help="Pose of the sensor: pose.json, statement.json, or poses.json with --view.")
     ] = None,
+    view: ViewOfPoses = None,
     frame: Annotated[
         str, typer.Option("--in", help="Frame of the points in PLY and PCD: sensor, or part (needs --pose).")
     ] = "sensor",
@@ -52,14 +52,14 @@ def cloud(
     from mitsim.report.export.cloud_writers import write_cloud_pcd, write_cloud_ply
     from mitsim.report.export.e57 import write_e57
     from mitsim.report.export.ros_bag import Stamped, write_mcap
-    from mitsim.report.export.run_scene import read_pose
     from mitsim.running.progress import say
+    from mitsim.study.task_measurement import read_pose
 
     suffix = _suffix(output, CLOUD_SUFFIXES)
     for option, given, allowed in (("--in", frame, ("sensor", "part")), ("--unit", unit, ("mm", "m"))):
         if given not in allowed:
             raise InputError(option, "", repr(given), " or ".join(allowed))
-    known = None if pose is None else read_pose(pose)
+    known = None if pose is None else read_pose(pose, view)
     if frame == "part" and known is None:
         raise InputError("--in", "", "part, without --pose", "a JSON file with the sensor's pose", "give --pose FILE")
     read = read_cloud(cloud)
@@ -96,13 +96,13 @@ def run(
     from mitsim.report.export.gltf import write_glb
     from mitsim.report.export.rerun_recording import write_rrd
     from mitsim.report.export.ros_bag import Stamped, write_mcap
-    from mitsim.report.export.run_scene import labelled_scans, read_run_scene
+    from mitsim.report.export.run_scene import read_run_scene
     from mitsim.report.export.usd import write_usd
     from mitsim.running.progress import say
 
     suffix = _suffix(output, RUN_SUFFIXES)
     scene = read_run_scene(folder, views)
-    scans = labelled_scans(scene)
+    scans = [(view, kind, cloud_points(one)) for view in scene.views for kind, one in view.clouds.items()]
     if suffix in (".mcap", ".e57") and not scans:
         raise InputError("--views", "", f"{views}: none of these views has a cloud", "views with clouds", "see clouds/")
     check_file(output)
@@ -111,20 +111,13 @@ def run(
     elif suffix == ".rrd":
         write_rrd(scene, output, folder.resolve().name)
     elif suffix == ".e57":
-        write_e57([(name, cloud_points(one), view.part_from_sensor) for name, one, view in scans], output)
+        write_e57([(f"{view.name}_{kind}", points, view.part_from_sensor) for view, kind, points in scans], output)
     elif suffix == ".mcap":
-        write_mcap(
-            [
-                Stamped(
-                    f"/{view.name}/{name.removeprefix(view.name + '_')}",
-                    f"{view.name}_optical",
-                    cloud_points(one),
-                    view.part_from_sensor,
-                )
-                for name, one, view in scans
-            ],
-            output,
-        )
+        stamped = [
+            Stamped(f"/{view.name}/{kind}", f"{view.name}_optical", points, view.part_from_sensor)
+            for view, kind, points in scans
+        ]
+        write_mcap(stamped, output)
     else:
         write_usd(scene, output)
     say(f"run: {output}: {len(scene.views)} views, {len(scans)} clouds")
@@ -175,9 +168,8 @@ def targets(
         raise InputError("--robot", "", repr(robot), ", ".join(ROBOT_FORMATS))
     target_format = ROBOT_FORMATS[robot]
     if output.suffix.lower() != target_format.suffix:
-        raise InputError(
-            "--output", "", output.name, f"a name that ends in {target_format.suffix}: {target_format.what}"
-        )
+        allowed = f"a name that ends in {target_format.suffix}: {target_format.what}"
+        raise InputError("--output", "", output.name, allowed)
     found, tool = read_targets(folder, views)
     check_file(output)
     with atomic_write(output) as file:
@@ -188,9 +180,7 @@ def targets(
 
 @app.command("map")
 def map_(
-    map_file: Annotated[
-        str, typer.Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")
-    ],
+    map_file: MapFile,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
     sensor: Annotated[
         str,

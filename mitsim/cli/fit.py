@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from mitsim.cli.options import Defines, Seed, Variant, check_file, definitions, start
+from mitsim.cli.options import Defines, ObjectWindow, Seed, Variant, check_file, definitions, start
 
 
 def finish(
@@ -86,13 +86,7 @@ def sensor_(
     output: Annotated[Path, typer.Option("--output", "-o", help="Sensor TOML file to write.")] = Path("my-camera.toml"),
     off: Annotated[list[Path] | None, typer.Option(help="Capture with the projector off; once for each.")] = None,
     dark: Annotated[list[Path] | None, typer.Option(help="Capture with all light off; once for each.")] = None,
-    window: Annotated[
-        tuple[int, int, int, int] | None,
-        typer.Option(
-            metavar="COLUMN ROW WIDTH HEIGHT",
-            help="Window of the first camera's image that shows the object [px]; default: the whole image.",
-        ),
-    ] = None,
+    window: ObjectWindow = None,
     seed: Seed = 1,
     variant: Variant = None,
 ) -> None:

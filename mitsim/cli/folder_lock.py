@@ -48,12 +48,8 @@ def lock_folder(folder: Path) -> Callable[[], None]:
     handle = _locked(folder)
     if handle is None:
         return lambda: None
-    about = {
-        "pid": os.getpid(),
-        "host": platform.node(),
-        "since": f"{datetime.now():%Y-%m-%d %H:%M:%S}",
-        "command": " ".join(sys.argv[1:2]),
-    }
+    about = {"pid": os.getpid(), "host": platform.node(), "since": f"{datetime.now():%Y-%m-%d %H:%M:%S}"}
+    about |= {"command": " ".join(sys.argv[1:2])}
     os.ftruncate(handle, 0)
     os.pwrite(handle, json.dumps(about).encode(), 0)
     remove_partial(folder)
@@ -120,13 +116,9 @@ def _locked(folder: Path) -> int | None:
         except BlockingIOError:
             holder = _holder(handle)
             os.close(handle)
-            raise InputError(
-                folder,
-                "",
-                f"a folder that {holder} is writing to",
-                "a folder that no other command is writing to",
-                "wait until that command ends, or choose another folder with -o",
-            ) from None
+            allowed = "a folder that no other command is writing to"
+            hint = "wait until that command ends, or choose another folder with -o"
+            raise InputError(folder, "", f"a folder that {holder} is writing to", allowed, hint) from None
         except OSError:  # a file system without locks
             os.close(handle)
             path.unlink(missing_ok=True)

@@ -9,6 +9,7 @@ import typer
 
 from characterisation.files.errors import InputError
 from mitsim.cli.folder_lock import remove_partial_beside
+from mitsim.cli.options import definitions
 
 #: settings of an imported capture that the user should check
 SETTINGS_TO_CHECK = (
@@ -123,7 +124,7 @@ def import_(
         axes=axes,
         link=None if link is None else str(link),
         subpixel_bits=subpixel_bits,
-        images=_by_camera(images),
+        images=_patterns(images),
         channel=channel,
         exposure_s=exposure,
         pose=None if pose is None else str(pose),
@@ -147,12 +148,10 @@ def import_(
     say(f"capture: {folder}")
 
 
-def _by_camera(given: list[str] | None) -> dict[str, str] | None:
+def _patterns(images: list[str] | None) -> dict[str, str] | None:
     """Return the patterns of --images by camera."""
-    out = {}
-    for item in given or []:
-        name, mark, pattern = item.partition("=")
-        if not mark or not name or not pattern:
-            raise InputError("--images", "", repr(item), "NAME=PATTERN, as left='cam0_*.png'")
-        out[name] = pattern
-    return out or None
+    allowed = "NAME=PATTERN, as left='cam0_*.png'"
+    patterns = definitions(images, "--images", allowed)
+    if empty := [name for name, pattern in patterns.items() if not pattern]:
+        raise InputError("--images", "", repr(f"{empty[0]}="), allowed)
+    return patterns or None

@@ -15,12 +15,13 @@ def doctor(json: Json = False) -> None:
     Example: mitsim doctor
     """
     import json as json_module
+    from dataclasses import asdict
 
-    from mitsim.cli.doctor import examine, findings_as_json
+    from mitsim.cli.doctor import examine
 
     findings = examine()
     if json:
-        print(json_module.dumps(findings_as_json(findings), indent=2))
+        print(json_module.dumps([asdict(finding) for finding in findings], indent=2))
     else:
         for finding in findings:
             print(f"{finding.verdict:8} {finding.what:32} {finding.detail}")

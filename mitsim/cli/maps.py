@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -12,6 +11,7 @@ from characterisation.files.errors import InputError
 from mitsim.cli.devices import mount
 from mitsim.cli.options import (
     Defines,
+    MapFile,
     Out,
     OutCloud,
     Position,
@@ -27,6 +27,7 @@ from mitsim.cli.options import (
     asking,
     check_file,
     check_folder,
+    check_no_workers,
     definitions,
     pose_of,
     print_reasons,
@@ -34,12 +35,8 @@ from mitsim.cli.options import (
     start,
 )
 
-
-class Noise(StrEnum):
-    """Correlation of the errors of neighbouring predicted points."""
-
-    INDEPENDENT = "independent"
-    CORRELATED = "correlated"
+#: what workers are allowed with, and why
+_ONE_AT_A_TIME = ("not with a [device]", "a device takes one capture at a time")
 
 
 def make(
@@ -69,18 +66,16 @@ def make(
     """
     start(variant)
     from characterisation.files.documents import read_toml
-    from mitsim.capture.simulated.simulate import SimulatedSensor
     from mitsim.maps.campaign.acquire import (
-        coupon_residuals,
         found_shots,
         found_source,
         in_turn,
         out_of_range,
-        simulated_source,
     )
     from mitsim.maps.campaign.live import live_source, place_by_place, plan_live
     from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
     from mitsim.maps.campaign.run import measure_captures, run_campaign
+    from mitsim.maps.use import simulate_campaign
     from mitsim.report.figures import write_map_figures
     from mitsim.report.findings import spread_in_words
     from mitsim.running.progress import say
@@ -90,9 +85,8 @@ def make(
         raise InputError("--scheduler", "", scheduler, "not with --captures", "existing captures need no cluster")
     file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
     live = None if file.device is None else plan_live(campaign, file, chosen)
-    if live is not None and (scheduler is not None or processes != 1):
-        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
-        raise InputError(option, "", given, "not with a [device]", "a device takes one capture at a time")
+    if live is not None:
+        check_no_workers(scheduler, processes, *_ONE_AT_A_TIME)
     plan = plan_campaign(campaign, file, chosen) if live is None else live.campaign
     check_folder(output)
     if compact is not None:
@@ -107,16 +101,7 @@ def make(
         with live_source(live, mount) as take:
             performance_map = run_campaign(plan, place_by_place(in_turn(take, plan)), output)
     else:
-        workers = requested_workers(scheduler, processes)
-        simulated = SimulatedSensor(plan.sensor)
-        coupon_residuals(simulated, plan)
-        if workers is None:
-            source = in_turn(simulated_source(simulated, plan.file.samples_per_pixel), plan)
-        else:
-            from mitsim.maps.campaign.orders import worker_source
-
-            source = worker_source(workers, plan)
-        performance_map = run_campaign(plan, source, output)
+        performance_map = simulate_campaign(plan, output, requested_workers(scheduler, processes))
     if compact is not None:
         performance_map.save(compact, compact=True)
     write_map_figures(performance_map, output)
@@ -154,7 +139,6 @@ def compare(
     if distance is not None:
         check_distance(loaded, distance)
     check_folder(output)
-    output.mkdir(parents=True, exist_ok=True)
     write_png(comparison_figure(loaded, "fraction", distance), output / "compare_fraction.png", dpi=62)
     write_png(comparison_figure(loaded, "noise", distance), output / "compare_noise.png", dpi=62)
     write_png(strip_figure(loaded), output / "compare_strip.png", dpi=80)
@@ -172,8 +156,9 @@ def predict(
     roll: Roll = 0.0,
     sensor: SensorOption = "ensenso-n10",
     noise: Annotated[
-        Noise, typer.Option(help="Errors of neighbouring points: independent, or correlated as measured in the map.")
-    ] = Noise.INDEPENDENT,
+        Literal["independent", "correlated"],
+        typer.Option(help="Errors of neighbouring points: independent, or correlated as measured in the map."),
+    ] = "independent",
     seed: Seed = 1,
     define: Defines = None,
     yes: Yes = False,
@@ -192,7 +177,7 @@ def predict(
     performance_map = read_map(map_file, chosen)
     loaded = load_scene(scene, chosen, definitions(define))
     pose = pose_of(position, target, roll, chosen)
-    correlated = noise is Noise.CORRELATED
+    correlated = noise == "correlated"
     cloud = maps.predict(loaded, chosen, performance_map, pose, seed=seed, correlated=correlated, ask=asking(yes))
     check_file(output)
     write_cloud(cloud, output)
@@ -200,9 +185,7 @@ def predict(
 
 
 def validate(
-    map_file: Annotated[
-        Path, typer.Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")
-    ],
+    map_file: MapFile,
     campaign: Annotated[Path, typer.Argument(help="Campaign TOML file with the coupons to capture.")],
     output: Out,
     sensor: SensorOption = "ensenso-n10",
@@ -255,9 +238,8 @@ def validate(
     path = map_path(map_file)
     performance_map = PerformanceMap.load(path)
     file, chosen = read_toml(campaign, CampaignFile), load_sensor(sensor)
-    if file.device is not None and (scheduler is not None or processes != 1):
-        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
-        raise InputError(option, "", given, "not with a [device]", "a device takes one capture at a time")
+    if file.device is not None:
+        check_no_workers(scheduler, processes, *_ONE_AT_A_TIME)
     live = None if file.device is None else held_out_live(campaign, file, chosen, performance_map)
     plan = held_out_campaign(campaign, chosen, performance_map) if live is None else live.campaign
     shots = held_out_shots(plan, poses, seed)

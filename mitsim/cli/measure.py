@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from characterisation.files.errors import InputError
-from mitsim.cli.options import Clouds, DecodedAs, Defines, Json, Variant, check_file, definitions, start
+from mitsim.cli.options import (
+    Clouds,
+    DecodedAs,
+    Defines,
+    Json,
+    PoseFile,
+    Variant,
+    ViewOfPoses,
+    check_file,
+    definitions,
+    start,
+)
 
 if TYPE_CHECKING:
     from characterisation.tasks.result import Result
@@ -53,14 +64,8 @@ def clouds(
     bright_dots: Annotated[bool, typer.Option("--bright-dots", help="The dots are brighter than the plate.")] = False,
     task: Annotated[Path | None, typer.Option(help="Task TOML file: measure what it defines; needs --scene.")] = None,
     scene: Annotated[Path | None, typer.Option(help="Scene of the part; it assigns pixels to features.")] = None,
-    pose: Annotated[
-        Path | None,
-        typer.Option(
-            help="Pose of the sensor: pose.json, statement.json, or poses.json with --view; default: that of "
-            "the capture."
-        ),
-    ] = None,
-    view: Annotated[int | None, typer.Option(min=0, help="Number of the view in poses.json.")] = None,
+    pose: PoseFile = None,
+    view: ViewOfPoses = None,
     correct: Annotated[
         Path | None,
         typer.Option(

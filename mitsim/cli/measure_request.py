@@ -37,10 +37,8 @@ if TYPE_CHECKING:
 #: directions of a difference: along the view rays, or along the surface normal; ``auto`` depends on the grids
 DIRECTIONS = ("auto", "rays", "surface")
 
-_WINDOW_SYNTAX, _PLATE_SYNTAX = (
-    "NAME=COLUMN,ROW,WIDTH,HEIGHT [px], or NAME alone",
-    "NAME=COLUMN,ROW,WIDTH,HEIGHT,PITCH, or NAME=PITCH [mm]",
-)
+_WINDOW_SYNTAX = "NAME=COLUMN,ROW,WIDTH,HEIGHT [px], or NAME alone"
+_PLATE_SYNTAX = "NAME=COLUMN,ROW,WIDTH,HEIGHT,PITCH, or NAME=PITCH [mm]"
 
 
 @dataclass(frozen=True)
@@ -79,13 +77,9 @@ class Request:
         results = measure_windows(cloud, self.plan)
         if self.plates:
             if given.capture is None or not given.capture.images:
-                raise InputError(
-                    given.path,
-                    "",
-                    "a cloud without images",
-                    "a capture folder, whose images show the dots",
-                    "give the capture folder, which the command decodes: mitsim measure CAPTURE --dots ...",
-                )
+                allowed = "a capture folder, whose images show the dots"
+                hint = "give the capture folder, which the command decodes: mitsim measure CAPTURE --dots ..."
+                raise InputError(given.path, "", "a cloud without images", allowed, hint)
             image = image_on_grid(given.capture, cloud.grid)
             for name, plate in self.plates.items():
                 results += measure_plate(name, plate, cloud, image)
@@ -153,9 +147,8 @@ def read_request(
     named: dict[str, tuple[Shape, Roi | None]] = {}
     for shape, texts in features.items():
         for text in texts:
-            name, numbers = parse_numbers(f"--{shape}", text, (0, 4), _WINDOW_SYNTAX)
-            check_unique(f"--{shape}", name, named)
-            named[name] = cast(Shape, shape), parse_window(f"--{shape}", text, numbers, _WINDOW_SYNTAX)
+            name, region, _ = parse_window(f"--{shape}", text, (0, 4), _WINDOW_SYNTAX, named)
+            named[name] = cast(Shape, shape), region
     pairs: list[tuple[PairKind, str, str]] = []
     for kind, texts in between.items():
         for text in texts:
@@ -165,17 +158,15 @@ def read_request(
             pairs.append((cast(PairKind, kind), names[0], names[1]))
     known: dict[str, Plate] = {}
     for text in plates:
-        name, numbers = parse_numbers("--dots", text, (1, 5), _PLATE_SYNTAX)
-        check_unique("--dots", name, {**named, **known})
-        if not 0 < numbers[-1] < 1e4:
+        name, region, pitch = parse_window("--dots", text, (1, 5), _PLATE_SYNTAX, {**named, **known})
+        if pitch is None or not 0 < pitch < 1e4:
             raise InputError("--dots", "", repr(text), f"{_PLATE_SYNTAX}, the pitch over 0 and under 10000")
-        known[name] = Plate(parse_window("--dots", text, numbers[:-1], _PLATE_SYNTAX), numbers[-1], not bright)
+        known[name] = Plate(region, pitch, not bright)
     if by not in DIRECTIONS:
         raise InputError("--by", "", repr(by), ", ".join(DIRECTIONS))
     if against is None and (by != "auto" or window is not None):
         raise InputError("--by" if window is None else "--window", "", "no --against", "--against CLOUD")
-    numbers = [] if window is None else list(map(float, window))
-    region = parse_window("--window", str(window), numbers, "COLUMN ROW WIDTH HEIGHT")
+    region = _window("--window", str(window), window or (), "COLUMN ROW WIDTH HEIGHT")
     plan = WindowPlan(named, pairs)
     plan.check()
     return Request(plan, known, by, region, against is not None)
@@ -200,52 +191,53 @@ def _difference_results(difference: Difference) -> list[Result]:
     return [result(f"difference {name}", value=value) for name, value in values.items()]
 
 
-def parse_numbers(option: str, text: str, counts: tuple[int, ...], allowed: str) -> tuple[str, list[float]]:
-    """Return name and numbers of a text such as ``name=1,2,3``.
+def parse_window(
+    option: str, text: str, counts: tuple[int, ...], allowed: str, known: Mapping[str, object]
+) -> tuple[str, Roi | None, float | None]:
+    """Return name, window and length of a text such as ``name=200,150,300,200,600``.
 
-    ``counts`` lists how many numbers are allowed; ``allowed`` describes the form of the text.
+    Parameters
+    ----------
+    option, text
+        The option and its text.
+    counts
+        How many numbers are allowed: four are the window [px], one more or one alone is the length.
+    allowed
+        Form of the text, for the error.
+    known
+        Names that are in use.
+
+    Returns
+    -------
+    The window is None for the whole grid, the length is None without one.
 
     Raises
     ------
     InputError
-        If the text has another form. The error names the option and the allowed form.
+        If the text has another form, the name is in use, or the window is not one.
     """
     name, _, rest = text.partition("=")
     try:
-        numbers = [float(one) for one in rest.split(",")] if rest.strip() else []
+        numbers = [float(word) for word in rest.split(",")] if rest.strip() else []
     except ValueError:
         numbers = [float("nan")]
     if not name.strip() or len(numbers) not in counts or not np.isfinite(numbers).all():
         raise InputError(option, "", repr(text), allowed)
     try:
-        return checked_name(name.strip()), numbers
+        name = checked_name(name.strip())
     except ValueError as error:
         raise InputError(option, "", repr(name.strip()), str(error)) from None
-
-
-def parse_window(option: str, text: str, numbers: Sequence[float], allowed: str) -> Roi | None:
-    """Return the window of four numbers [px]; no numbers give None, the whole grid.
-
-    Raises
-    ------
-    InputError
-        If the numbers are not whole, a position is negative, or a size is 0.
-    """
-    if not numbers:
-        return None
-    column, row, width, height = (int(one) for one in numbers)
-    if min(column, row) < 0 or min(width, height) < 1 or any(one != int(one) for one in numbers):
-        raise InputError(option, "", repr(text), f"{allowed}: whole pixels, width and height over 0")
-    return Roi(column, row, width, height)
-
-
-def check_unique(option: str, name: str, known: Mapping[str, object]) -> None:
-    """Check that a name is not used yet.
-
-    Raises
-    ------
-    InputError
-        If it is among the ``known`` names.
-    """
     if name in known:
         raise InputError(option, "", f"{name!r} a second time", "a different name for each feature")
+    length = numbers.pop() if len(numbers) in (1, 5) else None
+    return name, _window(option, text, numbers, allowed), length
+
+
+def _window(option: str, text: str, numbers: Sequence[float], allowed: str) -> Roi | None:
+    """Return the window of four numbers [px]; no numbers give None, the whole grid."""
+    if not numbers:
+        return None
+    column, row, width, height = (int(number) for number in numbers)
+    if min(column, row) < 0 or min(width, height) < 1 or any(number != int(number) for number in numbers):
+        raise InputError(option, "", repr(text), f"{allowed}: whole pixels, width and height over 0")
+    return Roi(column, row, width, height)

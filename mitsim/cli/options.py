@@ -49,6 +49,21 @@ Clouds = Annotated[
         help="Point clouds (.ply, .pcd, .npy, .mat, .xyz), capture folders (decoded first), or folders of either.",
     ),
 ]
+MapFile = Annotated[str, typer.Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")]
+ObjectWindow = Annotated[
+    tuple[int, int, int, int] | None,
+    typer.Option(
+        metavar="COLUMN ROW WIDTH HEIGHT",
+        help="Window of the first camera's image that shows the object [px]; default: the whole image.",
+    ),
+]
+PoseFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="Pose of the sensor: pose.json, statement.json, or poses.json with --view; default: that of the capture."
+    ),
+]
+ViewOfPoses = Annotated[int | None, typer.Option(min=0, help="Number of the view in poses.json.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON in place of the table.")]
 DecodedAs = Annotated[str | None, typer.Option(help="Decode captures with the settings of this sensor.")]
 Overwrite = Annotated[bool, typer.Option(help="Replace a finished run; its finished trials are reused.")]
@@ -133,6 +148,21 @@ def start(variant: str | None) -> None:
     backend.activate(variant)
 
 
+def check_no_workers(scheduler: str | None, processes: int, allowed: str, hint: str) -> None:
+    """Check that no options ask for workers.
+
+    Parameters
+    ----------
+    scheduler, processes
+        Values of ``--scheduler`` and ``--processes``.
+    allowed, hint
+        Where workers are allowed, and why only there.
+    """
+    if scheduler is not None or processes != 1:
+        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
+        raise InputError(option, "", given, allowed, hint)
+
+
 def requested_workers(scheduler: str | None, processes: int) -> Executor | None:
     """Return what ``--scheduler`` and ``--processes`` ask for; None if this process works alone.
 
@@ -145,7 +175,17 @@ def requested_workers(scheduler: str | None, processes: int) -> Executor | None:
 
 
 def pose_of(position: tuple[float, float, float], target: tuple[float, float, float], roll: float, sensor: Any) -> Any:
-    """Return ``world_from_sensor`` of a sensor whose reference camera is at a position and looks at a target."""
+    """Return ``world_from_sensor``.
+
+    Parameters
+    ----------
+    position, target
+        Position of the reference camera, and the point that it looks at [mm].
+    roll
+        Rotation about the view axis [deg].
+    sensor
+        The sensor.
+    """
     import numpy as np
 
     from mitsim.sensor.poses import look_at
@@ -156,13 +196,13 @@ def pose_of(position: tuple[float, float, float], target: tuple[float, float, fl
     return look_at(position, target, roll_deg=roll, sensor=sensor)
 
 
-def definitions(given: list[str] | None) -> dict[str, str]:
-    """Return the values of -D by name."""
+def definitions(given: list[str] | None, option: str = "-D", allowed: str = "name=value") -> dict[str, str]:
+    """Return the values of a repeatable option by name; ``allowed`` describes its form in an error."""
     out = {}
     for item in given or []:
         name, mark, value = item.partition("=")
         if not mark or not name:
-            raise InputError("-D", "", repr(item), "name=value")
+            raise InputError(option, "", repr(item), allowed)
         out[name] = value
     return out
 
@@ -190,13 +230,8 @@ def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
     if not (folder / last).exists():
         return
     if not overwrite:
-        raise InputError(
-            "--output",
-            "",
-            f"{folder}, a finished run",
-            "a folder without one",
-            "to repeat the run, add --overwrite (it reuses finished trials); to rewrite its page, use mitsim report",
-        )
+        hint = "to repeat the run, add --overwrite (it reuses finished trials); to rewrite its page, use mitsim report"
+        raise InputError("--output", "", f"{folder}, a finished run", "a folder without one", hint)
     (folder / last).unlink()
 
 

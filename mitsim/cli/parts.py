@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from characterisation.files.atomic_io import atomic_write
+from characterisation.files.errors import InputError
 from mitsim.cli.options import (
     Defines,
     Json,
@@ -21,6 +22,12 @@ from mitsim.cli.options import (
     pose_of,
     start,
 )
+
+if TYPE_CHECKING:
+    from mitsim.report.author_page import Authored
+    from mitsim.scene.first_hits import VisibleSurfaces
+    from mitsim.sensor.preset import Sensor
+    from mitsim.sensor.transforms import Transform
 
 
 def check(
@@ -51,48 +58,60 @@ def check(
     start(variant)
     import json as json_module
 
-    from mitsim.report.scene_preview import preview_figure
     from mitsim.report.scene_table import as_data, as_text
-    from mitsim.report.style import write_png
     from mitsim.running.progress import say
-    from mitsim.scene.authoring.check import findings, read_features
-    from mitsim.scene.first_hits import visible_surfaces
-    from mitsim.scene.inspect import inspect
-    from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
-    from mitsim.sensor.working_volume import pose_at, usual_place
+    from mitsim.sensor.working_volume import usual_place
 
     chosen = load_sensor(sensor)
-    wanted = read_features(task) if task else None
-    loaded = load_scene(scene, chosen.wavelength_nm, definitions(define))
+    stand = None if position is None else pose_of(position, target, roll, chosen)
+    checked, visible, pose = _inspected(scene, chosen, definitions(define), task, stand, roll)
+    facts, found, centre = checked.facts, checked.found, checked.scene.centre
     if position is None:
-        place = usual_place(chosen, loaded.centre)
-        pose = pose_at(chosen, place, loaded.centre, roll)
-        seen = [" ".join(f"{round(float(v), 1) + 0.0:g}" for v in point) for point in (place, loaded.centre)]
-        say(f"no position was given: using --position {seen[0]} --target {seen[1]}")
-    else:
-        pose = pose_of(position, target, roll, chosen)
-    facts, visible = inspect(loaded), visible_surfaces(loaded, chosen.rig, pose)
-    found = findings(facts, chosen, pose, visible, position is not None, wanted)
+        ends = [" ".join(f"{round(float(v), 1) + 0.0:g}" for v in end) for end in (usual_place(chosen, centre), centre)]
+        say(f"no position was given: using --position {ends[0]} --target {ends[1]}")
     if output:
+        from mitsim.report.scene_preview import preview_figure
+        from mitsim.report.style import write_png
+
         check_file(output)
-        write_png(preview_figure(loaded, facts, chosen, pose, visible, list(wanted.features) if wanted else []), output)
+        first = list(checked.task.features) if checked.task else []
+        write_png(preview_figure(checked.scene, facts, chosen, pose, visible, first), output)
         say(f"picture: {output}")
     if html:
-        from mitsim.report.author_page import Authored, author_page
+        from mitsim.report.author_page import author_page
 
         check_file(html)
-        text = author_page(Authored(loaded, facts, chosen, found, task, wanted))
+        text = author_page(checked)
         with atomic_write(html) as part_of:
             part_of.write_text(text, encoding="utf-8")
         say(f"page: {html}")
     if json:
-        about = {"scene": loaded.where, "sensor": chosen.name, "world_from_sensor": pose.matrix().tolist()}
+        about = {"scene": checked.scene.where, "sensor": chosen.name, "world_from_sensor": pose.matrix().tolist()}
         print(json_module.dumps({**about, **as_data(facts, visible, found)}, indent=2))
     else:
         print(as_text(facts, visible, found))
     if any(one.severity == "error" for one in found):
         raise typer.Exit(1)
+
+
+def _inspected(
+    scene: Path, sensor: Sensor, defined: dict[str, str], task: Path | None, stand: Transform | None, roll: float = 0.0
+) -> tuple[Authored, VisibleSurfaces, Transform]:
+    """Load a scene and look for mistakes; return also what the sensor sees, and its pose: the usual one if None."""
+    from mitsim.report.author_page import Authored
+    from mitsim.scene.authoring.check import findings, read_features
+    from mitsim.scene.first_hits import visible_surfaces
+    from mitsim.scene.inspect import inspect
+    from mitsim.scene.load import load_scene
+    from mitsim.sensor.working_volume import pose_at, usual_place
+
+    wanted = read_features(task) if task else None
+    loaded = load_scene(scene, sensor.wavelength_nm, defined)
+    pose = stand or pose_at(sensor, usual_place(sensor, loaded.centre), loaded.centre, roll)
+    facts, visible = inspect(loaded), visible_surfaces(loaded, sensor.rig, pose)
+    found = findings(facts, sensor, pose, visible, stand is not None, wanted)
+    return Authored(loaded, facts, sensor, found, task, wanted), visible, pose
 
 
 def part(
@@ -146,7 +165,6 @@ def part(
 
     Example: mitsim part bracket.step -o scenes/bracket --process milled --Ra 1.6 --sensor ensenso-n10 --edit
     """
-    from characterisation.files.errors import InputError
     from mitsim.running.progress import say
     from mitsim.scene.authoring.fineness import fineness_for
     from mitsim.scene.authoring.part_folder import Finishing, described, write_part
@@ -182,28 +200,17 @@ def part(
 def _edit(scene: Path, sensor: str | None, port: int) -> None:
     """Serve the editor page of a scene until the user ends it."""
     start(None)
-    from characterisation.files.errors import InputError
-    from mitsim.report.author_page import Authored, author_page, findings_data
+    from mitsim.report.author_page import author_page, findings_data
     from mitsim.report.author_server import AuthorServer
     from mitsim.running.progress import say
-    from mitsim.scene.authoring.check import findings, read_features
-    from mitsim.scene.first_hits import visible_surfaces
-    from mitsim.scene.inspect import inspect
-    from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
-    from mitsim.sensor.working_volume import pose_at, usual_place
 
     chosen, task = load_sensor(sensor or "ensenso-n10"), scene.parent / "task.toml"
     if not 0 <= port <= 65535:
         raise InputError("--port", "", port, "0 to 65535")
 
     def authored() -> Authored:
-        loaded = load_scene(scene, chosen.wavelength_nm)
-        facts = inspect(loaded)
-        pose = pose_at(chosen, usual_place(chosen, loaded.centre), loaded.centre)
-        known = read_features(task) if task.exists() else None
-        found = findings(facts, chosen, pose, visible_surfaces(loaded, chosen.rig, pose), False, known)
-        return Authored(loaded, facts, chosen, found, task if known else None, known)
+        return _inspected(scene, chosen, {}, task if task.exists() else None, None)[0]
 
     authored()  # report errors in the scene before serving the page
     names = {"scene": scene.name, "task": task.name, "study": "study.toml"}

@@ -172,11 +172,8 @@ def run_application(app: typer.Typer) -> None:
         code = _end(3, "the reader of the output has closed it; finished work is kept")
     except OSError as error:
         if error.errno in FULL:
-            code = _end(
-                3,
-                f"{error.filename or 'output'}: cannot be written ({error.strerror}); "
-                "finished work is kept: free some space and run the same command again",
-            )
+            kept = "finished work is kept: free some space and run the same command again"
+            code = _end(3, f"{error.filename or 'output'}: cannot be written ({error.strerror}); {kept}")
         elif error.errno in _OF_THE_USER and error.filename is not None:
             code = _end(2, f"{error.filename}: found {error.strerror}; allowed: a path that can be read and written")
         else:

@@ -20,6 +20,7 @@ from mitsim.cli.options import (
     Target,
     Variant,
     check_folder,
+    check_no_workers,
     definitions,
     pose_of,
     requested_workers,
@@ -80,15 +81,10 @@ def render(
     Example: mitsim render scenes/two_pillars/two_pillars.xml --position 0 -400 300 -o captures/first
     """
     if (position is None) == (many is None):
-        raise InputError(
-            "--position",
-            "",
-            "both --position and --many" if many else "neither --position nor --many",
-            "one of them: a position, or a plan",
-        )
-    if (scheduler is not None or processes != 1) and many is None:
-        option, given = ("--scheduler", scheduler) if scheduler is not None else ("--processes", str(processes))
-        raise InputError(option, "", given, "only with --many", "a single capture runs in this process")
+        found = "both --position and --many" if many else "neither --position nor --many"
+        raise InputError("--position", "", found, "one of them: a position, or a plan")
+    if many is None:
+        check_no_workers(scheduler, processes, "only with --many", "a single capture runs in this process")
     start(variant)
     from mitsim.sensor.noise_sources import Noise
     from mitsim.study.many_captures import CaptureJob, CaptureSettings, digest_of, origin_of
@@ -127,11 +123,9 @@ def render(
     residual = render_residual(simulated, loaded, pose, first, Rendering(samples, depth), seed=seed)
     capture.settings["render_residual"] = asdict(residual) if isfinite(residual.noise) else None
     blind = [name if name == "projector" else f"camera {name}" for name in sees_nothing(loaded, chosen.rig, pose)]
-    unseen = (
-        [f"no pixel of the {', '.join(blind)} shows the part: check --position, --target and --roll"] if blind else []
-    )
-    if unseen:
-        capture.settings["warnings"] = [*capture.settings.get("warnings", []), *unseen]
+    if blind:
+        unseen = f"no pixel of the {', '.join(blind)} shows the part: check --position, --target and --roll"
+        capture.settings["warnings"] = [*capture.settings.get("warnings", []), unseen]
     capture.settings["deviation"] = asdict(moved)
     capture.settings["render"] = {"digest": digest}
     known = {}
@@ -143,8 +137,8 @@ def render(
         finishes = [one for one in loaded.finishes if one and one.scatter]
         for source in dict.fromkeys(f"{one}: {one.scatter.provenance}" for one in finishes if one.scatter):
             say(source)
-    for warning in unseen:
-        say(f"warning: {warning}")
+    if blind:
+        say(f"warning: {unseen}")
     say(f"{residual}" + (f"; over {LIMIT}: increase --samples" if residual.worst > LIMIT else ""))
     say(f"capture: {output}")
 

@@ -205,9 +205,8 @@ def exposures(
     """Find the fewest exposures of one view with which every feature nearly reaches its least possible uncertainty.
 
     The limits of a feature are the most points and the smallest uncertainty that any exposures reach; --within says how
-    near is enough. The command
-    simulates the light once and decodes sets of exposures. Exit code 1 if a feature that the task needs has too few
-    points at every exposure, or if a limit is not met.
+    near is enough. The command simulates the light once and decodes sets of exposures. Exit code 1 if a feature that
+    the task needs has too few points at every exposure, or if a limit is not met.
 
     Example: mitsim study exposures scenes/two_pillars/study.toml --view 40 -o runs/exposures
     """

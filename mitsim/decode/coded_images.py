@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Settings
+from mitsim.decode.cloud import capture_cloud
 from mitsim.decode.decoder_registry import Coordinates, projector_size
 from mitsim.decode.grey_levels import MeasuredNoise
 from mitsim.decode.noise import fringe_noise
@@ -105,3 +107,22 @@ class CodedImages:
                 found = {axis: each.placed(shape, region.slices) for axis, each in found.items()}
             out[name] = found
         return out
+
+
+def decoded_once(
+    capture: Capture, settings: Settings, imager: Imager | None
+) -> tuple[PointCloud, CodedImages | None, Imager | MeasuredNoise | None]:
+    """Return the cloud of a capture; its coded images, decoded already, if it has any; and the noise of its images.
+
+    The noise is that of the imager or, without one, the noise that fringes show.
+
+    Raises
+    ------
+    InputError
+        If the settings belong to another technology, or the capture is inconsistent.
+    """
+    images = CodedImages.of(capture, settings, imager)
+    if images is None:
+        return capture_cloud(capture, settings, imager=imager), None, imager
+    cloud = capture_cloud(capture, settings, imager=images.noise, coordinates=images.coordinates)
+    return cloud, images, images.noise

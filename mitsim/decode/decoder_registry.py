@@ -21,10 +21,9 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import SETTINGS_OF, Settings
 from mitsim.decode.device_maps import (
     DeviceMapGeometry,
+    MapName,
     camera_map_geometry,
-    decode_depth_map,
-    decode_disparity_map,
-    decode_point_map,
+    decode_device_map,
     disparity_map_geometry,
 )
 from mitsim.decode.grey_levels import MeasuredNoise
@@ -150,10 +149,6 @@ class Technology:
     from_device: bool = False
 
 
-def _stereo_geometry(rig: Rig, settings: MatcherSettings, pattern: None) -> StereoGeometry:
-    return stereo_geometry(rig)
-
-
 def _stereo(images: Images, geometry: StereoGeometry, settings: MatcherSettings, pattern: None) -> PointCloud:
     # the ambient image is the last one; SGBM uses one frame
     ambient = images.capture.decoding.ambient_image
@@ -245,13 +240,10 @@ def _time_of_flight(
     return decode_time_of_flight(stack, geometry, code, settings, images.context(roi))
 
 
-MapDecoder = Callable[..., PointCloud]
+def _device_technology(name: MapName, prepare: Callable[[Rig], DeviceMapGeometry]) -> Technology:
+    """Return the technology of a device's map ``name``, within the range of any settings."""
 
-
-def _map_decoder(name: str, decode: MapDecoder) -> Callable[[Images, DeviceMapGeometry, Settings, None], PointCloud]:
-    """Return a function that decodes the map ``name`` within the range of any settings."""
-
-    def decode_named_map(images: Images, geometry: DeviceMapGeometry, settings: Settings, pattern: None) -> PointCloud:
+    def decode(images: Images, geometry: DeviceMapGeometry, settings: Settings, pattern: None) -> PointCloud:
         capture = images.capture
         if name not in capture.derived:
             raise InputError(
@@ -260,27 +252,21 @@ def _map_decoder(name: str, decode: MapDecoder) -> Callable[[Images, DeviceMapGe
                 ", ".join(capture.derived) or "no map",
                 f"a map of {name}, since its technology is {capture.technology}",
             )
-        return decode(
+        return decode_device_map(
+            name,
             capture.derived[name],
             geometry,
-            settings.near_mm,
-            settings.far_mm,
+            (settings.near_mm, settings.far_mm),
             sensor=capture.sensor,
             source=capture.source,
             roi=images.roi,
         )
 
-    return decode_named_map
-
-
-def _device_technology(name: str, prepare: Callable[[Rig], DeviceMapGeometry], decode: MapDecoder) -> Technology:
-    return Technology(
-        (), lambda rig, settings, pattern: prepare(rig), _map_decoder(name, decode), DEVICE_RANGE_MM, True
-    )
+    return Technology((), lambda rig, settings, pattern: prepare(rig), decode, DEVICE_RANGE_MM, True)
 
 
 TECHNOLOGIES: dict[str, Technology] = {
-    "active_stereo": Technology((), _stereo_geometry, _stereo),
+    "active_stereo": Technology((), lambda rig, settings, pattern: stereo_geometry(rig), _stereo),
     "reference_stereo": Technology((RandomDots, DiffractionSpots), _reference_geometry, _reference),
     "structured_light": Technology(
         (PhaseShift, GrayCode, GrayCodePhaseShift, ImageSequence),
@@ -288,9 +274,9 @@ TECHNOLOGIES: dict[str, Technology] = {
         _structured_light,
     ),
     "time_of_flight": Technology((AmplitudeModulation,), _time_of_flight_geometry, _time_of_flight),
-    "depth_map": _device_technology("depth", camera_map_geometry, decode_depth_map),
-    "disparity_map": _device_technology("disparity", disparity_map_geometry, decode_disparity_map),
-    "point_map": _device_technology("points", camera_map_geometry, decode_point_map),
+    "depth_map": _device_technology("depth", camera_map_geometry),
+    "disparity_map": _device_technology("disparity", disparity_map_geometry),
+    "point_map": _device_technology("points", camera_map_geometry),
 }
 
 

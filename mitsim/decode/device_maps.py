@@ -16,6 +16,7 @@ filters and fills nothing. Points that the device has filled cannot be recognise
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ from characterisation.region_of_interest import Roi, checked_roi
 from mitsim.decode.grid_cloud import cloud_on_grid
 from mitsim.decode.structured_light.geometry import camera_grid
 from mitsim.sensor.camera import Rectification, Rig
+
+MapName = Literal["depth", "disparity", "points"]
 
 
 @dataclass(frozen=True)
@@ -77,26 +80,29 @@ def disparity_map_geometry(rig: Rig) -> DeviceMapGeometry:
     return DeviceMapGeometry(grid, rig.baseline_direction, pair)
 
 
-def decode_depth_map(
-    depth: NDArray[np.floating],
+def decode_device_map(
+    name: MapName,
+    values: NDArray[np.floating],
     geometry: DeviceMapGeometry,
-    near_mm: float,
-    far_mm: float,
+    range_mm: tuple[float, float],
     *,
     sensor: str,
     source: str,
     roi: Roi | None = None,
 ) -> PointCloud:
-    """Convert depths to points on the view rays of the grid.
+    """Convert a map to points on the view rays of the grid; a map of points is accepted as it is.
 
     Parameters
     ----------
-    depth
-        (H, W) [mm] along the axis of the grid, NaN where there is none.
+    name
+        ``depth``, ``disparity`` or ``points``.
+    values
+        Depths along the axis of the grid (H, W) [mm]; disparities of the rectified left image (H, W) [px]; or points in
+        the sensor frame (H, W, 3) [mm]. NaN where there is none.
     geometry
-        From :func:`camera_map_geometry` or :func:`disparity_map_geometry`.
-    near_mm, far_mm
-        Range of accepted depths [mm].
+        From :func:`camera_map_geometry`, or :func:`disparity_map_geometry` for disparities.
+    range_mm
+        Nearest and farthest accepted depth [mm].
     sensor, source
         Copied into the cloud.
     roi
@@ -114,53 +120,34 @@ def decode_depth_map(
         If the map does not have the grid's size, or the region does not lie in the grid.
     """
     grid = geometry.grid
-    if depth.shape != (grid.height, grid.width):
-        raise _wrong_size("depth", depth.shape, grid)
-    roi = checked_roi(roi, grid.width, grid.height, "decode_depth_map")
-    columns, rows = roi.pixels()
-    z, rays = depth[roi.slices].astype(np.float64), grid.rays_at(columns, rows)
-    points = grid.origin + rays * (z / (rays @ grid.rotation[:, 2]))[..., None]
-    cloud = _cloud_in_range(points, z, geometry, (near_mm, far_mm), sensor, source, roi)
-    without_ray = np.isnan(rays[..., 0])
-    cloud.status[roi.slices][without_ray] = Status.UNCALIBRATED
-    return cloud
-
-
-def decode_disparity_map(
-    disparity: NDArray[np.floating],
-    geometry: DeviceMapGeometry,
-    near_mm: float,
-    far_mm: float,
-    *,
-    sensor: str,
-    source: str,
-    roi: Roi | None = None,
-) -> PointCloud:
-    """Triangulate disparities (H, W) [px] of the rectified left image; otherwise as :func:`decode_depth_map`."""
-    assert geometry.rectification is not None  # disparity_map_geometry
-    with np.errstate(divide="ignore"):
-        depth = geometry.rectification.depth(disparity)
-    return decode_depth_map(depth, geometry, near_mm, far_mm, sensor=sensor, source=source, roi=roi)
-
-
-def decode_point_map(
-    points: NDArray[np.floating],
-    geometry: DeviceMapGeometry,
-    near_mm: float,
-    far_mm: float,
-    *,
-    sensor: str,
-    source: str,
-    roi: Roi | None = None,
-) -> PointCloud:
-    """Accept points (H, W, 3) [mm] in the sensor frame as they are; otherwise as :func:`decode_depth_map`."""
-    grid = geometry.grid
-    if points.shape != (grid.height, grid.width, 3):
-        raise _wrong_size("points", points.shape, grid)
-    roi = checked_roi(roi, grid.width, grid.height, "decode_point_map")
-    measured = points[roi.slices].astype(np.float64)
-    depth = (measured - grid.origin) @ grid.rotation[:, 2]
-    return _cloud_in_range(measured, depth, geometry, (near_mm, far_mm), sensor, source, roi)
+    if values.shape != (grid.height, grid.width, *((3,) if name == "points" else ())):
+        found = " x ".join(map(str, values.shape[1::-1])) + " px"
+        allowed = f"{grid.width} x {grid.height} px, as the calibration says"
+        raise InputError(f"map of {name}", "size", found, allowed)
+    roi = checked_roi(roi, grid.width, grid.height, "decode_device_map")
+    measured = values[roi.slices].astype(np.float64)
+    without_ray = np.zeros(measured.shape[:2], bool)
+    if name == "points":
+        points, depth = measured, (measured - grid.origin) @ grid.rotation[:, 2]
+    else:
+        depth = measured
+        if name == "disparity":
+            assert geometry.rectification is not None  # disparity_map_geometry
+            with np.errstate(divide="ignore"):
+                depth = geometry.rectification.depth(values[roi.slices]).astype(np.float64)
+        columns, rows = roi.pixels()
+        rays = grid.rays_at(columns, rows)
+        points = grid.origin + rays * (depth / (rays @ grid.rotation[:, 2]))[..., None]
+        without_ray = np.isnan(rays[..., 0])
+    is_measured = np.isfinite(points).all(axis=-1)
+    with np.errstate(invalid="ignore"):
+        accepted = is_measured & (depth >= range_mm[0]) & (depth <= range_mm[1])
+    status = np.select(
+        [without_ray, accepted, is_measured],
+        [Status.UNCALIBRATED, Status.VALID, Status.OUT_OF_RANGE],
+        Status.NO_SURFACE,
+    ).astype(np.uint8)
+    return cloud_on_grid(np.where(accepted[..., None], points, np.nan), status, None, roi, geometry, sensor, source)
 
 
 def roi_of_other_grid(grid: ViewGrid, other: ViewGrid, roi: Roi, near_mm: float, far_mm: float) -> Roi | None:
@@ -183,27 +170,3 @@ def roi_of_other_grid(grid: ViewGrid, other: ViewGrid, roi: Roi, near_mm: float,
     low = np.clip(np.floor(projected.min(axis=0)), 0, size).astype(int)
     high = np.clip(np.ceil(projected.max(axis=0)) + 1, 0, size).astype(int)
     return None if (low >= high).any() else Roi.between(*low, *high)
-
-
-def _cloud_in_range(
-    points: NDArray[np.float64],
-    depth: NDArray[np.float64],
-    geometry: DeviceMapGeometry,
-    range_mm: tuple[float, float],
-    sensor: str,
-    source: str,
-    roi: Roi,
-) -> PointCloud:
-    """Return the cloud of points (h, w, 3) of a region, with depths (h, w); points outside the range are rejected."""
-    near_mm, far_mm = range_mm
-    measured = np.isfinite(points).all(axis=-1)
-    with np.errstate(invalid="ignore"):
-        accepted = measured & (depth >= near_mm) & (depth <= far_mm)
-    status = np.select([accepted, measured], [Status.VALID, Status.OUT_OF_RANGE], Status.NO_SURFACE).astype(np.uint8)
-    points = np.where(accepted[..., None], points, np.nan)
-    return cloud_on_grid(points, status, None, roi, geometry, sensor, source)
-
-
-def _wrong_size(name: str, shape: tuple[int, ...], grid: ViewGrid) -> InputError:
-    allowed = f"{grid.width} x {grid.height} px, as the calibration says"
-    return InputError(f"map of {name}", "size", " x ".join(map(str, shape[1::-1])) + " px", allowed)

@@ -17,8 +17,8 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.capture.recordings.recognise import ReadOptions, read_recording
-from mitsim.decode.cloud import Settings, capture_cloud, decoder_settings
-from mitsim.decode.noise import known_noise
+from mitsim.decode.cloud import Settings, decoder_settings
+from mitsim.decode.coded_images import decoded_once
 from mitsim.decode.plain_clouds import is_plain, read_plain_cloud
 from mitsim.running.progress import say
 from mitsim.sensor.matcher import MatcherSettings
@@ -98,8 +98,7 @@ def read_cloud(path: Path, sensor: str | None = None, reference: bool = False) -
             "a cloud (.ply, .pcd, .npy, .mat, .xyz), a capture folder, or folders of these",
         )
     settings, imager = decoder_settings(capture, sensor)
-    cloud = capture_cloud(capture, settings, imager=known_noise(capture, imager))
-    return InputCloud(path, cloud, capture, margin_of(settings))
+    return InputCloud(path, decoded_once(capture, settings, imager)[0], capture, margin_of(settings))
 
 
 def _plain(path: Path) -> InputCloud:

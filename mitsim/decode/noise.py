@@ -14,25 +14,10 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
-from mitsim.decode.decoder_registry import projector_size
 from mitsim.decode.grey_levels import MeasuredNoise
 from mitsim.decode.structured_light.measured_noise import measured_noise
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import GrayCode, LightCode, axes, has_fringes, roles
-
-
-def known_noise(capture: Capture, imager: Imager | None) -> Imager | MeasuredNoise | None:
-    """Return the imager or, if there is none, the noise that a structured-light capture's fringes show.
-
-    The result is None if neither is available: for a Gray code alone, three steps of one period, or a bracket of
-    exposures.
-    """
-    code = capture.decoding.pattern
-    if imager is not None or capture.technology != "structured_light" or not isinstance(code, LightCode):
-        return imager
-    if capture.decoding.bracket_s is not None:
-        return None
-    return fringe_noise(capture.images, code, projector_size(capture), 2.0**capture.bits - 1)
 
 
 def fringe_noise(

@@ -1,4 +1,4 @@
-"""Load performance maps, and predict clouds from them."""
+"""Make and load performance maps, and predict clouds from them."""
 
 from __future__ import annotations
 
@@ -8,17 +8,91 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from characterisation.point_cloud import PointCloud
+from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decode.cloud import sensor_geometry
+from mitsim.maps.campaign.acquire import coupon_residuals, in_turn, simulated_source
 from mitsim.maps.campaign.missing_finishes import NeededFinishes, map_with_finishes, seen_finishes
+from mitsim.maps.campaign.orders import worker_source
+from mitsim.maps.campaign.plan import Campaign, CampaignFile, plan_campaign
+from mitsim.maps.campaign.run import run_campaign
 from mitsim.maps.prediction import CharacterisedScene, Predictor
+from mitsim.running.executor import Executor
 from mitsim.scene.load import Scene
 from mitsim.sensor.poses import as_pose
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.transforms import Transform
+
+
+def characterise(
+    campaign: str | Path,
+    sensor: Sensor,
+    folder: str | Path,
+    *,
+    file: CampaignFile | None = None,
+    workers: Executor | None = None,
+) -> PerformanceMap:
+    """Make the performance map of a sensor from simulated captures of coupons, as ``mitsim map make`` does.
+
+    Parameters
+    ----------
+    campaign
+        Campaign TOML file; paths in it are relative to its folder.
+    sensor
+        The sensor that captures the coupons.
+    folder
+        Where captures, ``samples.nc`` and ``map.nc`` are kept. A campaign that was stopped continues there.
+    file
+        The content of the campaign, if a program states it; ``campaign`` is then the place for errors and paths.
+    workers
+        Processes or cluster that take the captures; by default this process takes them.
+
+    Returns
+    -------
+    PerformanceMap
+        F and sigma over distance, normal and finish.
+
+    Raises
+    ------
+    InputError
+        If the campaign is not valid, or names a device.
+
+    See Also
+    --------
+    performance_map : Load a map that is made already.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> small = ms.CampaignFile(
+    ...     distances_mm=[500],
+    ...     samples_per_pixel=1,
+    ...     orientations=[{"up_to_deg": 10, "subdivisions": 0}],
+    ...     samples=[{"scene": "coupon.xml"}],
+    ... )
+    >>> made = ms.characterise("campaign.toml", ms.load_sensor("small.toml"), "small_map", file=small)
+    >>> made.data["distance"].values.tolist()
+    [500.0]
+    """
+    content = read_toml(campaign, CampaignFile) if file is None else file
+    if content.device is not None:
+        raise InputError(campaign, "device", content.device, "no device", "use mitsim map make for live captures")
+    return simulate_campaign(plan_campaign(campaign, content, sensor), folder, workers)
+
+
+def simulate_campaign(plan: Campaign, folder: str | Path, workers: Executor | None = None) -> PerformanceMap:
+    """Simulate the captures of a planned campaign, and make its map in ``folder``."""
+    simulated = SimulatedSensor(plan.sensor)
+    coupon_residuals(simulated, plan)
+    if workers is None:
+        source = in_turn(simulated_source(simulated, plan.file.samples_per_pixel), plan)
+    else:
+        source = worker_source(workers, plan)
+    return run_campaign(plan, source, folder)
 
 
 def performance_map(sensor_name_or_path: str | Path) -> PerformanceMap:

@@ -45,10 +45,8 @@ class Agreement:
     ``count`` is the number of views with a value. Over these, ``spearman`` is the rank correlation of u with ``error``;
     views that u rates as impossible rank last. ``score_spearman`` is that of V_m with minus ``error``. For both, 1 is
     perfect and NaN stands for fewer than 4 views. ``trials`` is the number of repeats with an error and a u. Over
-    these,
-    ``coverage`` is the share of errors within 2 u, ``low`` to ``high`` is its 95 % interval, and ``ratio`` is the
-    median of
-    |error| / u. They are NaN without trials.
+    these, ``coverage`` is the share of errors within 2 u, ``low`` to ``high`` is its 95 % interval, and ``ratio`` is
+    the median of |error| / u. They are NaN without trials.
     """
 
     views: NDArray[np.int64]

@@ -8,24 +8,21 @@ Signal chain: scene XML and shapes, task, findings of ``mitsim check`` -> one se
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import tomllib
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
-from jinja2 import Environment, FileSystemLoader
-from markupsafe import Markup
 
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 from characterisation.tasks.definitions import DEFINITIONS
-from mitsim.report.view_clouds import box_around, fewer_triangles, packed
+from mitsim.report.templates import joined_script, rendered, script_content
+from mitsim.report.view_clouds import box_around, packed, packed_normals, smoothly_shaded
 from mitsim.report.view_data import COLOURS, as_json
 from mitsim.scene.authoring.check import SceneFinding, TaskFeatures
 from mitsim.scene.inspect import SceneFacts
@@ -43,8 +40,6 @@ MOST_TRIANGLES = 150_000
 
 #: largest number of faces on a page
 MOST_FACES = 2000
-
-_CREASE = np.deg2rad(30.0)
 
 
 @dataclass(frozen=True)
@@ -69,27 +64,15 @@ def author_page(about: Authored, served: str = "") -> str:
     InputError
         If the scene was not read from a file, or has more than :data:`MOST_FACES` shapes.
     """
-    script = page_script()
-    policy = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
     data = page_data(about, served)
-    return environment.get_template("author_page.html.j2").render(
-        data=as_json(data),
-        script=Markup(script),
-        policy=f"sha256-{policy}",
-        title=data["name"],
-        served=bool(served),
-        metals=list(CONSTANTS),
-        processes=list(PROCESSES),
-    )
-
-
-def page_script() -> str:
-    """Return the one script of the page."""
-    parts = [(Path(__file__).parent / name).read_text(encoding="utf-8") for name in SCRIPTS]
-    return "(() => {\n'use strict';\n" + "\n".join(parts) + "})();\n"
+    content = {
+        "data": as_json(data),
+        "title": data["name"],
+        "served": bool(served),
+        "metals": list(CONSTANTS),
+        "processes": list(PROCESSES),
+    }
+    return rendered("author_page.html.j2", content | script_content(joined_script(SCRIPTS)))
 
 
 def page_data(about: Authored, served: str) -> dict[str, Any]:
@@ -125,7 +108,7 @@ def page_data(about: Authored, served: str) -> dict[str, Any]:
 
 def findings_data(found: Sequence[SceneFinding]) -> list[dict[str, str]]:
     """Return the findings for the script."""
-    return [{"severity": one.severity, "about": one.about, "what": one.what, "advice": one.advice} for one in found]
+    return [asdict(one) for one in found]
 
 
 def _definition(kind: Any) -> dict[str, Any]:
@@ -171,13 +154,12 @@ def solid(scene: Scene, without_area: Collection[str] = ()) -> dict[str, Any]:
         start += len(mesh.vertices)
         unknown = {"area": None} if name in without_area else {}
         faces.append({"name": name, "triangles": len(mesh.faces)} | _measures(corners) | unknown)
-    steps, planes = _planes(vertices), _planes(normals)
     return {
         "box": {"origin": box.origin.tolist(), "step": box.step},
         "faces": faces,
-        "vertices": packed(box.steps(steps).T.tobytes()),
-        "normals": packed(np.rint(127 * planes).astype(np.int8).T.tobytes()),
-        "triangles": packed(np.concatenate(triangles).astype("<u4").tobytes() if triangles else b""),
+        "vertices": packed(box.steps(np.concatenate([np.empty((0, 3)), *vertices])).T.tobytes()),
+        "normals": packed_normals(np.concatenate([np.empty((0, 3)), *normals])),
+        "triangles": packed(np.concatenate([np.empty((0, 3), int), *triangles]).astype("<u4").tobytes()),
     }
 
 
@@ -195,20 +177,12 @@ def fair_share(counts: Sequence[int], most: int) -> int:
     return most
 
 
-def _planes(parts: list[np.ndarray]) -> np.ndarray:
-    return np.concatenate(parts) if parts else np.empty((0, 3))
-
-
 def _shaded(corners: np.ndarray, most: int) -> trimesh.Trimesh:
     """Return a shape with at most ``most`` triangles and vertex normals that are smooth except at creases."""
     if not len(corners):
         return trimesh.Trimesh(np.empty((0, 3)), np.empty((0, 3), int))
     merged = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=True)
-    places, triangles = fewer_triangles(np.asarray(merged.vertices, float), np.asarray(merged.faces, np.int64), most)
-    shaded: trimesh.Trimesh = trimesh.graph.smooth_shade(
-        trimesh.Trimesh(places, triangles, process=True), angle=_CREASE
-    )
-    return shaded
+    return smoothly_shaded(merged, most)
 
 
 def _measures(corners: np.ndarray) -> dict[str, Any]:

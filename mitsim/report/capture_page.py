@@ -16,7 +16,7 @@ from characterisation.files.atomic_io import atomic_write
 from characterisation.plots.style import BLUE, FIELD, VERMILION, drawing
 from characterisation.point_cloud import Status
 from mitsim.report.cloud_figures import REASONS
-from mitsim.report.style import write_png
+from mitsim.report.style import colour_scale, write_png
 from mitsim.running.numbers import percent
 from mitsim.twin.compare.captures_run import Shown
 
@@ -34,7 +34,14 @@ PICTURE = "side_by_side.png"
 def write_capture_page(folder: Path, preamble: str, table: str, real: Shown, simulated: Shown) -> Path:
     """Write ``index.md`` and its picture into a folder, and return the path of the page.
 
-    ``preamble`` and ``table`` are Markdown.
+    Parameters
+    ----------
+    folder
+        Folder to write, which exists.
+    preamble, table
+        Texts of the page, in Markdown.
+    real, simulated
+        Data of the specimen in the two captures.
     """
     write_png(capture_figure(real, simulated), folder / PICTURE, dpi=_DPI)
     page = folder / "index.md"
@@ -70,10 +77,8 @@ def capture_figure(real: Shown, simulated: Shown) -> Figure:
             drawn = field.imshow(side.residual, cmap="RdBu_r", vmin=-reach, vmax=reach)
             field.set_facecolor(FIELD)
             for one in (image, field):
-                one.set_xticks([])
-                one.set_yticks([])
-        bar = figure.colorbar(drawn, ax=axes[1].tolist(), label="residual along V [mm]", extend="both", pad=0.01)
-        bar.outline.set_visible(False)  # type: ignore[operator]
+                one.set(xticks=[], yticks=[])
+        colour_scale(figure, drawn, axes[1].tolist(), "residual along V [mm]")
         _histograms(axes[2, 0], sides)
         _statuses(axes[2, 1], sides)
     return figure
@@ -91,9 +96,7 @@ def _histograms(axes: Axes, sides: tuple[Shown, Shown]) -> None:
             axes.stairs(density, edges, fill=True, color=BLUE, alpha=0.45, label=label)
         else:
             axes.stairs(density, edges, color=VERMILION, label=label)
-    axes.set_xlim(0, float(edges[-1]))
-    axes.set_xlabel("grey level on the specimen [DN]")
-    axes.set_ylabel("density [1/DN]")
+    axes.set(xlim=(0, float(edges[-1])), xlabel="grey level on the specimen [DN]", ylabel="density [1/DN]")
     axes.legend(loc="upper right")
 
 
@@ -109,6 +112,5 @@ def _statuses(axes: Axes, sides: tuple[Shown, Shown]) -> None:
             start += share
     axes.set_yticks([0, 1], ["real", "simulated"])
     axes.invert_yaxis()
-    axes.set_xlim(0, 1)
-    axes.set_xlabel("share of the specimen's pixels [1]")
+    axes.set(xlim=(0, 1), xlabel="share of the specimen's pixels [1]")
     axes.legend(loc="upper center", bbox_to_anchor=(0.45, -0.24), ncols=1, fontsize=7.5)

@@ -10,13 +10,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-from characterisation.files.atomic_io import atomic_write
 from characterisation.files.errors import InputError
 from mitsim.report.first_rows import breakable, exact, tolerance_words
 from mitsim.report.first_screen import of_choice, sensor_rows
 from mitsim.report.placement_figure import VERDICTS
+from mitsim.report.pose_texts import pose_texts
+from mitsim.report.templates import write_page
 from mitsim.running.numbers import NONE, listed, percent, quantity, rounded, two_digits, with_degree_signs
 from mitsim.study.choice_document import CHOICE, CellEntry, ChoiceDocument, SensorEntry, read_choice
 from mitsim.study.scene_geometry import read_scene_geometry
@@ -33,19 +32,7 @@ def write_choice_page(folder: Path) -> Path:
     choice = read_choice(folder)
     if choice is None:
         raise InputError(folder / CHOICE, "", "no such file", "a folder made by mitsim study choose")
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["breakable"] = breakable
-    text = environment.get_template("choice.html.j2").render(page_content(choice, folder))
-    path = folder / "choice.html"
-    with atomic_write(path) as file:
-        file.write_text(text, encoding="utf-8")
-    return path
+    return write_page(folder / "choice.html", "choice.html.j2", page_content(choice, folder))
 
 
 def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
@@ -116,25 +103,15 @@ def _cell(cell: CellEntry, unit: str) -> dict[str, str]:
 
 
 def _details(choice: ChoiceDocument, one: SensorEntry, tolerances: bool) -> dict[str, Any]:
-    poses = []
-    for pose in one.poses:
-        position = [row[3] for row in pose.world_from_sensor[:3]]
-        poses.append(
-            {
-                "view": pose.view,
-                "azimuth": f"{rounded(pose.azimuth_deg)}°",
-                "elevation": f"{rounded(pose.elevation_deg)}°",
-                "roll": f"{rounded(pose.roll_deg)}°",
-                "standoff": f"{rounded(pose.standoff_mm)}\N{NO-BREAK SPACE}mm",
-                "position": ", ".join(rounded(x) for x in position),
-                "for": listed([name for name, cell in one.measurements.items() if cell.view == pose.view]) or "none",
-            }
-        )
     return {
         "name": one.name,
         "words": with_degree_signs(one.words),
         "rows": sensor_rows(choice, one),
         "tolerances": tolerances,
-        "poses": poses,
+        "poses": [
+            pose_texts(pose)
+            | {"for": listed([name for name, cell in one.measurements.items() if cell.view == pose.view]) or "none"}
+            for pose in one.poses
+        ],
         "trials": max((cell.trials for cell in one.measurements.values()), default=0),
     }

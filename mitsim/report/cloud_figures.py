@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import base64
 import math
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -18,6 +20,7 @@ from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
 from mitsim.capture.picture import STRETCH_EXPONENT, grey_limits
 from mitsim.report.findings import reason_shares
+from mitsim.report.style import colour_scale
 from mitsim.running.numbers import percent
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.png import encode_png
@@ -88,6 +91,14 @@ def window(predicted: PointCloud, margin: int = 8) -> tuple[slice, slice]:
     )
 
 
+def draw_status(axes: Axes, status: NDArray[np.uint8], **options: Any) -> None:
+    """Draw the status (H, W) of pixels in the colours of :data:`REASONS`."""
+    colours = ListedColormap([REASONS[status][1] for status in Status])
+    steps = BoundaryNorm(np.arange(len(Status) + 1) - 0.5, len(Status))
+    axes.imshow(np.ma.masked_equal(status, Status.NO_SURFACE), cmap=colours, norm=steps, **options)
+    axes.set_facecolor(FIELD)
+
+
 def cloud_figure(predicted: PointCloud, decoded: PointCloud) -> Figure:
     """Draw the distance along the view ray [mm] and the status of every pixel of both clouds, cropped to the part."""
     cut = window(predicted)
@@ -96,8 +107,6 @@ def cloud_figure(predicted: PointCloud, decoded: PointCloud) -> Figure:
     present = sorted({Status(int(s)) for cloud in clouds.values() for s in np.unique(cloud.status[cut])})
     # the part's own depth sets the colours, since a false match can lie at any distance
     near, far = depth_limits(distances[0])
-    colours = ListedColormap([REASONS[status][1] for status in Status])
-    steps = BoundaryNorm(np.arange(len(Status) + 1) - 0.5, len(Status))
     height, width = predicted.status[cut].shape
     top, left = cut[0].start, cut[1].start
     extent = (left - 0.5, left + width - 0.5, top + height - 0.5, top - 0.5)
@@ -111,28 +120,15 @@ def cloud_figure(predicted: PointCloud, decoded: PointCloud) -> Figure:
             depth = grid[0, column].imshow(
                 np.ma.masked_invalid(distances[column]), cmap=SEQUENTIAL, vmin=near, vmax=far, extent=extent
             )
-            grid[1, column].imshow(
-                np.ma.masked_equal(cloud.status[cut], Status.NO_SURFACE), cmap=colours, norm=steps, extent=extent
-            )
-            grid[1, column].set_facecolor(FIELD)
+            draw_status(grid[1, column], cloud.status[cut], extent=extent)
             grid[0, column].set_title(f"{title}: distance")
             grid[1, column].set_title(f"{title}: status")
         for axes in grid[-1] if not tall else grid.ravel():
             axes.set_xlabel("column [px]")
         for axes in grid[:, 0] if not tall else grid[0, :1]:
             axes.set_ylabel("row [px]")
-        label = "distance along the view ray [mm]"
-        bar = figure.colorbar(
-            depth,
-            ax=grid.ravel().tolist(),
-            label=label,
-            extend="both",
-            pad=0.01,
-            shrink=1.0 if tall else 0.5,
-            anchor=(0.0, 1.0),
-            aspect=22,
-        )
-        bar.outline.set_visible(False)  # type: ignore[operator]
+        beside = {"shrink": 1.0 if tall else 0.5, "anchor": (0.0, 1.0), "aspect": 22}
+        colour_scale(figure, depth, grid.ravel().tolist(), "distance along the view ray [mm]", **beside)
         shares = reason_shares([(predicted, decoded)])
         legend = [
             Patch(facecolor=REASONS[s][1], label=f"{REASONS[s][0]}: {' | '.join(map(percent, shares.get(s, (0, 0))))}")

@@ -22,10 +22,10 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from characterisation.maps.performance_map import PerformanceMap, lambert_projection
-from characterisation.plots.discs import disc, disc_image, disc_view, noise_limits, plain_log_ticks
+from characterisation.plots.discs import disc_image, disc_view, noise_limits, plain_log_ticks
 from characterisation.plots.style import FIELD, NOISE, SEQUENTIAL, drawing
 from mitsim.report.findings import incidence_of_nodes
-from mitsim.report.style import write_png
+from mitsim.report.style import colour_scale, write_png
 from mitsim.running.numbers import count, finish_name
 
 Floats = NDArray[np.float64]
@@ -90,21 +90,23 @@ def _map_figure(
 def colour_bar(
     figure: Figure, grid: NDArray[np.object_], norm: Normalize, colours: str | Colormap, label: str, extend: str
 ) -> None:
-    """Add one labelled colour scale below all axes of a figure."""
-    mappable = ScalarMappable(norm=norm, cmap=colours)
-    bar = figure.colorbar(
-        mappable,
-        ax=grid.ravel().tolist(),
-        location="bottom",
-        label=label,
-        extend=extend,
-        aspect=45,
-        shrink=0.75,
-        pad=0.03,
-    )
+    """Add one labelled colour scale below all axes of a figure.
+
+    Parameters
+    ----------
+    figure, grid
+        The figure, and its axes.
+    norm, colours
+        Scale of the values, and name of the colours.
+    label
+        Quantity and unit.
+    extend
+        Ends beyond which values lie: ``neither``, ``both`` or ``max``.
+    """
+    mappable, below = ScalarMappable(norm=norm, cmap=colours), {"location": "bottom", "aspect": 45, "shrink": 0.75}
+    bar = colour_scale(figure, mappable, grid.ravel().tolist(), label, extend=extend, pad=0.03, **below)
     if isinstance(norm, LogNorm):
         plain_log_ticks(bar, float(norm.vmin or 0), float(norm.vmax or 1))
-    bar.outline.set_visible(False)  # type: ignore[operator]
 
 
 def patches_figure(patches: xr.Dataset, cells: int = 61) -> Figure:
@@ -127,17 +129,8 @@ def patches_figure(patches: xr.Dataset, cells: int = 61) -> Figure:
         figure = Figure((max(2.35 * len(samples) + 0.4, 5.5), 4.0), layout="constrained")
         grid = np.asarray(figure.subplots(1, max(len(samples), 1), squeeze=False))
         for axes, sample in zip(grid[0], matt_to_shiny(samples), strict=False):
-            rim = disc(axes, reach)
-            shown = axes.imshow(
-                np.ma.masked_equal(counts[sample], 0),
-                norm=norm,
-                cmap=SEQUENTIAL,
-                origin="lower",
-                extent=(-reach, reach, -reach, reach),
-                interpolation="none",
-                zorder=1,
-            )
-            shown.set_clip_path(rim)
+            seen = np.where(counts[sample] > 0, counts[sample], np.nan)
+            disc_image(axes, seen, (edges[1:] + edges[:-1]) / 2, largest).set(norm=norm, cmap=SEQUENTIAL)
             disc_view(axes, largest)
             title = finish_name(*samples[sample]).replace(", ", "\n")
             axes.set_title(f"{title}\n{count(int(counts[sample].sum()))} patches")

@@ -19,6 +19,9 @@ from mitsim.running.numbers import finish_name, quantity, rounded, two_digits
 
 Floats = NDArray[np.float64]
 
+#: incidence up to which the noise of a surface is summarised [deg]
+NOISE_UP_TO_DEG = 45.0
+
 
 def ranked_views(scores: xr.Dataset, measurement: str) -> NDArray[np.int64]:
     """Return the indices (not numbers) of the views that can make a measurement, least predicted risk first.
@@ -81,10 +84,10 @@ def half_recovery_incidence(performance_map: PerformanceMap, sample: int, distan
     return float("nan") if good[-1] == known[-1] else float(lows[good[-1]] + np.radians(3.75))
 
 
-def median_noise(performance_map: PerformanceMap, sample: int, distance: int, largest_incidence: float) -> float:
-    """Return the median of sigma [mm] up to an incidence angle [rad]; NaN without a value."""
+def median_noise(performance_map: PerformanceMap, sample: int, distance: int) -> float:
+    """Return the median of sigma [mm] up to :data:`NOISE_UP_TO_DEG`; NaN without a value."""
     sigma = performance_map.data["ray_noise_std"].values[sample, distance]
-    near = sigma[(incidence_of_nodes(performance_map) <= largest_incidence) & np.isfinite(sigma)]
+    near = sigma[(incidence_of_nodes(performance_map) <= np.radians(NOISE_UP_TO_DEG)) & np.isfinite(sigma)]
     return float(np.median(near)) if len(near) else float("nan")
 
 

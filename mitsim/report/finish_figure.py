@@ -109,10 +109,7 @@ def fit_figure(found: CouponFit) -> Figure:
         ]
         for axes, (values, title, colours, unit) in zip(panels, shown, strict=True):
             drawn = axes.imshow(values, **colours)
-            axes.set_facecolor(FIELD)
-            axes.set_title(title)
-            axes.set_xticks([])
-            axes.set_yticks([])
+            axes.set(facecolor=FIELD, title=title, xticks=[], yticks=[])
             figure.colorbar(drawn, ax=axes, orientation="horizontal", label=unit, fraction=0.06, pad=0.03)
         figure.suptitle(
             f"{Path(view.name).name}, {view.camera} ({found.source}): residual {worst.rms_dn:.2g} DN rms, "

@@ -37,7 +37,7 @@ _KINDS = {
 
 
 @dataclass(frozen=True)
-class Row:
+class ResultRow:
     """One measurement in the short table, as texts; ``colour`` of its verdict.
 
     ``about`` says what is measured. ``share`` of the tolerance with its ``share_interval`` and the largest
@@ -99,23 +99,23 @@ class RowValues:
             return None
         return self.share / self.demand
 
-    def texts(self) -> Row:
+    def texts(self) -> ResultRow:
         """Return the row of the table, as texts."""
         limit = self.share_limit
         size = _size(self.tolerance)
-        return Row(
+        return ResultRow(
             name=self.name,
             about=self.about,
             nominal=exact(self.nominal, self.unit),
             tolerance=tolerance_words(self.tolerance, self.nominal, self.unit),
             bias=_signed(self.bias, self.unit),
-            uncertainty=_quantity(self.uncertainty, self.unit),
-            needed=_quantity(self.needed, self.unit),
+            uncertainty=quantity(self.uncertainty, self.unit),
+            needed=quantity(self.needed, self.unit),
             share=NONE if self.share is None else _share(self.share),
             share_interval="" if limit is None else _interval(self.demand_interval, limit),
             share_limit="" if limit is None else percent(limit),
             accepted=accepted_words(self.accepted, self.unit, size),
-            false_accept=NONE if self.false_accept is None else percent(self.false_accept),
+            false_accept=percent(self.false_accept),
             without_value=percent(self.without_value),
             limited=self.limited,
             points="" if self.points is None or not math.isfinite(self.points) else count(round(self.points)),
@@ -192,7 +192,3 @@ def _signed(value: float | None, unit: str) -> str:
     if value is None:
         return NONE
     return ("+" if value > 0 else MINUS if value < 0 else "") + quantity(abs(value), unit)
-
-
-def _quantity(value: float | None, unit: str) -> str:
-    return NONE if value is None else quantity(value, unit)

@@ -17,11 +17,12 @@ from markupsafe import Markup
 from numpy.typing import ArrayLike
 
 from characterisation.statements.verdict_words import OFTEN, Judged, fits_all, losses_in_words, result_in_words
-from mitsim.report.first_rows import Row, RowValues, measured_words
+from mitsim.report.first_rows import ResultRow, RowValues, measured_words
 from mitsim.report.placement_figure import face_verdicts, placement_figure
+from mitsim.report.pose_texts import pose_of_view, pose_words
 from mitsim.report.set_words import with_sets
 from mitsim.report.style import Picture, as_svg
-from mitsim.running.numbers import NONE, count, rounded, with_degree_signs
+from mitsim.running.numbers import NONE, count, with_degree_signs
 from mitsim.study.choice_document import ChoiceDocument, SensorEntry, judged
 from mitsim.study.run_folder import Run
 from mitsim.study.scene_geometry import SceneGeometry
@@ -42,7 +43,7 @@ class FirstScreen:
 
     words: str
     tone: Tone
-    rows: list[Row]
+    rows: list[ResultRow]
     picture: Picture | None
     poses: list[tuple[str, ArrayLike]]
     verdicts: dict[str, str]
@@ -68,6 +69,11 @@ class FirstScreen:
         """Return the largest share of the tolerance that fits, if it is the same for all rows; otherwise empty."""
         limits = {row.share_limit for row in self.rows if row.tolerance != NONE and row.share != NONE}
         return limits.pop() if len(limits) == 1 else ""
+
+
+#: values of a measurement, and of its decision, that documents and rows hold by the same names
+_MEASURED = ("verdict", "bias", "without_value")
+_DECIDED = ("needed", "demand", "demand_interval", "accepted", "false_accept")
 
 
 def tone_of(results: Sequence[Judged]) -> Tone:
@@ -96,9 +102,7 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     verdicts = face_verdicts(asked)
     result = with_sets(result_in_words(results), fits_all(results), run.about.view_sets)
     best = f"the best of {count(run.scores.sizes['view'])} views for all measurements together"
-    pose = pose_words(
-        *(float(view_scores[name]) for name in ("standoff_mm", "azimuth_deg", "elevation_deg", "roll_deg"))
-    )
+    pose = pose_words(pose_of_view(run, document.view))
     return FirstScreen(
         with_degree_signs(result.words[:1].upper() + result.words[1:]),
         tone_of(results) if result.good else "bad",
@@ -122,9 +126,7 @@ def of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None) -> FirstSc
     of = sum(one.status != "excluded" for one in choice.sensors)
     caption = f"{best.name}, the best of {of} sensor{'s' if of > 1 else ''}"
     if best.poses:
-        first = best.poses[0]
-        caption += f", in view {first.view}: "
-        caption += pose_words(first.standoff_mm, first.azimuth_deg, first.elevation_deg, first.roll_deg)
+        caption += f", in view {best.poses[0].view}: {pose_words(best.poses[0])}"
     results = judged(best)
     lost = "" if any(one.verdict != "no tolerance" for one in results) else losses_in_words(results)
     return FirstScreen(
@@ -138,43 +140,27 @@ def of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None) -> FirstSc
     )
 
 
-def pose_words(standoff_mm: float, azimuth_deg: float, elevation_deg: float, roll_deg: float) -> str:
-    """Describe a pose in plain words: distance, azimuth, elevation and roll, each with its reference."""
-    return (
-        f"distance {rounded(standoff_mm)}\N{NO-BREAK SPACE}mm, "
-        f"azimuth {rounded(azimuth_deg)}° (about the part’s z axis, from x), "
-        f"elevation {rounded(elevation_deg)}° (above the plane z = 0), "
-        f"roll {rounded(roll_deg)}° (about the line of sight, clockwise as the sensor sees)"
-    )
-
-
-def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[Row]:
+def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[ResultRow]:
     """Return the rows for the measurements of one sensor."""
     return [
         RowValues(
             name=name,
             about=measured_words("", asked.features),
             unit=asked.unit,
-            verdict=cell.verdict,
             nominal=asked.nominal,
             tolerance=asked.tolerance,
-            bias=cell.bias,
             uncertainty=cell.uncertainty,
-            without_value=cell.without_value,
-            needed=cell.needed,
             share=cell.share_of_tolerance,
             rule=asked.rule,
-            demand=cell.demand,
-            demand_interval=cell.demand_interval,
-            accepted=cell.accepted,
-            false_accept=cell.false_accept,
+            **_same_names(cell, _MEASURED),
+            **_same_names(cell, _DECIDED),
         ).texts()
         for name, cell in one.measurements.items()
         for asked in (choice.measurements[name],)
     ]
 
 
-def _run_row(run: Run, view_scores: xr.Dataset, name: str, one: StatedMeasurement) -> Row:
+def _run_row(run: Run, view_scores: xr.Dataset, name: str, one: StatedMeasurement) -> ResultRow:
     """Return the row of a measurement of a run; ``view_scores`` are the scores of the stated view."""
     entry, decision = run.about.measurements.get(name), one.decision
     limit = feature = ""
@@ -187,22 +173,20 @@ def _run_row(run: Run, view_scores: xr.Dataset, name: str, one: StatedMeasuremen
         name=name,
         about="" if entry is None else measured_words(entry.kind, entry.features),
         unit=one.unit,
-        verdict=one.verdict,
         nominal=math.nan if entry is None else entry.nominal,
         tolerance=tolerance,
-        bias=one.bias,
         uncertainty=one.standard_uncertainty,
-        without_value=one.without_value,
-        needed=None if decision is None else decision.needed,
         share=one.share_of_tolerance,
-        rule="" if decision is None else decision.rule,
-        demand=None if decision is None else decision.demand,
-        demand_interval=None if decision is None else decision.demand_interval,
-        accepted=None if decision is None else decision.accepted,
-        false_accept=None if decision is None else decision.false_accept,
+        **_same_names(one, _MEASURED),
+        **({} if decision is None else _same_names(decision, ("rule", *_DECIDED))),
         limited=f"{limit} on {feature}" if limit and feature else limit,
         points=points if limit else None,
     ).texts()
+
+
+def _same_names(entry: object, names: Sequence[str]) -> dict[str, Any]:
+    """Return the values of an entry that a row holds by the same names."""
+    return {name: getattr(entry, name) for name in names}
 
 
 def _judged(name: str, one: StatedMeasurement) -> Judged:

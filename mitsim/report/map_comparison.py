@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
-from characterisation.plots.discs import disc, disc_view, noise_limits
+from characterisation.plots.discs import disc, disc_image, disc_view, noise_limits
 from characterisation.plots.style import NOISE, SEQUENTIAL, drawing
 from mitsim.report.figures import colour_bar, matt_to_shiny
 from mitsim.running.numbers import finish_name
@@ -58,22 +58,13 @@ def comparison_figure(
         grid = np.asarray(figure.subplots(len(maps), len(samples), squeeze=False))
         for number, (one, row) in enumerate(zip(maps, grid, strict=True)):
             place = nearest_distance(one, distance_mm)
-            half_cell = float(one.data["a"][1] - one.data["a"][0]) / 2
-            reach = float(one.data["a"][-1]) + half_cell
             for sample, axes in zip(samples, row, strict=True):
-                rim = disc(axes, 2 * math.sin(_LARGEST / 2))
                 index = _index(one, sample)
-                if index is not None:
-                    shown = axes.imshow(
-                        np.ma.masked_invalid(one.data[variable].values[index, place]),
-                        norm=norm,
-                        cmap=colours,
-                        origin="lower",
-                        extent=(-reach, reach, -reach, reach),
-                        interpolation="none",
-                        zorder=1,
-                    )
-                    shown.set_clip_path(rim)
+                if index is None:
+                    disc(axes, 2 * math.sin(_LARGEST / 2))
+                else:
+                    values = one.data[variable].values[index, place]
+                    disc_image(axes, values, one.data["a"].values, _LARGEST).set(norm=norm, cmap=colours)
                 disc_view(axes, _LARGEST, labelled=number == 0)
                 if number == 0:
                     axes.set_title(finish_name(*sample).replace(", ", "\n"), fontsize=8)
@@ -107,8 +98,7 @@ def strip_figure(maps: Sequence[PerformanceMap]) -> Figure:
         for sample, top, bottom in zip(samples, upper, lower, strict=True):
             top.set_title(finish_name(*sample).replace(", ", "\n"), fontsize=8)
             top.set_ylim(-0.03, 1.03)
-            bottom.set_xscale("log")
-            bottom.set_yscale("log")
+            bottom.set(xscale="log", yscale="log")
             if not any(np.isfinite(line.get_ydata()).any() for each in lower for line in each.lines):
                 # matplotlib finds no limits if no map has a noise
                 bottom.set_ylim(*noise_limits(maps[0].data["ray_noise_std"].values))
@@ -149,13 +139,9 @@ def check_distance(maps: Sequence[PerformanceMap], distance_mm: float) -> None:
         if not near <= distance_mm <= far:
             outside.append(f"{sensor_name(one)} from {near:g} to {far:g} mm")
     if outside:
-        raise InputError(
-            "--distance",
-            "",
-            f"{distance_mm:g} mm",
-            f"a distance that all maps cover; {', '.join(outside)}",
-            "omit those maps, or omit --distance to draw each map in the middle of its range",
-        )
+        allowed = f"a distance that all maps cover; {', '.join(outside)}"
+        hint = "omit those maps, or omit --distance to draw each map in the middle of its range"
+        raise InputError("--distance", "", f"{distance_mm:g} mm", allowed, hint)
 
 
 def sensor_name(one: PerformanceMap) -> str:

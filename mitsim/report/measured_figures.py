@@ -11,9 +11,10 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from characterisation.acceptance.cloud_difference import Difference
-from characterisation.plots.style import BLUE, FIELD, INK, SEQUENTIAL, VERMILION, drawing
+from characterisation.plots.style import BLUE, INK, SEQUENTIAL, VERMILION, drawing
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
+from mitsim.report.style import colour_scale, pixel_axes
 
 #: ends of the colours: this percentile of |difference|, or this many robust deviations from the median if that is less
 _PERCENTILE, _DEVIATIONS = 98.0, 6.0
@@ -25,10 +26,12 @@ def distance_figure(cloud: PointCloud, windows: Mapping[str, Roi]) -> Figure:
     known = distance[np.isfinite(distance)]
     near, far = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
     with drawing():
-        figure, axes = _picture(distance.shape)
+        rows, columns = distance.shape
+        figure = Figure((9.0, min(max(8.0 * rows / columns, 2.5), 9.0)), layout="constrained")
+        axes = figure.subplots()
+        pixel_axes(axes)
         drawn = axes.imshow(distance, cmap=SEQUENTIAL, vmin=near, vmax=max(far, near + 1e-6))
-        bar = figure.colorbar(drawn, ax=axes, label="distance along the view ray [mm]", extend="both", pad=0.01)
-        bar.outline.set_visible(False)  # type: ignore[operator]
+        colour_scale(figure, drawn, axes, "distance along the view ray [mm]")
         _outline(axes, windows)
     return figure
 
@@ -36,7 +39,19 @@ def distance_figure(cloud: PointCloud, windows: Mapping[str, Roi]) -> Figure:
 def difference_figure(
     difference: NDArray[np.float64], found: Difference, windows: Mapping[str, Roi], part: Roi | None = None
 ) -> Figure:
-    """Draw the signed difference [mm] of every pixel, in the whole image or a part, and its histogram."""
+    """Draw the signed difference of every pixel, in the whole image or a part, and its histogram.
+
+    Parameters
+    ----------
+    difference
+        (H, W) [mm], NaN where a pixel has no counterpart.
+    found
+        Distribution of the difference.
+    windows
+        Windows to outline [px], by name.
+    part
+        Part of the image that is shown [px]; None for all of it.
+    """
     part = part or Roi.whole(difference.shape[1], difference.shape[0])
     known = difference[np.isfinite(difference)]
     reach = float(np.percentile(np.abs(known), _PERCENTILE)) if len(known) else 1.0
@@ -48,13 +63,9 @@ def difference_figure(
         figure = Figure((9.0, tall + 1.9), layout="constrained")
         axes, histogram = figure.subplots(2, 1, height_ratios=[tall, 1.2])
         drawn = axes.imshow(difference, cmap="RdBu_r", vmin=-reach, vmax=reach)
-        axes.set_facecolor(FIELD)
-        axes.set_xlabel("column [px]")
-        axes.set_ylabel("row [px]")
-        axes.set_xlim(part.left - 0.5, part.right - 0.5)
-        axes.set_ylim(part.bottom - 0.5, part.top - 0.5)
-        bar = figure.colorbar(drawn, ax=axes, label="farther than the reference by [mm]", extend="both", pad=0.01)
-        bar.outline.set_visible(False)  # type: ignore[operator]
+        pixel_axes(axes)
+        axes.set(xlim=(part.left - 0.5, part.right - 0.5), ylim=(part.bottom - 0.5, part.top - 0.5))
+        colour_scale(figure, drawn, axes, "farther than the reference by [mm]")
         _outline(axes, windows)
         histogram.hist(np.clip(known, -1.5 * reach, 1.5 * reach), 121, color=BLUE)
         histogram.axvline(found.median, color=VERMILION, label=f"median {found.median:.3g} mm")
@@ -62,15 +73,6 @@ def difference_figure(
         histogram.set_ylabel("pixels")
         histogram.legend(loc="upper right")
     return figure
-
-
-def _picture(shape: tuple[int, ...]) -> tuple[Figure, Axes]:
-    figure = Figure((9.0, min(max(8.0 * shape[0] / shape[1], 2.5), 9.0)), layout="constrained")
-    axes = figure.subplots()
-    axes.set_facecolor(FIELD)
-    axes.set_xlabel("column [px]")
-    axes.set_ylabel("row [px]")
-    return figure, axes
 
 
 def _outline(axes: Axes, windows: Mapping[str, Roi]) -> None:

@@ -14,24 +14,22 @@ from __future__ import annotations
 
 import html
 import math
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
-from characterisation.files.atomic_io import atomic_write
 from characterisation.point_cloud import Status
 from characterisation.scores.coverage import NORMAL_COVERAGE
 from characterisation.tasks.covariance import LEAST_CHANCE, PERSISTENT_REACH_PX, PERSISTENT_TURN
 from mitsim.report import findings
 from mitsim.report.agreement import Agreement, agreement, chance_level
 from mitsim.report.cloud_figures import REASONS
-from mitsim.report.first_rows import breakable
 from mitsim.report.first_screen import of_run
 from mitsim.report.page_pictures import camera_view, cloud_picture, map_pictures, measurement_pictures
+from mitsim.report.pose_texts import pose_of_view, pose_texts
 from mitsim.report.statement_section import statement_section
+from mitsim.report.templates import write_page
 from mitsim.report.view_sphere import view_sphere
 from mitsim.running.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
 from mitsim.study.run_folder import Run, read_run
@@ -72,21 +70,7 @@ def write_report(folder: str | Path) -> Path:
         If a file of the run is missing or damaged; the message names the file.
     """
     run = read_run(folder)
-    text = _template().render(page_content(run))
-    path = run.folder / "report.html"
-    with atomic_write(path) as file:
-        file.write_text(text, encoding="utf-8")
-    return path
-
-
-@cache
-def _template() -> Template:
-    loader = FileSystemLoader(Path(__file__).parent)
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters["breakable"] = breakable
-    return environment.get_template("page.html.j2")
+    return write_page(run.folder / "report.html", "page.html.j2", page_content(run))
 
 
 def page_content(run: Run) -> dict[str, Any]:
@@ -104,7 +88,7 @@ def page_content(run: Run) -> dict[str, Any]:
         "minimum_points": count(int(scores.attrs.get("minimum_points", 100))),
         "first": of_run(run, read_scene_geometry(run.folder)),
         "statement": None if run.statement is None else statement_section(run.statement),
-        "stated_pose": None if run.statement is None else _pose(run, run.statement.view),
+        "stated_pose": None if run.statement is None else pose_texts(pose_of_view(run, run.statement.view)),
         "race_confidence": percent(about.confidence.get(ALL, 0.0)),
         "answers": [_answer(run, name, agreements[name]) for name in run.measurements],
         "tolerances": bool(np.isfinite(scores["tolerance"].values).any()),
@@ -167,20 +151,6 @@ def _spread(views: list[int], number: int) -> list[int]:
     return [views[round(last * i / max(number - 1, 1))] for i in range(number)]
 
 
-def _pose(run: Run, view: int) -> dict[str, str]:
-    """Return the pose of a view as texts: angles in deg, position in mm, both in the part frame."""
-    here = run.scores.sel(view=view)
-    position = here["world_from_sensor"].values[:3, 3]
-    return {
-        "view": str(view),
-        "azimuth": f"{rounded(float(here['azimuth_deg']))}°",
-        "elevation": f"{rounded(float(here['elevation_deg']))}°",
-        "roll": f"{rounded(float(here['roll_deg']))}°",
-        "standoff": f"{rounded(float(here['standoff_mm']))}\N{NO-BREAK SPACE}mm",
-        "position": ", ".join(rounded(float(x)) for x in position),
-    }
-
-
 def _answer(run: Run, name: str, found: Agreement) -> dict[str, Any]:
     """Return the best view of one measurement from the race, or from the screening if none was raced."""
     entry, scores = run.about.measurements[name], run.scores.sel(measurement=name)
@@ -196,7 +166,7 @@ def _answer(run: Run, name: str, found: Agreement) -> dict[str, Any]:
         "trials": count(trials),
         "confidence": percent(run.about.confidence.get(name, 0.0)),
     }
-    return row | _pose(run, best) | _expected(run, name, best) | measured
+    return row | pose_texts(pose_of_view(run, best)) | _expected(run, name, best) | measured
 
 
 def _expected(run: Run, name: str, view: int) -> dict[str, str]:
@@ -250,7 +220,7 @@ def _table(run: Run, name: str) -> dict[str, Any]:
     for rank, i in enumerate(findings.ranked_views(run.scores, name)[:TOP], 1):
         view, points = int(numbers[i]), run.scores["n"].isel(view=int(i))
         rows.append(
-            _pose(run, view)
+            pose_texts(pose_of_view(run, view))
             | _expected(run, name, view)
             | {
                 "rank": rank,

@@ -18,18 +18,12 @@ from characterisation.point_cloud import Status
 from mitsim.report import figures, findings
 from mitsim.report.agreement import CHANCE, CONFIRMED, TOO_FEW, Agreement, chance_level
 from mitsim.report.cloud_figures import REASONS, camera_images, cloud_figure
+from mitsim.report.pose_texts import angles_in_words, pose_of_view
 from mitsim.report.style import Picture, as_svg
 from mitsim.report.view_data import LIMITS
 from mitsim.report.view_figures import agreement_figure, uncertainty_figure
 from mitsim.running.numbers import count, finish_name, listed, percent, quantity, rounded, two_digits
 from mitsim.study.run_folder import Run
-
-
-def pose_words(run: Run, view: int) -> str:
-    """Describe the pose of a view in words, angles in deg."""
-    here = run.scores.sel(view=view)
-    azimuth, elevation, roll = (rounded(float(here[f"{name}_deg"])) for name in ("azimuth", "elevation", "roll"))
-    return f"azimuth {azimuth}°, elevation {elevation}°, roll {roll}°"
 
 
 def _picture(figure: Any, alt: str, caption: str) -> Picture:
@@ -60,10 +54,11 @@ def map_pictures(run: Run) -> Iterator[tuple[str, Picture]]:
     yield "Fraction of points recovered", _picture(figures.fraction_figure(performance_map), alt, caption)
 
     low, high = noise_limits(performance_map.data["ray_noise_std"].values)
-    medians = [findings.median_noise(performance_map, i, middle, math.radians(45)) for i in order]
+    medians = [findings.median_noise(performance_map, i, middle) for i in order]
     noises = [f"{two_digits(s)} mm on {name}" for s, name in zip(medians, names, strict=True) if math.isfinite(s)]
     caption = (
-        f"Dark means little noise. At {distances[middle]:g} mm and up to 45° of incidence the median of σ is "
+        f"Dark means little noise. At {distances[middle]:g} mm and up to {findings.NOISE_UP_TO_DEG:g}° of incidence "
+        f"the median of σ is "
         f"{listed(noises) or 'not known'} (logarithmic colours from the {NOISE_PERCENTILES[0]}nd to the "
         f"{NOISE_PERCENTILES[1]}th percentile, {two_digits(low)} to {two_digits(high)} mm)."
     )
@@ -90,7 +85,7 @@ def measurement_pictures(run: Run, name: str, found: Agreement) -> Iterator[Pict
         u = quantity(float(here["predicted_uncertainty"].sel(view=best)), unit)
         caption = (
             f"{count(able)} of {count(total)} views can make this measurement, and view {best} "
-            f"({pose_words(run, best)}) is the best, with u = {u}. Bright means a small u."
+            f"({angles_in_words(pose_of_view(run, best))}) is the best, with u = {u}. Bright means a small u."
         )
     alt = f"Predicted standard uncertainty of {name} over the sphere of views, seen from above. {caption}"
     yield _picture(uncertainty_figure(run.scores, name, unit, run.checked, best), alt, caption)
@@ -129,10 +124,11 @@ def camera_view(run: Run, view: int) -> dict[str, Any]:
     images, stretch = camera_images(capture, seen)
     rank = float(run.scores["uncertainty_rank"].sel(view=view).values.mean())
     able = int(run.scores["uncertainty_possible"].sel(view=view).values.sum())
-    caption = f"View {view}: {pose_words(run, view)}; mean rank {rounded(rank, 1)} of {run.scores.sizes['view']}, "
+    angles = angles_in_words(pose_of_view(run, view))
+    caption = f"View {view}: {angles}; mean rank {rounded(rank, 1)} of {run.scores.sizes['view']}, "
     caption += f"{able} of {len(run.measurements)} measurements possible ({capture.source}; {stretch})."
     return {
-        "images": [(name, uri, f"{name} camera, view {view}, {pose_words(run, view)}") for name, uri in images.items()],
+        "images": [(name, uri, f"{name} camera, view {view}, {angles}") for name, uri in images.items()],
         "caption": caption,
     }
 

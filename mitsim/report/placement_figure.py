@@ -44,8 +44,9 @@ _NOT_ASKED = "#b9bdc4"
 #: words of the legend, where they are not the verdict
 _LEGEND = {"no tolerance": "measured, without tolerance"}
 
-#: pixels along the longer side of the picture
+#: pixels along the longer side of the picture, and of the raster in which places for labels are found
 _PIXELS = 900
+_LABEL_PIXELS = 240
 
 #: azimuth of the picture's viewpoint relative to the sensor, and its minimum elevation [deg]
 _ASIDE_DEG, _LOWEST_DEG = 62.0, 18.0
@@ -86,7 +87,23 @@ def placement_figure(
 def draw_placement(
     figure: FigureBase, geometry: SceneGeometry, poses: Sequence[tuple[str, ArrayLike]], verdicts: Mapping[str, str]
 ) -> None:
-    """Draw into a figure or subfigure, about 1.9 times as wide as high; see :func:`placement_figure`."""
+    """Draw a part with a sensor at each pose into a figure.
+
+    Parameters
+    ----------
+    figure
+        Figure or subfigure, about 1.9 times as wide as high.
+    geometry
+        Triangles of the part, and eyes of the sensor [mm].
+    poses
+        Label and part_from_sensor (4, 4) [mm] of each pose; the first sensor is drawn in full.
+    verdicts
+        Verdict of each feature, a key of :data:`VERDICTS`.
+
+    See Also
+    --------
+    placement_figure : The same as a figure of its own.
+    """
     matrices = [np.asarray(pose, float) for _, pose in poses]
     with drawing():
         middle = _middle(geometry)
@@ -136,9 +153,7 @@ def _part(
     geometry: SceneGeometry, flat: Floats, depth: Floats, turn: Floats, verdicts: Mapping[str, str]
 ) -> tuple[Floats, tuple[float, float, float, float]]:
     """Return the picture of the part, (rows, columns, 4), and its extent: left, right, bottom and top."""
-    low, high = flat.reshape(-1, 2).min(axis=0), flat.reshape(-1, 2).max(axis=0)
-    scale = _PIXELS / max(float((high - low).max()), 1e-9)
-    index, _ = depth_buffer((flat - low) * scale, depth, tuple(np.ceil((high - low) * scale).astype(int) + 1))
+    index, low, _, scale = _raster(flat, depth, _PIXELS)
     colours = np.array([to_rgb(VERDICTS.get(verdicts.get(name, ""), _NOT_ASKED)) for name in geometry.names])
     normal = np.cross(geometry.corners[:, 1] - geometry.corners[:, 0], geometry.corners[:, 2] - geometry.corners[:, 0])
     length = np.linalg.norm(normal, axis=1)
@@ -162,6 +177,14 @@ def _part(
         low[1] + index.shape[0] / scale - half,
     )
     return picture, extent
+
+
+def _raster(flat: Floats, depth: Floats, pixels: int) -> tuple[NDArray[np.int64], Floats, Floats, float]:
+    """Return the nearest triangle of every pixel, the ends of the part in the picture (2,), and pixels per mm."""
+    low, high = flat.reshape(-1, 2).min(axis=0), flat.reshape(-1, 2).max(axis=0)
+    scale = pixels / max(float((high - low).max()), 1e-9)
+    size = tuple(np.ceil((high - low) * scale).astype(int) + 1)
+    return depth_buffer((flat - low) * scale, depth, size)[0], low, high, scale
 
 
 def depth_buffer(places: Floats, depth: Floats, size: tuple[int, ...]) -> tuple[NDArray[np.int64], Floats]:
@@ -239,17 +262,14 @@ def _sensor(
 
 def _labels(axes: Axes, geometry: SceneGeometry, flat: Floats, depth: Floats, verdicts: Mapping[str, str]) -> None:
     """Draw the names of the measured features in columns left and right of the part, with lines that do not cross."""
-    low, high = flat.reshape(-1, 2).min(axis=0), flat.reshape(-1, 2).max(axis=0)
-    scale = 240 / max(float((high - low).max()), 1e-9)
-    index, _ = depth_buffer((flat - low) * scale, depth, tuple(np.ceil((high - low) * scale).astype(int) + 1))
+    index, low, high, scale = _raster(flat, depth, _LABEL_PIXELS)
     shown = np.where(index >= 0, geometry.shape[np.maximum(index, 0)], -1)
     places = {}
     for number, name in enumerate(geometry.names):
         if name in verdicts and (shown == number).any():
             inside = distance_transform_edt(np.pad(shown == number, 1))[1:-1, 1:-1]
-            row, column = np.unravel_index(
-                int(inside.argmax()), inside.shape
-            )  # the point farthest from the edges of the feature
+            # the point farthest from the edges of the feature
+            row, column = np.unravel_index(int(inside.argmax()), inside.shape)
             places[name] = low + np.array([column, row]) / scale
     order = sorted(places, key=lambda name: (-list(VERDICTS).index(verdicts[name]), places[name][0]))  # worst first
     label_columns(axes, {name: places[name] for name in order}, low, high)

@@ -53,7 +53,19 @@ def preview_figure(
     visible: VisibleSurfaces,
     first: Sequence[str] = (),
 ) -> Figure:
-    """Draw both views with their legend; shapes named in ``first`` get the first colours, then the largest."""
+    """Draw both views with their legend.
+
+    Parameters
+    ----------
+    scene, facts
+        The loaded scene, and its shapes.
+    sensor, pose
+        The sensor, and world_from_sensor [mm].
+    visible
+        What the reference camera's pixels see.
+    first
+        Names of the shapes that get the first colours; the largest of the others follow.
+    """
     colours = _colours(facts, first)
     with drawing():
         camera = sensor.rig.reference
@@ -121,8 +133,7 @@ def _from_sensor(axes: Axes, colours: list[str], sensor: Sensor, visible: Visibl
         rows, columns = ((np.arange(count) - 1) * _STEP for count in region.shape)
         axes.contour(columns, rows, region, [0.5], colors=INK, linewidths=0.9, linestyles=style)
     height, width = visible.shape.shape
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     bare(axes)
     seen = visible.shape >= 0
     if seen.any():
@@ -161,8 +172,7 @@ def _from_above(
     image = _painted(shape, front, lit, colours, np.ones(size, bool))
     axes.imshow(image, extent=window, interpolation="antialiased", zorder=0)
     _outline(axes, facts, sensor, pose, window)
-    axes.set_xlim(left, right)
-    axes.set_ylim(bottom, top)
+    axes.set(xlim=(left, right), ylim=(bottom, top))
     bare(axes)
     length = round_length(0.3 * (right - left))
     place = (left + 0.04 * (right - left), bottom + 0.045 * (top - bottom))

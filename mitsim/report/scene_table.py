@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -76,9 +77,7 @@ def as_data(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[SceneFi
         "bounds_mm": facts.bounds.tolist(),
         "features": shapes,
         "emitters": [{"type": kind, "flux_w": _or_null(flux)} for kind, flux in facts.emitters],
-        "findings": [
-            {"severity": one.severity, "about": one.about, "what": one.what, "advice": one.advice} for one in found
-        ],
+        "findings": [asdict(one) for one in found],
     }
 
 

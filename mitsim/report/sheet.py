@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
@@ -20,9 +21,10 @@ from characterisation.files.atomic_io import atomic_write
 from characterisation.plots.style import INK, MUTED, drawing
 from mitsim.report.first_screen import FirstScreen, Tone, of_choice, of_run
 from mitsim.report.placement_figure import draw_placement
+from mitsim.report.pose_texts import angles_in_words, origin_text, pose_of_view
 from mitsim.report.statement_section import exposed_in_words
 from mitsim.running.numbers import listed, rounded, two_digits
-from mitsim.study.choice_document import CHOICE, ChoiceDocument, read_choice
+from mitsim.study.choice_document import CHOICE, ChoiceDocument, PoseEntry, read_choice
 from mitsim.study.run_folder import Run, read_run
 from mitsim.study.scene_geometry import SceneGeometry, read_scene_geometry
 from mitsim.study.statement_file import read_statement
@@ -99,13 +101,8 @@ def sheet_figure(sheet: Sheet, geometry: SceneGeometry | None) -> Figure:
         if sheet.missing:
             down.fact("Not included", listed(list(sheet.missing)))
         down.fact("Made with", sheet.versions)
-        figure.text(
-            _MARGIN / _WIDTH,
-            0.35 / _HEIGHT,
-            "Simulated: no real sensor has measured this part.",
-            fontsize=7.5,
-            color=MUTED,
-        )
+        down.place = 0.35
+        down.put(_MARGIN, "Simulated: no real sensor has measured this part.", fontsize=7.5, color=MUTED, va="baseline")
     return figure
 
 
@@ -114,6 +111,12 @@ class _Column:
 
     def __init__(self, figure: Figure) -> None:
         self.figure, self.place = figure, _HEIGHT - _MARGIN
+
+    def put(self, left: float, text: str, **style: Any) -> None:
+        """Write one line at a distance [in] from the left edge."""
+        style.setdefault("fontsize", 8.5)
+        style.setdefault("va", "top")
+        self.figure.text(left / _WIDTH, self.place / _HEIGHT, text, **style)
 
     def write(
         self,
@@ -126,15 +129,14 @@ class _Column:
         across: int = _ACROSS,
         line: float = _LINE,
     ) -> None:
+        """Write wrapped lines, and move down by each."""
         for one in textwrap.wrap(text, across) or [""]:
-            self.figure.text(
-                left / _WIDTH, self.place / _HEIGHT, one, fontsize=size, fontweight=weight, color=colour, va="top"
-            )
+            self.put(left, one, fontsize=size, fontweight=weight, color=colour)
             self.place -= line
 
     def fact(self, name: str, text: str) -> None:
         self.place -= 0.05
-        self.figure.text(_MARGIN / _WIDTH, self.place / _HEIGHT, name, fontsize=8.5, color=MUTED, va="top")
+        self.put(_MARGIN, name, color=MUTED)
         self.write(text, left=_MARGIN + 1.2, across=_ACROSS - 22)
 
 
@@ -158,22 +160,10 @@ def _table(down: _Column, first: FirstScreen) -> None:
     ]
     for number, cells in enumerate([head, *rows[:_MOST_ROWS]]):
         for left, text in zip(lefts, cells, strict=False):
-            colour = MUTED if number == 0 else INK
             weight = "bold" if number and first.tolerances and left == lefts[1] else "normal"
-            down.figure.text(
-                (_MARGIN + left) / _WIDTH,
-                down.place / _HEIGHT,
-                text,
-                fontsize=8.5,
-                va="top",
-                color=colour,
-                fontweight=weight,
-            )
+            down.put(_MARGIN + left, text, color=INK if number else MUTED, fontweight=weight)
         if number and first.tolerances:
-            colour = first.rows[number - 1].colour
-            down.figure.text(
-                (_MARGIN + lefts[1] - 0.14) / _WIDTH, down.place / _HEIGHT, "●", fontsize=8, va="top", color=colour
-            )
+            down.put(_MARGIN + lefts[1] - 0.14, "●", fontsize=8, color=first.rows[number - 1].colour)
         down.place -= _ROW
     if len(rows) > _MOST_ROWS:
         down.write(f"and {len(rows) - _MOST_ROWS} more: see the page", colour=MUTED)
@@ -185,16 +175,8 @@ def _of_run(run: Run, geometry: SceneGeometry | None) -> Sheet:
     facts = [("Part", run.about.scene)]
     missing = list[str]()
     if document is not None:
-        here = run.scores.sel(view=document.view)
-        angles = [f"{name} {rounded(float(here[f'{name}_deg']))}°" for name in ("azimuth", "elevation", "roll")]
-        place = ", ".join(rounded(float(x), 1) for x in here["world_from_sensor"].values[:3, 3])
-        facts.append(
-            (
-                "Pose",
-                f"view {document.view}: {', '.join(angles)}; the sensor’s origin at ({place}) mm in the "
-                "part’s frame; the full pose is in statement.json",
-            )
-        )
+        pose = pose_of_view(run, document.view)
+        facts.append(("Pose", f"{_placed(pose)}; {_origin(pose)}; the full pose is in statement.json"))
         facts.append(("Calibration", document.calibration))
         missing = [one.name for one in document.influences if not one.included]
     if "round" in run.about.lay.values():
@@ -214,22 +196,7 @@ def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: P
     missing = list[str]()
     if best is not None:
         for pose in best.poses:
-            place = ", ".join(rounded(row[3], 1) for row in pose.world_from_sensor[:3])
-            angles = [
-                f"{name} {rounded(angle)}°"
-                for name, angle in (
-                    ("azimuth", pose.azimuth_deg),
-                    ("elevation", pose.elevation_deg),
-                    ("roll", pose.roll_deg),
-                )
-            ]
-            facts.append(
-                (
-                    "Pose",
-                    f"view {pose.view}: {', '.join(angles)}, {rounded(pose.standoff_mm)} mm away; the "
-                    f"sensor’s origin at ({place}) mm in the part’s frame",
-                )
-            )
+            facts.append(("Pose", f"{_placed(pose)}, {rounded(pose.standoff_mm)} mm away; {_origin(pose)}"))
         if best.capture is not None:
             times = listed([two_digits(1e3 * one) for one in best.capture.exposures_s])
             facts.append(("Exposures", f"{best.capture.images} images of {times} ms each"))
@@ -247,6 +214,14 @@ def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: P
     versions = f"mitsim {choice.mitsim}, seed {choice.seed}; {_digests(folder, (CHOICE,))}{digest}"
     title = f"{'No sensor' if best is None else best.name} measures {Path(choice.scene).stem}"
     return Sheet(title, first, facts, missing, versions)
+
+
+def _placed(pose: PoseEntry) -> str:
+    return f"view {pose.view}: {angles_in_words(pose)}"
+
+
+def _origin(pose: PoseEntry) -> str:
+    return f"the sensor’s origin at ({origin_text(pose, 1)}) mm in the part’s frame"
 
 
 def _digests(folder: Path, names: Sequence[str]) -> str:

@@ -8,18 +8,17 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
-from characterisation.plots.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing
+from characterisation.plots.style import BLUE, INK, MUTED, VERMILION, drawing
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
 from mitsim.capture.picture import STRETCH_EXPONENT
 from mitsim.maps.data_sheet import DataSheet, Recovery
-from mitsim.report.cloud_figures import REASONS
+from mitsim.report.cloud_figures import REASONS, draw_status
 from mitsim.report.style import plain_log
 from mitsim.running.numbers import two_digits
 from mitsim.sensor.preset_covariance import preset_covariance
@@ -42,9 +41,7 @@ def noise_figure(sheets: Sequence[DataSheet]) -> Figure:
                 axes.loglog(
                     known.distance_mm, known.sigma_mm, color=VERMILION, lw=1.1, label=_short(known.source), **mark
                 )  # type: ignore[arg-type]
-            axes.set_title(sheet.sensor.name)
-            axes.set_xlabel("distance [mm]")
-            axes.set_ylabel("sigma along V [mm]")
+            axes.set(title=sheet.sensor.name, xlabel="distance [mm]", ylabel="sigma along V [mm]")
             largest = np.nanmax([*spread, *(s for known in sheet.sensor.published_noise for s in known.sigma_mm)])
             axes.set_ylim(max(axes.get_ylim()[0], largest / 300), 2.5 * largest)
             _plain_ticks(axes, distance)
@@ -65,9 +62,7 @@ def residual_figure(sheets: Sequence[DataSheet]) -> Figure:
             axes.hist(found.values, bins=np.linspace(-reach, reach, 91).tolist(), density=True, color=BLUE, alpha=0.75)
             x = np.linspace(-reach, reach, 200)
             axes.plot(x, np.exp(-0.5 * (x / spread) ** 2) / (spread * math.sqrt(2 * math.pi)), color=INK, lw=0.9)
-            axes.set_yticks([])
-            axes.set_xlabel("residual along V [mm]")
-            axes.set_title(f"{sheet.sensor.name}, {found.distance:.0f} mm")
+            axes.set(yticks=[], xlabel="residual along V [mm]", title=f"{sheet.sensor.name}, {found.distance:.0f} mm")
             label = f"kurtosis {found.excess_kurtosis:+.2f}\n{found.independent} independent: p = {found.p_normal:.2g}"
             axes.text(0.02, 0.97, label, transform=axes.transAxes, va="top", fontsize=7, color=MUTED)
     return figure
@@ -75,8 +70,6 @@ def residual_figure(sheets: Sequence[DataSheet]) -> Figure:
 
 def gallery_figure(sensor: str, gallery: Sequence[tuple[str, Capture, PointCloud]]) -> Figure:
     """Draw the reference camera's brightened image of each finish, and beside it the status of each pixel."""
-    colours = ListedColormap([REASONS[status][1] for status in Status])
-    steps = BoundaryNorm(np.arange(len(Status) + 1) - 0.5, len(Status))
     with drawing():
         figure = Figure((3.3 * len(gallery), 5.6), layout="constrained")
         grid = np.asarray(figure.subplots(2, len(gallery), squeeze=False))
@@ -88,12 +81,10 @@ def gallery_figure(sensor: str, gallery: Sequence[tuple[str, Capture, PointCloud
             shown = np.clip((image - low) / max(high - low, 1e-9), 0, 1) ** STRETCH_EXPONENT
             upper.imshow(shown, cmap="gray", vmin=0, vmax=1)
             upper.set_title(finish)
-            lower.imshow(np.ma.masked_equal(cloud.status[cut], Status.NO_SURFACE), cmap=colours, norm=steps)
-            lower.set_facecolor(FIELD)
+            draw_status(lower, cloud.status[cut])
             present |= set(np.unique(cloud.status[cut]).tolist())
             for axes in (upper, lower):
-                axes.set_xticks([])
-                axes.set_yticks([])
+                axes.set(xticks=[], yticks=[])
         figure.suptitle(sensor, fontsize=10)
         legend = [Patch(facecolor=REASONS[Status(s)][1], label=REASONS[Status(s)][0]) for s in sorted(present)]
         figure.legend(handles=legend, loc="outside lower center", ncols=3, handlelength=1.1)

@@ -65,18 +65,18 @@ def _row(name: str, one: StatedMeasurement) -> dict[str, str]:
     known = one.bias is not None and one.standard_uncertainty is not None
     return {
         "name": name,
-        "bias": _number(one.bias, one.unit),
-        "bias_uncertainty": _number(one.bias_uncertainty, one.unit),
-        "uncertainty": _number(one.standard_uncertainty, one.unit),
-        "uncorrected": _number(math.hypot(one.bias or 0, one.standard_uncertainty or 0) if known else None, one.unit),
+        "bias": quantity(one.bias, one.unit),
+        "bias_uncertainty": quantity(one.bias_uncertainty, one.unit),
+        "uncertainty": quantity(one.standard_uncertainty, one.unit),
+        "uncorrected": quantity(math.hypot(one.bias or 0, one.standard_uncertainty or 0) if known else None, one.unit),
         "interval": _interval(one.interval, one.unit),
         "corrected": _interval(one.interval_corrected, one.unit),
         "without": percent(one.without_value),
-        "share": NONE if one.share_of_tolerance is None else percent(one.share_of_tolerance),
-        "tolerance": NONE if one.tolerance is None else quantity(one.tolerance, one.unit),
+        "share": percent(one.share_of_tolerance),
+        "tolerance": quantity(one.tolerance, one.unit),
         "verdict": one.verdict,
-        "repeatability": _number(one.repeatability, one.unit),
-        "after_four": _number(one.after_repeats.get("4"), one.unit),
+        "repeatability": quantity(one.repeatability, one.unit),
+        "after_four": quantity(one.after_repeats.get("4"), one.unit),
     }
 
 
@@ -103,11 +103,7 @@ def _budget_row(name: str, one: StatedMeasurement, groups: list[str]) -> dict[st
             continue
         ends = f"{two_digits(math.sqrt(line.low))} to {two_digits(math.sqrt(line.high))}"
         cells.append({"u": quantity(math.sqrt(line.variance), one.unit), "share": f"{percent(line.share)}; {ends}"})
-    return {"name": name, "cells": cells, "whole": _number(one.standard_uncertainty, one.unit)}
-
-
-def _number(value: float | None, unit: str) -> str:
-    return NONE if value is None else quantity(value, unit)
+    return {"name": name, "cells": cells, "whole": quantity(one.standard_uncertainty, one.unit)}
 
 
 def _interval(ends: tuple[float | None, float | None], unit: str) -> str:

@@ -13,9 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
@@ -79,6 +81,33 @@ def write_png(figure: Figure, path: Path, dpi: int = _DPI) -> Path:
     with atomic_write(path) as file:  # Pillow, given the file itself, would report "encoder error" on a full disk
         file.write_bytes(picture.getvalue())
     return path
+
+
+def colour_scale(figure: Figure, shown: Any, axes: Any, label: str, **options: Any) -> Colorbar:
+    """Add a colour scale without a frame, for values that may lie beyond its ends.
+
+    Parameters
+    ----------
+    figure, axes
+        The figure, and the axes beside which the scale lies.
+    shown
+        Image or other artist with the colours.
+    label
+        Quantity and unit.
+    options
+        Further arguments of :meth:`matplotlib.figure.Figure.colorbar`.
+    """
+    options.setdefault("extend", "both")
+    options.setdefault("pad", 0.01)
+    bar = figure.colorbar(shown, ax=axes, label=label, **options)
+    bar.outline.set_visible(False)  # type: ignore[operator]
+    return bar
+
+
+def pixel_axes(axes: Axes) -> None:
+    """Label the axes of an image of all pixels, and colour those without a value."""
+    axes.set_facecolor(FIELD)
+    axes.set(xlabel="column [px]", ylabel="row [px]")
 
 
 def plain_log(axis: Axis, few: bool = False) -> None:

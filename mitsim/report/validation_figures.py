@@ -9,7 +9,6 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from characterisation.maps.validation import Pair, within_limits
 from characterisation.plots.style import BLUE, VERMILION, drawing
@@ -31,12 +30,10 @@ def agreement_figure(pairs: Sequence[Pair]) -> Figure:
             top, middle, bottom = grid[:, column]
             top.set_title(f"|V| = {distance:g} mm")
             for axes, name in ((top, "fraction"), (middle, "sigma")):
-                _two(
-                    axes,
-                    incidence,
-                    [getattr(p.measured, name) for p in here],
-                    [getattr(p.predicted, name) for p in here],
-                )
+                measured = [getattr(pair.measured, name) for pair in here]
+                predicted = [getattr(pair.predicted, name) for pair in here]
+                axes.plot(incidence, measured, "o", ms=3.5, color=BLUE, label="captured")
+                axes.plot(incidence, predicted, "x", ms=4.5, mew=1.0, color=VERMILION, label="from the map")
                 axes.set_xlabel("incidence [deg]")
             top.set_ylim(-0.03, 1.06)
             _histograms(bottom, here)
@@ -46,11 +43,6 @@ def agreement_figure(pairs: Sequence[Pair]) -> Figure:
         grid[0, 0].legend(loc="lower left")
         figure.suptitle(finish_name(pairs[0].finish, pairs[0].roughness), fontsize=10)
     return figure
-
-
-def _two(axes: Axes, x: NDArray[np.float64], measured: list[float], predicted: list[float]) -> None:
-    axes.plot(x, measured, "o", ms=3.5, color=BLUE, label="captured")
-    axes.plot(x, predicted, "x", ms=4.5, mew=1.0, color=VERMILION, label="from the map")
 
 
 def _histograms(axes: Axes, pairs: Sequence[Pair]) -> None:

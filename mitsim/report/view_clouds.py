@@ -55,7 +55,7 @@ class ShownCloud:
 
 
 @dataclass(frozen=True)
-class Box:
+class CoordinateRaster:
     """Raster of coordinates: ``origin`` (3,) [mm] of step 0, and the ``step`` [mm] along all axes."""
 
     origin: Floats
@@ -66,14 +66,14 @@ class Box:
         return np.clip(np.rint((points - self.origin) / self.step), 0, LAST_STEP).astype("<u2")
 
 
-def box_around(clouds: Iterable[Floats]) -> Box:
+def box_around(clouds: Iterable[Floats]) -> CoordinateRaster:
     """Return the raster that encloses all points (n, 3) [mm]."""
     known = [places for places in clouds if len(places)]
     if not known:
-        return Box(np.zeros(3), 1.0)
+        return CoordinateRaster(np.zeros(3), 1.0)
     low = np.min([places.min(axis=0) for places in known], axis=0)
     high = np.max([places.max(axis=0) for places in known], axis=0)
-    return Box(low, max(float((high - low).max()), 1e-6) / LAST_STEP)
+    return CoordinateRaster(low, max(float((high - low).max()), 1e-6) / LAST_STEP)
 
 
 def choose_clouds(scores: xr.Dataset, available: Sequence[int], first: Sequence[int]) -> list[int]:
@@ -93,7 +93,17 @@ def choose_clouds(scores: xr.Dataset, available: Sequence[int], first: Sequence[
 
 
 def shown_cloud(cloud: PointCloud, part_from_sensor: Floats, features: Sequence[str], most: int) -> ShownCloud:
-    """Return at most ``most`` points of a cloud, evenly over its pixels; ``part_from_sensor`` (4, 4)."""
+    """Return points of a cloud, evenly over its pixels.
+
+    Parameters
+    ----------
+    cloud, part_from_sensor
+        The cloud, and the pose of its sensor, (4, 4) [mm].
+    features
+        Names of the features of the task.
+    most
+        Largest number of points.
+    """
     valid, stride = cloud.valid, 1.0
     rows, columns = np.nonzero(valid)
     while len(rows) > most:
@@ -127,7 +137,7 @@ def noise_ends(clouds: Mapping[int, ShownCloud]) -> tuple[float, float] | None:
     return (float(low), float(high)) if high > low else (float(low) / 1.1, float(low) * 1.1)
 
 
-def packed_cloud(cloud: ShownCloud, box: Box, ends: tuple[float, float] | None) -> str:
+def packed_cloud(cloud: ShownCloud, box: CoordinateRaster, ends: tuple[float, float] | None) -> str:
     """Return base64 of planes x, y, z (steps of the box), noise (0 to 254, log of ``ends`` [mm]), feature."""
     noise = np.full(len(cloud.sigma), UNKNOWN, np.uint8)
     if ends is not None:
@@ -138,22 +148,32 @@ def packed_cloud(cloud: ShownCloud, box: Box, ends: tuple[float, float] | None) 
     return packed(box.steps(cloud.points).T.tobytes() + noise.tobytes() + feature.tobytes())
 
 
-def packed_part(mesh: trimesh.Trimesh, box: Box) -> dict[str, Any]:
+def packed_part(mesh: trimesh.Trimesh, box: CoordinateRaster) -> dict[str, Any]:
     """Return the part for the page: ``vertices`` (planes x, y, z), ``normals`` (times 127), ``triangles`` (uint16).
 
     ``shown`` is the number of triangles on the page, ``count`` that of the part.
     """
-    vertices, triangles = fewer_triangles(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64))
-    merged = trimesh.Trimesh(vertices, triangles, process=True)
-    shaded = trimesh.graph.smooth_shade(merged, angle=CREASE)
-    normals = np.rint(127 * np.asarray(shaded.vertex_normals)).astype(np.int8)
+    shaded = smoothly_shaded(mesh)
     return {
         "vertices": packed(box.steps(np.asarray(shaded.vertices)).T.tobytes()),
-        "normals": packed(normals.T.tobytes()),
+        "normals": packed_normals(np.asarray(shaded.vertex_normals)),
         "triangles": packed(np.asarray(shaded.faces).astype("<u2").tobytes()),
         "shown": len(shaded.faces),
         "count": len(mesh.faces),
     }
+
+
+def smoothly_shaded(mesh: trimesh.Trimesh, most: int = MOST_TRIANGLES) -> trimesh.Trimesh:
+    """Return a surface with at most ``most`` triangles and vertex normals that are smooth except at creases."""
+    vertices, triangles = fewer_triangles(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64), most)
+    merged = trimesh.Trimesh(vertices, triangles, process=True)
+    shaded: trimesh.Trimesh = trimesh.graph.smooth_shade(merged, angle=CREASE)
+    return shaded
+
+
+def packed_normals(normals: Floats) -> str:
+    """Return base64 of unit normals (n, 3): planes x, y, z, times 127."""
+    return packed(np.rint(127 * normals).astype(np.int8).T.tobytes())
 
 
 def fewer_triangles(

@@ -53,6 +53,15 @@ def uncertainty_figure(scores: xr.Dataset, measurement: str, unit: str, checked:
     """Draw the predicted u of every view for one measurement, a disc for each roll, on a logarithmic scale.
 
     Bright is a small u. If views share a position, the best is on top.
+
+    Parameters
+    ----------
+    scores
+        Scores of a run, over ``view`` and ``measurement``.
+    measurement, unit
+        Name of the measurement, and its unit: mm or deg.
+    checked, best
+        Numbers of the views that were rendered, and of the best one; None if no view can make the measurement.
     """
     worst_first = np.argsort(-scores["uncertainty_rank"].sel(measurement=measurement).values, kind="stable")
     scores = scores.isel(view=worst_first)

@@ -16,16 +16,12 @@ finish returns:
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import math
-from pathlib import Path
 from typing import Any
-
-from markupsafe import Markup
 
 from characterisation.tasks.covariance import LEAST_CHANCE
 from mitsim.report import findings
+from mitsim.report.pose_texts import angle_texts, pose_of_view
+from mitsim.report.templates import joined_script, script_content
 from mitsim.report.view_data import as_json, solids, view_data
 from mitsim.running.numbers import NONE, count, percent, quantity, rounded, two_digits
 from mitsim.study.run_folder import Run, TriedEntry, ViewSetEntry
@@ -41,13 +37,10 @@ def view_sphere(run: Run) -> dict[str, Any]:
     """Return the content of the sphere's section for the template."""
     about = view_data(run)
     clouds, bodies = solids(run)
-    script = page_script()
     first = run.measurements[0] if run.measurements else ""
     return {
         "data": as_json(about | bodies),
         "clouds": clouds,
-        "script": Markup(script),
-        "policy": "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii"),
         "measurements": run.measurements,
         "first": first,
         "rows": _rows(run, first),
@@ -57,13 +50,12 @@ def view_sphere(run: Run) -> dict[str, Any]:
         "sets": [_set_words(run, entry) for entry in run.about.view_sets],
         "shown": bodies["shown"],
         "part": bodies["part"],
-    }
+    } | script_content(page_script())
 
 
 def page_script() -> str:
     """Return the one script of the page."""
-    parts = [(Path(__file__).parent / name).read_text(encoding="utf-8") for name in SCRIPTS]
-    return "(() => {\n'use strict';\n" + "\n".join(parts) + "})();\n"
+    return joined_script(SCRIPTS)
 
 
 def _rows(run: Run, name: str) -> list[dict[str, str]]:
@@ -75,19 +67,17 @@ def _rows(run: Run, name: str) -> list[dict[str, str]]:
     rows = list[dict[str, str]]()
     for i in findings.ranked_views(run.scores, name)[:TOP]:
         one = here.isel(view=int(i))
-        u = float(one["predicted_uncertainty"])
+        u, pose = float(one["predicted_uncertainty"]), pose_of_view(run, int(one["view"]))
         rows.append(
             {
                 "rank": str(len(rows) + 1),
-                "view": str(int(one["view"])),
+                "view": str(pose.view),
                 "uncertainty": quantity(u, entry.unit),
                 "ratio": two_digits(tolerance / u) if u > 0 else NONE,
                 "chance": percent(float(one["chance"])),
                 "score": rounded(float(one["V_m"]), 2),
-                "azimuth": f"{rounded(float(one['azimuth_deg']))}°",
-                "elevation": f"{rounded(float(one['elevation_deg']))}°",
-                "roll": f"{rounded(float(one['roll_deg']))}°",
-                "standoff": rounded(float(one["standoff_mm"])),
+                "standoff": rounded(pose.standoff_mm),
+                **angle_texts(pose),
             }
         )
     return rows
@@ -100,8 +90,7 @@ def _set_words(run: Run, entry: ViewSetEntry) -> dict[str, Any]:
         u = entry.uncertainty.get(name)
         reach = "" if entry.feasible.get(name, True) else ": not reached, even with all views together"
         lines.append(
-            f"{name}: {quantity(math.nan if u is None else u, unit)}, limit {quantity(limit, unit)}{reach}"
-            + _confirmed_words(entry, name)
+            f"{name}: {quantity(u, unit)}, limit {quantity(limit, unit)}{reach}" + _confirmed_words(entry, name)
         )
     minimal = "proven" if entry.exact else "not proven: a smaller set may exist"
     return {

@@ -41,16 +41,16 @@ def with_degree_signs(text: str) -> str:
     return re.sub(r"(?<=\d) deg\b", "°", text)
 
 
-def quantity(value: float, unit: str) -> str:
+def quantity(value: float | None, unit: str) -> str:
     """Write a quantity with two significant digits and its unit; a dash without a value."""
-    if not math.isfinite(value):
+    if value is None or not math.isfinite(value):
         return NONE
     return f"{two_digits(value)}°" if unit == "deg" else f"{two_digits(value)}{SPACE}{unit}"
 
 
-def percent(share: float) -> str:
-    """Write a share as a percentage, with one decimal below ten; 100 % is all of it."""
-    if not math.isfinite(share):
+def percent(share: float | None) -> str:
+    """Write a share as a percentage, with one decimal below ten; 100 % is all of it; a dash without a value."""
+    if share is None or not math.isfinite(share):
         return NONE
     if share == 0:
         return f"0{SPACE}%"

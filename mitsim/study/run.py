@@ -83,9 +83,9 @@ def run_study(
     Parameters
     ----------
     study
-        Study to run.
+        From :func:`mitsim.open_study`.
     folder
-        Folder of the run; created if it does not exist.
+        Where scores, poses, trials, clouds and the statement are kept.
     minutes
         Time limit of the race [min]; it replaces the limit in the study.
     workers
@@ -95,6 +95,13 @@ def run_study(
     -------
     list of Statement
         The statement of every measurement from the best view; empty if no view allows every measurement.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> stated = ms.run_study(ms.open_study("study.toml"), "run")  # doctest: +SKIP
+    >>> stated[0].measurement, stated[0].standard_uncertainty  # doctest: +SKIP
+    ('point1_point2_distance', 1.9)
     """
     session, clock = Session(study, folder, workers), _Clock()
     folder, twin = session.folder, session.renderer

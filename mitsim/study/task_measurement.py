@@ -282,7 +282,8 @@ def _pose(path: Path, matrix: Any) -> Transform:
         pose = Transform.from_matrix(np.array(matrix, float).reshape(4, 4))
     except (TypeError, ValueError):
         raise InputError(path, "world_from_sensor", repr(matrix)[:60], "a 4 x 4 matrix, rows first [mm]") from None
-    if not np.allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(pose.rotation) < 0:
+    orthogonal = np.allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-4)
+    if not orthogonal or np.linalg.det(pose.rotation) < 0 or not np.isfinite(pose.translation).all():
         raise InputError(
             path, "world_from_sensor", "a matrix that is not a rigid motion", "a rotation, and a translation in mm"
         )

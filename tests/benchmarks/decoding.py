@@ -16,10 +16,9 @@ import cv2
 import numpy as np
 
 from mitsim.decode.image_context import ImageContext
-from mitsim.decode.structured_light.decoder import decode_structured_light
+from mitsim.decode.structured_light.decoder import decode_coordinates, decode_structured_light
 from mitsim.decode.structured_light.geometry import structured_light_geometry
-from mitsim.decode.structured_light.gray_code import decode_gray_code
-from mitsim.decode.structured_light.phase_shift import decode_phase_shift, fit_phases
+from mitsim.decode.structured_light.phase_shift import fit_phases
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import GrayCode, PhaseShift, roles, value
@@ -113,17 +112,17 @@ def main() -> None:
     runs: dict[str, tuple[Callable[[], object], float]] = {
         "24 phase images, phase and modulation": (lambda: fit_phases(phase, shifts), 1),
         "24 phase images, coordinate": (
-            lambda: decode_phase_shift(phase, PHASE, PROJECTOR[0], SETTINGS, full_scale=255),
+            lambda: decode_coordinates(phase, PHASE, PROJECTOR, SETTINGS, full_scale=255),
             1,
         ),
         "24 phase images of 12 bit, coordinate": (
-            lambda: decode_phase_shift(deep, PHASE, PROJECTOR[0], SETTINGS, full_scale=4095),
+            lambda: decode_coordinates(deep, PHASE, PROJECTOR, SETTINGS, full_scale=4095),
             1,
         ),
         "24 phase images, cloud": (lambda: decode_structured_light(phase, geometry, "eye", PHASE, SETTINGS, about), 1),
         "24 phase images, plain numpy, coordinate": (lambda: naive_phase(phase), 1),
         "3 phase images, OpenCV, spatially unwrapped": (opencv_phase(phase), 1),
-        "22 Gray images, coordinate": (lambda: decode_gray_code(gray, GRAY, *PROJECTOR, SETTINGS, full_scale=255), 1),
+        "22 Gray images, coordinate": (lambda: decode_coordinates(gray, GRAY, PROJECTOR, SETTINGS, full_scale=255), 1),
         "22 Gray images, cloud": (lambda: decode_structured_light(gray, geometry, "eye", GRAY, SETTINGS, about), 1),
         "22 Gray images, plain numpy, coordinate": (lambda: naive_gray(gray), 1),
         "20 Gray images, OpenCV getProjPixel": (opencv_gray_pixels(gray), SHARE**2 / 2),
@@ -132,9 +131,9 @@ def main() -> None:
             1,
         ),
     }
-    ours = decode_phase_shift(phase, PHASE, PROJECTOR[0], SETTINGS, full_scale=255).value
+    ours = decode_coordinates(phase, PHASE, PROJECTOR, SETTINGS, full_scale=255)["columns"].value
     assert np.nanmax(np.abs(ours - naive_phase(phase))) < 1e-3
-    bits = decode_gray_code(gray, GRAY, *PROJECTOR, SETTINGS, full_scale=255)["columns"].value
+    bits = decode_coordinates(gray, GRAY, PROJECTOR, SETTINGS, full_scale=255)["columns"].value
     assert np.mean(np.abs(bits - naive_gray(gray)) <= 0.5) > 0.999
 
     times: dict[str, list[float]] = {name: [] for name in runs}

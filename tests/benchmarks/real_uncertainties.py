@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from two_rays import triangulate
 
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.coupon.view_frame import in_view_frame
@@ -30,7 +31,6 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.recordings.ensenso import read_ensenso
 from mitsim.decode.cloud import capture_cloud, decoder_settings
 from mitsim.decode.plate import Plate, image_on_grid, plate_dots, plate_scale
-from mitsim.decode.triangulate import triangulate
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.drift import Drift, drift_modes
 from mitsim.sensor.preset import load_sensor

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from characterisation.point_cloud import Status
-from mitsim.decode.structured_light.gray_code import decode_gray_code
-from mitsim.decode.structured_light.phase_shift import decode_phase_shift
+from mitsim.decode.structured_light.decoder import decode_coordinates
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_formation import expose
 from mitsim.sensor.light_code import GrayCode, PhaseShift, roles, value
@@ -72,9 +71,14 @@ def test_a_phase_at_a_corner_is_as_noisy_as_decoded_images(rng):
     light = np.stack([level * value(code, role, u) for role in every])
     stack = expose(light, sensor.imager, None, Noise.only("shot", "read", "quantisation"), rng)
     settings = DecoderSettings(near_mm=450, far_mm=1250)
-    found = decode_phase_shift(
-        stack, code, projector.width, settings, full_scale=sensor.imager.full_scale, imager=sensor.imager
-    )
+    found = decode_coordinates(
+        stack,
+        code,
+        (projector.width, projector.height),
+        settings,
+        full_scale=sensor.imager.full_scale,
+        imager=sensor.imager,
+    )["columns"]
     one = np.std((found.value - u)[found.status == Status.VALID])
     assert (found.status == Status.VALID).mean() > 0.99, np.unique(found.status)
     assert coordinate_noise(sensor, 700, 30.0) * np.sqrt(47.0**2 / 2) == pytest.approx(one, rel=0.1)
@@ -94,7 +98,7 @@ def test_a_line_fitted_to_stripes_is_better_than_a_stripe(rng):
         columns = np.arange(47) - 23.0
         u = 600 + rng.uniform(0, 8) + scale * rng.uniform(0.8, 1.25) * columns[None]
         stack = np.stack([200 * value(code, role, u) for role in every]).astype(np.float32)
-        found = decode_gray_code(stack, code, projector.width, projector.height, settings, full_scale=255)
+        found = decode_coordinates(stack, code, (projector.width, projector.height), settings, full_scale=255)
         errors.append(np.polyfit(columns, (found["columns"].value - u)[0], 1)[1])
     wanted = coordinate_noise(sensor, 700, 30.0)
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(wanted, rel=0.1)

@@ -14,11 +14,11 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.decode import coded_images
-from mitsim.decode.checks import image_sanity
 from mitsim.decode.checks.checked_cloud import checked_cloud
-from mitsim.decode.checks.rig_sanity import measured_row_error
-from mitsim.decode.checks.sanity import capture_findings, capture_warnings, cloud_warnings, row_error_in_words
+from mitsim.decode.checks.rig_sanity import measured_row_error, row_error_warnings
+from mitsim.decode.checks.sanity import code_findings, row_error_in_words
 from mitsim.decode.cloud import capture_cloud
+from mitsim.decode.coded_images import CodedImages
 from mitsim.decode.matching.stereo import stereo_geometry
 from mitsim.decode.structured_light import decoder, two_cameras
 from mitsim.decode.structured_light.decoder import decode_coordinates
@@ -102,8 +102,12 @@ def pair():
     return {"left": camera(), "right": camera(60.0, (0.0, -6.0, 0.0))}
 
 
+def capture_findings(capture, settings):
+    return code_findings(CodedImages.of(capture, settings), capture.rig, capture.source == "device")
+
+
 def said(capture, settings=SETTINGS):
-    return " | ".join(capture_warnings(capture, settings))
+    return " | ".join(capture_findings(capture, settings).warnings)
 
 
 def with_images(capture, order):
@@ -378,7 +382,7 @@ def test_rows_of_two_cameras_by_the_texture(off):
     cloud = PointCloud(points.astype(np.float32), status, geometry.grid, "rig", "device", geometry.baseline)
     found = measured_row_error((look(cameras["left"]), look(turned)), geometry, cloud)
     assert abs(found - off) < 0.1
-    assert bool(cloud_warnings(found)) == (abs(off) > 0.3)
+    assert bool(row_error_warnings(found)) == (abs(off) > 0.3)
 
 
 @pytest.mark.parametrize("paired", [False, True])
@@ -392,7 +396,7 @@ def test_cloud_and_checks_decode_the_images_once(monkeypatch, paired):
         stacks.append(stack.shape)
         return decode_coordinates(stack, *rest, **options)
 
-    for module in (coded_images, decoder, two_cameras, image_sanity):
+    for module in (coded_images, decoder, two_cameras):
         monkeypatch.setattr(module, "decode_coordinates", counted)
     decoded = checked_cloud(capture, settings, None)
     assert stacks == [stack.shape for stack in capture.images.values()]

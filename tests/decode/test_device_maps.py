@@ -11,9 +11,7 @@ from characterisation.point_cloud import Status, ViewGrid
 from characterisation.region_of_interest import Roi
 from mitsim.decode.device_maps import (
     camera_map_geometry,
-    decode_depth_map,
-    decode_disparity_map,
-    decode_point_map,
+    decode_device_map,
     disparity_map_geometry,
     roi_of_other_grid,
 )
@@ -48,7 +46,9 @@ def plane_depths(camera: Camera) -> np.ndarray:
 def test_depths_of_a_plane_become_points_of_the_plane(distortion, model):
     camera = Camera(K, distortion, WIDTH, HEIGHT, PLACE, model)
     depth = plane_depths(camera)
-    cloud = decode_depth_map(depth, camera_map_geometry(Rig({"camera": camera})), 1.0, 1e5, sensor="s", source="device")
+    cloud = decode_device_map(
+        "depth", depth, camera_map_geometry(Rig({"camera": camera})), (1.0, 1e5), sensor="s", source="device"
+    )
     assert cloud.valid.all()
     # rays of bent grids are kept in float32: 6e-8 of 600 mm
     np.testing.assert_allclose(cloud.points @ NORMAL, OFFSET, atol=5e-4)
@@ -60,7 +60,9 @@ def test_pixels_beyond_the_fold_of_the_distortion_are_left_out_with_their_reason
     camera = Camera(K, np.array([-1.5, 0, 0, 0, 0]), WIDTH, HEIGHT)
     depth = np.full((HEIGHT, WIDTH), 500.0, np.float32)
     depth[::3] = np.nan
-    cloud = decode_depth_map(depth, camera_map_geometry(Rig({"camera": camera})), 1.0, 1e5, sensor="s", source="device")
+    cloud = decode_device_map(
+        "depth", depth, camera_map_geometry(Rig({"camera": camera})), (1.0, 1e5), sensor="s", source="device"
+    )
     radius = np.linalg.norm((camera.pixel_grid() - K[:2, 2]) / [70.0, 72.0], axis=-1)
     assert (cloud.status[radius > 0.3145] == Status.UNCALIBRATED).all()
     assert cloud.valid[(radius < 0.314) & np.isfinite(depth)].all()
@@ -71,7 +73,9 @@ def test_what_is_missing_or_out_of_range_says_so():
     camera = Camera(K, np.zeros(5), WIDTH, HEIGHT)
     depth = np.full((HEIGHT, WIDTH), 500.0, np.float32)
     depth[0, 0], depth[1, 1], depth[2, 2] = np.nan, 299.0, 801.0
-    cloud = decode_depth_map(depth, camera_map_geometry(Rig({"c": camera})), 300.0, 800.0, sensor="s", source="device")
+    cloud = decode_device_map(
+        "depth", depth, camera_map_geometry(Rig({"c": camera})), (300.0, 800.0), sensor="s", source="device"
+    )
     assert cloud.status[0, 0] == Status.NO_SURFACE
     assert cloud.status[1, 1] == cloud.status[2, 2] == Status.OUT_OF_RANGE
     assert cloud.valid.sum() == WIDTH * HEIGHT - 3
@@ -85,7 +89,9 @@ def test_disparities_are_triangulated_with_the_offset_of_the_principal_points():
     rig = Rig({"left": Camera(K, np.zeros(5), WIDTH, HEIGHT)}, rectification=pair)
     disparity = np.full((HEIGHT, WIDTH), 3.0, np.float32)
     disparity[5, 6], disparity[7, 8] = np.nan, -12.5
-    cloud = decode_disparity_map(disparity, disparity_map_geometry(rig), 1.0, 1e5, sensor="s", source="device")
+    cloud = decode_device_map(
+        "disparity", disparity, disparity_map_geometry(rig), (1.0, 1e5), sensor="s", source="device"
+    )
     depth = 70.0 * 75.0 / (3.0 + 12.5)  # f B / (d + cx_right - cx_left)
     local = np.array([(50 - 31.0) / 70.0, (30 - 18.0) / 72.0, 1.0]) * depth
     np.testing.assert_allclose(cloud.points[30, 50], turn.T @ local, rtol=1e-6)
@@ -99,11 +105,11 @@ def test_points_are_taken_as_they_are(distortion, model):
     camera = Camera(K, distortion, WIDTH, HEIGHT, PLACE, model)
     geometry = camera_map_geometry(Rig({"camera": camera}))
     depth = plane_depths(camera)
-    points = decode_depth_map(depth, geometry, 1.0, 1e5, sensor="s", source="device").points
-    cloud = decode_point_map(points, geometry, 1.0, 1e5, sensor="s", source="device")
+    points = decode_device_map("depth", depth, geometry, (1.0, 1e5), sensor="s", source="device").points
+    cloud = decode_device_map("points", points, geometry, (1.0, 1e5), sensor="s", source="device")
     np.testing.assert_array_equal(cloud.points, points)
     middle = float(np.median(depth))
-    cut = decode_point_map(points, geometry, middle, 1e5, sensor="s", source="device")
+    cut = decode_device_map("points", points, geometry, (middle, 1e5), sensor="s", source="device")
     # at the median itself float32 decides
     np.testing.assert_array_equal(cut.valid[depth > middle * (1 + 1e-6)], True)
     np.testing.assert_array_equal(cut.valid[depth < middle * (1 - 1e-6)], False)
@@ -114,8 +120,8 @@ def test_a_window_is_cut_out_of_the_whole(distortion, model):
     camera = Camera(K, distortion, WIDTH, HEIGHT, PLACE, model)
     geometry, depth = camera_map_geometry(Rig({"camera": camera})), plane_depths(camera)
     roi = Roi.between(7, 11, 33, 29)
-    whole = decode_depth_map(depth, geometry, 1.0, 1e5, sensor="s", source="device")
-    part = decode_depth_map(depth, geometry, 1.0, 1e5, sensor="s", source="device", roi=roi)
+    whole = decode_device_map("depth", depth, geometry, (1.0, 1e5), sensor="s", source="device")
+    part = decode_device_map("depth", depth, geometry, (1.0, 1e5), sensor="s", source="device", roi=roi)
     inside = np.zeros((HEIGHT, WIDTH), bool)
     inside[11:29, 7:33] = True
     np.testing.assert_array_equal(part.points[inside], whole.points[inside])
@@ -125,9 +131,9 @@ def test_a_window_is_cut_out_of_the_whole(distortion, model):
 def test_maps_of_another_size_are_refused():
     geometry = camera_map_geometry(Rig({"c": Camera(K, np.zeros(5), WIDTH, HEIGHT)}))
     with pytest.raises(InputError, match="60 x 40 px, as the calibration says"):
-        decode_depth_map(np.ones((4, 4)), geometry, 1.0, 2.0, sensor="s", source="device")
+        decode_device_map("depth", np.ones((4, 4)), geometry, (1.0, 2.0), sensor="s", source="device")
     with pytest.raises(InputError, match="map of points: size: found 4 x 4 px"):
-        decode_point_map(np.ones((4, 4, 3)), geometry, 1.0, 2.0, sensor="s", source="device")
+        decode_device_map("points", np.ones((4, 4, 3)), geometry, (1.0, 2.0), sensor="s", source="device")
 
 
 def test_a_window_of_another_grid_holds_all_that_it_shows(rng):

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.structured_light.gray_code import binary_of_gray, decode_gray_code, decode_gray_code_phase_shift
-from mitsim.decode.structured_light.phase_shift import phase_noise
+from mitsim.decode.structured_light.decoder import decode_coordinates
+from mitsim.decode.structured_light.gray_code import binary_of_gray
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, roles, value
 
@@ -35,7 +35,7 @@ def draw(code, u, v, dtype=np.uint8, scale=1):
 
 
 def decode(stack, code, full_scale=255, settings=SETTINGS):
-    return decode_gray_code(stack, code, WIDTH, HEIGHT, settings, full_scale=full_scale)
+    return decode_coordinates(stack, code, (WIDTH, HEIGHT), settings, full_scale=full_scale)
 
 
 @given(st.lists(st.integers(0, 2**16 - 1), min_size=1))
@@ -130,7 +130,7 @@ def test_fringes_with_gray_orders_are_exact(complementary, thresholds, mean, con
         contrast=contrast,
     )
     u, v = coordinates(rng)
-    found = decode_gray_code_phase_shift(draw(code, u, v, float), code, WIDTH, HEIGHT, SETTINGS, full_scale=255)
+    found = decode_coordinates(draw(code, u, v, float), code, (WIDTH, HEIGHT), SETTINGS, full_scale=255)["columns"]
     assert (found.status == Status.VALID).all()
     assert np.abs(found.value - u).max() < 1e-5
 
@@ -153,7 +153,7 @@ def test_the_complementary_bit_keeps_the_edges_of_the_fringes(rng):
                 )
             ]
         )
-        found = decode_gray_code_phase_shift(stack, code, WIDTH, HEIGHT, SETTINGS, full_scale=255)
+        found = decode_coordinates(stack, code, (WIDTH, HEIGHT), SETTINGS, full_scale=255)["columns"]
         wrong[complementary] = np.mean(~(np.abs(found.value - u) < 8))
     assert wrong[True] == 0
     # |shift| is 1/4 px in the mean, and an edge comes every 16 px: 1/64 of 4800 pixels, +- 4 sigma
@@ -165,7 +165,7 @@ def test_a_phase_that_contradicts_the_gray_code_is_refused(rng):
     stack = draw(code, u, v)
     fringes = slice(-4, None)
     stack[fringes, :30] = draw(code, u + 10, v)[fringes, :30]  # half a fringe elsewhere
-    found = decode_gray_code_phase_shift(stack, code, WIDTH, HEIGHT, SETTINGS, full_scale=255)
+    found = decode_coordinates(stack, code, (WIDTH, HEIGHT), SETTINGS, full_scale=255)["columns"]
     # refused where the phase is 3/8 to 5/8 of a period from the stripe's centre; the stripe is +-1/4 wide: half of them
     assert abs(np.mean(found.status[:30] == Status.PHASE_INCONSISTENT) - 0.5) < 4 * np.sqrt(0.25 / 2400)
     assert (found.status[30:] == Status.VALID).all()
@@ -174,8 +174,8 @@ def test_a_phase_that_contradicts_the_gray_code_is_refused(rng):
 def test_quantisation_enters_as_the_closed_form_says(rng):
     code, (u, v) = GrayCodePhaseShift(period_px=20, steps=8), coordinates(rng)
     stack = draw(code, u, v)
-    found = decode_gray_code_phase_shift(stack, code, WIDTH, HEIGHT, SETTINGS, full_scale=255)
-    expected = 20 / (2 * np.pi) * phase_noise(8, np.sqrt(1 / 12), 1.0) / found.modulation
+    found = decode_coordinates(stack, code, (WIDTH, HEIGHT), SETTINGS, full_scale=255)["columns"]
+    expected = 20 / (2 * np.pi) * np.sqrt(2 / 8 / 12) / found.modulation
     assert np.isclose(((found.value - u) / expected).std(), 1, rtol=0.05)  # 4800 pixels: standard error 1 %
 
 

@@ -8,7 +8,8 @@ import pytest
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.decode.cloud import capture_cloud
-from mitsim.decode.noise import known_noise, sigma_source
+from mitsim.decode.coded_images import decoded_once
+from mitsim.decode.noise import sigma_source
 from mitsim.decode.structured_light.measured_noise import measured_noise
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -120,8 +121,7 @@ def test_points_scatter_as_their_sigma_says(pair, rng):
         decoding=Decoding(pattern=code),
     )
     settings = DecoderSettings(near_mm=50, far_mm=20000, triangulate="cameras" if pair else "projector")
-    noise = known_noise(capture, None)
-    cloud = capture_cloud(capture, settings, imager=noise)
+    cloud, _, noise = decoded_once(capture, settings, None)
     inner = cloud.valid & np.isfinite(cloud.sigma)
     rays = cloud.points[inner] / np.linalg.norm(cloud.points[inner], axis=1, keepdims=True)
     off = (cloud.points[inner, 2] - 500.0) / rays[:, 2]

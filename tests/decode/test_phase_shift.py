@@ -8,22 +8,40 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.special import erfc
 from scipy.stats import norm
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.structured_light.phase_shift import decode_phase_shift, fit_phases, phase_noise
+from mitsim.decode.structured_light.decoder import decode_coordinates
+from mitsim.decode.structured_light.phase_shift import fit_phases
 from mitsim.decode.structured_light.projector_gamma import correct_phase, estimate_gamma, harmonic_ratio
-from mitsim.decode.structured_light.unwrapping import failure_rate, unwrap, unwrapping_path
+from mitsim.decode.structured_light.unwrapping import unwrap, unwrapping_path
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import PhaseShift, roles, value
 
 EXTENT = 1024
+SIZE = (EXTENT, EXTENT)
 SETTINGS = DecoderSettings(near_mm=300, far_mm=900)
 HIERARCHICAL = PhaseShift(periods_px=[1100, 150, 20], steps=8)
 HETERODYNE = PhaseShift(periods_px=[EXTENT / 45, EXTENT / 49.5, EXTENT / 50], steps=[4, 4, 6])
 U = np.linspace(3, EXTENT - 4, 200 * 150).reshape(150, 200)
+
+
+def phase_noise(steps: int, sigma_i: float, modulation: float) -> float:
+    """Return the expected standard deviation of an N-step phase [rad], for noise sigma_I and modulation B [DN]."""
+    return float(np.sqrt(2.0 / steps) * sigma_i / modulation)
+
+
+def failure_rate(path, relative_noise: float) -> float:
+    """Return the expected share of pixels with a wrong fringe order.
+
+    ``relative_noise`` is sigma_I / B of Gaussian noise. Each step fails with P = erfc(0.5 / (sqrt(2) sigma)). Here
+    sigma is the noise of its residual [cycles]. The sum over the steps is an upper bound, and close to the true rate
+    while P is small. Rejected pixels are not considered.
+    """
+    return float(min(1.0, sum(erfc(0.5 / (np.sqrt(2) * gain * relative_noise)) for gain in path.noise)))
 
 
 def draw(code, u=U, offset=20.0, height=200.0):
@@ -62,7 +80,7 @@ def test_shifts_need_not_be_equidistant(rng):
 
 @pytest.mark.parametrize("code", [HIERARCHICAL, HETERODYNE], ids=["hierarchical", "heterodyne"])
 def test_without_noise_the_coordinate_is_exact(code):
-    found = decode_phase_shift(draw(code), code, EXTENT, SETTINGS, full_scale=255)
+    found = decode_coordinates(draw(code), code, SIZE, SETTINGS, full_scale=255)["columns"]
     assert (found.status == Status.VALID).all()
     assert np.abs(found.value - U).max() < 1e-5
     assert np.isnan(found.sigma).all()
@@ -74,7 +92,7 @@ def test_whole_grey_levels_cost_what_quantisation_must(bits, rng):
     full = 2**bits - 1
     images = draw(HIERARCHICAL, height=200 * full / 255, offset=rng.uniform(10, 30, U.shape) * full / 255)
     images = np.rint(images).astype(np.uint8 if bits == 8 else np.uint16)
-    found = decode_phase_shift(images, HIERARCHICAL, EXTENT, SETTINGS, full_scale=full)
+    found = decode_coordinates(images, HIERARCHICAL, SIZE, SETTINGS, full_scale=full)["columns"]
     modulation, error = 100 * full / 255, found.value - U
     expected = 20 / (2 * np.pi) * phase_noise(8, np.sqrt(1 / 12), modulation)
     assert np.isclose(error.std(), expected, rtol=0.05)  # 30000 pixels: standard error 0.4 %
@@ -92,7 +110,7 @@ def test_noise_is_that_of_the_closed_form(steps, signal, rng):
     u = np.linspace(3, EXTENT - 4, 60000).reshape(200, 300)
     electrons = rng.poisson(draw(code, u, 0.1 * signal, signal)) + rng.normal(0, 12, (4 * steps, *u.shape))
     images = np.rint(electrons * imager.gain + imager.black_level).astype(np.uint16)
-    found = decode_phase_shift(images, code, EXTENT, SETTINGS, full_scale=4095, imager=imager)
+    found = decode_coordinates(images, code, SIZE, SETTINGS, full_scale=4095, imager=imager)["columns"]
     valid = found.status == Status.VALID
     assert valid.mean() > 0.9999  # a quarter of a cycle is 5.7 sigma at the faintest
     level = 0.6 * signal
@@ -159,7 +177,7 @@ def test_k_sigma_refuses_what_the_normal_distribution_says(rng):
 def test_at_the_ends_of_a_period_as_long_as_the_projector_nothing_is_guessed():
     code = PhaseShift(periods_px=[EXTENT, 128, 16], steps=4)
     u = np.arange(EXTENT, dtype=float)[None]
-    found = decode_phase_shift(draw(code, u), code, EXTENT, SETTINGS, full_scale=255)
+    found = decode_coordinates(draw(code, u), code, SIZE, SETTINGS, full_scale=255)["columns"]
     assert (found.status[0, [0, -1]] == Status.PHASE_INCONSISTENT).all()
     assert (found.status[0, 1:-1] == Status.VALID).all()
 
@@ -195,7 +213,7 @@ def test_each_reason_is_told(reason):
     else:  # another surface's light in the middle period
         images[(slice(8, 16), *spot)] = images[(slice(8, 16), *spot)][::-1]
         expected = Status.PHASE_INCONSISTENT
-    found = decode_phase_shift(images, HIERARCHICAL, EXTENT, SETTINGS, full_scale=255)
+    found = decode_coordinates(images, HIERARCHICAL, SIZE, SETTINGS, full_scale=255)["columns"]
     outside = np.ones(U.shape, bool)
     outside[spot] = False
     assert (found.status[outside] == Status.VALID).all()
@@ -229,9 +247,9 @@ def test_the_ratio_of_the_harmonics_is_pans():
 def test_a_whole_decoding_corrects_gamma_on_request():
     bent = draw(HIERARCHICAL, offset=0, height=1)
     images = 20 + 200 * bent**2.2
-    plain = decode_phase_shift(images, HIERARCHICAL, EXTENT, SETTINGS, full_scale=255)
+    plain = decode_coordinates(images, HIERARCHICAL, SIZE, SETTINGS, full_scale=255)["columns"]
     asked = SETTINGS.model_copy(update={"correct_gamma": True})
-    right = decode_phase_shift(images, HIERARCHICAL, EXTENT, asked, full_scale=255)
+    right = decode_coordinates(images, HIERARCHICAL, SIZE, asked, full_scale=255)["columns"]
     assert np.nanmax(np.abs(right.value - U)) < 0.1 * np.nanmax(np.abs(plain.value - U)) < 0.1
 
 
@@ -249,7 +267,7 @@ def test_what_cannot_be_decoded_is_refused(change, message):
     stack, extent, full_scale = np.zeros((24, 5, 5), np.uint8), EXTENT, 255
     stack, extent, full_scale = ({"stack": stack, "extent": extent, "full_scale": full_scale} | change).values()
     with pytest.raises(InputError, match=message):
-        decode_phase_shift(stack, HIERARCHICAL, extent, SETTINGS, full_scale=full_scale)
+        decode_coordinates(stack, HIERARCHICAL, (extent, extent), SETTINGS, full_scale=full_scale)
 
 
 def test_gamma_needs_five_steps_and_fringes():

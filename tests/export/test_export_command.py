@@ -66,7 +66,7 @@ def test_a_cloud_without_points_is_written(tmp_path, suffix):
         (["-o", "out.ply", "--in", "world"], "--in: found 'world'; allowed: sensor or part"),
         (["-o", "out.ply", "--unit", "inch"], "--unit: found 'inch'"),
         (["-o", "out.ply", "--pose", "none.json"], "none.json"),
-        (["-o", "out.ply", "--pose", "bent.json"], "not a rotation"),
+        (["-o", "out.ply", "--pose", "bent.json"], "not a rigid motion"),
     ],
 )
 def test_bad_options_of_a_cloud_are_told(tmp_path, monkeypatch, options, message):

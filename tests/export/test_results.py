@@ -18,7 +18,7 @@ from characterisation.files.errors import InputError
 from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.task_reading import read_task
 from mitsim.report.export.qif import NAMESPACE, write_qif
-from mitsim.report.export.results import Result, RunResults, read_results, write_results_csv, write_results_json
+from mitsim.report.export.results import ExpectedResult, RunResults, read_results, write_results_csv, write_results_json
 
 from .known_cloud import POSE
 
@@ -83,7 +83,7 @@ def every_kind(tmp_path_factory):
     path.write_text("\n".join(lines))
     task = read_task(path)
     results = [
-        Result(
+        ExpectedResult(
             name,
             m.kind,
             m.features,

@@ -12,7 +12,7 @@ from report.view_sphere_run import write_expecting_run
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
-from mitsim.report.export.robot_targets import ROBOT_FORMATS, Target, kuka_numbers, read_targets
+from mitsim.report.export.robot_targets import ROBOT_FORMATS, RobotTarget, kuka_numbers, read_targets
 from mitsim.sensor.transforms import Transform
 
 from .known_cloud import POSE
@@ -27,7 +27,7 @@ def numbers(text):
 
 def line_of(robot, pose):
     """The line that a controller's file has for one pose."""
-    text = ROBOT_FORMATS[robot].write([Target("view_0001", pose)], "flange")
+    text = ROBOT_FORMATS[robot].write([RobotTarget("view_0001", pose)], "flange")
     (line,) = [line for line in text.splitlines() if "view_0001" in line]
     return line
 
@@ -52,7 +52,7 @@ def read_ur(line):
 
 
 def read_moveit(pose):
-    text = ROBOT_FORMATS["moveit"].write([Target("view_0001", pose)], "flange")
+    text = ROBOT_FORMATS["moveit"].write([RobotTarget("view_0001", pose)], "flange")
     (said,) = yaml.safe_load(text)["poses"].values()
     assert said["header"]["frame_id"] == "part"
     place, turn = said["pose"]["position"], said["pose"]["orientation"]

@@ -11,7 +11,7 @@ from mitsim.capture.devices.device_error import DeviceError
 from mitsim.capture.devices.grbl_reports import (
     ALARMS,
     ERRORS,
-    Status,
+    StatusReport,
     parse_refusal,
     parse_setting,
     parse_status,
@@ -21,9 +21,9 @@ from mitsim.capture.devices.grbl_reports import (
 
 def test_status_reports_of_the_manual_are_read():
     idle = parse_status("<Idle|MPos:0.000,-10.000,5.000|FS:0,0|WCO:0.000,1.551,5.664>")
-    assert idle == Status("Idle", "", (0, -10, 5), None, (0, 1.551, 5.664))
+    assert idle == StatusReport("Idle", "", (0, -10, 5), None, (0, 1.551, 5.664))
     held = parse_status("<Hold:0|WPos:-2.500,0.000,11.000|Bf:15,128|F:500|Pn:XP|Ov:100,100,100>")
-    assert held == Status("Hold", "0", None, (-2.5, 0, 11), None)
+    assert held == StatusReport("Hold", "0", None, (-2.5, 0, 11), None)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,8 @@ from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.recordings.recognise import ReadOptions, read_recording
-from mitsim.decode.checks.sanity import cloud_warnings, pair_row_error
+from mitsim.decode.checks.rig_sanity import row_error_warnings
+from mitsim.decode.checks.sanity import pair_row_error
 from mitsim.decode.cloud import capture_cloud, decoder_settings
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.matching.stereo import decode_stereo
@@ -185,4 +186,4 @@ def test_the_older_calibration_of_the_oak_is_told_by_its_rows(real_data, tmp_pat
     )
     found = pair_row_error(capture, cloud)
     assert found == pytest.approx(rows, abs=0.05)
-    assert len(cloud_warnings(found)) == (rows > 0.3)
+    assert len(row_error_warnings(found)) == (rows > 0.3)

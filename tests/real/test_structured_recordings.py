@@ -18,13 +18,15 @@ from mitsim.capture.grey_image import read_grey
 from mitsim.capture.recordings.image_folder import read_image_folder
 from mitsim.cli.program import app
 from mitsim.decode.checks.image_sanity import image_warnings
-from mitsim.decode.checks.sanity import capture_warnings
+from mitsim.decode.checks.sanity import code_findings
 from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.decode.coded_images import CodedImages
 from mitsim.decode.structured_light.decoder import decode_coordinates
 from mitsim.decode.structured_light.phase_shift import fit_phases
 from mitsim.decode.structured_light.projector_gamma import correct_phase, gamma_from_white
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
+from mitsim.sensor.light_code import roles
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform
 
@@ -183,6 +185,15 @@ def test_the_calibration_beside_the_recording_is_read_as_its_author_meant(procam
     np.testing.assert_allclose(projector.project(point), expected[:, 0], atol=2e-3)
 
 
+def capture_warnings(capture, settings):
+    return code_findings(CodedImages.of(capture, settings), capture.rig, recorded=True).warnings
+
+
+def warnings_of(stack, code, size, settings, full_scale, camera):
+    images = CodedImages({camera: stack[: len(roles(code, *size))]}, code, size, settings, full_scale, None, {})
+    return image_warnings(images, camera, images.coordinates[camera])
+
+
 def test_nothing_is_said_of_a_recording_that_is_right(procam, recorded):
     assert capture_warnings(recorded, procam[0].settings) == []
 
@@ -211,7 +222,7 @@ def test_a_calibration_of_other_captures_is_said(procam, recorded):
 def test_the_images_of_the_mugs_are_right(mugs):
     sensor, capture = mugs
     size = sensor.rig.projector.width, sensor.rig.projector.height
-    assert image_warnings(capture.images["camera"], sensor.pattern, size, sensor.settings, 255, "camera") == []
+    assert warnings_of(capture.images["camera"], sensor.pattern, size, sensor.settings, 255, "camera") == []
 
 
 def gray(axis, bits):
@@ -227,7 +238,7 @@ def test_the_images_of_binocular_gray_are_right_and_their_finest_bits_are_lost(r
 
     def said(groups, extent):
         code = ImageSequence(kind="image_sequence", images=groups)
-        return image_warnings(stack, code, (extent, extent), settings, 255, eye)
+        return warnings_of(stack, code, (extent, extent), settings, 255, eye)
 
     left_out = unused | {"count": 6}
     assert said([*begin, gray("columns", 9), left_out, gray("rows", 9), left_out], 512) == []
@@ -244,7 +255,7 @@ def test_the_automatic_exposure_of_pi_fringe_is_said(real_data):
     stack = np.stack([read_grey(folder / name, green=True) for name in names])
     groups = [gray(axis, 11) | {"first": "least_significant"} for axis in ("columns", "rows")]
     code = ImageSequence(kind="image_sequence", images=groups)
-    said = image_warnings(stack, code, (1280, 720), DecoderSettings(near_mm=50, far_mm=20000), 255, "camera")
+    said = warnings_of(stack, code, (1280, 720), DecoderSettings(near_mm=50, far_mm=20000), 255, "camera")
     assert len(said) == 2
     assert all("Check whether the exposure was automatic" in each for each in said)
 

@@ -243,7 +243,7 @@ def test_of_several_image_sets_one_is_chosen(tmp_path, form):
     other["2_150358_left.png"] = encode_png(255 - IMAGES[0])
     content = files(node()) | other
     path = unpack(tmp_path / "r", content) if form == "folder" else pack(tmp_path / "r.zip", content)
-    with pytest.raises(InputError, match=r"2 image sets: 1_150358, 2_150358.*--frame 0 to 1"):
+    with pytest.raises(InputError, match=r"2 image sets \(1_150358, 2_150358\).*--frame 0 to 1"):
         read_ensenso(path)
     np.testing.assert_array_equal(read_ensenso(path, frame=0).images["left"][0], IMAGES[0])
     second = read_ensenso(path, frame=1)

@@ -25,7 +25,7 @@ from mitsim.capture.recordings.ensenso import read_ensenso
 from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 from mitsim.capture.workspace import written_frame
 from mitsim.cli.program import app
-from mitsim.decode.device_maps import camera_map_geometry, decode_depth_map
+from mitsim.decode.device_maps import camera_map_geometry, decode_device_map
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, F, CX, CY = 80, 60, 66.0, 37.0, 31.0
@@ -165,7 +165,7 @@ def test_a_cloud_written_in_any_frame_is_the_cloud_that_was_written(tmp_path_fac
     rig = read_node(tmp_path_factory.mktemp("rig"), tree_of()).rig
     geometry = camera_map_geometry(rig)
     depth = np.where(rng.random((HEIGHT, WIDTH)) < 0.9, rng.uniform(400, 800, (HEIGHT, WIDTH)), np.nan)
-    cloud = decode_depth_map(depth.astype(np.float32), geometry, 300, 900, sensor="s", source="device")
+    cloud = decode_device_map("depth", depth.astype(np.float32), geometry, (300, 900), sensor="s", source="device")
     path = tmp_path_factory.mktemp("cloud") / "c.ply"
     write_cloud(cloud, path, WrittenFrame("of a robot", moved.matrix()))
     back = read_cloud(path)

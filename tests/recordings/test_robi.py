@@ -144,7 +144,7 @@ def test_one_command_from_the_scene_to_the_verdict(scene, tmp_path):
 def test_several_views_are_asked_about(scene):
     with pytest.raises(InputError, match="choose with --frame 0 to 1"):
         read_robi(scene)
-    with pytest.raises(InputError, match="0 to 1: views in the order"):
+    with pytest.raises(InputError, match=r"0 to 1: views of list\.txt, in their order"):
         read_robi(scene, frame=2)
 
 

@@ -23,7 +23,14 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.report import view_clouds
 from mitsim.report.page import _rolls, _standoffs, write_report
-from mitsim.report.view_clouds import Box, box_around, choose_clouds, fewer_triangles, packed_part, shown_cloud
+from mitsim.report.view_clouds import (
+    CoordinateRaster,
+    box_around,
+    choose_clouds,
+    fewer_triangles,
+    packed_part,
+    shown_cloud,
+)
 from mitsim.report.view_data import sites, target
 from mitsim.report.view_figures import uncertainty_figure
 from mitsim.report.view_sphere import LEAST_CHANCE, page_script, view_sphere
@@ -227,7 +234,7 @@ def test_a_box_holds_places_to_half_a_step():
     places = rng.uniform(-200, 300, (500, 3)) * [1, 0.1, 0.01]
     box = box_around([places, np.empty((0, 3))])
     assert np.abs(box.steps(places) * box.step + box.origin - places).max() <= 0.5001 * box.step
-    assert box_around([]) == Box(pytest.approx(np.zeros(3)), 1.0)
+    assert box_around([]) == CoordinateRaster(pytest.approx(np.zeros(3)), 1.0)
 
 
 def test_views_of_one_direction_share_a_site_and_the_target_is_where_axes_meet(data, expecting):

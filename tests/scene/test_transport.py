@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from benchmarks.two_rays import triangulate
 
 from characterisation.features.fits import fit_sphere
 from characterisation.region_of_interest import Roi
-from mitsim.decode.triangulate import triangulate
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.projector_light import ProjectedPatterns

@@ -18,7 +18,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from importlib import import_module
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -26,8 +25,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import MissingEnvironmentError
 from mitsim.capture.devices.depthai_settings import DepthaiSettings, configuration, configure
-from mitsim.capture.devices.device_error import DeviceError
-from mitsim.capture.devices.open_camera import check_open
+from mitsim.capture.devices.device_error import DeviceError, check_open
 
 Image = NDArray[np.unsignedinteger[Any]]
 
@@ -121,9 +119,7 @@ class DepthaiCamera:
     def __enter__(self) -> DepthaiCamera:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _light(self, dots: float, flood: float) -> None:

@@ -1,4 +1,4 @@
-"""The error of a connected device; the command line ends with exit code 3 on it."""
+"""The error of a connected device, on which the command line ends with exit code 3; and the check that it is open."""
 
 from __future__ import annotations
 
@@ -31,3 +31,16 @@ class DeviceError(MissingEnvironmentError):
     def __reduce__(self) -> tuple[Any, ...]:
         """Support pickling between processes."""
         return type(self), (self.where, self.what, self.found, self.expected, self.hint)
+
+
+def check_open(where: str, what: str, closed: bool, fault: str) -> None:
+    """Reject a camera that was closed, or that failed at ``fault`` ("" for no failure).
+
+    Raises
+    ------
+    DeviceError
+        Naming the rejected operation.
+    """
+    if closed or fault:
+        found = "a camera that was closed" if not fault else f"a camera that has failed, at {fault}"
+        raise DeviceError(where, what, found, "an open camera", "Open it again")

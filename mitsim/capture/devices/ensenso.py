@@ -19,7 +19,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from types import TracebackType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -28,9 +27,8 @@ from pydantic import Field
 
 from characterisation.files.documents import Document
 from characterisation.files.errors import MissingEnvironmentError
-from mitsim.capture.devices.device_error import DeviceError
+from mitsim.capture.devices.device_error import DeviceError, check_open
 from mitsim.capture.devices.ensenso_faults import fault_of, no_library
-from mitsim.capture.devices.open_camera import check_open
 
 Value = bool | int | float | str
 Images = NDArray[np.unsignedinteger[Any]]
@@ -162,9 +160,7 @@ class EnsensoCamera:
     def __enter__(self) -> EnsensoCamera:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _item(self, path: str) -> Any:

@@ -33,7 +33,7 @@ from mitsim.capture.devices.device_error import DeviceError
 from mitsim.capture.devices.grbl_reports import (
     IN_USE,
     STANDING,
-    Status,
+    StatusReport,
     is_welcome,
     parse_refusal,
     parse_setting,
@@ -224,7 +224,7 @@ class Grbl:
         self._rates, self._accelerations = tuple(rates), tuple(accelerations)
         self.resolution, self.travel = tuple(resolution), tuple(travel)
 
-    def _place(self) -> tuple[Status, tuple[float, ...]]:
+    def _place(self) -> tuple[StatusReport, tuple[float, ...]]:
         """Return a status report of a working stage, and the positions of its axes [own deg]."""
         for _ in range(REPORTS_FOR_OFFSET):
             status = self._status()
@@ -244,7 +244,7 @@ class Grbl:
                 return status, tuple(machine[column] for column in self._columns)
         raise self._fault("status (?)", "work positions without their offset (WCO)", "machine positions", "Set $10=1")
 
-    def _status(self) -> Status:
+    def _status(self) -> StatusReport:
         """Request a status report, and wait for it."""
         if stray := [line for line in self._line.unread().splitlines() if line.strip()]:
             for line in stray:

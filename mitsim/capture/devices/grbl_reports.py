@@ -76,7 +76,7 @@ _NUMBERED = re.compile(r"(error|ALARM):(\d{1,3})", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class Status:
+class StatusReport:
     """A status report: ``state`` and ``detail`` of ``Hold:0``; positions of all axes.
 
     ``machine`` is the position from the machine's zero, ``work`` from the work offset; a report has one of the two.
@@ -90,7 +90,7 @@ class Status:
     offset: tuple[float, ...] | None
 
 
-def parse_status(line: str) -> Status | None:
+def parse_status(line: str) -> StatusReport | None:
     """Parse ``<Idle|MPos:0.000,0.000,0.000|FS:0,0>``; None if it is not a status report."""
     if not (line.startswith("<") and line.endswith(">")):
         return None
@@ -107,7 +107,7 @@ def parse_status(line: str) -> Status | None:
                 return None
     if (known["MPos"] is None) == (known["WPos"] is None):
         return None
-    return Status(name, detail, known["MPos"], known["WPos"], known["WCO"])
+    return StatusReport(name, detail, known["MPos"], known["WPos"], known["WCO"])
 
 
 def parse_setting(line: str) -> tuple[int, float] | None:

@@ -13,7 +13,6 @@ others                    YAML, XML or JSON of OpenCV, ROS, Kalibr; .mat, .npz, 
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from characterisation.files.documents import Document, read_toml_table, validate
 from characterisation.files.errors import InputError
 from mitsim.capture.calibration import CalibrationDocument, rig_of
 from mitsim.capture.recordings.depthai_calibration import is_depthai_calibration, read_depthai_calibration
+from mitsim.capture.recordings.json_fields import parsed_json
 from mitsim.capture.recordings.nxlib_calibration import nxlib_rig
 from mitsim.capture.recordings.nxlib_tree import NxLibTree
 from mitsim.sensor.calibration_qualifiers import check_camera
@@ -101,10 +101,7 @@ def _read(source: str | Path, size: tuple[int, int] | None) -> Calibrated:
     if path.suffix.lower() != ".json":
         known = f".toml, .json, .yml, .yaml, .xml, .mat or .npz, or a preset: {', '.join(presets())}"
         raise InputError(path, "", f"the ending {path.suffix!r}", known)
-    try:
-        table = json.loads(read_bounded(path, "a calibration").decode("utf-8-sig"), parse_constant=lambda _: None)
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, "", f"text that is not JSON ({error})", "a calibration in JSON") from None
+    table = parsed_json(read_bounded(path, "a calibration"), path, "a calibration in JSON")
     if is_depthai_calibration(table):
         read = read_depthai_calibration(path)
         return Calibrated(read.rig(*size) if size else read.rig(), read.name)

@@ -14,7 +14,6 @@ extrinsics from one socket to the next, in centimetres -> rig in the frame of th
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.checked_files import read_bounded
-from characterisation.files.documents import shown
 from characterisation.files.errors import InputError
+from mitsim.capture.recordings.json_fields import JsonFields, parsed_json
 from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.png import LONGEST_SIDE_PX
@@ -85,53 +84,13 @@ def read_depthai_calibration(path: str | Path) -> DepthaiCalibration:
         If it is no such file, or a value is missing or invalid; the error names the field.
     """
     path = Path(path)
-    data = read_bounded(path, "a calibration.json of DepthAI")
-    try:
-        table = json.loads(data.decode("utf-8-sig"), parse_constant=lambda _: None)
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, "", f"text that is not JSON ({error})", "a calibration of DepthAI") from None
+    table = parsed_json(read_bounded(path, "a calibration.json of DepthAI"), path, "a calibration of DepthAI")
     if not is_depthai_calibration(table):
         raise InputError(path, "cameraData", "nothing", "a calibration of DepthAI, as saved from readCalibration2")
-    return _calibration(_Fields(table, path), path)
+    return _calibration(JsonFields(table, path), path)
 
 
-class _Fields:
-    """Values of a JSON table by path; errors name missing or invalid fields."""
-
-    def __init__(self, root: Any, path: Path, base: str = "") -> None:
-        self.root, self.path, self.base = root, path, base
-
-    def get(self, field: str) -> Any:
-        node = self.root
-        for key in field.split("."):
-            node = node.get(key) if isinstance(node, dict) else None
-        return node
-
-    def integer(self, field: str, low: int, high: int) -> int:
-        value = self.get(field)
-        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-            raise self.fault(field, f"a whole number, {low} to {high}")
-        return value
-
-    def numbers(self, field: str, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
-        try:
-            values = np.asarray(self.get(field))
-        except ValueError:
-            values = np.array(None)
-        fits = values.ndim == len(shape) and all(
-            wanted is None or wanted == found for wanted, found in zip(shape, values.shape, strict=True)
-        )
-        if values.dtype.kind not in "iuf" or not fits or not (np.abs(values.astype(float)) <= 1e9).all():
-            raise self.fault(field, " x ".join("n" if n is None else str(n) for n in shape) + " finite numbers")
-        return values.astype(np.float64)
-
-    def fault(self, field: str, allowed: str) -> InputError:
-        value = self.get(field)
-        found = "nothing" if value is None else shown(value, self.path)
-        return InputError(self.path, self.base + field, found, allowed)
-
-
-def _calibration(fields: _Fields, path: Path) -> DepthaiCalibration:
+def _calibration(fields: JsonFields, path: Path) -> DepthaiCalibration:
     entries = fields.get("cameraData")
     if isinstance(entries, dict):  # newer files have a map from the socket's number
         entries = [[int(key) if re.fullmatch("[0-9]{1,3}", key) else key, value] for key, value in entries.items()]
@@ -143,7 +102,7 @@ def _calibration(fields: _Fields, path: Path) -> DepthaiCalibration:
     cameras: dict[int, Camera] = {}
     steps: dict[int, tuple[int, Transform, NDArray[np.float64] | None]] = {}
     for socket, table in entries:
-        each = _Fields(table, path, f"cameraData.{socket}.")
+        each = JsonFields(table, path, f"cameraData.{socket}.")
         if not each.get("width") and not each.get("height"):
             continue  # a socket without a camera
         cameras[socket] = _camera(each)
@@ -167,7 +126,7 @@ def _calibration(fields: _Fields, path: Path) -> DepthaiCalibration:
     return DepthaiCalibration(cameras, left, right, motion, spec, name if isinstance(name, str) and name else "depthai")
 
 
-def _camera(each: _Fields) -> Camera:
+def _camera(each: JsonFields) -> Camera:
     width, height = (each.integer(side, 1, LONGEST_SIDE_PX) for side in ("width", "height"))
     matrix = each.numbers("intrinsicMatrix", (3, 3))
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or matrix[1, 0] != 0 or np.any(matrix[2] != [0, 0, 1]):
@@ -183,18 +142,15 @@ def _camera(each: _Fields) -> Camera:
     raise each.fault("distortionCoeff", "4 or more for a fisheye; 0, 4, 5, 8, 12 or 14 for a perspective lens")
 
 
-def _extrinsics(each: _Fields) -> Transform:
-    rotation = each.numbers("extrinsics.rotationMatrix", (3, 3))
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
-        raise each.fault("extrinsics.rotationMatrix", "a rotation matrix, by rows")
-    u, _, v = np.linalg.svd(rotation)  # stored in single precision: use the nearest exact rotation
+def _extrinsics(each: JsonFields) -> Transform:
+    rotation = each.rotation("extrinsics.rotationMatrix", 1e-3)
     translation = _translation(each, "extrinsics.translation")
     if translation is None:
         raise each.fault("extrinsics.translation", "x, y and z [cm]")
-    return Transform(np.asarray(u @ v), translation)
+    return Transform(rotation, translation)
 
 
-def _translation(each: _Fields, field: str) -> NDArray[np.float64] | None:
+def _translation(each: JsonFields, field: str) -> NDArray[np.float64] | None:
     """Return a translation [mm]; None if absent."""
     if not isinstance(each.get(field), dict):
         return None

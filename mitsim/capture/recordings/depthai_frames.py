@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.recordings.mcap_messages import mcap_messages
+from mitsim.capture.recordings.recording_files import chosen_frame
 from mitsim.sensor.png import LONGEST_SIDE_PX
 
 _IMG_FRAME = "dai.proto.img_frame.ImgFrame"
@@ -108,12 +109,8 @@ def _chosen(sequences: dict[str, list[int]], frame: int | None, where: Path) -> 
         places = [[place] * len(sequences) for place in range(min(map(len, sequences.values())))]
     if not places:
         raise InputError(where, "", "streams without a frame in common", "streams that were recorded together")
-    if frame is None and len(places) > 1:
-        allowed = f"one in a capture: choose 0 to {len(places) - 1}"
-        raise InputError(where, "--frame", f"{len(places)} frames", allowed)
-    if frame is not None and not 0 <= frame < len(places):
-        raise InputError(where, "--frame", str(frame), f"0 to {len(places) - 1}")
-    return dict(zip(sequences, places[frame or 0], strict=True)), len(places)
+    number = chosen_frame(frame, len(places), where, "frames")
+    return dict(zip(sequences, places[number], strict=True)), len(places)
 
 
 def _frame(file: Path, place: int, count: int) -> RecordedFrame:

@@ -30,7 +30,7 @@ from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import Image, decode_grey
 from mitsim.capture.recordings.nxlib_calibration import nxlib_rig, sensor_from_workspace
 from mitsim.capture.recordings.nxlib_tree import NxLibTree
-from mitsim.capture.recordings.recording_files import plain_name, recorded_files, recorded_names
+from mitsim.capture.recordings.recording_files import chosen_frame, plain_name, recorded_files, recorded_names
 
 _CALIB = "_calib.json"
 _WHAT = "an Ensenso recording: a zip, an .enscam or a folder"
@@ -130,17 +130,8 @@ def _image_set(path: Path, frame: int | None) -> _ImageSet:
             raise InputError(path, f"*_{side}.png", "no such file", "one in a recording", hint)
     if not bases:
         raise InputError(path, f"*{_CALIB}", "no such file", "one in a recording", hint)
-    if frame is None and len(bases) > 1:
-        shown = ", ".join(PurePosixPath(base).name for base in bases[:4])
-        raise InputError(
-            path,
-            f"*{_CALIB}",
-            f"{len(bases)} image sets: {shown}",
-            "one in a capture",
-            f"choose with --frame 0 to {len(bases) - 1}",
-        )
-    if frame is not None and not 0 <= frame < len(bases):
-        raise InputError(path, "--frame", frame, f"0 to {len(bases) - 1}: image sets in the order of their names")
+    shown = ", ".join(PurePosixPath(base).name for base in bases[:4])
+    number = chosen_frame(frame, len(bases), path, f"image sets ({shown})")
     strays = [
         name
         for name in names
@@ -155,7 +146,7 @@ def _image_set(path: Path, frame: int | None) -> _ImageSet:
             "complete image sets",
             hint,
         )
-    base = bases[frame or 0]
+    base = bases[number]
     left, right = (_of_side(path, base, side, names, hint) for side in ("left", "right"))
     if len(left) != len(right):
         raise InputError(path, f"{base}_*", f"{len(left)} left and {len(right)} right images", "as many of each")

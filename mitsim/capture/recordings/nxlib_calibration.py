@@ -124,11 +124,7 @@ def _camera_matrix(tree: NxLibTree, path: str) -> NDArray[np.float64]:
 
 
 def _rotation(tree: NxLibTree, path: str) -> NDArray[np.float64]:
-    rotation = tree.numbers(path, (3, 3)).T
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
-        raise tree.fault(path, "a rotation, stored by columns")
-    u, _, v = np.linalg.svd(rotation)  # stored in single precision: use the nearest exact rotation
-    return np.asarray(u @ v)
+    return tree.rotation(path, 1e-4, by_columns=True)
 
 
 def _distortion(tree: NxLibTree, path: str) -> NDArray[np.float64]:

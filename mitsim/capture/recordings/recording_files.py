@@ -141,6 +141,22 @@ def frame_of(given: int | str | None, path: Path, names: list[str] | None = None
     raise InputError(path, "--frame", repr(given), _readable(names) if names else "a number, from 0")
 
 
+def chosen_frame(frame: int | None, count: int, where: Path, what: str) -> int:
+    """Return the number of the chosen one of ``count`` frames, from 0; a single one need not be chosen.
+
+    Raises
+    ------
+    InputError
+        If there are several and none was chosen, or there is no such frame; ``what`` names them, in the plural.
+    """
+    if frame is None and count > 1:
+        allowed, hint = "one in a capture", f"choose with --frame 0 to {count - 1}"
+        raise InputError(where, "--frame", f"{count} {what}", allowed, hint)
+    if frame is not None and not 0 <= frame < count:
+        raise InputError(where, "--frame", frame, f"0 to {count - 1}: {what}, in their order")
+    return frame or 0
+
+
 def _readable(names: list[str]) -> str:
     """Return the readable frames in words: their numbers and names."""
     shown = ", ".join(f"{number} ({name})" for number, name in enumerate(names[:8]))

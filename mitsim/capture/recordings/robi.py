@@ -25,6 +25,8 @@ from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import read_grey
+from mitsim.capture.recordings.json_fields import nearest_rotation
+from mitsim.capture.recordings.recording_files import chosen_frame
 from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.transforms import Transform
@@ -69,13 +71,8 @@ def read_robi(
     views = read_bounded(folder / "list.txt").decode("utf-8", "replace").split()
     if not views:
         raise InputError(folder / "list.txt", "", "no view", "the names of the views, one per line: view_0")
-    if frame is None and len(views) > 1:
-        raise InputError(
-            folder, "views", f"{len(views)}", "one in a capture", f"choose with --frame 0 to {len(views) - 1}"
-        )
-    if frame is not None and not 0 <= frame < len(views):
-        raise InputError(folder, "--frame", frame, f"0 to {len(views) - 1}: views in the order of list.txt")
-    view, where = views[frame or 0], _calibrations(folder, calibration)
+    view = views[chosen_frame(frame, len(views), folder, "views of list.txt")]
+    where = _calibrations(folder, calibration)
     files = {
         "left": folder / "StereoPattern" / f"LEFT_{view}.bmp",
         "right": folder / "StereoPattern" / f"RIGHT_{view}.bmp",
@@ -191,9 +188,7 @@ def _pose(path: Path) -> Transform:
         matrix = np.array(json.loads(read_bounded(path))["cam_pose"], float).reshape(4, 4)
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(path, "cam_pose", f"invalid data ({error!r})", "16 numbers, rows first") from None
-    turn = matrix[:3, :3]
-    if not np.isfinite(matrix).all() or np.abs(turn @ turn.T - np.eye(3)).max() > _RIGID or np.linalg.det(turn) < 0:
+    turn = nearest_rotation(matrix[:3, :3], _RIGID) if np.isfinite(matrix).all() else None
+    if turn is None:
         raise InputError(path, "cam_pose", "a matrix that is not a rigid motion", "a rotation and a translation")
-    # stored with few digits: use the nearest rotation
-    u, _, vt = np.linalg.svd(turn)
-    return Transform(u @ vt, matrix[:3, 3])
+    return Transform(turn, matrix[:3, 3])

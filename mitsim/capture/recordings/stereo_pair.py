@@ -17,7 +17,7 @@ from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import CHANNELS, SUFFIXES, channel_name, is_colour, read_grey
 from mitsim.capture.recordings.calibration_file import camera_of, read_calibration
 from mitsim.capture.recordings.image_folder import size_of_images
-from mitsim.capture.recordings.recording_files import frame_of
+from mitsim.capture.recordings.recording_files import chosen_frame, frame_of
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.projector_images import counted
 
@@ -65,15 +65,7 @@ def read_stereo_pair(
         allowed = "as many of each, named after the camera: left_0.png, right_0.png"
         raise InputError(folder, "images", found, allowed, hint)
     known = [file.stem for file in files[names[0]]]
-    if frame is None and counts[0] > 1:
-        raise InputError(
-            folder,
-            "images",
-            f"{counts[0]} pairs",
-            "one in a capture",
-            f"choose with --frame 0 to {counts[0] - 1}, or {known[0]} to {known[-1]}",
-        )
-    number = frame_of(frame, folder, known) or 0
+    number = chosen_frame(frame_of(frame, folder, known), counts[0], folder, f"pairs, {known[0]} to {known[-1]}")
     chosen = {name: each[number] for name, each in files.items()}
     levels = {name: read_grey(file, channel=channel) for name, file in chosen.items()}
     first = levels[names[0]]

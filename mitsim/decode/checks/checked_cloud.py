@@ -12,18 +12,15 @@ from pathlib import Path
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Settings
+from mitsim.decode.checks.rig_sanity import Findings, row_error_warnings
 from mitsim.decode.checks.sanity import (
-    Findings,
-    cloud_warnings,
     code_findings,
     pair_row_error,
     row_error_in_words,
     uncalibrated_in_words,
 )
-from mitsim.decode.cloud import capture_cloud
-from mitsim.decode.coded_images import CodedImages
+from mitsim.decode.coded_images import decoded_once
 from mitsim.decode.depth_range import range_warning, surface_beyond
-from mitsim.decode.grey_levels import MeasuredNoise
 from mitsim.decode.noise import sigma_source
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.preset import Sensor, presets
@@ -67,17 +64,10 @@ def checked_cloud(
     InputError
         If the settings belong to another technology, or the capture is inconsistent.
     """
-    images = CodedImages.of(capture, settings, imager)
-    if images is None:
-        noise: Imager | MeasuredNoise | None = imager
-        found = Findings()
-        cloud = capture_cloud(capture, settings, imager=imager)
-    else:
-        noise = images.noise
-        cloud = capture_cloud(capture, settings, imager=noise, coordinates=images.coordinates)
-        found = code_findings(images, capture.rig, capture.source == "device")
+    cloud, images, noise = decoded_once(capture, settings, imager)
+    found = Findings() if images is None else code_findings(images, capture.rig, capture.source == "device")
     matched = pair_row_error(capture, cloud)
-    warnings = [*capture.settings.get("warnings", []), *found.warnings, *cloud_warnings(matched)]
+    warnings = [*capture.settings.get("warnings", []), *found.warnings, *row_error_warnings(matched)]
     if lost := uncalibrated_in_words(cloud):
         warnings.append(lost)
     beyond = surface_beyond(capture, cloud, settings)

@@ -11,22 +11,19 @@ quarter of the pixels one period off, and all are valid.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsim.decode.checks.code_lines import CodeLines
 from mitsim.decode.structured_light.gray_code import decode_stripes
 from mitsim.decode.structured_light.phase_shift import fit_phases
-from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis, Origin, Role, Wave, offset_in_pixels, origin_shift
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, LightCode
 
-Levels = NDArray[np.unsignedinteger[Any]]
 Floats = NDArray[np.float64]
 
 #: least number of edges, and least share of the changes of a stripe's number that are by one: along a surface one bit
@@ -53,7 +50,7 @@ _OTHER_ORIGIN: dict[Origin, Origin] = {"edge": "pixel", "pixel": "edge"}
 
 
 @dataclass(frozen=True)
-class Edges:
+class StripeEdges:
     """Fringes at the edges of Gray stripes along one axis.
 
     - ``by_one``: share of the changes of the stripe's number that are by one [1]; NaN if there are few.
@@ -73,18 +70,9 @@ class Edges:
         return self.by_one >= _BY_ONE
 
 
-def stripe_edges(
-    lines: Sequence[Levels],
-    code: LightCode,
-    image_roles: list[Role],
-    axis: Axis,
-    settings: DecoderSettings,
-    full_scale: float,
-) -> Edges | None:
-    """Return the fringes at the edges of Gray stripes; None if the axis has no Gray bits or no fringes.
-
-    ``lines``: images (P, n, W) of rows, and (P, H, m) of columns [DN].
-    """
+def stripe_edges(images: CodeLines, axis: Axis) -> StripeEdges | None:
+    """Return the fringes at the edges of Gray stripes; None if the axis has no Gray bits or no fringes."""
+    code, image_roles, full_scale = images.code, images.image_roles, images.full_scale
     gray = [role for role in image_roles if role.kind == "gray" and role.axis == axis]
     phases = [i for i, role in enumerate(image_roles) if role.kind == "phase" and role.axis == axis]
     if isinstance(code, GrayCode) or not gray or not phases:
@@ -93,13 +81,13 @@ def stripe_edges(
     periods = sorted({image_roles[i].index for i in phases})
     numbers = [[i for i in phases if image_roles[i].index == index] for index in periods]
     shifts = [np.array([image_roles[i].shift for i in each]) for each in numbers]
-    threshold = settings.minimum_modulation_dn * full_scale / 255
+    threshold = images.settings.minimum_modulation_dn * full_scale / 255
     found: list[tuple[Floats, Floats, Floats, Floats]] = []
-    for way, part in enumerate(lines):
+    for way, part in enumerate(images.lines):
         fitted = fit_phases(np.concatenate([part[each] for each in numbers]), shifts)
         white_minus_black = fitted.modulation[-1] / np.float32(code.contrast)
         middle = fitted.offset + np.float32(0.5 - code.mean) * white_minus_black
-        decoded = decode_stripes(part, image_roles, axis, settings.bit_share, (middle, white_minus_black))
+        decoded = decode_stripes(part, image_roles, axis, images.settings.bit_share, (middle, white_minus_black))
         clear = (decoded.number == decoded.neighbour) & (fitted.modulation.min(axis=0) > threshold)
         clear &= part[phases].max(axis=0) < full_scale
         number, turns = decoded.number.astype(float), fitted.phase.astype(float) / (2 * np.pi)
@@ -115,7 +103,7 @@ def stripe_edges(
         found.append((change[change != 0], position[at_edge], middle_cycles[:, at_edge], (step * change)[:, at_edge]))
     changes, positions, cycles, rises = (np.concatenate(each, axis=-1) for each in zip(*found, strict=True))
     enough = len(changes) >= _ENOUGH
-    return Edges(
+    return StripeEdges(
         float(np.mean(np.abs(changes) == 1)) if enough else float("nan"),
         positions,
         cycles,
@@ -124,7 +112,7 @@ def stripe_edges(
 
 
 @dataclass(frozen=True)
-class Fringes:
+class DescribedFringes:
     """Fringes of one period as the sensor file describes them: ``period`` [px] and ``shifts`` (N,) delta [rad]."""
 
     period: float
@@ -134,7 +122,7 @@ class Fringes:
 
 
 @dataclass(frozen=True)
-class Change:
+class FringeChange:
     """A change of the description of fringes: other ``wave``, ``at``, sign or order of the shifts, or 180 deg more."""
 
     wave: bool = False
@@ -148,7 +136,7 @@ class Change:
         """Return a weighted number of mistakes that the change corrects, to choose the simplest of those that fit."""
         return self.wave + self.reverse + 1.1 * self.negated + 2.0 * self.half_turn
 
-    def shifts(self, fringes: Fringes) -> Floats:
+    def shifts(self, fringes: DescribedFringes) -> Floats:
         """Return the shifts delta (N,) [rad] after the change."""
         wave = _OTHER_WAVE[fringes.wave] if self.wave else fringes.wave
         at = _OTHER_ORIGIN[fringes.at] if self.at else fringes.at
@@ -156,7 +144,7 @@ class Change:
         listed = (-listed if self.negated else listed)[:: -1 if self.reverse else 1]
         return np.asarray(listed + origin_shift(wave, at, fringes.period) + np.pi * self.half_turn)
 
-    def in_words(self, fringes: Fringes) -> str:
+    def in_words(self, fringes: DescribedFringes) -> str:
         """Return what to write in the sensor file."""
         parts = [
             (self.reverse, "the shifts in the reverse order"),
@@ -174,24 +162,25 @@ class Change:
 #: all changes of a description, the simplest first
 CHANGES = sorted(
     (
-        Change(wave=wave, negated=negated, reverse=reverse, half_turn=half_turn)
+        FringeChange(wave=wave, negated=negated, reverse=reverse, half_turn=half_turn)
         for wave, negated, reverse, half_turn in product((False, True), repeat=4)
     ),
     key=lambda change: change.mistakes,
 )
 
 
-def origin_in_words(edges: Edges, code: LightCode, image_roles: list[Role], axis: Axis, extent: int) -> str:
+def origin_in_words(edges: StripeEdges, images: CodeLines, axis: Axis) -> str:
     """Return a warning if fringes and Gray code of an axis do not count from one origin, or not in one direction.
 
-    ``extent`` of the projector along the axis [px]. "" if they agree, or the edges do not tell.
+    "" if they agree, or the edges do not tell.
     """
+    code, image_roles = images.code, images.image_roles
     every = described(code, image_roles, axis)
     if not edges.bits_fit or edges.cycles.shape[1] < _ENOUGH:
         return ""
     forward = edges.rising > 0.5
     measured = [
-        Deviation.of(edges.position, fringes.period, cycles if forward else -cycles)
+        PhaseDeviation.of(edges.position, fringes.period, cycles if forward else -cycles)
         for fringes, cycles in zip(every, edges.cycles, strict=True)
     ]
     if min(each.length for each in measured) < _CONCENTRATED:
@@ -209,8 +198,8 @@ def origin_in_words(edges: Edges, code: LightCode, image_roles: list[Role], axis
         None,
     )
     start = f"the fringes and the Gray code of the {axis} do not count from one origin"
-    if change != Change():
-        offset = _fitting_offset(edges, every, image_roles, axis, extent)
+    if change != FringeChange():
+        offset = _fitting_offset(edges, every, image_roles, axis, images.extent(axis))
         if offset is not None:
             return f"{start}: they fit if the Gray code has offset_px = {offset} in [pattern]"
     if change is None or any(each.unusual(edges, f, n) for each, f, n in zip(measured, every, needed, strict=True)):
@@ -221,7 +210,7 @@ def origin_in_words(edges: Edges, code: LightCode, image_roles: list[Role], axis
         )
         return f"{start}: they fit if the fringes of the {axis} have about {fitting}"
     change = replace(change, at=_half_a_pixel_off(edges, every, measured, needed))
-    if change == Change():
+    if change == FringeChange():
         return ""
     if change.reverse or change.negated:
         start = f"in the {axis}, the fringes move in the other direction than the Gray code"
@@ -233,10 +222,10 @@ def origin_in_words(edges: Edges, code: LightCode, image_roles: list[Role], axis
     return f'{start}: they fit if {where}, in a [pattern] of kind = "image_sequence"'
 
 
-def described(code: LightCode, image_roles: list[Role], axis: Axis) -> list[Fringes]:
+def described(code: LightCode, image_roles: list[Role], axis: Axis) -> list[DescribedFringes]:
     """Return the fringes of an axis as the sensor file describes them, from the longest period on."""
     groups = code.fringes(axis) if isinstance(code, ImageSequence) else []
-    out: list[Fringes] = []
+    out: list[DescribedFringes] = []
     for index in sorted({role.index for role in image_roles if role.kind == "phase" and role.axis == axis}):
         own = [role for role in image_roles if (role.kind, role.axis, role.index) == ("phase", axis, index)]
         wave: Wave = "cosine"
@@ -245,12 +234,12 @@ def described(code: LightCode, image_roles: list[Role], axis: Axis) -> list[Frin
             wave, at = groups[index].wave, groups[index].at
         elif not isinstance(code, ImageSequence | GrayCode):
             wave, at = code.wave, code.at
-        out.append(Fringes(own[0].period, np.array([role.shift for role in own]), wave, at))
+        out.append(DescribedFringes(own[0].period, np.array([role.shift for role in own]), wave, at))
     return out
 
 
 @dataclass(frozen=True)
-class Deviation:
+class PhaseDeviation:
     """Phase at the edges less that of their coordinate.
 
     ``cycles``: circular mean [cycles]. ``length`` of the mean of the unit vectors [1].
@@ -260,7 +249,7 @@ class Deviation:
     length: float
 
     @classmethod
-    def of(cls, position: Floats, period: float, cycles: Floats) -> Deviation:
+    def of(cls, position: Floats, period: float, cycles: Floats) -> PhaseDeviation:
         """Measure the deviation of ``cycles`` (n,) at edges ``position`` (n,) [px] of fringes of ``period`` [px]."""
         mean = np.mean(np.exp(2j * np.pi * (cycles - position / period)))
         return cls(float(np.angle(mean) / (2 * np.pi)), float(np.abs(mean)))
@@ -270,11 +259,11 @@ class Deviation:
         """Return the deviation from the nearest quarter turn [cycles]."""
         return self.cycles - round(4 * self.cycles) / 4
 
-    def error(self, edges: Edges) -> float:
+    def error(self, edges: StripeEdges) -> float:
         """Return the standard error of the mean [cycles]; of n angles it is sqrt(-2 ln length / n)."""
         return float(np.sqrt(-2 * np.log(self.length) / edges.position.size)) / (2 * np.pi)
 
-    def unusual(self, edges: Edges, fringes: Fringes, shifts: Floats) -> bool:
+    def unusual(self, edges: StripeEdges, fringes: DescribedFringes, shifts: Floats) -> bool:
         """Return whether neither another wave nor half a pixel nor the projector's gamma explains the deviation."""
         allowed = _UNUSUAL / fringes.period + 5 * self.error(edges) + gamma_error(edges, fringes.period, shifts)
         return abs(self.quarters_removed) > allowed
@@ -291,7 +280,9 @@ def _degrees(shifts: Floats) -> list[int]:
     return [int(each) % 360 for each in np.rint(np.degrees(shifts))]
 
 
-def _fitting_offset(edges: Edges, every: list[Fringes], image_roles: list[Role], axis: Axis, extent: int) -> str | None:
+def _fitting_offset(
+    edges: StripeEdges, every: list[DescribedFringes], image_roles: list[Role], axis: Axis, extent: int
+) -> str | None:
     """Return another usual offset of the Gray code with which it fits the fringes as they are described, or None.
 
     A whole number of quarter periods explains the same edges. It is the fringes that are then said to be wrong.
@@ -304,7 +295,7 @@ def _fitting_offset(edges: Edges, every: list[Fringes], image_roles: list[Role],
             continue
         position = edges.position + stated - offset
         deviations = [
-            Deviation.of(position, fringes.period, cycles).cycles
+            PhaseDeviation.of(position, fringes.period, cycles).cycles
             for fringes, cycles in zip(every, edges.cycles, strict=True)
         ]
         quarters = [4 * (offset - stated) / fringes.period for fringes in every]
@@ -313,7 +304,7 @@ def _fitting_offset(edges: Edges, every: list[Fringes], image_roles: list[Role],
     return None
 
 
-def gamma_error(edges: Edges, period: float, shifts: Floats) -> float:
+def gamma_error(edges: StripeEdges, period: float, shifts: Floats) -> float:
     """Return the largest mean phase error at the edges that the gamma of a projector causes [cycles].
 
     (1 + cos x)^gamma has harmonics c_n with c_(n+1) / c_n = (gamma - n) / (gamma + n + 1), by the binomial series. Of N
@@ -330,7 +321,9 @@ def gamma_error(edges: Edges, period: float, shifts: Floats) -> float:
     return common * ratio / (2 * np.pi)
 
 
-def _half_a_pixel_off(edges: Edges, every: list[Fringes], measured: list[Deviation], needed: list[Floats]) -> bool:
+def _half_a_pixel_off(
+    edges: StripeEdges, every: list[DescribedFringes], measured: list[PhaseDeviation], needed: list[Floats]
+) -> bool:
     """Return whether the edges show that the fringes count from the other of edge and pixel."""
     for fringes, deviation, shifts in zip(every, measured, needed, strict=True):
         error = deviation.error(edges) + gamma_error(edges, fringes.period, shifts)

@@ -14,23 +14,19 @@ one is preferred with which the coordinate rises along the image, as camera and 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.checks.fringe_origin import CHANGES, Change, described
-from mitsim.decode.structured_light.decoder import decode_coordinates
-from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.decode.checks.code_lines import CodeLines
+from mitsim.decode.checks.fringe_origin import CHANGES, FringeChange, described
 from mitsim.sensor.image_role import Axis
 from mitsim.sensor.image_sequence import FringeImages, ImageSequence
 from mitsim.sensor.light_code import GrayCode, LightCode, roles
 
-Levels = NDArray[np.unsignedinteger[Any]]
 Floats = NDArray[np.float64]
 
 #: pixels on either side of a jump that have to be smooth
@@ -46,46 +42,36 @@ _CONTRADICTED, _BETTER = 0.1, 0.3
 _STRICTER = 3.0
 
 
-def wave_in_words(
-    lines: Sequence[Levels],
-    code: LightCode,
-    size: tuple[int, int],
-    settings: DecoderSettings,
-    full_scale: float,
-    axis: Axis,
-) -> str:
-    """Return a warning if the fringes of an axis fit with another wave only, or "".
-
-    ``lines``: images (P, n, W) of rows, and (P, H, m) of columns [DN]. ``size`` (width, height) of the projector [px].
-    """
-    image_roles = roles(code, *size)
-    if isinstance(code, GrayCode) or any(role.kind == "gray" and role.axis == axis for role in image_roles):
+def wave_in_words(lines: CodeLines, axis: Axis) -> str:
+    """Return a warning if the fringes of an axis fit with another wave only, or ""."""
+    code, size = lines.code, lines.size
+    if isinstance(code, GrayCode) or any(role.kind == "gray" and role.axis == axis for role in lines.image_roles):
         return ""
-    extent = size[0] if axis == "columns" else size[1]
 
-    def tried(code: LightCode, settings: DecoderSettings = settings) -> _Trial:
-        parts = [decode_coordinates(part, code, size, settings, full_scale=full_scale)[axis] for part in lines]
-        rows, columns = ((each.value, each.status) for each in parts)
-        return _Trial.of([rows, (columns[0].T, columns[1].T)], extent, along=0 if axis == "columns" else 1)
+    def tried(variant: CodeLines) -> _Trial:
+        rows, columns = (part[axis] for part in variant.decoded())
+        parts = [(rows.value, rows.status), (columns.value.T, columns.status.T)]
+        return _Trial.of(parts, variant.extent(axis), along=0 if axis == "columns" else 1)
 
     try:
-        stated = tried(code)
+        stated = tried(lines)
         if stated.faults < _BETTER:
             return ""
-        trials = {change: tried(with_change(code, size, axis, change)) for change in CHANGES}
+        variants = {change: replace(lines, code=with_change(code, size, axis, change)) for change in CHANGES}
+        trials = {change: tried(variant) for change, variant in variants.items()}
     except InputError:
         return ""
     limit = min(_CONTRADICTED, stated.faults - _BETTER)
     fitting = [change for change, trial in trials.items() if trial.faults <= limit]
     if not fitting:
         return ""
-    strict = settings.model_copy(update={"consistency_sigma": settings.consistency_sigma / _STRICTER})
-    stricter = {change: tried(with_change(code, size, axis, change), strict).faults for change in fitting}
+    strict = lines.settings.model_copy(update={"consistency_sigma": lines.settings.consistency_sigma / _STRICTER})
+    stricter = {change: tried(replace(variants[change], settings=strict)).faults for change in fitting}
     change = min(fitting, key=lambda each: (not trials[each].rises, round(stricter[each], 1), each.mistakes))
-    words = f"the fringes of the {axis} fit if they have {change.in_words(described(code, image_roles, axis)[0])}"
+    words = f"the fringes of the {axis} fit if they have {change.in_words(described(code, lines.image_roles, axis)[0])}"
     kind = (
         ""
-        if isinstance(code, ImageSequence) or change == Change(wave=True)
+        if isinstance(code, ImageSequence) or change == FringeChange(wave=True)
         else ', in a [pattern] of kind = "image_sequence"'
     )
     return f"{words}{kind}: their phases contradict one another, or jump from end to end of the projector"
@@ -132,7 +118,7 @@ def has_jump(values: Floats, lit: NDArray[np.bool_], extent: int) -> NDArray[np.
     return np.asarray(jump.any(axis=1))
 
 
-def with_change(code: LightCode, size: tuple[int, int], axis: Axis, change: Change) -> ImageSequence:
+def with_change(code: LightCode, size: tuple[int, int], axis: Axis, change: FringeChange) -> ImageSequence:
     """Return the code as a sequence in which the fringes of an axis have another description."""
     every = described(code, roles(code, *size), axis)
     changed = [

@@ -15,15 +15,16 @@ Signal chain: images, every few pixels -> coordinates with each origin -> share 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
+from mitsim.decode.checks.code_lines import CodeLines
+from mitsim.decode.checks.rig_sanity import LARGEST_MISS_PX, light_plane_normals
+from mitsim.decode.coded_images import CodedImages
 from mitsim.decode.structured_light.decoder import decode_coordinates
 from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.camera import Camera, Rig
@@ -32,7 +33,6 @@ from mitsim.sensor.image_role import Axis, Offset
 from mitsim.sensor.image_sequence import GrayImages, ImageSequence
 from mitsim.sensor.light_code import GrayCode, LightCode, axes, roles
 
-Levels = NDArray[np.unsignedinteger[Any]]
 Floats = NDArray[np.float64]
 Origins = dict[Axis, Offset]
 
@@ -46,30 +46,16 @@ _FRACTION, _MANY, _LEAST = 0.25, 0.5, 0.02
 #: least share of the lit pixels that an origin explains to be believed
 _EXPLAINED = 0.3
 
-#: largest distance of the second coordinate from the point that the first gives [projector px], in addition to half a
-#: stripe: that of :mod:`mitsim.decode.checks.rig_sanity`
-_LARGEST_MISS_PX = 3.0
 
-
-def beyond_in_words(
-    lines: Sequence[Levels],
-    code: LightCode,
-    size: tuple[int, int],
-    settings: DecoderSettings,
-    full_scale: float,
-    axis: Axis,
-) -> str:
-    """Return a warning if another origin of a Gray code leaves far fewer pixels beyond the projector, or "".
-
-    ``lines``: images (P, n, W) of rows, and (P, H, m) of columns [DN]. ``size`` (width, height) of the projector [px].
-    """
+def beyond_in_words(lines: CodeLines, axis: Axis) -> str:
+    """Return a warning if another origin of a Gray code leaves far fewer pixels beyond the projector, or ""."""
     try:
         others = {
-            words: _share_rejected(lines, with_origins(code, origins), size, settings, full_scale, axis)
-            for words, origins in other_origins(code, size).items()
+            words: _share_rejected(replace(lines, code=with_origins(lines.code, origins)), axis)
+            for words, origins in other_origins(lines.code, lines.size).items()
             if axis in origins
         }
-        stated = _share_rejected(lines, code, size, settings, full_scale, axis) if others else 0.0
+        stated = _share_rejected(lines, axis) if others else 0.0
     except InputError:
         return ""
     words = min(others, key=lambda each: others[each], default="")
@@ -79,26 +65,24 @@ def beyond_in_words(
     return f"{share:.0f} % of the lit pixels decode to {axis} beyond the projector: they fit if {words}"
 
 
-def gray_origin_warning(
-    stack: Levels, rig: Rig, code: LightCode, settings: DecoderSettings, full_scale: float, others_may_be_meant: bool
-) -> str:
+def gray_origin_warning(images: CodedImages, rig: Rig, others_may_be_meant: bool) -> str:
     """Return a warning if another origin of a Gray code fits the geometry of camera and projector better, or "".
 
-    ``stack`` (P, H, W) images of the first camera [DN]. ``others_may_be_meant``: also warn if another origin fits as
-    well, and the sensor file does not state ``offset_px``.
+    The images of the first camera count. ``others_may_be_meant``: also warn if another origin fits as well, and the
+    sensor file does not state ``offset_px``.
     """
-    eye, projector = rig.reference, rig.projector
+    eye, projector, code, size = rig.reference, rig.projector, images.code, images.size
     if projector is None:
         return ""
-    size = projector.width, projector.height
+    stack = next(iter(images.stacks.values()))
     step = max(1, min(stack.shape[1:]) // _COARSE)
     places = np.s_[step // 2 :: step, step // 2 :: step]
     coarse = np.ascontiguousarray(stack[:, *places])
     rays = eye.rays(eye.pixel_grid()[places])
 
     def seen_with(tried: LightCode) -> _Explained:
-        found = decode_coordinates(coarse, tried, size, settings, full_scale=full_scale)
-        return _Explained.of(eye, projector, rays, found, settings)
+        found = decode_coordinates(coarse, tried, size, images.settings, full_scale=images.full_scale)
+        return _Explained.of(eye, projector, rays, found, images.settings)
 
     try:
         others = {words: seen_with(with_origins(code, o)) for words, o in other_origins(code, size).items()}
@@ -175,19 +159,13 @@ def _in_words(origins: Origins) -> str:
     return f"the Gray code of the {' and '.join(origins)} has offset_px = {value} in [pattern]"
 
 
-def _share_rejected(
-    lines: Sequence[Levels],
-    code: LightCode,
-    size: tuple[int, int],
-    settings: DecoderSettings,
-    full_scale: float,
-    axis: Axis,
-) -> float:
+def _share_rejected(lines: CodeLines, axis: Axis) -> float:
     """Return the share of the lit pixels that have no coordinate along an axis [1]."""
-    status = np.concatenate(
-        [decode_coordinates(part, code, size, settings, full_scale=full_scale)[axis].status.ravel() for part in lines]
+    parts = [part[axis] for part in lines.decoded()]
+    status, lit = (
+        np.concatenate([each.ravel() for each in all_parts])
+        for all_parts in ([each.status for each in parts], [each.lit for each in parts])
     )
-    lit = np.isin(status, [Status.VALID, Status.PHASE_INCONSISTENT])
     return float(np.mean(status[lit] != Status.VALID)) if lit.mean() > 0.02 else 0.0
 
 
@@ -208,17 +186,18 @@ class _Explained:
         settings: DecoderSettings,
     ) -> _Explained:
         """Intersect unit ``rays`` (h, w, 3) of the camera with columns or rows, those across the baseline if coded."""
-        statuses = [each.status for each in found.values()]
-        lit = np.all([np.isin(status, [Status.VALID, Status.PHASE_INCONSISTENT]) for status in statuses], axis=0)
-        known = np.all([status == Status.VALID for status in statuses], axis=0)
+        lit = np.all([each.lit for each in found.values()], axis=0)
+        known = np.all([each.status == Status.VALID for each in found.values()], axis=0)
         if lit.mean() < _LEAST or not known.any():
             return cls(0.0, float("nan"))
-        apart = np.abs(projector.sensor_from_camera.inverse().directions(eye.centre - projector.centre))
+        start = eye.centre - projector.centre
+        apart = np.abs(projector.sensor_from_camera.inverse().directions(start))
         across: Axis = "columns" if apart[0] >= apart[1] else "rows"
         axis = across if across in found else next(iter(found))
         directions = eye.sensor_from_camera.directions(rays[known])
-        inverse = _inverse_depth(projector, directions, eye.centre - projector.centre, found[axis].value[known], axis)
+        normal = light_plane_normals(projector, found[axis].value[known], axis)
         with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = -np.einsum("ij,ij->i", normal, directions) / (normal @ start)  # 1 / distance along the ray
             depth = rays[known][:, 2] / inverse
             explained = (depth >= settings.near_mm) & (depth <= settings.far_mm)
             points = eye.centre + directions / inverse[:, None]
@@ -226,21 +205,9 @@ class _Explained:
         missed = np.zeros(len(place), bool)
         for other, second in found.items():
             if other != axis:
-                allowed = _LARGEST_MISS_PX + np.sqrt(3) * second.sigma[known][explained]
+                allowed = LARGEST_MISS_PX + np.sqrt(3) * second.sigma[known][explained]
                 seen = second.value[known][explained]
                 missed |= ~(np.abs(place[:, 0 if other == "columns" else 1] - seen) <= allowed)
         explained[explained] = ~missed
         share = float(explained.sum() / lit.sum())
         return cls(share, float(np.median(depth[explained])) if explained.any() else float("nan"))
-
-
-def _inverse_depth(projector: Camera, rays: Floats, start: Floats, value: Floats, axis: Axis) -> Floats:
-    """Return 1 / t (n,) [1/mm] where rays (n, 3) from ``start`` [mm] relative to the projector meet columns or rows."""
-    ends = [
-        np.full_like(value, end) for end in (0.0, (projector.height if axis == "columns" else projector.width) - 1.0)
-    ]
-    pixels = [np.stack([value, end] if axis == "columns" else [end, value], axis=-1) for end in ends]
-    one, other = (projector.sensor_from_camera.directions(projector.rays(each)) for each in pixels)
-    normal = np.cross(one, other)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(-np.einsum("ij,ij->i", normal, rays) / (normal @ start))

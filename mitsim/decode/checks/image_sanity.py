@@ -10,9 +10,8 @@ changes is nearly the sum of their absolute values. If bits are exchanged, the c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,20 +19,17 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
+from mitsim.decode.checks.code_lines import CodeLines, line_slices, lines_of
 from mitsim.decode.checks.fringe_origin import origin_in_words, stripe_edges
 from mitsim.decode.checks.fringe_wave import wave_in_words
 from mitsim.decode.checks.gray_origin import beyond_in_words
-from mitsim.decode.structured_light.decoder import decode_coordinates
+from mitsim.decode.coded_images import CodedImages
 from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis, Kind, Role
-from mitsim.sensor.light_code import LightCode, axes, roles
 
 Levels = NDArray[np.unsignedinteger[Any]]
 Floats = NDArray[np.float32]
-
-#: number of lines of pixels evaluated, along rows and along columns
-_LINES = 48
 
 #: number of successive changes of a coordinate in one sum
 _CHANGES = 12
@@ -79,39 +75,23 @@ class Smoothness:
         return self.evenness < SMOOTH or self.contradicted > CONTRADICTED
 
 
-def image_warnings(
-    stack: Levels,
-    code: LightCode,
-    size: tuple[int, int],
-    settings: DecoderSettings,
-    full_scale: float,
-    camera: str,
-    decoded: Mapping[Axis, ProjectorCoordinate] | None = None,
-) -> list[str]:
-    """Return warnings about the images (P, H, W) of one camera; ``size`` (width, height) of the pattern [px].
-
-    ``decoded``: coordinates (H, W) of the images; without them, some rows and columns of the images are decoded.
-    """
-    image_roles = roles(code, *size)
-    lines = _lines(stack[: len(image_roles)])
-    out = _plain_images(lines[0], image_roles, settings, full_scale, camera)
+def image_warnings(images: CodedImages, camera: str, decoded: Mapping[Axis, ProjectorCoordinate]) -> list[str]:
+    """Return warnings about the images of one camera; ``decoded``: their coordinates (H, W)."""
+    stack = images.stacks[camera]
+    lines = CodeLines(lines_of(stack), images.code, images.size, images.settings, images.full_scale)
+    rows, image_roles, settings = lines.lines[0], lines.image_roles, images.settings
+    out = _plain_images(rows, image_roles, settings, images.full_scale, camera)
     if out:
         return out
-    if decoded is None:
-        found = smoothness(lines, code, size, settings, full_scale)
-    else:
-        shape = stack.shape[1:]
-        found = _smoothness([{axis: each.part(way) for axis, each in decoded.items()} for way in _line_slices(shape)])
-    for axis in [axis for axis in axes(code) if axis in found]:
-        warning = _unresolved(lines[0], image_roles, axis, settings, camera)
-        own, order = found[axis], ""
-        edges = None if warning else stripe_edges(lines, code, image_roles, axis, settings, full_scale)
+    shape = stack.shape[1:]
+    found = _smoothness([{axis: each.part(way) for axis, each in decoded.items()} for way in line_slices(shape)])
+    for axis, own in found.items():
+        warning, order = _unresolved(rows, image_roles, axis, settings, camera), ""
+        edges = None if warning else stripe_edges(lines, axis)
         if edges is not None:
-            extent = size[0] if axis == "columns" else size[1]
-            warning = origin_in_words(edges, code, image_roles, axis, extent)
+            warning = origin_in_words(edges, lines, axis)
         elif not warning:
-            warning = wave_in_words(lines, code, size, settings, full_scale, axis)
-            warning = warning or beyond_in_words(lines, code, size, settings, full_scale, axis)
+            warning = wave_in_words(lines, axis) or beyond_in_words(lines, axis)
         if warning and camera not in warning:
             warning = f"{camera}: {warning}"
         if not warning and (own.doubtful or own.evenness < _ASKED):
@@ -119,28 +99,14 @@ def image_warnings(
             orders: Iterable[tuple[str, list[int]]] = _other_orders(image_roles, axis)
             if edges is not None and edges.bits_fit:
                 orders = _with_bits_in_place(orders, image_roles, axis)
-            measure = partial(_smoothness_in, lines, code, size, settings, full_scale, axis)
-            order = _fitting_order(lines[0], image_roles, axis, orders, measure, least)
+            order = _fitting_order(lines, axis, orders, least)
         if order:
             warning = f"{_doubt(own, axis, camera)}: they fit if {order}"
-        warning = warning or _changed_exposure(lines[0], image_roles, axis, camera)
+        warning = warning or _changed_exposure(rows, image_roles, axis, camera)
         if not warning and own.doubtful:
             warning = f"{_doubt(own, axis, camera)}: check that the images are in the order of [pattern]"
         out += [warning] if warning else []
     return out
-
-
-def _smoothness_in(
-    lines: Sequence[Levels],
-    code: LightCode,
-    size: tuple[int, int],
-    settings: DecoderSettings,
-    full_scale: float,
-    axis: Axis,
-    order: list[int],
-) -> Smoothness:
-    """Return the smoothness of the coordinate along an axis with the images in another order."""
-    return smoothness([each[order] for each in lines], code, size, settings, full_scale, axis)[axis]
 
 
 def _doubt(found: Smoothness, axis: Axis, camera: str) -> str:
@@ -150,42 +116,21 @@ def _doubt(found: Smoothness, axis: Axis, camera: str) -> str:
     return f"bits or phases of the {axis} contradict one another on {100 * found.contradicted:.0f} % of {camera}"
 
 
-def _fitting_order(
-    stack: Levels,
-    image_roles: list[Role],
-    axis: Axis,
-    orders: Iterable[tuple[str, list[int]]],
-    smoothness_in: Callable[[list[int]], Smoothness],
-    least: float,
-) -> str:
-    """Return the description of an order of the images (P, H, W) with more smoothness than ``least``; "" if none."""
+def _fitting_order(lines: CodeLines, axis: Axis, orders: Iterable[tuple[str, list[int]]], least: float) -> str:
+    """Return the description of an order of the images with more smoothness than ``least``; "" if none."""
     best, description = least, ""
     for name, order in orders:
-        found = smoothness_in(order)
+        rows, columns = (each[order] for each in lines.lines)
+        try:
+            found = _smoothness(replace(lines, lines=(rows, columns)).decoded(), axis)[axis]
+        except InputError:
+            continue
         # an order may be smooth although most pixels are contradictory, or its pairs are not complements
-        if _changed_exposure(stack[order], image_roles, axis, ""):
+        if _changed_exposure(rows, lines.image_roles, axis, ""):
             continue
         if not found.doubtful and found.evenness - found.contradicted > best:
             best, description = found.evenness - found.contradicted, name
     return description
-
-
-def smoothness(
-    lines: Sequence[Levels],
-    code: LightCode,
-    size: tuple[int, int],
-    settings: DecoderSettings,
-    full_scale: float,
-    only: Axis | None = None,
-) -> dict[Axis, Smoothness]:
-    """Return the smoothness of coordinates along ``lines``: images (P, n, W) of rows, and (P, H, m) of columns."""
-    decoded: list[Mapping[Axis, ProjectorCoordinate]] = []
-    for part in lines:
-        try:
-            decoded.append(decode_coordinates(part, code, size, settings, full_scale=full_scale))
-        except InputError:
-            decoded.append({})
-    return _smoothness(decoded, only)
 
 
 def _smoothness(
@@ -194,31 +139,21 @@ def _smoothness(
     """Return the smoothness of coordinates along decoded rows (n, W), and along decoded columns (H, m)."""
     evenness: dict[Axis, list[float]] = {}
     statuses: dict[Axis, list[NDArray[np.uint8]]] = {}
+    lit_pixels: dict[Axis, list[NDArray[np.bool_]]] = {}
     for way, found in enumerate(lines):
         for axis, coordinate in found.items():
             if only in (None, axis):
                 values = coordinate.value if way == 0 else coordinate.value.T
                 evenness.setdefault(axis, []).append(_evenness(values))
                 statuses.setdefault(axis, []).append(coordinate.status.ravel())
+                lit_pixels.setdefault(axis, []).append(coordinate.lit.ravel())
     out: dict[Axis, Smoothness] = {}
     for axis, each in evenness.items():
-        status = np.concatenate(statuses[axis])
-        lit = np.isin(status, [Status.VALID, Status.PHASE_INCONSISTENT])
+        status, lit = np.concatenate(statuses[axis]), np.concatenate(lit_pixels[axis])
         share = float(np.mean(status[lit] == Status.PHASE_INCONSISTENT)) if lit.mean() > 0.02 else 0.0
         known = [value for value in each if np.isfinite(value)]
         out[axis] = Smoothness(max(known, default=float("nan")), share)
     return out
-
-
-def _lines(stack: Levels) -> list[Levels]:
-    return [np.ascontiguousarray(stack[:, *way]) for way in _line_slices(stack.shape[1:])]
-
-
-def _line_slices(shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
-    """Return the rows, and the columns, of an image (H, W) that are evaluated."""
-    height, width = shape
-    down, along = max(1, height // _LINES), max(1, width // _LINES)
-    return [np.s_[down // 2 :: down, :], np.s_[:, along // 2 :: along]]
 
 
 def _evenness(values: NDArray[np.float64]) -> float:

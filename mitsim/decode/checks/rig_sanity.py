@@ -8,7 +8,7 @@ rectified rows -> disparity, and row error by the other coordinate or by the tex
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from characterisation.point_cloud import PointCloud, Status
-from mitsim.decode.checks.row_texture import textured_row_error, uniform_light_mean
+from mitsim.decode.checks.row_texture import rectified, textured_row_error, uniform_light_mean
 from mitsim.decode.checks.texture_matches import COMPARED_ROWS, LEAST_BLOCKS, texture_matches
+from mitsim.decode.coded_images import CodedImages
 from mitsim.decode.matching.row_error import row_error
 from mitsim.decode.matching.stereo import StereoGeometry, stereo_geometry
 from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
@@ -164,30 +165,37 @@ def _meeting(eye: Camera, projector: Camera, rays: Floats, coordinates: dict[Axi
         with np.errstate(invalid="ignore", divide="ignore"):
             return along, (off[:, 0] * step[:, 1] - off[:, 1] * step[:, 0]) / np.linalg.norm(step, axis=1)
     ((axis, value),) = coordinates.items()
-    ends = [
-        np.full_like(value, end) for end in (0.0, (projector.height if axis == "columns" else projector.width) - 1.0)
-    ]
-    pixels = [np.stack([value, end] if axis == "columns" else [end, value], axis=-1) for end in ends]
-    one, other = (projector.sensor_from_camera.directions(projector.rays_to_fold(each)) for each in pixels)
-    normal = np.cross(one, other)
+    normal = light_plane_normals(projector, value, axis)
     with np.errstate(invalid="ignore", divide="ignore"):
         return -(normal @ start) / np.einsum("ij,ij->i", normal, rays), np.zeros(len(rays))
 
 
-def pair_warnings(
-    stacks: Sequence[Levels],
-    decoded: Sequence[Mapping[Axis, ProjectorCoordinate]],
-    rig: Rig,
-    code: LightCode,
-    size: tuple[int, int],
-    full_scale: float,
-) -> tuple[list[str], float, str]:
-    """Return warnings about two cameras that see one code: exchanged, another calibration, or a row error.
+def light_plane_normals(projector: Camera, value: Floats, axis: Axis) -> Floats:
+    """Return normals (n, 3), in the sensor frame, of the planes of light of columns or rows ``value`` (n,) [px]."""
+    last = (projector.height if axis == "columns" else projector.width) - 1.0
+    ends = [np.full_like(value, end) for end in (0.0, last)]
+    pixels = [np.stack([value, end] if axis == "columns" else [end, value], axis=-1) for end in ends]
+    first, second = (projector.sensor_from_camera.directions(projector.rays_to_fold(each)) for each in pixels)
+    return np.asarray(np.cross(first, second))
 
-    ``stacks`` and ``decoded``: images (P, H, W) of the left and the right camera, and their coordinates (H, W).
 
-    Also return the row error [px] of the right image and its source: the code of the rows if present, else the texture
-    of the surface. NaN and "" if neither gives it, or the calibration is doubtful.
+@dataclass(frozen=True)
+class Findings:
+    """Findings about a capture: ``warnings``, and ``row_error`` [px] of the second camera; NaN if unknown.
+
+    ``row_error_source``: the source of the row error, "" if unknown.
+    """
+
+    warnings: list[str] = field(default_factory=list)
+    row_error: float = float("nan")
+    row_error_source: str = ""
+
+
+def pair_findings(images: CodedImages, rig: Rig) -> Findings:
+    """Check two cameras that see one code: exchanged, another calibration, or a row error.
+
+    The source of the row error is the code of the rows if present, else the texture of the surface. It is unknown if
+    neither gives it, or the calibration is doubtful.
     """
     geometry = stereo_geometry(rig)
     exchangeable = geometry.raw_size[0] == geometry.raw_size[1]
@@ -195,27 +203,23 @@ def pair_warnings(
     exchanged = (
         f"the images of {names} fit the calibration if they are exchanged: check whether left and right are exchanged"
     )
-    found = list(decoded)
+    found = list(images.coordinates.values())
     matches = _Matches.of(found, geometry)
     if matches.decoded < 0.005:
-        return [], float("nan"), ""
-    textures = None
+        return Findings()
+    textures, doubt = None, "check that the calibration belongs to these images"
     if not np.isfinite(matches.row_error):
-        image_roles = roles(code, *size)
-        textures = [uniform_light_mean(stack, image_roles, full_scale) for stack in stacks]
+        image_roles = roles(images.code, *images.size)
+        textures = [uniform_light_mean(stack, image_roles, images.full_scale) for stack in images.stacks.values()]
         columns = found[0]["columns"].value, found[1]["columns"].value
         contradiction, other_order = _texture_contradiction((textures[0], textures[1]), columns, rig, geometry)
         if contradiction:
             fits = exchangeable and other_order
-            return (
-                [exchanged if fits else f"{contradiction}: check that the calibration belongs to these images"],
-                np.nan,
-                "",
-            )
+            return Findings([exchanged if fits else f"{contradiction}: {doubt}"])
     if matches.doubtful:
         if exchangeable and not _Matches.of(found[::-1], geometry).doubtful:
-            return [exchanged], float("nan"), ""
-        return [f"{matches}: check that the calibration belongs to these images"], float("nan"), ""
+            return Findings([exchanged])
+        return Findings([f"{matches}: {doubt}"])
     offset, source = matches.row_error, "by the code of the rows"
     if textures is not None:
         source = "by the texture of the surface"
@@ -223,18 +227,12 @@ def pair_warnings(
         if variation > _LARGEST_SPREAD + 0.5 * abs(offset if np.isfinite(offset) else 0.0):
             swapped = textured_row_error((textures[1], textures[0]), columns[::-1], geometry) if exchangeable else None
             if swapped is not None and abs(swapped[0]) < LARGEST_ROW_ERROR and not swapped[1] > _LARGEST_SPREAD:
-                return [exchanged], float("nan"), ""
+                return Findings([exchanged])
             told = (
                 f"the rows of the two cameras vary by {variation:.1f} px over the image, by the texture of the surface"
             )
-            return [f"{told}: check that the calibration belongs to these images"], float("nan"), ""
-    if not np.isfinite(offset):
-        return [], offset, ""
-    return (
-        ([row_error_warning(offset)] if abs(offset) > LARGEST_ROW_ERROR else []),
-        offset,
-        source,
-    )
+            return Findings([f"{told}: {doubt}"])
+    return Findings(row_error_warnings(offset), offset, source) if np.isfinite(offset) else Findings()
 
 
 def _texture_contradiction(
@@ -317,7 +315,7 @@ class _Matches:
         height = geometry.map_left.shape[1]
         lines = np.arange(2, height - 2, max(1, height // _COARSE))
         u_left, u_right = (
-            _on_rows(each["columns"], positions[:, lines], there[lines])
+            rectified(each["columns"].value, positions[:, lines], there[lines])
             for each, positions, there in zip(found, maps, seen, strict=True)
         )
         place = np.stack([find_coordinates(one, other)[0] for one, other in zip(u_left, u_right, strict=True)])
@@ -356,11 +354,6 @@ class _Matches:
             share = f"{100 * self.matched:.0f} %"
             return f"only {share} of the first camera's decoded pixels have a match in the second's rectified rows"
         return f"the rows of the two cameras are {self.spread:.1f} px apart, unevenly, after rectification"
-
-
-def _on_rows(coordinate: ProjectorCoordinate, positions: NDArray[np.float32], seen: NDArray[np.bool_]) -> Floats:
-    values = map_coordinates(coordinate.value, positions[::-1], output=np.float64, order=1, cval=np.nan)
-    return np.where(seen, values, np.nan)
 
 
 def _core(values: Floats, least: float) -> Floats:
@@ -425,9 +418,11 @@ def measured_row_error(images: tuple[Levels, Levels], geometry: StereoGeometry, 
     return float(np.median(known)) if len(known) >= _LEAST else float("nan")
 
 
-def row_error_warning(offset: float) -> str:
-    """Return the warning about a row error [px]."""
-    return (
+def row_error_warnings(offset: float) -> list[str]:
+    """Return the warning about a row error ``offset`` [px] of a pair, if it is large."""
+    if not abs(offset) > LARGEST_ROW_ERROR:  # nor if it is unknown
+        return []
+    return [
         f"the rows of the two cameras are {offset:+.2f} px apart after rectification, over {LARGEST_ROW_ERROR:g} px: "
         "the calibration belongs to another rig, or the rig has moved since"
-    )
+    ]

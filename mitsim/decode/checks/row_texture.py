@@ -67,7 +67,7 @@ def textured_row_error(
     ``textures`` [DN] and ``columns`` [projector px], (H, W) each: raw left and right, NaN where unknown.
     """
     left, right = (
-        [_rectified(values, positions, seen) for values in own]
+        [rectified(values, positions, seen) for values in own]
         for own, positions, seen in (
             ((textures[0], columns[0]), geometry.map_left, geometry.seen_left),
             ((textures[1], columns[1]), geometry.map_right, geometry.seen_right),
@@ -110,7 +110,8 @@ def _smooth_variation(places: Floats, errors: Floats) -> float:
     return varying if left < _FOLLOWED * varying else float("nan")
 
 
-def _rectified(values: Floats, positions: NDArray[np.float32], seen: NDArray[np.bool_]) -> Floats:
+def rectified(values: Floats, positions: NDArray[np.float32], seen: NDArray[np.bool_]) -> Floats:
+    """Return values (H, W) at raw ``positions`` (2, h, w), NaN where they are not ``seen`` (h, w)."""
     out = map_coordinates(values, positions[::-1], output=np.float64, order=1, cval=np.nan)
     return np.where(seen, out, np.nan)
 

@@ -5,7 +5,7 @@ A warning is not an error: the capture is still written and decoded according to
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,12 +16,11 @@ from mitsim.capture.decoding import Settings
 from mitsim.decode.checks.gray_origin import gray_origin_warning
 from mitsim.decode.checks.image_sanity import image_warnings
 from mitsim.decode.checks.rig_sanity import (
-    LARGEST_ROW_ERROR,
+    Findings,
     baseline_warning,
     camera_warnings,
     measured_row_error,
-    pair_warnings,
-    row_error_warning,
+    pair_findings,
 )
 from mitsim.decode.cloud import decoder_settings
 from mitsim.decode.coded_images import CodedImages
@@ -30,40 +29,17 @@ from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 
 
-@dataclass(frozen=True)
-class Findings:
-    """Findings about a capture: ``warnings``, and ``row_error`` [px] of the second camera; NaN if unknown.
-
-    ``row_error_source``: the source of the row error, "" if unknown.
-    """
-
-    warnings: list[str] = field(default_factory=list)
-    row_error: float = float("nan")
-    row_error_source: str = ""
-
-
-def capture_warnings(capture: Capture, settings: Settings) -> list[str]:
-    """Return the warnings about a capture, see :func:`capture_findings`."""
-    return capture_findings(capture, settings).warnings
-
-
 def with_warnings(capture: Capture) -> Capture:
-    """Return the capture with the warnings about it added to those that its settings already have."""
-    if capture.technology != "structured_light":
-        return capture
-    settings, _ = decoder_settings(capture)
-    stored = capture.settings.get("warnings", [])
-    warnings = list(dict.fromkeys([*stored, *capture_warnings(capture, settings)]))
-    return replace(capture, settings=capture.settings | ({"warnings": warnings} if warnings else {}))
-
-
-def capture_findings(capture: Capture, settings: Settings) -> Findings:
-    """Check the images and calibration of a structured-light capture; other captures have no findings.
+    """Return the capture with the warnings about it added to those that its settings already have.
 
     A bracket of exposures is not checked, and images that are missing are reported by decoding.
     """
-    images = CodedImages.of(capture, settings)
-    return Findings() if images is None else code_findings(images, capture.rig, capture.source == "device")
+    if capture.technology != "structured_light":
+        return capture
+    images = CodedImages.of(capture, decoder_settings(capture)[0])
+    found = Findings() if images is None else code_findings(images, capture.rig, capture.source == "device")
+    warnings = list(dict.fromkeys([*capture.settings.get("warnings", []), *found.warnings]))
+    return replace(capture, settings=capture.settings | ({"warnings": warnings} if warnings else {}))
 
 
 def code_findings(images: CodedImages, rig: Rig, recorded: bool) -> Findings:
@@ -71,27 +47,25 @@ def code_findings(images: CodedImages, rig: Rig, recorded: bool) -> Findings:
 
     The origin of the code is checked in ``recorded`` images: a simulation has the pattern that its file states.
     """
-    code, size, settings, full_scale = images.code, images.size, images.settings, images.full_scale
     try:
         coordinates = images.coordinates
     except InputError:
         coordinates = {}  # decoding reports the error
     out = []
-    for name, stack in images.stacks.items():
-        out += image_warnings(stack, code, size, settings, full_scale, name, coordinates.get(name, {}))
+    for name in images.stacks:
+        out += image_warnings(images, name, coordinates.get(name, {}))
     if out or not coordinates:
         return Findings(out)
-    decoded = [coordinates[name] for name in images.stacks]
-    if settings.triangulate == "cameras":
+    if images.settings.triangulate == "cameras":
         try:
-            return Findings(*pair_warnings(list(images.stacks.values()), decoded, rig, code, size, full_scale))
+            return pair_findings(images, rig)
         except InputError as error:
             return Findings([str(error)])
-    name, stack = next(iter(images.stacks.items()))
-    if origin := gray_origin_warning(stack, rig, code, settings, full_scale, recorded):
+    name, decoded = next(iter(coordinates.items()))
+    if origin := gray_origin_warning(images, rig, recorded):
         return Findings([f"{name}: {origin}"])
-    along = baseline_warning(rig, code)
-    return Findings(([along] if along else []) + camera_warnings(decoded[0], rig, settings))
+    along = baseline_warning(rig, images.code)
+    return Findings(([along] if along else []) + camera_warnings(decoded, rig, images.settings))
 
 
 def pair_row_error(capture: Capture, cloud: PointCloud) -> float:
@@ -118,11 +92,6 @@ def row_error_in_words(capture: Capture, settings: Settings, found: Findings, ma
         "row error of the second camera: unknown; the code has no rows and the surface too little texture. Project "
         "rows too, or take one capture of a printed surface"
     )
-
-
-def cloud_warnings(offset: float) -> list[str]:
-    """Return warnings about a decoded pair with a row error ``offset`` [px]."""
-    return [row_error_warning(offset)] if np.isfinite(offset) and abs(offset) > LARGEST_ROW_ERROR else []
 
 
 def uncalibrated_in_words(cloud: PointCloud) -> str:

@@ -106,22 +106,15 @@ def search_range(rectification: Rectification, settings: MatcherSettings) -> tup
     """
     limit = rectification.width - 1  # beyond it, no column of an image has its match in the other
     smallest, largest = (float(rectification.disparity(depth)) for depth in (settings.far_mm, settings.near_mm))
-    if not np.isfinite([smallest, largest]).all():
+    if not np.isfinite([smallest, largest]).all() or smallest > limit or largest < -limit:
         raise InputError(
             "matcher settings",
             "near_mm, far_mm",
             f"{settings.near_mm} to {settings.far_mm} mm",
-            "depths whose disparity is finite",
+            "depths that both cameras can see, at a finite disparity",
         )
     first = max(int(np.floor(smallest)) - 1, -limit)
     last = min(int(np.ceil(largest)) + 1, limit)
-    if smallest > limit or largest < -limit:
-        raise InputError(
-            "matcher settings",
-            "near_mm, far_mm",
-            f"{settings.near_mm} to {settings.far_mm} mm",
-            "depths that both cameras can see",
-        )
     return first, 16 * -(-(last - first + 1) // 16)
 
 
@@ -181,20 +174,19 @@ def match_both_ways(
     return Matches(found + np.float32(first), both_ways_disagreement(found, back, count), matched_back)
 
 
-def _sgbm(count: int, settings: MatcherSettings, uniqueness: int) -> cv2.StereoSGBM:
-    area = settings.block_size**2
+def _sgbm(count: int, penalties: Penalties, mode: int) -> cv2.StereoSGBM:
     return cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=count,
-        blockSize=settings.block_size,
-        P1=round(settings.p1 * area),
-        P2=round(settings.p2 * area),
+        blockSize=penalties.block,
+        P1=penalties.p1,
+        P2=penalties.p2,
         disp12MaxDiff=-1,
-        preFilterCap=settings.prefilter_cap,
-        uniquenessRatio=uniqueness,
+        preFilterCap=penalties.cap,
+        uniquenessRatio=penalties.uniqueness,
         speckleWindowSize=0,
         speckleRange=0,
-        mode=_MODES[settings.mode],
+        mode=mode,
     )
 
 
@@ -235,7 +227,7 @@ def _disparities(
     height, width = reference.shape[0], reference.shape[1] - count
     penalties = _penalties(settings, uniqueness)
     if settings.mode != "hh" or bytes_by_opencv(height, width, count) <= budget or not fits_16_bits(penalties):
-        found = _sgbm(count, settings, uniqueness).compute(reference, other)
+        found = _sgbm(count, penalties, _MODES[settings.mode]).compute(reference, other)
     else:
         found = match_in_bands(reference, other, count, penalties, rows_in_budget(budget, height, width, count))
     sixteenths = found.astype(np.float32)

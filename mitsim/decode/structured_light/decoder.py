@@ -22,7 +22,7 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status
 from characterisation.region_of_interest import Roi, checked_roi
 from mitsim.decode.blocks import in_blocks
-from mitsim.decode.grey_levels import MeasuredNoise
+from mitsim.decode.grey_levels import MeasuredNoise, check_full_scale
 from mitsim.decode.grid_cloud import cloud_on_grid
 from mitsim.decode.image_context import ImageContext
 from mitsim.decode.structured_light.geometry import (
@@ -31,16 +31,21 @@ from mitsim.decode.structured_light.geometry import (
     exact_inverse_depth,
     structured_light_geometry,
 )
-from mitsim.decode.structured_light.gray_code import decode_gray_code, decode_gray_code_phase_shift
-from mitsim.decode.structured_light.image_sequence import decode_image_sequence
-from mitsim.decode.structured_light.phase_shift import decode_phase_shift
+from mitsim.decode.structured_light.gray_code import (
+    STRIPE_IMAGES,
+    CodedAxis,
+    decode_gray_fringes,
+    decode_stripes,
+    interpolated_columns,
+    stripe_coordinate,
+)
+from mitsim.decode.structured_light.phase_shift import Fringes, decode_fringes
 from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
-from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import GrayCode, LightCode, PhaseShift, axes
+from mitsim.sensor.light_code import GrayCode, LightCode, axes, check_stack, roles
 
 
 def decode_coordinates(
@@ -54,6 +59,8 @@ def decode_coordinates(
     interpolate: bool = False,
 ) -> dict[Axis, ProjectorCoordinate]:
     """Return the projector coordinates seen by each pixel, for each axis of any code.
+
+    Along each axis, the images are those of Gray bits, of fringes, or of both; the roles of the images tell which.
 
     Parameters
     ----------
@@ -76,19 +83,46 @@ def decode_coordinates(
     InputError
         If the stack does not fit the code, or the code is ambiguous over the projector.
     """
-    width, height = size
-    if isinstance(code, GrayCode):
-        return decode_gray_code(stack, code, width, height, settings, full_scale=full_scale, interpolate=interpolate)
-    if isinstance(code, ImageSequence):
-        return decode_image_sequence(
-            stack, code, size, settings, full_scale=full_scale, imager=imager, interpolate=interpolate
+    image_roles = roles(code, *size)
+    check_stack(stack, image_roles)
+    check_full_scale(stack, full_scale)
+    found: dict[Axis, ProjectorCoordinate] = {}
+    for axis in axes(code):
+        extent = size[0] if axis == "columns" else size[1]
+        shared = [i for i, role in enumerate(image_roles) if role.axis in (axis, None) and role.kind in STRIPE_IMAGES]
+        phases = [i for i, role in enumerate(image_roles) if role.axis == axis and role.kind == "phase"]
+        phases.sort(key=lambda i: image_roles[i].index)  # stable: period after period, each in the order shown
+        used = shared + phases
+        images = stack if used == list(range(len(stack))) else stack[used]
+        axis_roles = [image_roles[i] for i in used]
+        gray = [role for role in axis_roles if role.kind == "gray"]
+        coded_axis = CodedAxis(axis, extent, min(role.period for role in gray), gray[0].offset) if gray else None
+        if isinstance(code, GrayCode) or not phases:
+            assert coded_axis is not None
+            decoded = decode_stripes(images, axis_roles, axis, settings.bit_share)
+            saturated = (stack if isinstance(code, GrayCode) else images).max(axis=0) >= full_scale
+            found[axis] = stripe_coordinate(decoded, coded_axis, saturated, settings, full_scale)
+            if interpolate and axis == "columns":
+                found[axis] = interpolated_columns(found[axis], decoded, images, axis_roles, coded_axis)
+            continue
+        fringes = Fringes.of([image_roles[i] for i in phases], code.mean, code.contrast)
+        if coded_axis is not None:
+            found[axis] = decode_gray_fringes(
+                images, axis_roles, coded_axis, fringes, settings, full_scale=full_scale, imager=imager
+            )
+            continue
+        plain = {role.kind: image for role, image in zip(axis_roles, images, strict=True) if role.axis is None}
+        white_black = (plain["white"], plain["black"]) if len(plain) == 2 else None
+        found[axis] = decode_fringes(
+            images[len(shared) :],
+            fringes,
+            extent,
+            settings,
+            full_scale=full_scale,
+            imager=imager,
+            white_black=white_black,
         )
-    if isinstance(code, PhaseShift):
-        extent = width if code.axis == "columns" else height
-        found = decode_phase_shift(stack, code, extent, settings, full_scale=full_scale, imager=imager)
-    else:
-        found = decode_gray_code_phase_shift(stack, code, width, height, settings, full_scale=full_scale, imager=imager)
-    return {code.axis: found}
+    return found
 
 
 def decode_structured_light(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.grey_levels import MeasuredNoise, check_full_scale, grey_level_variance
+from mitsim.decode.grey_levels import MeasuredNoise, grey_level_variance
 from mitsim.decode.structured_light.phase_shift import (
     Fringes,
     fit_phases,
@@ -34,14 +34,13 @@ from mitsim.decode.structured_light.unwrapping import UnwrappingPath, beat_cycle
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis, Role
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, axes, check_stack, gray_offset, roles, stripes
 
 #: kinds of images that determine the stripe
-_STRIPE_IMAGES = ("white", "black", "gray", "gray_inverse")
+STRIPE_IMAGES = ("white", "black", "gray", "gray_inverse")
 
 
 @dataclass(frozen=True)
-class Stripes:
+class DecodedStripes:
     """Decoded bits of one axis, (H, W) each.
 
     ``number`` of the stripe, uint16. ``neighbour``: number with the undecided bit inverted, else the same number.
@@ -83,7 +82,7 @@ def decode_stripes(
     axis: Axis,
     bit_share: float,
     middle_contrast: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None,
-) -> Stripes:
+) -> DecodedStripes:
     """Decode the Gray bits of one axis.
 
     Parameters
@@ -131,63 +130,12 @@ def decode_stripes(
     neighbour = binary_of_gray(np.bitwise_xor(gray, weak_bits))
     number_change = number.astype(np.int32) - neighbour
     multiple = (weak_bits & (weak_bits - np.uint16(1))) != 0
-    return Stripes(number, neighbour, multiple | (np.abs(number_change) > 1), contrast)
-
-
-def decode_gray_code(
-    stack: NDArray[np.generic],
-    code: GrayCode,
-    width: int,
-    height: int,
-    settings: DecoderSettings,
-    *,
-    full_scale: float,
-    interpolate: bool = False,
-) -> dict[Axis, ProjectorCoordinate]:
-    """Decode the images of a Gray code.
-
-    Parameters
-    ----------
-    stack
-        (P, H, W) raw images [DN] of one camera, in the order of :func:`mitsim.sensor.light_code.roles`.
-    code, settings
-        The code, and the limits of the decoder.
-    width, height
-        Size of the projector [px].
-    full_scale
-        Value of a saturated pixel [DN].
-    interpolate
-        Interpolate columns between the edges of their stripes (:mod:`mitsim.decode.structured_light.stripe_edges`).
-
-    Returns
-    -------
-    dict
-        A coordinate for each axis of the code: the centre of the stripe, or the edge between two. ``sigma`` is stripe /
-        sqrt(12), the standard deviation of a uniform distribution over the stripe.
-
-    Raises
-    ------
-    InputError
-        If the stack does not fit the code.
-    """
-    image_roles = roles(code, width, height)
-    check_stack(stack, image_roles)
-    check_full_scale(stack, full_scale)
-    saturated = stack.max(axis=0) >= full_scale
-    out: dict[Axis, ProjectorCoordinate] = {}
-    for axis in axes(code):
-        extent = width if axis == "columns" else height
-        decoded = decode_stripes(stack, image_roles, axis, settings.bit_share)
-        coded = CodedAxis(axis, extent, stripes(code, extent)[1], gray_offset(code, extent))
-        out[axis] = stripe_coordinate(decoded, coded, saturated, settings, full_scale)
-        if interpolate and axis == "columns":
-            out[axis] = interpolated_columns(out[axis], decoded, stack, image_roles, coded)
-    return out
+    return DecodedStripes(number, neighbour, multiple | (np.abs(number_change) > 1), contrast)
 
 
 def interpolated_columns(
     coordinate: ProjectorCoordinate,
-    decoded: Stripes,
+    decoded: DecodedStripes,
     stack: NDArray[np.generic],
     image_roles: list[Role],
     coded: CodedAxis,
@@ -213,7 +161,7 @@ def interpolated_columns(
 
 
 def stripe_coordinate(
-    decoded: Stripes,
+    decoded: DecodedStripes,
     coded: CodedAxis,
     saturated: NDArray[np.bool_],
     settings: DecoderSettings,
@@ -238,43 +186,6 @@ def stripes_outside(number: NDArray[np.unsignedinteger], coded: CodedAxis) -> ND
     """Return whether stripes (...), by their numbers, lie beyond the projector's first or last pixel."""
     start = number * coded.stripe - coded.offset  # from the projector's edge
     return np.asarray((start >= coded.extent) | (start + coded.stripe <= 0))
-
-
-def decode_gray_code_phase_shift(
-    stack: NDArray[np.generic],
-    code: GrayCodePhaseShift,
-    width: int,
-    height: int,
-    settings: DecoderSettings,
-    *,
-    full_scale: float,
-    imager: Imager | MeasuredNoise | None = None,
-) -> ProjectorCoordinate:
-    """Decode a Gray code for the order of the fringe, and phase shifting for the position in it.
-
-    ``stack`` (P, H, W) [DN]; ``width`` and ``height`` of the projector [px]; ``full_scale`` [DN]; ``imager`` as for
-    :func:`mitsim.decode.structured_light.phase_shift.decode_phase_shift`.
-
-    Raises
-    ------
-    InputError
-        If the stack does not fit the code, or gamma has fewer than five steps and neither white nor black.
-    """
-    image_roles = roles(code, width, height)
-    check_stack(stack, image_roles)
-    check_full_scale(stack, full_scale)
-    extent = width if code.axis == "columns" else height
-    shift = np.array([role.shift for role in image_roles if role.kind == "phase"])
-    fringes = Fringes((code.period_px,), (shift,), code.mean, code.contrast)
-    return decode_gray_fringes(
-        stack,
-        image_roles,
-        CodedAxis(code.axis, extent, stripes(code, extent)[1]),
-        fringes,
-        settings,
-        full_scale=full_scale,
-        imager=imager,
-    )
 
 
 def decode_gray_fringes(
@@ -344,7 +255,7 @@ def decode_gray_fringes(
     coded = [
         image
         for image, role in zip(stack, image_roles, strict=True)
-        if role.axis in (axis, None) and role.kind in _STRIPE_IMAGES
+        if role.axis in (axis, None) and role.kind in STRIPE_IMAGES
     ]
     for image in coded:
         saturated |= (image >= full_scale) & undecided
@@ -362,7 +273,7 @@ def _unwrapping_of_fringes(fringes: Fringes, stripe: float) -> UnwrappingPath:
         return unwrapping_path(fringes.periods, fringes.steps, stripe)
 
 
-def _centre(decoded: Stripes, coded: CodedAxis) -> NDArray[np.float64]:
+def _centre(decoded: DecodedStripes, coded: CodedAxis) -> NDArray[np.float64]:
     """Return the centre of the stripe, or the edge to its neighbour [projector px]."""
     centre = decoded.number.astype(np.float64) + decoded.neighbour
     centre += 1

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from characterisation.point_cloud import Status
 from mitsim.decode.blocks import BLOCK, in_blocks
-from mitsim.decode.grey_levels import MeasuredNoise, check_full_scale, grey_level_variance
+from mitsim.decode.grey_levels import MeasuredNoise, grey_level_variance
 from mitsim.decode.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.decode.structured_light.projector_gamma import (
     correct_phase,
@@ -32,8 +32,8 @@ from mitsim.decode.structured_light.projector_gamma import (
 )
 from mitsim.decode.structured_light.unwrapping import unwrap, unwrapping_path
 from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.image_role import Role
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import PhaseShift, check_stack, roles
 
 #: blocks are padded to a multiple of this number of pixels. A processor rounds the elements that do not fill a vector
 #: differently, and a pixel's phase must not depend on its position in a window
@@ -104,51 +104,6 @@ def fit_phases(stack: NDArray[np.generic], shifts: Sequence[NDArray[np.floating]
     return Phases(phase.reshape(-1, *shape), modulation.reshape(-1, *shape), offset.reshape(shape))
 
 
-def phase_noise(steps: int, sigma_i: float, modulation: float) -> float:
-    """Return the expected standard deviation of an N-step phase [rad], for noise sigma_I and modulation B [DN]."""
-    return float(np.sqrt(2.0 / steps) * sigma_i / modulation)
-
-
-def decode_phase_shift(
-    stack: NDArray[np.generic],
-    code: PhaseShift,
-    extent: int,
-    settings: DecoderSettings,
-    *,
-    full_scale: float,
-    imager: Imager | MeasuredNoise | None = None,
-) -> ProjectorCoordinate:
-    """Decode the images of a phase-shift code.
-
-    Parameters
-    ----------
-    stack
-        (P, H, W) raw images [DN] of one camera, in the order of :func:`mitsim.sensor.light_code.roles`.
-    code, settings
-        The code, and the limits of the decoder.
-    extent
-        Number of projector pixels along the code's axis.
-    full_scale
-        Value of a saturated pixel [DN]; a pixel that has it in any image is rejected.
-    imager
-        The imager, or measured noise, from which the expected noise follows. If it is None, ``sigma`` is NaN. Phases of
-        different periods are then compared by quantisation and ``systematic_rad`` alone.
-
-    Raises
-    ------
-    InputError
-        If the stack does not fit the code, the code is ambiguous over the extent, or gamma has to be corrected from
-        fewer than five steps.
-    """
-    image_roles = roles(code, extent, extent)
-    check_stack(stack, image_roles)
-    check_full_scale(stack, full_scale)
-    steps = code.steps_of_period
-    shifts = [np.array([role.shift for role in image_roles if role.index == index]) for index in range(len(steps))]
-    fringes = Fringes(tuple(code.periods_px), tuple(shifts), code.mean, code.contrast)
-    return decode_fringes(stack, fringes, extent, settings, full_scale=full_scale, imager=imager)
-
-
 @dataclass(frozen=True)
 class Fringes:
     """Fringes along one axis.
@@ -167,6 +122,13 @@ class Fringes:
     shifts: tuple[NDArray[np.floating], ...]
     mean: float
     contrast: float
+
+    @classmethod
+    def of(cls, image_roles: Sequence[Role], mean: float, contrast: float) -> Fringes:
+        """Return the fringes of the images of an axis, period after period; ``mean`` and ``contrast`` of its code."""
+        periods = {role.index: role.period for role in image_roles}
+        shifts = (np.array([role.shift for role in image_roles if role.index == index]) for index in periods)
+        return cls(tuple(periods.values()), tuple(shifts), mean, contrast)
 
     @property
     def steps(self) -> tuple[int, ...]:
@@ -192,10 +154,20 @@ def decode_fringes(
         (P, H, W) images [DN], period after period.
     fringes
         Periods and shifts.
-    extent, settings, full_scale, imager
-        As for :func:`decode_phase_shift`.
+    extent, settings
+        Number of projector pixels along the axis, and the limits of the decoder.
+    full_scale
+        Value of a saturated pixel [DN]; a pixel that has it in any image is rejected.
+    imager
+        The imager, or measured noise, from which the expected noise follows. If it is None, ``sigma`` is NaN. Phases of
+        different periods are then compared by quantisation and ``systematic_rad`` alone.
     white_black
         Images (H, W) of a white and a black frame, from which gamma can be estimated with fewer than five steps.
+
+    Raises
+    ------
+    InputError
+        If the fringes are ambiguous over the extent, or gamma has to be corrected from fewer than five steps.
     """
     path = unwrapping_path(fringes.periods, fringes.steps, extent)
     phases = fit_phases(stack, fringes.shifts)

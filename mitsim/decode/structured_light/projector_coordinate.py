@@ -32,6 +32,11 @@ class ProjectorCoordinate:
     modulation: NDArray[np.float32]
     status: NDArray[np.uint8]
 
+    @property
+    def lit(self) -> NDArray[np.bool_]:
+        """(H, W) whether the pixel shows the code, although its bits or phases may contradict one another."""
+        return np.isin(self.status, [Status.VALID, Status.PHASE_INCONSISTENT])
+
     def part(self, region: tuple[slice, slice]) -> ProjectorCoordinate:
         """Return the coordinate of a region (rows, columns), without copying it."""
         value, sigma = self.value[region], self.sigma[region]

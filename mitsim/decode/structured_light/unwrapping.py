@@ -20,7 +20,6 @@ from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erfc
 
 from characterisation.files.errors import InputError
 from mitsim.decode.blocks import in_blocks
@@ -108,16 +107,6 @@ def unwrapping_path(periods: tuple[float, ...], steps: tuple[int, ...], extent: 
         tuple(float(np.linalg.norm(gain * scale)) for gain in gains),
         tuple(float(np.linalg.norm(gain)) for gain in gains),
     )
-
-
-def failure_rate(path: UnwrappingPath, relative_noise: float) -> float:
-    """Return the expected share of pixels with a wrong fringe order.
-
-    ``relative_noise`` is sigma_I / B of Gaussian noise. Each step fails with P = erfc(0.5 / (sqrt(2) sigma)). Here
-    sigma is the noise of its residual [cycles]. The sum over the steps is an upper bound, and close to the true rate
-    while P is small. Rejected pixels are not considered.
-    """
-    return float(min(1.0, sum(erfc(0.5 / (np.sqrt(2) * gain * relative_noise)) for gain in path.noise)))
 
 
 def unwrap(

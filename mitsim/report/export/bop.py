@@ -118,24 +118,32 @@ def objects_of(names: Sequence[str], patterns: Sequence[str]) -> list[tuple[str,
     """
     if not patterns:
         return [tuple(names)]
-    found = [tuple(fnmatch.filter(names, pattern)) for pattern in patterns]
-    for pattern, shapes in zip(patterns, found, strict=True):
+    objects = [tuple(fnmatch.filter(names, pattern)) for pattern in patterns]
+    for pattern, shapes in zip(patterns, objects, strict=True):
         if not shapes:
             raise InputError("--object", "", repr(pattern), f"a pattern of shapes: {', '.join(names)}")
-    every = [name for shapes in found for name in shapes]
+    every = [name for shapes in objects for name in shapes]
     for name in every:
         if every.count(name) > 1:
-            both = [pattern for pattern, shapes in zip(patterns, found, strict=True) if name in shapes]
-            raise InputError(
-                "--object", "", f"{' and '.join(both)}, which both have {name}", "objects without common shapes"
-            )
-    return found
+            both = [pattern for pattern, shapes in zip(patterns, objects, strict=True) if name in shapes]
+            found = f"{' and '.join(both)}, which both have {name}"
+            raise InputError("--object", "", found, "objects without common shapes")
+    return objects
 
 
 def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train", patterns: Sequence[str] = ()) -> int:
     """Write a data set atomically, with one BOP scene for each finish, and return the number of images.
 
-    ``patterns`` assign shapes to objects (:func:`objects_of`).
+    Parameters
+    ----------
+    sources
+        Captures, as :func:`find_sources` returns them.
+    output
+        Folder to write.
+    split
+        Name of the split: train, val or test.
+    patterns
+        Patterns of the shapes of each object (:func:`objects_of`).
 
     Raises
     ------
@@ -181,7 +189,14 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
 def bop_frame(capture: Capture, scene: Scene, objects: Sequence[Scene], where: str | Path) -> tuple[Frame, float]:
     """Decode a capture onto the pixels of a pinhole for BOP; also return the scale of its depth images [mm].
 
-    ``objects`` are parts of the scene (:meth:`mitsim.scene.load.Scene.only`).
+    Parameters
+    ----------
+    capture, where
+        The capture, and its folder for errors.
+    scene
+        The scene that was rendered.
+    objects
+        Parts of the scene (:meth:`mitsim.scene.load.Scene.only`).
 
     Raises
     ------
@@ -262,12 +277,9 @@ def _write_frame(frame: Frame, place: Path, number: int, scale: float, tables: d
             (place / f"{path}.png").write_bytes(encode_png(np.ascontiguousarray(image)))
     pose, key = frame.camera_from_part, str(number)
     turn, shift = pose.rotation.ravel().tolist(), pose.translation.tolist()
-    tables["camera"][key] = {
-        "cam_K": _matrix(frame.grid),
-        "depth_scale": scale,
-        "cam_R_w2c": turn,
-        "cam_t_w2c": shift,
-    }
+    grid = frame.grid
+    matrix = [grid.fx, 0.0, grid.cx, 0.0, grid.fy, grid.cy, 0.0, 0.0, 1.0]
+    tables["camera"][key] = {"cam_K": matrix, "depth_scale": scale, "cam_R_w2c": turn, "cam_t_w2c": shift}
     numbers = range(1, len(frame.masks) + 1)  # BOP counts objects from 1
     tables["gt"][key] = [{"cam_R_m2c": turn, "cam_t_m2c": shift, "obj_id": number} for number in numbers]
     tables["gt_info"][key] = [_info(silhouette, visible, counts > 0) for silhouette, visible in frame.masks]
@@ -293,20 +305,9 @@ def _box(mask: NDArray[np.bool_]) -> list[int]:
     return [int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)]
 
 
-def _matrix(grid: ViewGrid) -> list[float]:
-    return [grid.fx, 0.0, grid.cx, 0.0, grid.fy, grid.cy, 0.0, 0.0, 1.0]
-
-
 def _camera_file(grid: ViewGrid, scale: float) -> dict[str, Any]:
-    return {
-        "cx": grid.cx,
-        "cy": grid.cy,
-        "depth_scale": scale,
-        "fx": grid.fx,
-        "fy": grid.fy,
-        "height": grid.height,
-        "width": grid.width,
-    }
+    axes = {"cx": grid.cx, "cy": grid.cy, "depth_scale": scale, "fx": grid.fx, "fy": grid.fy}
+    return axes | {"height": grid.height, "width": grid.width}
 
 
 def _write_models(folder: Path, objects: Sequence[Scene]) -> None:

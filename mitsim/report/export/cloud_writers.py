@@ -10,11 +10,11 @@ import json
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from characterisation.files.atomic_io import atomic_write, atomic_write_named
 from mitsim.report.export.cloud_points import FIELDS, CloudPoints
 from mitsim.report.export.needed import needed
+from mitsim.report.export.run_scene import quaternion
 from mitsim.sensor.transforms import Transform
 
 #: integers have 32 bits: Open3D skips properties of 16
@@ -63,9 +63,7 @@ def write_cloud_pcd(points: CloudPoints, path: str | Path, part_from_sensor: Tra
     )
     if part_from_sensor is not None and points.frame == "sensor":
         scale = 0.001 if points.unit == "m" else 1.0
-        x, y, z, w = Rotation.from_matrix(part_from_sensor.rotation).as_quat(canonical=True)
-        cloud.metadata.viewpoint = tuple(
-            float(value) for value in (*(scale * part_from_sensor.translation), w, x, y, z)
-        )
+        x, y, z, w = quaternion(part_from_sensor)
+        cloud.metadata.viewpoint = (*(scale * part_from_sensor.translation).tolist(), w, x, y, z)
     with atomic_write_named(path) as file:
         cloud.save(file, encoding=pypcd4.Encoding.BINARY)

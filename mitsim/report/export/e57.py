@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from characterisation.files.atomic_io import atomic_write_named
 from mitsim.report.export.cloud_points import COVARIANCE, CloudPoints
 from mitsim.report.export.cloud_writers import about
 from mitsim.report.export.needed import needed
+from mitsim.report.export.run_scene import quaternion
 from mitsim.running.version import __version__
 from mitsim.sensor.transforms import Transform
 
@@ -38,34 +38,23 @@ def write_e57(scans: Sequence[tuple[str, CloudPoints, Transform | None]], path: 
 
 
 def _write_scan(image: Any, libe57: Any, name: str, points: CloudPoints, pose: Transform | None) -> None:
-    file = image.image_file
-    scan = libe57.StructureNode(file)
-    table = points.table()
+    file, table = image.image_file, points.table()
     guid = uuid.UUID(hashlib.sha256(name.encode() + table.tobytes()).hexdigest()[:32])
-    for key, text in (
-        ("guid", f"{{{guid}}}"),
-        ("name", name),
-        ("description", json.dumps(about(points))),
-        ("sensorModel", points.sensor),
-        ("sensorSoftwareVersion", f"mitsim {__version__}"),
-    ):
-        scan.set(key, libe57.StringNode(file, text))
+    head: dict[str, Any] = {
+        "guid": f"{{{guid}}}",
+        "name": name,
+        "description": json.dumps(about(points)),
+        "sensorModel": points.sensor,
+        "sensorSoftwareVersion": f"mitsim {__version__}",
+    }
     if pose is not None:
-        scan.set("pose", _pose(file, libe57, pose))
+        x, y, z, w = quaternion(pose)
+        translation = dict(zip("xyz", (pose.translation / 1000).tolist(), strict=True))
+        head["pose"] = {"rotation": {"w": w, "x": x, "y": y, "z": z}, "translation": translation}
     if len(table):
-        scan.set(
-            "indexBounds",
-            _bounds(
-                file,
-                libe57.IntegerNode,
-                libe57,
-                {"row": table["row"], "column": table["col"], "return": np.zeros(1, int)},
-            ),
-        )
-        scan.set(
-            "cartesianBounds",
-            _bounds(file, libe57.FloatNode, libe57, {axis: table[axis].astype(float) for axis in "xyz"}),
-        )
+        head["indexBounds"] = _bounds(row=table["row"], column=table["col"]) | {"returnMinimum": 0, "returnMaximum": 0}
+        head["cartesianBounds"] = _bounds(**{axis: table[axis] for axis in "xyz"})
+    scan = _structure(file, libe57, head)
     single = libe57.E57_SINGLE
     prototype, buffers = libe57.StructureNode(file), libe57.VectorSourceDestBuffer()
     arrays: list[NDArray[Any]] = []  # libe57 keeps only pointers
@@ -91,23 +80,16 @@ def _write_scan(image: Any, libe57: Any, name: str, points: CloudPoints, pose: T
         writer.close()
 
 
-def _pose(file: Any, libe57: Any, pose: Transform) -> Any:
-    x, y, z, w = Rotation.from_matrix(pose.rotation).as_quat(canonical=True)
-    out = libe57.StructureNode(file)
-    for key, values in (
-        ("rotation", {"w": w, "x": x, "y": y, "z": z}),
-        ("translation", dict(zip("xyz", pose.translation / 1000, strict=True))),
-    ):
-        node = libe57.StructureNode(file)
-        for name, value in values.items():
-            node.set(name, libe57.FloatNode(file, float(value)))
-        out.set(key, node)
-    return out
+def _bounds(**columns: NDArray[Any]) -> dict[str, Any]:
+    ends = (("Minimum", np.min), ("Maximum", np.max))
+    return {f"{name}{end}": function(values).item() for name, values in columns.items() for end, function in ends}
 
 
-def _bounds(file: Any, kind: Any, libe57: Any, columns: dict[str, NDArray[Any]]) -> Any:
+def _structure(file: Any, libe57: Any, values: dict[str, Any]) -> Any:
+    """Return a node of E57 with a child for each text, whole number, number or table."""
+    nodes = {str: libe57.StringNode, int: libe57.IntegerNode, float: libe57.FloatNode}
     out = libe57.StructureNode(file)
-    for name, values in columns.items():
-        out.set(f"{name}Minimum", kind(file, values.min().item()))
-        out.set(f"{name}Maximum", kind(file, values.max().item()))
+    for name, value in values.items():
+        table = isinstance(value, dict)
+        out.set(name, _structure(file, libe57, value) if table else nodes[type(value)](file, value))
     return out

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from xml.etree.ElementTree import Element, SubElement
+from typing import Any
+from xml.etree.ElementTree import Element
 
 from characterisation.features.figures import Circle, EdgePoint, Point
 from characterisation.features.surfaces import Cone, Cylinder, Plane, Sphere
-from characterisation.tasks.definitions import DEFINITIONS
+from characterisation.tasks.definitions import DEFINITIONS, MeasurementKind
 from characterisation.tasks.task_file import Measurement, Nominal, Task
 from mitsim.sensor.transforms import Transform
 
 #: QIF's characteristics by kind of measurement; sizes of a sphere have other names
-CHARACTERISTICS = {
+CHARACTERISTICS: dict[MeasurementKind, str] = {
     "intersection_distance": "DistanceBetween",
     "axis_distance": "DistanceBetween",
     "point_distance": "DistanceBetween",
@@ -38,15 +39,8 @@ CHARACTERISTICS = {
 }
 
 #: zones that QIF cannot represent without a tolerance
-GEOMETRIC = (
-    "Position",
-    "Parallelism",
-    "Perpendicularity",
-    "Angularity",
-    "Coaxiality",
-    "Symmetry",
-    "Flatness",
-    "Cylindricity",
+GEOMETRIC = tuple(
+    name for kind, name in CHARACTERISTICS.items() if DEFINITIONS[kind].zone and not name.startswith("UserDefined")
 )
 
 #: QIF's kinds of feature by mitsim's
@@ -62,6 +56,16 @@ FEATURES = {
 }
 
 
+#: zones of a position by the kind of feature, where they are not diametrical
+_POSITION_ZONES = {
+    "sphere": "SphericalZone",
+    "intersection": "SphericalZone",
+    "edge_point": "NonDiametricalZone",
+    "plane": "NonDiametricalZone",
+    "mid_plane": "NonDiametricalZone",
+}
+
+
 class Ids:
     """Numbers of a document's elements, by key or new."""
 
@@ -69,26 +73,39 @@ class Ids:
         self.last = 0
         self.by_key: dict[tuple[str, str], int] = {}
 
-    def new(self, kind: str, name: str) -> str:
+    def new(self, kind: str, name: str = "") -> str:
         """Number the element of a kind and a name."""
         self.last += 1
         self.by_key[kind, name] = self.last
         return str(self.last)
 
-    def of(self, kind: str, name: str) -> str:
+    def of(self, kind: str, name: str = "") -> str:
         """Return the number of that element."""
         return str(self.by_key[kind, name])
 
 
-def text(parent: Element, tag: str, content: object, attributes: Mapping[str, str] | None = None) -> Element:
-    """Append an element of text; a bool in XML's form, a float with all its digits."""
-    out = SubElement(parent, tag, dict(attributes or {}))
-    if isinstance(content, bool):
-        out.text = "true" if content else "false"
-    elif isinstance(content, float):
-        out.text = decimal(content)
-    else:
-        out.text = str(content)
+#: content of an element: text, or a number; children by their tags; a list of elements, which QIF counts in ``n``
+Content = str | float | Mapping[str, Any] | list[Element]
+
+
+def element(tag: str, content: Content = "", /, **attributes: str) -> Element:
+    """Build an element with its children in the order of its content; children of content None are left out.
+
+    A bool has XML's form, a float all its digits.
+    """
+    out = Element(tag, attributes)
+    match content:
+        case Mapping():
+            out.extend(element(name, child) for name, child in content.items() if child is not None)
+        case list():
+            out.set("n", str(len(content)))
+            out.extend(content)
+        case bool():
+            out.text = "true" if content else "false"
+        case float():
+            out.text = decimal(content)
+        case _ if content != "":
+            out.text = str(content)
     return out
 
 
@@ -98,73 +115,56 @@ def decimal(value: float) -> str:
     return "0" if written in ("", "-0") else written
 
 
-def vector(parent: Element, tag: str, values: Iterable[float]) -> Element:
-    """Append three numbers."""
-    return text(parent, tag, " ".join(decimal(float(value)) for value in values))
+def vector(values: Iterable[float]) -> str:
+    """Format three numbers."""
+    return " ".join(decimal(float(value)) for value in values)
 
 
-def references(parent: Element, tag: str, numbers: Iterable[str]) -> None:
-    """Append a list of ids."""
-    found = list(numbers)
-    out = SubElement(parent, tag, n=str(len(found)))
-    for number in found:
-        text(out, "Id", number)
+def references(numbers: Iterable[str]) -> list[Element]:
+    """Build a list of ids."""
+    return [element("Id", number) for number in numbers]
 
 
-def attributes(parent: Element, values: Mapping[str, str | float | int]) -> None:
-    """Append mitsim's own attributes, each with the prefix ``mitsim.``."""
-    out = SubElement(parent, "Attributes", n=str(len(values)))
-    for name, value in values.items():
-        kind = {str: "AttributeStr", int: "AttributeI1", float: "AttributeD1"}[type(value)]
-        SubElement(out, kind, name=f"mitsim.{name}", value=str(value))
+def attributes(values: Mapping[str, str | float | int]) -> list[Element]:
+    """Build mitsim's own attributes, each with the prefix ``mitsim.``."""
+    kinds: dict[type, str] = {str: "AttributeStr", int: "AttributeI1", float: "AttributeD1"}
+    return [element(kinds[type(value)], name=f"mitsim.{name}", value=str(value)) for name, value in values.items()]
 
 
-def transform(parent: Element, number: str, name: str, pose: Transform) -> None:
-    """Append a transform: the directions of its axes, and its origin [mm]."""
-    out = SubElement(parent, "Transform", id=number)
-    turn = SubElement(out, "Rotation")
-    for k, axis in enumerate("XYZ"):
-        vector(turn, f"{axis}Direction", pose.rotation[:, k])
-    vector(out, "Origin", pose.translation)
-    text(out, "Name", name)
+def transform(number: str, name: str, pose: Transform) -> Element:
+    """Build a transform: the directions of its axes, and its origin [mm]."""
+    axes = {f"{axis}Direction": vector(pose.rotation[:, k]) for k, axis in enumerate("XYZ")}
+    return element("Transform", {"Rotation": axes, "Origin": vector(pose.translation), "Name": name}, id=number)
 
 
-def feature_definition(parent: Element, number: str, kind: str, nominal: Nominal) -> None:
-    """Append the definition that features of one size share."""
-    out = SubElement(parent, f"{FEATURES[kind]}FeatureDefinition", id=number)
+def feature_size(nominal: Nominal) -> dict[str, Any]:
+    """Return the content of a definition, which features of one size share."""
+    size: dict[str, Any] = {}
+    if isinstance(nominal, Cylinder | Sphere | Cone | Circle | EdgePoint):
+        size["InternalExternal"] = "NOT_APPLICABLE"
     if isinstance(nominal, Cylinder | Sphere | Cone | Circle):
-        text(out, "InternalExternal", "NOT_APPLICABLE")
-        text(out, "Diameter", 2.0 * float(nominal.radius))
-        if isinstance(nominal, Cone):
-            text(out, "HalfAngle", math.degrees(nominal.half_angle))
-    elif isinstance(nominal, EdgePoint):
-        text(out, "InternalExternal", "NOT_APPLICABLE")
+        size["Diameter"] = 2.0 * float(nominal.radius)
+    if isinstance(nominal, Cone):
+        size["HalfAngle"] = math.degrees(nominal.half_angle)
+    return size
 
 
-def feature_nominal(parent: Element, number: str, name: str, kind: str, nominal: Nominal, definition: str) -> None:
-    """Append the nominal geometry of a feature, part frame."""
-    out = SubElement(parent, f"{FEATURES[kind]}FeatureNominal", id=number)
-    text(out, "Name", name)
-    text(out, "FeatureDefinitionId", definition)
+def feature_geometry(nominal: Nominal) -> dict[str, Any]:
+    """Return the content for the nominal geometry of a feature [mm], part frame."""
     match nominal:
         case Cylinder() | Cone():
-            axis = SubElement(out, "Axis")
-            vector(axis, "AxisPoint", nominal.point)
-            vector(axis, "Direction", nominal.axis)
+            return {"Axis": {"AxisPoint": vector(nominal.point), "Direction": vector(nominal.axis)}}
         case Plane():
-            vector(out, "Location", nominal.point)
-            vector(out, "Normal", nominal.normal)
+            return {"Location": vector(nominal.point), "Normal": vector(nominal.normal)}
         case Sphere():
-            vector(out, "Location", nominal.centre)
+            return {"Location": vector(nominal.centre)}
         case Circle():
-            vector(out, "Location", nominal.centre)
-            vector(out, "Normal", nominal.normal)
+            return {"Location": vector(nominal.centre), "Normal": vector(nominal.normal)}
         case EdgePoint():
-            vector(out, "Location", nominal.point)
-            vector(out, "Normal", nominal.direction)
-            vector(out, "AdjacentNormal", nominal.normal)
+            directions = {"Normal": vector(nominal.direction), "AdjacentNormal": vector(nominal.normal)}
+            return {"Location": vector(nominal.point)} | directions
         case Point():
-            vector(out, "Location", nominal.place)
+            return {"Location": vector(nominal.place)}
 
 
 def characteristic(task: Task, asked: Measurement) -> str:
@@ -176,46 +176,46 @@ def characteristic(task: Task, asked: Measurement) -> str:
     return f"Spherical{name}" if of_sphere else name
 
 
-def tolerance(out: Element, name: str, asked: Measurement, what: str) -> None:
-    """Append the tolerance of a dimension, or that it is only measured; ``what`` describes a user-defined one."""
+def tolerance(name: str, asked: Measurement) -> dict[str, Any]:
+    """Return the content for the tolerance of a dimension, or that it is only measured."""
+    what = {"WhatToMeasure": asked.kind} if name.startswith("UserDefined") else {}
     if asked.deviations is None:
-        text(out, "NonTolerance", "MEASURED")
-    else:
-        lower, upper = asked.deviations
-        limits = SubElement(out, "Tolerance")
-        text(limits, "MaxValue", upper)
-        if not DEFINITIONS[asked.kind].zone:
-            text(limits, "MinValue", lower)
-        text(limits, "DefinedAsLimit", DEFINITIONS[asked.kind].zone)
-    if name.startswith("UserDefined"):
-        text(out, "WhatToMeasure", what)
+        return {"NonTolerance": "MEASURED"} | what
+    (lower, upper), is_zone = asked.deviations, DEFINITIONS[asked.kind].zone
+    limits = {"MaxValue": upper, "MinValue": None if is_zone else lower, "DefinedAsLimit": is_zone}
+    return {"Tolerance": limits} | what
 
 
-def zone(out: Element, name: str, task: Task, asked: Measurement, frame: str | None) -> None:
-    """Append the tolerance zone of a geometric characteristic; ``frame`` is the id of its datum reference frame."""
-    text(out, "ToleranceValue", asked.tolerance_size or 0.0)
-    if name in ("Flatness", "Cylindricity"):
-        return
-    if frame is not None:
-        text(out, "DatumReferenceFrameId", frame)
-    if name == "Symmetry":
-        return
-    if name != "Coaxiality":
-        text(out, "MaterialCondition", "NONE")
-    shape = SubElement(out, "ZoneShape")
-    first, *datums = (task.features[one].kind for one in asked.features)
-    if name == "Position":
-        zones = {
-            "sphere": "SphericalZone",
-            "intersection": "SphericalZone",
-            "edge_point": "NonDiametricalZone",
-            "plane": "NonDiametricalZone",
-            "mid_plane": "NonDiametricalZone",
-        }
-        SubElement(shape, zones.get(first, "DiametricalZone"))
-    elif name == "Coaxiality":
-        SubElement(shape, "DiametricalZone")
-    else:  # an axis parallel to a datum axis, or perpendicular to a datum plane
-        round_with = ("cylinder", "cone") if name == "Parallelism" else ("plane",)
-        round_zone = first in ("cylinder", "cone") and datums[0] in round_with
-        SubElement(shape, "DiametricalZone" if round_zone else "PlanarZone")
+def zone(name: str, task: Task, asked: Measurement, frame: str | None) -> dict[str, Any]:
+    """Return the content for the tolerance zone of a geometric characteristic.
+
+    Parameters
+    ----------
+    name
+        Of the characteristic, one of :data:`GEOMETRIC`.
+    task, asked
+        The task, and its measurement with a tolerance [mm].
+    frame
+        Id of the datum reference frame, None without datums.
+    """
+    shape = _zone_shape(name, *(task.features[feature].kind for feature in asked.features))
+    return {
+        "ToleranceValue": asked.tolerance_size or 0.0,
+        "DatumReferenceFrameId": frame,
+        "MaterialCondition": None if shape is None or name == "Coaxiality" else "NONE",
+        "ZoneShape": None if shape is None else {shape: {}},
+    }
+
+
+def _zone_shape(name: str, first: str, *datums: str) -> str | None:
+    """Return the shape of a zone for a feature of the kind ``first``; None where QIF has only one."""
+    match name:
+        case "Flatness" | "Cylindricity" | "Symmetry":
+            return None
+        case "Coaxiality":
+            return "DiametricalZone"
+        case "Position":
+            return _POSITION_ZONES.get(first, "DiametricalZone")
+    # round for an axis parallel to a datum axis, or perpendicular to a datum plane
+    round_with = ("cylinder", "cone") if name == "Parallelism" else ("plane",)
+    return "DiametricalZone" if first in ("cylinder", "cone") and datums[0] in round_with else "PlanarZone"

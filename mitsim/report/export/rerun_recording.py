@@ -18,31 +18,18 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 from characterisation.files.atomic_io import atomic_write_named
-from characterisation.point_cloud import PointCloud, Status
+from characterisation.point_cloud import Status
+from mitsim.report.cloud_figures import REASONS
 from mitsim.report.export.cloud_points import cloud_points
 from mitsim.report.export.gltf import FRUSTUM_MM
 from mitsim.report.export.needed import needed
 from mitsim.report.export.run_scene import RunScene, ShownView
 
-#: colours of the statuses, by number (Tol's "muted" and greys; valid points are dark)
-STATUS_COLOURS = (
-    (51, 34, 136),
-    (221, 221, 221),
-    (136, 204, 238),
-    (204, 102, 119),
-    (221, 204, 119),
-    (17, 119, 51),
-    (170, 68, 153),
-    (153, 153, 51),
-    (136, 34, 85),
-    (68, 170, 153),
-    (120, 120, 120),
-    (85, 34, 0),
-)
-
+#: of points with an unknown sigma
 _UNKNOWN = (150, 150, 150)
 
 
@@ -53,7 +40,8 @@ def write_rrd(scene: RunScene, path: str | Path, recording: str) -> None:
         stream = rerun.RecordingStream("mitsim", recording_id=recording, send_properties=False)
         stream.save(str(file))
         stream.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        classes = [(status.value, status.name.lower(), STATUS_COLOURS[status]) for status in Status]
+        colours = {status: (255 * np.array(to_rgb(REASONS[status][1]))).round().astype(np.uint8) for status in Status}
+        classes = [(status.value, status.name.lower(), colour.tolist()) for status, colour in colours.items()]
         stream.log("views", rerun.AnnotationContext(classes), static=True)
         if scene.part is not None:
             mesh = rerun.Mesh3D(
@@ -95,7 +83,7 @@ def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None
         points = cloud_points(cloud)
         stream.log(
             f"{place}/{kind}",
-            rerun.Points3D(points.points, colors=_colours(cloud), radii=-1.5),
+            rerun.Points3D(points.points, colors=_colours(points.sigma), radii=-1.5),
             rerun.AnyValues(
                 sigma=points.sigma.astype(np.float32), covariance=points.covariance.astype(np.float32).ravel()
             ),
@@ -103,9 +91,8 @@ def _log_view(rerun: Any, stream: Any, scene: RunScene, view: ShownView) -> None
         )
 
 
-def _colours(cloud: PointCloud) -> NDArray[np.uint8]:
+def _colours(sigma: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Return colours (n, 3) by ln sigma from its 2nd to its 98th percentile; grey where it is unknown."""
-    sigma = np.full(int(cloud.valid.sum()), np.nan) if cloud.sigma is None else cloud.sigma[cloud.valid].astype(float)
     out = np.tile(np.array(_UNKNOWN, np.uint8), (len(sigma), 1))
     known = np.isfinite(sigma) & (sigma > 0)
     if known.any():

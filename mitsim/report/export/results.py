@@ -1,7 +1,7 @@
 """Tabulate the results of a run: the expectation of every measurement from the chosen view; as CSV and JSON.
 
-Signal chain: ``run.json``, ``statement.json``, task -> a :class:`Result` for every measurement -> CSV, JSON, or QIF
-(:mod:`mitsim.report.export.qif`).
+Signal chain: ``run.json``, ``statement.json``, task -> an :class:`ExpectedResult` for every measurement -> CSV, JSON or
+QIF (:mod:`mitsim.report.export.qif`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.task_reading import read_task
+from mitsim.report.export.run_scene import view_pose
 from mitsim.running.version import __version__
 from mitsim.sensor.transforms import Transform
 from mitsim.study import StudyFile
@@ -25,7 +26,7 @@ from mitsim.study.statement_file import StatedMeasurement
 
 
 @dataclass(frozen=True)
-class Result:
+class ExpectedResult:
     """Expected result of one measurement, in its ``unit`` (mm or deg); missing numbers are None.
 
     ``expected`` is the mean value for a perfect part, nominal + ``bias``. ``low`` to ``high`` contain 95 % of the
@@ -55,7 +56,7 @@ class Result:
 class RunResults:
     """Results of a run, its task, and the views of its plan: number, pose and measurements of each."""
 
-    results: tuple[Result, ...]
+    results: tuple[ExpectedResult, ...]
     task: Task
     sensor: str
     study: str
@@ -95,11 +96,7 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
     view = run.statement.view
     results = tuple(_result(name, task, run.statement.measurements[name], view) for name in task.measurements)
     numbers = run.about.view_sets[0].views if run.about.view_sets else [view]
-    known = [int(number) for number in run.scores["view"].values]
-    poses = run.scores["world_from_sensor"].values
-    plan = tuple(
-        (number, Transform.from_matrix(poses[known.index(number)]), tuple(task.measurements)) for number in numbers
-    )
+    plan = tuple((number, view_pose(run, number), tuple(task.measurements)) for number in numbers)
     return RunResults(results, task, run.about.sensor, run.about.study, run.statement.measured_by, plan)
 
 
@@ -107,10 +104,10 @@ def write_results_csv(found: RunResults, path: str | Path) -> None:
     """Write one row for every measurement; missing numbers are empty fields."""
     out = io.StringIO()
     rows = [
-        asdict(one) | {"features": " ".join(one.features), "tolerance": _in_a_field(one.tolerance)}
-        for one in found.results
+        asdict(result) | {"features": " ".join(result.features), "tolerance": _in_a_field(result.tolerance)}
+        for result in found.results
     ]
-    writer = csv.DictWriter(out, list(Result.__dataclass_fields__), lineterminator="\n")
+    writer = csv.DictWriter(out, list(ExpectedResult.__dataclass_fields__), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     with atomic_write(path) as file:
@@ -144,10 +141,10 @@ def write_results_json(found: RunResults, path: str | Path) -> None:
     )
 
 
-def _result(name: str, task: Task, stated: StatedMeasurement, view: int) -> Result:
+def _result(name: str, task: Task, stated: StatedMeasurement, view: int) -> ExpectedResult:
     asked = task.measurements[name]
     low, high = (None if end is None else asked.nominal + end for end in stated.interval)
-    return Result(
+    return ExpectedResult(
         name,
         asked.kind,
         asked.features,
@@ -168,18 +165,11 @@ def _result(name: str, task: Task, stated: StatedMeasurement, view: int) -> Resu
 
 
 def _task_path(run: Run) -> Path:
+    hint = "give the task: --task FILE"
     study = Path(run.about.study)
     if not study.is_file():
-        raise InputError(
-            run.folder / "run.json",
-            "study",
-            f"{study}, which does not exist",
-            "a readable study",
-            "give the task: --task FILE",
-        )
+        raise InputError(run.folder / "run.json", "study", f"{study}, which does not exist", "a readable study", hint)
     path = study.parent / read_toml(study, StudyFile).task
     if not path.is_file():
-        raise InputError(
-            study, "task", f"{path}, which does not exist", "a readable task", "give the task: --task FILE"
-        )
+        raise InputError(study, "task", f"{path}, which does not exist", "a readable task", hint)
     return path

@@ -23,7 +23,7 @@ line; then C is set to 0.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.errors import InputError
-from mitsim.report.export.run_scene import numbers_of
+from mitsim.report.export.run_scene import numbers_of, quaternion
 from mitsim.sensor.transforms import Transform
 from mitsim.study.run_folder import read_run
 
@@ -42,7 +42,7 @@ _GIMBAL = 1 - 1e-12
 
 
 @dataclass(frozen=True)
-class Target:
+class RobotTarget:
     """A named pose of the tool in the part frame [mm]: ``name`` of letters, digits and underscores."""
 
     name: str
@@ -55,10 +55,10 @@ class RobotFormat:
 
     what: str
     suffix: str
-    write: Callable[[Sequence[Target], str], str]
+    write: Callable[[Sequence[RobotTarget], str], str]
 
 
-def read_targets(folder: str | Path, views: str = "best") -> tuple[list[Target], str]:
+def read_targets(folder: str | Path, views: str = "best") -> tuple[list[RobotTarget], str]:
     """Return the targets of a run's views, or of a folder of ``mitsim study score``; and the name of their tool.
 
     Parameters
@@ -88,12 +88,7 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[Target],
         chosen = sorted({*(about.view_sets[0].views if about.view_sets else about.leaders.values())})
     else:
         chosen = numbers_of(views, list(known))
-    return [Target(f"view_{number:04d}", poses[number]) for number in chosen], tool
-
-
-def abb_numbers(pose: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return position [mm] and quaternion w, x, y, z of a pose, as in RAPID."""
-    return pose.translation, Rotation.from_matrix(pose.rotation).as_quat(canonical=True)[[3, 0, 1, 2]]
+    return [RobotTarget(f"view_{number:04d}", poses[number]) for number in chosen], tool
 
 
 def kuka_numbers(pose: Transform) -> NDArray[np.float64]:
@@ -107,17 +102,7 @@ def kuka_numbers(pose: Transform) -> NDArray[np.float64]:
     return np.array([*pose.translation, *np.degrees([a, b, c])])
 
 
-def ur_numbers(pose: Transform) -> NDArray[np.float64]:
-    """Return x, y, z [m] and rotation vector [rad] of a pose, as in URScript."""
-    return np.array([*(pose.translation / 1000), *Rotation.from_matrix(pose.rotation).as_rotvec()])
-
-
-def moveit_numbers(pose: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return position [m] and quaternion x, y, z, w of a pose, as in ROS."""
-    return pose.translation / 1000, Rotation.from_matrix(pose.rotation).as_quat(canonical=True)
-
-
-def rapid_module(targets: Sequence[Target], tool: str) -> str:
+def rapid_module(targets: Sequence[RobotTarget], tool: str) -> str:
     r"""Return a RAPID module of robtargets, with the part frame as work object.
 
     Configurations are 0 and external axes are unused: ``ConfL\Off`` and ``ConfJ\Off`` let the controller choose.
@@ -129,14 +114,13 @@ def rapid_module(targets: Sequence[Target], tool: str) -> str:
     ]
     unused = ", ".join(["9E+09"] * 6)
     for one in targets:
-        place, turn = abb_numbers(one.part_from_tool)
-        lines.append(
-            f"  CONST robtarget {one.name} := [[{_listed(place, 4)}], [{_listed(turn, 9)}], [0, 0, 0, 0], [{unused}]];"
-        )
+        x, y, z, w = quaternion(one.part_from_tool)
+        pose = f"[{_listed(one.part_from_tool.translation, 4)}], [{_listed((w, x, y, z), 9)}]"
+        lines.append(f"  CONST robtarget {one.name} := [{pose}, [0, 0, 0, 0], [{unused}]];")
     return "\n".join([*lines, "ENDMODULE", ""])
 
 
-def krl_data(targets: Sequence[Target], tool: str) -> str:
+def krl_data(targets: Sequence[RobotTarget], tool: str) -> str:
     """Return a KRL data list of FRAMEs, with the part frame as base."""
     lines = [
         "DEFDAT mitsim_views PUBLIC",
@@ -150,22 +134,24 @@ def krl_data(targets: Sequence[Target], tool: str) -> str:
     return "\n".join([*lines, "ENDDAT", ""])
 
 
-def urscript(targets: Sequence[Target], tool: str) -> str:
+def urscript(targets: Sequence[RobotTarget], tool: str) -> str:
     """Return URScript poses, with the part frame as feature; ``pose_trans(part, view_0012)`` is a pose in the base."""
     lines = [
         f"# poses of the {tool} in the part frame; m, rotation vector in rad",
         "# move there: movej(pose_trans(part, view_...)), with part the pose of the part frame in the base",
     ]
-    lines += [f"{one.name} = p[{_listed(ur_numbers(one.part_from_tool), 9)}]" for one in targets]
+    for one in targets:
+        turn = Rotation.from_matrix(one.part_from_tool.rotation).as_rotvec()
+        lines.append(f"{one.name} = p[{_listed([*(one.part_from_tool.translation / 1000), *turn], 9)}]")
     return "\n".join([*lines, ""])
 
 
-def moveit_poses(targets: Sequence[Target], tool: str) -> str:
+def moveit_poses(targets: Sequence[RobotTarget], tool: str) -> str:
     """Return YAML of ``PoseStamped`` by name, in the frame ``part``; no exponents, which YAML 1.1 reads as text."""
     lines = [f"# poses of the {tool} in the part frame; m, quaternion x y z w", f"tool: {tool}", "poses:"]
     for one in targets:
-        place, turn = moveit_numbers(one.part_from_tool)
-        position = ", ".join(f"{k}: {_number(v, 9)}" for k, v in zip("xyz", place, strict=True))
+        origin, turn = one.part_from_tool.translation / 1000, quaternion(one.part_from_tool)
+        position = ", ".join(f"{k}: {_number(v, 9)}" for k, v in zip("xyz", origin, strict=True))
         orientation = ", ".join(f"{k}: {_number(v, 12)}" for k, v in zip("xyzw", turn, strict=True))
         lines += [
             f"  {one.name}:",
@@ -188,5 +174,5 @@ def _number(value: float, places: int) -> str:
     return f"{round(float(value), places) + 0.0:.{places}f}"
 
 
-def _listed(values: NDArray[np.float64], places: int) -> str:
+def _listed(values: Iterable[float], places: int) -> str:
     return ", ".join(_number(value, places) for value in values)

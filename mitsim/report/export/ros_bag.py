@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from characterisation.files.atomic_io import atomic_write_named
 from mitsim.report.export.cloud_points import FIELDS, CloudPoints
 from mitsim.report.export.needed import needed
+from mitsim.report.export.run_scene import quaternion
 from mitsim.sensor.transforms import Transform
 
 ROOT = "part"
@@ -136,14 +136,12 @@ def cloud_message(points: CloudPoints, frame: str, second: int) -> dict[str, Any
 
 
 def _transform(frame: str, pose: Transform) -> dict[str, Any]:
-    x, y, z, w = (float(value) for value in Rotation.from_matrix(pose.rotation).as_quat(canonical=True))
-    place = (float(value) / 1000 for value in pose.translation)
     return {
         "header": _header(ROOT, 1),
         "child_frame_id": frame,
         "transform": {
-            "translation": dict(zip("xyz", place, strict=True)),
-            "rotation": {"x": x, "y": y, "z": z, "w": w},
+            "translation": dict(zip("xyz", (pose.translation / 1000).tolist(), strict=True)),
+            "rotation": dict(zip("xyzw", quaternion(pose), strict=True)),
         },
     }
 

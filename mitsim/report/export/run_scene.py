@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from characterisation.cloud_files import read_cloud
-from characterisation.files.checked_files import read_json_object
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, ViewGrid
 from mitsim.sensor.transforms import Transform
@@ -62,29 +62,24 @@ def read_run_scene(folder: str | Path, views: str = "best") -> RunScene:
         If the folder is not a run, or a view does not exist.
     """
     run = read_run(folder)
-    known = [int(number) for number in run.scores["view"].values]
-    chosen = chosen_views(run, views)
-    poses = run.scores["world_from_sensor"].values
     shown = []
-    for number in chosen:
+    for number in chosen_views(run, views):
         clouds = {kind: _read_own(run, kind, number) for kind in KINDS if run.has(_cloud_name(kind, number))}
         best_of = tuple(name for name, best in run.about.leaders.items() if best == number)
-        pose = Transform.from_matrix(poses[known.index(number)])
-        shown.append(ShownView(number, pose, clouds, best_of))
+        shown.append(ShownView(number, view_pose(run, number), clouds, best_of))
     grids = [cloud.grid for view in shown for cloud in view.clouds.values()]
     if not grids and run.clouds:
         grids = [run.predicted(run.clouds[0]).grid]
     return RunScene(run.part(), tuple(shown), grids[0] if grids else None, run.about.sensor)
 
 
-def chosen_views(run: Run, views: str) -> list[int]:
-    """Return the view numbers selected by ``best``, ``all`` or a list of numbers, ascending.
+def view_pose(run: Run, number: int) -> Transform:
+    """Return the pose of the sensor in the part frame [mm] for a view of a run."""
+    return Transform.from_matrix(run.scores["world_from_sensor"].sel(view=number).values)
 
-    Raises
-    ------
-    InputError
-        If the selection is none of these, or a view does not exist.
-    """
+
+def chosen_views(run: Run, views: str) -> list[int]:
+    """Return the view numbers selected by ``best``, or as in :func:`numbers_of`, ascending."""
     known = [int(number) for number in run.scores["view"].values]
     if views == "best":
         with_cloud = [number for number in known if any(run.has(_cloud_name(kind, number)) for kind in KINDS)]
@@ -112,32 +107,6 @@ def numbers_of(views: str, known: Sequence[int]) -> list[int]:
     return chosen
 
 
-def read_pose(path: str | Path) -> Transform:
-    """Read ``world_from_sensor``, 4 x 4 by rows [mm], from a JSON file: ``pose.json``, ``statement.json``.
-
-    Raises
-    ------
-    InputError
-        If there is none, or it is not a rigid motion.
-    """
-    allowed = "world_from_sensor, 4 x 4 by rows, rigid [mm]"
-    try:
-        table = read_json_object(Path(path), f"JSON with {allowed}")
-        matrix = np.array(table["world_from_sensor"], float)
-    except InputError:
-        raise
-    except (ValueError, TypeError) as error:
-        raise InputError(path, "", f"a file that cannot be read ({error})", f"JSON with {allowed}") from None
-    except KeyError:
-        raise InputError(path, "world_from_sensor", "nothing", allowed) from None
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError(path, "world_from_sensor", table["world_from_sensor"], allowed)
-    turn = matrix[:3, :3]
-    if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
-        raise InputError(path, "world_from_sensor", "a matrix that is not a rotation", allowed)
-    return Transform.from_matrix(matrix)
-
-
 def frustum(grid: ViewGrid, depth: float) -> tuple[NDArray[np.float64], list[tuple[int, int]]]:
     """Return apex and corners (5, 3) of a grid's view pyramid, in grid coordinates, and its 8 edges.
 
@@ -150,14 +119,15 @@ def frustum(grid: ViewGrid, depth: float) -> tuple[NDArray[np.float64], list[tup
     return places, [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
 
 
+def quaternion(pose: Transform) -> tuple[float, float, float, float]:
+    """Return the rotation of a pose as a unit quaternion x, y, z, w with w >= 0."""
+    x, y, z, w = Rotation.from_matrix(pose.rotation).as_quat(canonical=True).tolist()
+    return x, y, z, w
+
+
 def sensor_from_grid(grid: ViewGrid) -> Transform:
     """Return the pose of a grid in the sensor frame."""
     return Transform(grid.rotation, grid.origin)
-
-
-def labelled_scans(scene: RunScene) -> Sequence[tuple[str, PointCloud, ShownView]]:
-    """Return all clouds of all views, each with a name such as ``view_0012_predicted``."""
-    return [(f"{view.name}_{kind}", cloud, view) for view in scene.views for kind, cloud in view.clouds.items()]
 
 
 def _cloud_name(kind: str, number: int) -> str:

@@ -1,0 +1,50 @@
+"""Describe the pose of a view: angles in deg, lengths in mm, in the part frame."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mitsim.running.numbers import SPACE, rounded
+from mitsim.study.choice_document import PoseEntry
+from mitsim.study.run_folder import Run
+
+
+def pose_of_view(run: Run, view: int) -> PoseEntry:
+    """Return the pose of a candidate view of a run."""
+    here = run.scores.sel(view=view)
+    names = ("azimuth_deg", "elevation_deg", "roll_deg", "standoff_mm")
+    numbers: dict[str, Any] = {name: float(here[name]) for name in names}
+    return PoseEntry.model_construct(view=view, world_from_sensor=here["world_from_sensor"].values.tolist(), **numbers)
+
+
+def angle_texts(pose: PoseEntry) -> dict[str, str]:
+    """Return azimuth, elevation and roll as texts."""
+    angles = {"azimuth": pose.azimuth_deg, "elevation": pose.elevation_deg, "roll": pose.roll_deg}
+    return {name: f"{rounded(angle)}°" for name, angle in angles.items()}
+
+
+def angles_in_words(pose: PoseEntry) -> str:
+    """Return azimuth, elevation and roll in one text."""
+    return ", ".join(f"{name} {angle}" for name, angle in angle_texts(pose).items())
+
+
+def origin_text(pose: PoseEntry, places: int = 0) -> str:
+    """Return the position of the sensor's origin [mm], rounded to a number of decimal places."""
+    return ", ".join(rounded(row[3], places) for row in pose.world_from_sensor[:3])
+
+
+def pose_texts(pose: PoseEntry) -> dict[str, str]:
+    """Return view, angles, standoff and position as texts for a row of a table."""
+    standoff = f"{rounded(pose.standoff_mm)}{SPACE}mm"
+    return {"view": str(pose.view), **angle_texts(pose), "standoff": standoff, "position": origin_text(pose)}
+
+
+def pose_words(pose: PoseEntry) -> str:
+    """Describe a pose in plain words: distance, azimuth, elevation and roll, each with its reference."""
+    angles = angle_texts(pose)
+    return (
+        f"distance {rounded(pose.standoff_mm)}{SPACE}mm, "
+        f"azimuth {angles['azimuth']} (about the part’s z axis, from x), "
+        f"elevation {angles['elevation']} (above the plane z = 0), "
+        f"roll {angles['roll']} (about the line of sight, clockwise as the sensor sees)"
+    )
