@@ -73,12 +73,27 @@ def read_grey(path: Path, *, green: bool = False, channel: int | None = None) ->
 
 
 def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel: int | None = None) -> Image:
-    """Read a grey image from the bytes of a file, as :func:`read_grey` does; messages name ``where``.
+    """Read a grey image from the bytes of a file, as :func:`read_grey` does.
+
+    Parameters
+    ----------
+    data
+        Content of the file.
+    where
+        Name of the file in messages.
+    green
+        Whether to take the green channel of a colour image.
+    channel
+        Number of the channel to take of a colour image (:data:`CHANNELS`).
 
     Raises
     ------
     InputError
         As :func:`read_grey`.
+
+    See Also
+    --------
+    read_grey : from a file
     """
     is_png = data.startswith(PNG_SIGNATURE)
     if is_png:

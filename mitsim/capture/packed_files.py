@@ -40,9 +40,18 @@ def packed(
     vendor: Mapping[str, bytes] | None = None,
     truth: Mapping[str, bytes] | None = None,
 ) -> dict[str, bytes]:
-    """Return the bytes of every file of a capture's folder, by path in the folder; messages name ``folder``.
+    """Return the bytes of every file of a capture's folder, by path in the folder.
 
-    ``vendor`` are the maker's files by name; ``truth`` are OpenEXR images by camera.
+    Parameters
+    ----------
+    capture
+        Capture to write.
+    folder
+        Folder that messages name.
+    vendor
+        The maker's files by name.
+    truth
+        OpenEXR images by camera.
 
     Raises
     ------
@@ -137,7 +146,18 @@ def files_of(capture: Capture, extra: Mapping[tuple[str, str], bytes], folder: P
 def check_image(
     image: NDArray[np.unsignedinteger[Any]], frames: list[NDArray[np.unsignedinteger[Any]]], bits: int, where: Path
 ) -> None:
-    """Check that an image has the type of the earlier ``frames`` and no value above its ``bits``.
+    """Check that an image has the type of the earlier images, and no value above its bits.
+
+    Parameters
+    ----------
+    image
+        (H, W) [DN].
+    frames
+        Earlier images of the camera.
+    bits
+        Bits of a grey level.
+    where
+        File that messages name.
 
     Raises
     ------

@@ -34,6 +34,17 @@ def grey_limits(frames: Sequence[NDArray[np.number[Any]]]) -> tuple[float, float
 def draw_capture(capture: Capture, ax: Any, camera: str | None, image: int) -> NDArray[np.object_]:
     """Draw one image of every camera, or of one; of a capture without images, the maps that the device computed.
 
+    Parameters
+    ----------
+    capture
+        Capture to draw.
+    ax
+        Axes to draw into, one for each camera; None for those of a new figure.
+    camera
+        Draw this camera alone; None for all.
+    image
+        Number of the image, from 0; negative numbers count from the last.
+
     Raises
     ------
     InputError

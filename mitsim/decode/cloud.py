@@ -138,8 +138,22 @@ def settings_in_words(
 ) -> str:
     """Describe the depths that are decoded, and whose settings are used.
 
-    ``sensor`` and ``range_mm`` are the user's, as for :func:`decoder_settings`. Decoders of codes and of device maps
-    accept all depths; a matcher without a range searches the default.
+    Decoders of codes and of device maps accept all depths; a matcher without a range searches the default.
+
+    Parameters
+    ----------
+    capture
+        Capture to decode.
+    settings
+        Settings of its decoder.
+    sensor
+        Sensor that the user names, as for :func:`decoder_settings`.
+    range_mm
+        Nearest and farthest depth that the user requests [mm].
+
+    See Also
+    --------
+    decoder_settings : the settings
     """
     stored, preset = capture.decoding, capture.sensor in presets()
     known = preset or any((sensor, range_mm, stored.near_mm, stored.range_mm, stored.decoder))

@@ -151,10 +151,21 @@ def decode_device_map(
 
 
 def roi_of_other_grid(grid: ViewGrid, other: ViewGrid, roi: Roi, near_mm: float, far_mm: float) -> Roi | None:
-    """Return the region of ``other`` that contains all that ``roi`` of ``grid`` shows in the range; None if empty.
+    """Return the region of another grid that contains all that a region shows in a range of depths; None if empty.
 
-    The boundary of the region is projected pixel by pixel at both depths [mm], so distorted rays are included. If a
-    point of it cannot be projected, the result is the whole of ``other``.
+    The boundary of the region is projected pixel by pixel at both depths, so distorted rays are included. If a point of
+    it cannot be projected, the result is the whole of ``other``.
+
+    Parameters
+    ----------
+    grid
+        Grid of the region.
+    other
+        Grid of the result.
+    roi
+        Region of ``grid``.
+    near_mm, far_mm
+        Range of depths [mm].
     """
     columns, rows = np.arange(roi.left, roi.right), np.arange(roi.top, roi.bottom)
     boundary = np.concatenate(

@@ -24,10 +24,19 @@ def needed_region(positions: NDArray[np.float32], width: int, height: int) -> Ro
 
 
 def was_read_out(positions: NDArray[np.float32], read_out: Roi, width: int, height: int) -> NDArray[np.bool_]:
-    """Return whether interpolation at ``positions`` (2, ...) needs only pixels that were read out.
+    """Return whether interpolation at positions needs only pixels that were read out.
 
-    The positions are column and row [px]. Where the region ends at the edge of the image, positions up to half a pixel
-    beyond it are included, as in whole images.
+    Where the region ends at the edge of the image, positions up to half a pixel beyond it are included, as in whole
+    images.
+
+    Parameters
+    ----------
+    positions
+        (2, ...) columns and rows [px].
+    read_out
+        Region of the image that was read out.
+    width, height
+        Size of the image [px].
     """
     column, row = positions
     inside = column >= (read_out.left if read_out.left > 0 else -0.5)

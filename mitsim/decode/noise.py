@@ -23,9 +23,18 @@ from mitsim.sensor.light_code import GrayCode, LightCode, axes, has_fringes, rol
 def fringe_noise(
     images: Mapping[str, NDArray[np.unsignedinteger[Any]]], code: LightCode, size: tuple[int, int], full_scale: float
 ) -> MeasuredNoise | None:
-    """Return the noise that the images (P, H, W) [DN] of each camera show, None if it cannot be measured.
+    """Return the noise that the images of each camera show, None if it cannot be measured.
 
-    ``size``: width and height of the projector [px]; ``full_scale``: value of a saturated pixel [DN].
+    Parameters
+    ----------
+    images
+        (P, H, W) [DN] by camera.
+    code
+        Code of the images.
+    size
+        (width, height) of the projector [px].
+    full_scale
+        Value of a saturated pixel [DN].
     """
     if isinstance(code, GrayCode):
         return None

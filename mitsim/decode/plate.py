@@ -110,10 +110,25 @@ def measure_plate(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.
 
     If the dots cannot be measured, each result has no value and gives the reason.
 
+    Parameters
+    ----------
+    name
+        Start of the names of the results.
+    plate
+        Window, pitch and colour of the dots.
+    cloud
+        Organised cloud of the plate.
+    image
+        (H, W) grey image on the grid of the cloud.
+
     Raises
     ------
     InputError
         If the window does not lie in the grid.
+
+    See Also
+    --------
+    plate_dots : the dots alone
     """
     names = [
         f"{name} {quantity}" for quantity in ("pitch", "neighbour distance", "neighbour spread", "in-plane", "flatness")
@@ -138,9 +153,20 @@ def measure_plate(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.
 
 
 def plate_dots(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.uint8]) -> PlateDots:
-    """Return the dots of a plate in a cloud, found in the image (H, W) on the cloud's grid.
+    """Return the dots of a plate in a cloud.
 
     Of several plates in the window, the one with the most dots is used.
+
+    Parameters
+    ----------
+    name
+        Name of the plate in messages.
+    plate
+        Window, pitch and colour of the dots.
+    cloud
+        Organised cloud of the plate.
+    image
+        (H, W) grey image on the grid of the cloud, in which the dots are found.
 
     Raises
     ------
@@ -148,6 +174,10 @@ def plate_dots(name: str, plate: Plate, cloud: PointCloud, image: NDArray[np.uin
         If there are too few dots, or they are not about a pitch apart, or do not form one grid.
     InputError
         If the window does not lie in the grid.
+
+    See Also
+    --------
+    measure_plate : the results from the dots
     """
     rows, columns = window_slices(plate.window, cloud, name)
     found = dot_centres(np.ascontiguousarray(image[rows, columns]), plate.dark)

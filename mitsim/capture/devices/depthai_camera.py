@@ -258,7 +258,19 @@ def _matcher(stereo: Any, settings: DepthaiSettings, dai: Any) -> None:
 
 
 def grey_frame(image: Image, socket: Any, dai: Any, number: int = 0) -> Any:
-    """Make an ``ImgFrame`` of a grey image (H, W) uint8, as from the camera at a socket."""
+    """Make an ``ImgFrame`` of a grey image.
+
+    Parameters
+    ----------
+    image
+        (H, W) uint8.
+    socket
+        Socket of the camera that the image is from.
+    dai
+        The package ``depthai``.
+    number
+        Sequence number of the frame.
+    """
     frame = dai.ImgFrame()
     frame.setType(dai.ImgFrame.Type.GRAY8)
     frame.setWidth(image.shape[1])
@@ -301,7 +313,20 @@ def frame_settings(frame: Any) -> dict[str, Any]:
 def aligned(
     queues: Mapping[str, Any], timeout_s: float, where: str, first: int = 0, now: Callable[[], float] = time.monotonic
 ) -> dict[str, Any]:
-    """Return the next frames of a common sequence number, at least ``first``, one from each queue.
+    """Return the next frames of a common sequence number, one from each queue.
+
+    Parameters
+    ----------
+    queues
+        Queues of frames by name.
+    timeout_s
+        Longest time to wait [s].
+    where
+        Name of the camera in messages.
+    first
+        Least sequence number.
+    now
+        Returns the time [s].
 
     Raises
     ------
@@ -330,7 +355,19 @@ def aligned(
 
 
 def fault_of(error: BaseException, dai: Any, where: str, what: str) -> BaseException:
-    """Return the error to raise instead of ``error``: a DeviceError for errors of the package, else itself."""
+    """Return the error to raise instead of an error: a DeviceError for errors of the package, else the error itself.
+
+    Parameters
+    ----------
+    error
+        Caught error.
+    dai
+        The package ``depthai``.
+    where
+        Name of the camera in messages.
+    what
+        Operation that failed.
+    """
     if isinstance(error, DeviceError) or not isinstance(error, RuntimeError):
         return error
     message = " ".join(str(error).split())[:200]

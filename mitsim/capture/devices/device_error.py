@@ -34,7 +34,18 @@ class DeviceError(MissingEnvironmentError):
 
 
 def check_open(where: str, what: str, closed: bool, fault: str) -> None:
-    """Reject a camera that was closed, or that failed at ``fault`` ("" for no failure).
+    """Reject a camera that was closed, or that failed.
+
+    Parameters
+    ----------
+    where
+        Name of the camera in messages.
+    what
+        Operation that is requested.
+    closed
+        Whether the camera was closed.
+    fault
+        Operation at which the camera failed, "" for no failure.
 
     Raises
     ------

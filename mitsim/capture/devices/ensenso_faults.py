@@ -77,9 +77,20 @@ def no_library(where: str, error: Exception) -> DeviceError:
 
 
 def fault_of(error: BaseException, nxlib: Any, where: str, what: str, known: list[str]) -> BaseException:
-    """Return the error to raise instead of ``error``: a DeviceError for errors of NxLib, else itself.
+    """Return the error to raise instead of an error: a DeviceError for errors of NxLib, else the error itself.
 
-    ``known``: serial numbers of the cameras that NxLib lists.
+    Parameters
+    ----------
+    error
+        Caught error.
+    nxlib
+        The package ``ensenso_nxlib``.
+    where
+        Name of the camera in messages.
+    what
+        Operation that failed.
+    known
+        Serial numbers of the cameras that NxLib lists.
     """
     if isinstance(error, nxlib.NxLibException):
         words, detail = _command_words(error, what) if error.get_error_code() == _EXECUTION_FAILED else (None, "")

@@ -182,8 +182,16 @@ class SerialLine:
 def open_line(port: str, baud: int, where: str, clock: Clock = WALL_CLOCK) -> SerialLine:
     """Open a port exclusively, 8 data bits, no parity, 1 stop bit.
 
-    ``port`` is a device (``/dev/ttyUSB0``, ``COM3``) or a URL of pyserial (``socket://host:4000``,
-    ``rfc2217://host:port``), for which ``baud`` may have no effect.
+    Parameters
+    ----------
+    port
+        A device (``/dev/ttyUSB0``, ``COM3``) or a URL of pyserial (``socket://host:4000``, ``rfc2217://host:port``).
+    baud
+        Bits per second; may have no effect for a URL.
+    where
+        Name of the device in messages.
+    clock
+        Measures and waits; by default that of the system.
 
     Raises
     ------

@@ -116,7 +116,18 @@ def _read(source: str | Path, size: tuple[int, int] | None) -> Calibrated:
 
 
 def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], where: str | Path) -> Camera:
-    """Return the camera of a name, or the first; its images must have the size (width, height).
+    """Return the camera of a name, or the first.
+
+    Parameters
+    ----------
+    calibrated
+        Cameras of a calibration.
+    name
+        Name of the camera; None for the first.
+    size
+        (width, height) [px] of the images; that of the camera must be the same.
+    where
+        File of the images, for messages.
 
     Raises
     ------

@@ -26,9 +26,20 @@ _LISTED = 3
 
 
 def advice(found: list[Path], camera: str, code: LightCode, size: tuple[int, int], count: int) -> str:
-    """Return advice on the images ``found`` of a camera; a ``code`` needs ``count`` images.
+    """Return advice on a number of images that does not fit the code.
 
-    ``size`` (width, height) of the projector [px]; ``count`` includes the ambient image.
+    Parameters
+    ----------
+    found
+        Images of the camera.
+    camera
+        Name of the camera.
+    code
+        Code that the sensor file states.
+    size
+        (width, height) of the projector [px].
+    count
+        Number of images that the code needs, with the ambient image.
     """
     more = count - len(roles(code, *size))
     reason = _missing_number(found) or _strangers(found, camera, count)

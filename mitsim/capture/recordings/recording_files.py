@@ -142,12 +142,23 @@ def frame_of(given: int | str | None, path: Path, names: list[str] | None = None
 
 
 def chosen_frame(frame: int | None, count: int, where: Path, what: str) -> int:
-    """Return the number of the chosen one of ``count`` frames, from 0; a single one need not be chosen.
+    """Return the number of the chosen frame, from 0; a single frame need not be chosen.
+
+    Parameters
+    ----------
+    frame
+        Number of the frame, None if none was chosen.
+    count
+        Number of frames.
+    where
+        File that messages name.
+    what
+        Name of the frames in messages, in the plural.
 
     Raises
     ------
     InputError
-        If there are several and none was chosen, or there is no such frame; ``what`` names them, in the plural.
+        If there are several and none was chosen, or there is no such frame.
     """
     if frame is None and count > 1:
         allowed, hint = "one in a capture", f"choose with --frame 0 to {count - 1}"

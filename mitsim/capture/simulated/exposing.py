@@ -110,7 +110,20 @@ def expose_camera(
     """Expose the imager of a camera; return its images as grey levels (count, H, W).
 
     All images at the shortest exposure come first, then those at the next. Pixels outside the region that is read out
-    are 0. ``stream`` seeds the noise.
+    are 0.
+
+    Parameters
+    ----------
+    sensor
+        Sensor with the imager and the pattern.
+    light
+        Light on the imagers, with exposures and the sources of noise that are on.
+    camera
+        Name of the camera.
+    patterns
+        Fixed patterns of the camera's imager.
+    stream
+        Seed of the noise.
     """
     imager, scale, noise, inside = sensor.imager, sensor.electrons(), light.noise, light.rois[camera].slices
     radiance, exposures = light.radiance[camera], light.exposures

@@ -34,7 +34,19 @@ _STEPS = 6
 
 
 def blur_by_lens(image: NDArray[np.float32], imager: Imager, camera: Camera, roi: Roi) -> NDArray[np.float32]:
-    """Return the image (h, w) of a region, blurred by the point spread of a camera's lens."""
+    """Return the image (h, w) of a region, blurred by the point spread of a camera's lens.
+
+    Parameters
+    ----------
+    image
+        (h, w) radiance of the region.
+    imager
+        Its blur at the centre and in the corner of the image.
+    camera
+        Camera whose image has the region.
+    roi
+        Region of the camera's image.
+    """
     centre, corner = imager.blur_px, imager.corner_blur_px
     if corner is None or corner == centre:
         return gaussian_blur(image, centre) if centre > 0 else image

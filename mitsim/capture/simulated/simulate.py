@@ -134,6 +134,27 @@ class SimulatedSensor:
 
         One more image has the light of the scene's emitters, if the sensor takes an ambient image or the scene has
         emitters.
+
+        Parameters
+        ----------
+        scene
+            Scene to render.
+        world_from_sensor
+            Pose of the sensor.
+        camera
+            Name of the camera.
+        indirect
+            Samples and smoothing of the interreflections.
+        seed
+            Seed of the light paths.
+        depth
+            Largest number of surfaces on a light path.
+        roi
+            Region of the image; by default all of it.
+
+        See Also
+        --------
+        radiance : all light
         """
         rays = self.rays[camera]
         roi = roi or rays.whole
@@ -158,8 +179,28 @@ class SimulatedSensor:
     ) -> NDArray[np.float32]:
         """Return the radiance (P, h, w) that reaches a camera's imager [W / (mm^2 sr)].
 
-        If the sensor takes an ambient image, it is the last. ``roi`` is a region of the image, by default all of it.
-        ``speckle`` is that of the region.
+        If the sensor takes an ambient image, it is the last.
+
+        Parameters
+        ----------
+        scene
+            Scene to render.
+        world_from_sensor
+            Pose of the sensor.
+        camera
+            Name of the camera.
+        rendering
+            Light paths, and interreflections that are rendered already.
+        seed
+            Seed of the light paths.
+        roi
+            Region of the image; by default all of it.
+        speckle
+            Speckle of the region; None for none.
+
+        See Also
+        --------
+        light : the radiance of all cameras, with exposures
         """
         rays, ambient_image = self.rays[camera], self.sensor.ambient_image
         roi = roi or rays.whole
@@ -204,6 +245,17 @@ class SimulatedSensor:
         """Return the radiance (h, w) of the sensor file's ``[room]``, after the lens [W / (mm^2 sr)].
 
         Its gradient is along the axes of the sensor frame at the middle of the working range, the same for all cameras.
+
+        Parameters
+        ----------
+        scene
+            Scene to light.
+        world_from_sensor
+            Pose of the sensor.
+        camera
+            Name of the camera.
+        roi
+            Region of the image.
         """
         relative = room_radiance(scene, directional_albedos(scene), self.pixel_rays(camera), world_from_sensor)[
             roi.slices
@@ -335,8 +387,12 @@ class SimulatedSensor:
     ) -> Capture:
         """Return one capture: :meth:`light`, exposed once.
 
-        The same seed gives the same bytes. Use another seed for each capture. The parameters are those of
-        :meth:`light`.
+        The same seed gives the same bytes. Use another seed for each capture.
+
+        Parameters
+        ----------
+        scene, world_from_sensor, seed, rendering, around, noise
+            As for :meth:`light`; ``seed`` is also that of the noise.
         """
         light = self.light(scene, world_from_sensor, seed=seed, rendering=rendering, around=around, noise=noise)
         return self.expose(light, seed)

@@ -69,7 +69,25 @@ def shift_angle(sensor: Sensor, camera: Camera) -> float:
 def contrast_map(
     scene: Scene, sensor: Sensor, camera: Camera, rays: PixelRays, world_from_sensor: Transform
 ) -> float | NDArray[np.float32]:
-    """Return C of each pixel (H, W), or one number if the whole scene has the same."""
+    """Return C of each pixel (H, W), or one number if the whole scene has the same.
+
+    Parameters
+    ----------
+    scene
+        Scene with the finishes.
+    sensor
+        Sensor with its wavelength and imager.
+    camera
+        Camera that sees the speckle.
+    rays
+        View rays of its pixels.
+    world_from_sensor
+        Pose of the sensor.
+
+    See Also
+    --------
+    draw_speckle : a realisation of speckle with this contrast
+    """
     values = [finish_contrast(finish, sensor, camera) for finish in scene.finishes]
     if len(set(values)) == 1:
         return values[0]
@@ -89,6 +107,27 @@ def draw_speckle(
     """Draw the speckle of a region of one camera's image for one pose; None without speckle.
 
     The gain is (h, w) [1], the shift (2, h, w) [rad].
+
+    Parameters
+    ----------
+    scene
+        Scene with the finishes.
+    sensor
+        Sensor with its wavelength and imager.
+    camera
+        Camera that sees the speckle.
+    rays
+        View rays of all its pixels.
+    world_from_sensor
+        Pose of the sensor.
+    roi
+        Region of the image.
+    rng
+        Generator of the draws.
+
+    See Also
+    --------
+    contrast_map : the contrast of the speckle
     """
     values = contrast_map(scene, sensor, camera, rays, world_from_sensor)
     if not np.any(values):

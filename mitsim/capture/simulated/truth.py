@@ -71,7 +71,22 @@ def true_image(
 ) -> Truth:
     """Return the ground truth of one camera of a simulated sensor.
 
-    ``samples``, ``depth`` and ``seed`` apply to the share of indirect light.
+    Parameters
+    ----------
+    simulated
+        Sensor, prepared.
+    scene
+        Scene that it sees.
+    world_from_sensor
+        Pose of the sensor.
+    camera
+        Name of the camera.
+    samples, depth, seed
+        Light paths per pixel, surfaces on a light path, and seed, for the share of indirect light.
+
+    See Also
+    --------
+    true_images : all cameras
     """
     # the camera as it is, not as its calibration says: these are the rays that the image shows
     eye, projector = simulated.sensor.true_rig.cameras[camera], simulated.sensor.projector
@@ -117,9 +132,24 @@ def true_image(
 def true_images(
     simulated: SimulatedSensor, scene: Scene, world_from_sensor: Transform, *, samples: int, depth: int, seed: int
 ) -> dict[str, Truth]:
-    """Return the ground truth of every camera by name; see :func:`true_image`.
+    """Return the ground truth of every camera by name.
 
     The share of indirect light follows paths of at least three surfaces, also where a capture has direct light alone.
+
+    Parameters
+    ----------
+    simulated
+        Sensor, prepared.
+    scene
+        Scene that it sees.
+    world_from_sensor
+        Pose of the sensor.
+    samples, depth, seed
+        As for :func:`true_image`.
+
+    See Also
+    --------
+    true_image : a single camera
     """
     return {
         name: true_image(simulated, scene, world_from_sensor, name, samples=samples, depth=max(depth, 3), seed=seed)

@@ -119,7 +119,19 @@ def has_jump(values: Floats, lit: NDArray[np.bool_], extent: int) -> NDArray[np.
 
 
 def with_change(code: LightCode, size: tuple[int, int], axis: Axis, change: FringeChange) -> ImageSequence:
-    """Return the code as a sequence in which the fringes of an axis have another description."""
+    """Return the code as a sequence in which the fringes of an axis have another description.
+
+    Parameters
+    ----------
+    code
+        Code with fringes along the axis.
+    size
+        (width, height) of the projector [px].
+    axis
+        Axis of the projector.
+    change
+        Change of the shifts of the fringes.
+    """
     every = described(code, roles(code, *size), axis)
     changed = [
         FringeImages(

@@ -79,7 +79,20 @@ def pair_row_error(capture: Capture, cloud: PointCloud) -> float:
 def row_error_in_words(capture: Capture, settings: Settings, found: Findings, matched: float) -> str:
     """Describe the row error of the second camera, or that it is unknown; "" if only one camera measures.
 
-    ``matched``: row error of a pair decoded by a matcher, see :func:`pair_row_error`.
+    Parameters
+    ----------
+    capture
+        Capture that is decoded.
+    settings
+        Settings of its decoder.
+    found
+        Findings of the checks.
+    matched
+        Row error of a pair decoded by a matcher, from :func:`pair_row_error` [px].
+
+    See Also
+    --------
+    pair_row_error : the number
     """
     if np.isfinite(matched):
         return f"row error of the second camera: {matched:+.2f} px"

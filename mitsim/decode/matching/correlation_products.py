@@ -76,7 +76,21 @@ class PreparedPair:
 def prepare_pair(
     left: Floats, right: Floats, columns: tuple[int, int], first: int, count: int, block: int
 ) -> PreparedPair:
-    """Prepare strips (F, h, W) for a search of ``count`` disparities from ``first`` on, for some left columns."""
+    """Prepare strips of a rectified pair for a search, for some left columns.
+
+    Parameters
+    ----------
+    left, right
+        (F, h, W) strips of the images.
+    columns
+        First left column of the search, and the end after the last.
+    first
+        First disparity [px].
+    count
+        Number of disparities.
+    block
+        Side of a matching block [px].
+    """
     begin, end = columns
     reach, blank = block // 2, np.float32(len(left) * BLANK_VARIANCE)
     # right pixels also search left of `begin` and right of `end`. The groups of columns are whole, so that each is

@@ -50,9 +50,18 @@ def nearest_value(values: NDArray[np.float32], known: NDArray[np.bool_], fallbac
 def right_property(
     property_of_right: NDArray[np.bool_], columns: NDArray[np.integer], disparity: NDArray[np.float32], outside: bool
 ) -> NDArray[np.bool_]:
-    """Return a property (H, W) of the right strip where left ``columns`` (w,) match at ``disparity`` (h, w) [px].
+    """Return a property of the right strip where left columns match.
 
-    Columns outside the strip give the value ``outside``.
+    Parameters
+    ----------
+    property_of_right
+        (H, W) property of the pixels of the right strip.
+    columns
+        (w,) left columns.
+    disparity
+        (h, w) at the left columns [px].
+    outside
+        Result for a match outside the strip.
     """
     right_column = np.rint(columns - disparity).astype(np.intp)
     inside = (right_column >= 0) & (right_column < property_of_right.shape[1])

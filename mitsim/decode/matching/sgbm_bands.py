@@ -62,7 +62,21 @@ def bytes_by_opencv(rows: int, width: int, count: int) -> float:
 
 
 def bytes_of_band(rows: int, height: int, width: int, count: int) -> float:
-    """Return the memory [bytes] that :func:`match_in_bands` needs for bands of ``rows`` rows, to a tenth."""
+    """Return the memory [bytes] that :func:`match_in_bands` needs for bands of ``rows`` rows, to a tenth.
+
+    Parameters
+    ----------
+    rows
+        Number of rows of a band.
+    height, width
+        Size of the image [px].
+    count
+        Number of disparities.
+
+    See Also
+    --------
+    rows_in_budget : the inverse
+    """
     state = 2.0 * width * count
     bands = -(-height // rows)
     # costs and sums of a band; the saved paths of each band; the current paths and the arrays of one row
@@ -70,7 +84,21 @@ def bytes_of_band(rows: int, height: int, width: int, count: int) -> float:
 
 
 def rows_in_budget(budget: float, height: int, width: int, count: int) -> int:
-    """Return the number of rows of a band that keeps the memory within a budget [bytes], or that needs the least."""
+    """Return the number of rows of a band that keeps the memory within a budget, or that needs the least.
+
+    Parameters
+    ----------
+    budget
+        Memory [bytes].
+    height, width
+        Size of the image [px].
+    count
+        Number of disparities.
+
+    See Also
+    --------
+    bytes_of_band : the memory of a band
+    """
     rows = np.arange(1, height + 1)
     needed = np.array([bytes_of_band(int(each), height, width, count) for each in rows])
     within = np.flatnonzero(needed <= budget)

@@ -291,9 +291,20 @@ def _shorten(
 def exact_inverse_depth(
     geometry: StructuredLightGeometry, ray: Floats, start: Floats, u: Floats
 ) -> tuple[Floats, Floats]:
-    """Return w and dw/du (n,) at which rays (n, 3) have coordinates ``u`` (n,), by the secant method from ``start``.
+    """Return the inverse depth w and dw/du (n,) at which rays have given projector coordinates, by the secant method.
 
     NaN where the exact projection does not reach ``u`` to :data:`MAXIMUM_ERROR_PX`.
+
+    Parameters
+    ----------
+    geometry
+        Camera, projector and axis of the code.
+    ray
+        (n, 3) from the camera's centre, sensor frame; the point is ``ray / w`` from it.
+    start
+        (n,) first w [1/mm].
+    u
+        (n,) coordinates [projector px].
     """
     component = 0 if geometry.axis == "columns" else 1
 

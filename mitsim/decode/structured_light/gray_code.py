@@ -142,8 +142,22 @@ def interpolated_columns(
 ) -> ProjectorCoordinate:
     """Return columns that are interpolated between the edges of their stripes, instead of the stripes' centres.
 
-    ``coordinate`` and ``decoded`` are the results for the columns of ``stack`` (P, H, W) [DN]; ``coded`` describes
-    their code.
+    Parameters
+    ----------
+    coordinate
+        Columns at the centres of their stripes.
+    decoded
+        Stripes of the columns.
+    stack
+        (P, H, W) images [DN].
+    image_roles
+        Role of each image.
+    coded
+        Code of the columns.
+
+    See Also
+    --------
+    stripe_coordinate : the stripes' centres
     """
     image_of = {(role.kind, role.axis, role.index): image for role, image in zip(image_roles, stack, strict=True)}
     bits = sorted((role.index for role in image_roles if role.kind == "gray" and role.axis == "columns"), reverse=True)
@@ -169,7 +183,22 @@ def stripe_coordinate(
 ) -> ProjectorCoordinate:
     """Return the projector coordinate of decoded stripes of an axis. Stripes beyond the projector are rejected.
 
-    ``saturated`` (H, W): whether the pixel is saturated in any image of the code; ``full_scale`` [DN].
+    Parameters
+    ----------
+    decoded
+        Stripes of the axis.
+    coded
+        Code of the axis.
+    saturated
+        (H, W) whether the pixel is saturated in any image of the code.
+    settings
+        Limits of the decoder.
+    full_scale
+        Value of a saturated pixel [DN].
+
+    See Also
+    --------
+    interpolated_columns : between the edges of the stripes
     """
     modulation = np.asarray(decoded.contrast / 2, np.float32)
     low_modulation = modulation < settings.minimum_modulation_dn * full_scale / 255

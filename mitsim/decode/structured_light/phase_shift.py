@@ -199,6 +199,19 @@ def gamma_corrected(
 
     The estimate uses the second harmonic of the shortest period if that has five steps or more, else white and black.
 
+    Parameters
+    ----------
+    phases
+        Fitted fringes.
+    stack
+        (P, H, W) images of the fringes [DN], period after period.
+    fringes
+        Periods and shifts.
+    minimum_modulation
+        Least modulation of the pixels that the estimate uses [DN].
+    white_black
+        (H, W) images of full light and of no light [DN].
+
     Raises
     ------
     InputError
@@ -229,7 +242,18 @@ def fringe_sigma(
 ) -> NDArray[np.float32]:
     """Return the expected standard deviation of the coordinate [projector px]; NaN without an imager.
 
-    ``variance`` [DN^2] of the grey levels and ``modulation`` [DN] of the finest fringe have the same shape (...).
+    Parameters
+    ----------
+    period
+        Period of the finest fringe [projector px].
+    steps
+        Number of its images.
+    variance
+        (...) of the grey levels [DN^2].
+    modulation
+        (...) of the finest fringe [DN].
+    imager
+        Imager or measured noise; the value is NaN if it is None.
     """
     if imager is None:
         return np.full(modulation.shape, np.nan, np.float32)

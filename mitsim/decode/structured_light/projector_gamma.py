@@ -141,7 +141,21 @@ def harmonic_ratio(gamma: float, mean: float, contrast: float) -> float:
 
 
 def phase_error(gamma: float, steps: int, mean: float, contrast: float) -> NDArray[np.float64]:
-    """Return the error of the N-step phase [rad] by gamma, at ``_SAMPLES`` equidistant true phases from 0 on."""
+    """Return the error of the N-step phase [rad] by gamma, at ``_SAMPLES`` equidistant true phases from 0 on.
+
+    Parameters
+    ----------
+    gamma
+        Exponent of the projector.
+    steps
+        Number N of equidistant steps.
+    mean, contrast
+        Of the projected cosine [1].
+
+    See Also
+    --------
+    correct_phase : phases without this error
+    """
     phi = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
     delta = 2 * np.pi * np.arange(steps) / steps
     light = np.maximum(mean + contrast * np.cos(phi[:, None] - delta), 0) ** gamma
@@ -151,7 +165,23 @@ def phase_error(gamma: float, steps: int, mean: float, contrast: float) -> NDArr
 def correct_phase(
     phase: NDArray[np.float32], gamma: float, steps: int, mean: float, contrast: float
 ) -> NDArray[np.float32]:
-    """Return phases (...) [rad] without the error that ``gamma`` causes with ``steps`` equidistant steps."""
+    """Return phases (...) [rad] without the error that a projector's gamma causes.
+
+    Parameters
+    ----------
+    phase
+        (...) measured phases [rad].
+    gamma
+        Exponent of the projector.
+    steps
+        Number of equidistant steps.
+    mean, contrast
+        Of the projected cosine [1].
+
+    See Also
+    --------
+    phase_error : the error
+    """
     true = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
     error = phase_error(gamma, steps, mean, contrast)
     # interpolated over the measured phase, not over the true one

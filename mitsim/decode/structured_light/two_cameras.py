@@ -126,8 +126,19 @@ def cloud_of_pair(
 ) -> PointCloud:
     """Return the cloud of two cameras whose images are decoded: see :func:`decode_structured_light_stereo`.
 
-    ``decoded`` is a function from the camera, 0 or 1, and a region of its raw image to the columns in this region, with
-    ``interpolate`` of :func:`~mitsim.decode.structured_light.decoder.decode_coordinates`.
+    Parameters
+    ----------
+    decoded
+        Function from the camera, 0 or 1, and a region of its raw image to the columns in this region, with
+        ``interpolate`` of :func:`~mitsim.decode.structured_light.decoder.decode_coordinates`.
+    geometry
+        Rectified geometry of the pair.
+    code
+        Code of the images; it must have columns.
+    settings
+        Limits of the decoder.
+    context
+        Regions of interest and read-out, and what else is known about the images.
 
     Raises
     ------

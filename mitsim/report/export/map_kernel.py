@@ -39,23 +39,48 @@ class SensorMap:
     def image(self, depth: Any, normals: Any, K: Any, finish: str, roughness: float = math.nan) -> tuple[Any, Any]:
         """Return F and sigma [mm], (H, W) each, for the view of a pinhole camera.
 
-        ``depth`` (H, W) [mm] along the optical axis; ``normals`` (H, W, 3) unit, camera frame (x right, y down, z
-        forward), toward the camera; ``K`` (3, 3), pixel centres at integers; ``roughness`` Ra [um].
+        Parameters
+        ----------
+        depth
+            (H, W) along the optical axis [mm].
+        normals
+            (H, W, 3) unit, camera frame (x right, y down, z forward), toward the camera.
+        K
+            (3, 3), pixel centres at integers.
+        finish, roughness
+            Material and finish, and Ra [um].
         """
         rays, length = self._rays(np.shape(depth), K)
         return self.look_up(np.asarray(depth) * length, self._in_view_frame(normals, rays), finish, roughness)
 
     def draw(self, depth: Any, normals: Any, K: Any, finish: str, roughness: float = math.nan, *, rng: Any) -> Any:
-        """Draw a depth image (H, W) [mm] of the sensor: NaN without a point; errors of pixels are independent."""
+        """Draw a depth image (H, W) [mm] of the sensor: NaN without a point; errors of pixels are independent.
+
+        Parameters
+        ----------
+        depth, normals, K, finish, roughness
+            As for :meth:`image`.
+        rng
+            Generator of the draws.
+        """
         fraction, sigma = self.image(depth, normals, K, finish, roughness)
         _, length = self._rays(np.shape(depth), K)
         noisy = np.asarray(depth) + sigma * rng.standard_normal(fraction.shape) / length
         return np.where(rng.random(fraction.shape) < fraction, noisy, np.nan)
 
     def look_up(self, distance: Any, normals: Any, finish: str, roughness: float = math.nan) -> tuple[Any, Any]:
-        """Return F and sigma [mm] (...) at distances |V| (...) [mm] and unit normals N (..., 3) in the view frame.
+        """Return F and sigma [mm] (...) at distances and normals.
 
         The view frame of a point has z opposite to its view ray, x along the baseline, y = z cross x.
+
+        Parameters
+        ----------
+        distance
+            |V| (...) [mm].
+        normals
+            N (..., 3) unit, view frame.
+        finish, roughness
+            Material and finish, and Ra [um].
         """
         probit, log_sigma = self._surface(finish, roughness)
         n = np.asarray(normals, float)
