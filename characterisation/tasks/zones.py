@@ -38,8 +38,17 @@ def position(feature: Plane | Axis | PointLike, *datums: Datum, nominal: Sequenc
     - Axis: a cylinder about the nominal axis.
     - Plane: two planes about the nominal plane; the offset is the largest over the outline.
 
-    With three datums, the nominal place is given in their frame (:func:`datum_motion`). Without datums, it is given by
-    the pose of the part, so an error of the pose counts.
+    Parameters
+    ----------
+    feature
+        Fitted feature.
+    *datums
+        Fitted datums. With three, the nominal place is given in their frame (:func:`datum_motion`). Without datums, it is
+        given by the pose of the part, so an error of the pose counts.
+    nominal
+        Nominal feature, then the nominal datums.
+    outline
+        (k, 3) [mm], places that span the feature.
     """
     target, *others = nominal
     motion = np.eye(4)
