@@ -43,8 +43,8 @@ def position(feature: Plane | Axis | PointLike, *datums: Datum, nominal: Sequenc
     feature
         Fitted feature.
     *datums
-        Fitted datums. With three, the nominal place is given in their frame (:func:`datum_motion`). Without datums, it is
-        given by the pose of the part, so an error of the pose counts.
+        Fitted datums. With three, the nominal place is given in their frame (:func:`datum_motion`). Without datums, it
+        is given by the pose of the part, so an error of the pose counts.
     nominal
         Nominal feature, then the nominal datums.
     outline
