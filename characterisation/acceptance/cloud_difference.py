@@ -87,9 +87,19 @@ def difference_to_surface(
 ) -> Floats:
     """Return the difference (h, w) [mm] of a cloud's points in a window from the surface of a reference.
 
-    Both are in one frame. The difference is NaN where the cloud has no point, or the reference has none within 1 % of
-    the point's distance. It is also NaN beyond the edge of the reference. ``progress`` iterates over the starts of the
-    blocks of points, and may report them.
+    The difference is NaN where the cloud has no point, or the reference has none within 1 % of the point's distance. It
+    is also NaN beyond the edge of the reference.
+
+    Parameters
+    ----------
+    cloud
+        Organised cloud to judge.
+    reference
+        Organised cloud of the surface, in the frame of ``cloud``. It needs no shared grid.
+    window
+        Rows and columns (h, w) of the cloud's grid; by default all.
+    progress
+        Iterates over the starts of the blocks of points, and may report them.
 
     Raises
     ------

@@ -183,6 +183,8 @@ def sigma_interval(sigma: ArrayLike, degrees: ArrayLike, confidence: float = 0.9
     sigma, degrees
         s [mm], unbiased in s^2, and its degrees of freedom nu, which need not be whole
         (:func:`characterisation.coupon.residual_field.plane_degrees`). The interval is NaN where nu is not positive.
+    confidence
+        Confidence of the interval, 0..1.
     """
     sigma, degrees = np.asarray(sigma, float), np.asarray(degrees, float)
     nu = np.where(degrees > 0, degrees, np.nan)

@@ -108,6 +108,8 @@ def refine(
         (n, 3) measured so far: vertices of icosahedra of various subdivisions.
     fraction, fraction_error, sigma, sigma_error
         (n,) F and sigma [mm] there with their standard errors. Sigma is NaN, and ignored, where no point was recovered.
+    refinement
+        Where to add normals.
     largest_angle
         Largest incidence [rad] of an added normal.
     """

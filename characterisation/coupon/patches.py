@@ -75,6 +75,8 @@ def patch_centres(
     ----------
     grid
         Pixels of the cloud.
+    coupon
+        Pose and size of the coupon, sensor frame.
     radius_px, margin_px
         Radius of the discs, and their least distance from the edge of the coupon.
     step_px
@@ -114,6 +116,10 @@ def measure_patches(
 
     Parameters
     ----------
+    cloud
+        Organised cloud of the coupon.
+    coupon
+        Pose and size of the coupon, sensor frame.
     radius_px
         Radius of the disc [px]; 6 px hold 113 possible points.
     margin_px

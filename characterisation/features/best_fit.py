@@ -102,6 +102,8 @@ def best_fit(
         (3,) [mm] Centre of the rotations.
     known
         (6, 6) covariance of the motion [w (rad), t (mm)] that is expected of each view, of mean 0.
+    seed
+        Selects the random numbers of the fit.
 
     Raises
     ------

@@ -166,6 +166,8 @@ def edge_covariance(
 
     Parameters
     ----------
+    figure
+        Circle or point of an edge.
     pitch
         Of the pixels on the face [mm]; on a tilted face the root mean square of both directions.
     count
@@ -173,6 +175,8 @@ def edge_covariance(
         Then give the number of rows that it crosses, at least 1, instead of :func:`crossings`.
     fraction
         F near the edge, above 0 and up to 1.
+    reach
+        Visible length of the edge on each side of the point [mm]; not used for a circle.
 
     Raises
     ------

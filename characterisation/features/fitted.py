@@ -79,6 +79,8 @@ def with_covariance(
 
     Parameters
     ----------
+    shape
+        Geometry, fitted or nominal.
     covariance
         (p, p) of the parameters of a small change.
     residual_std

@@ -140,6 +140,8 @@ def form_modes(surface: Plane | Cylinder, points: Array, rays: Array | None) -> 
     ----------
     surface
         On which the points (n, 3) [mm] lie, except for their noise.
+    points
+        (n, 3) [mm].
     rays
         (n, 3), or None for orthogonal deviations.
 

@@ -68,6 +68,8 @@ def pose_jacobian(surface: Surface, points: Array, rays: Array | None, about: Ar
 
     Parameters
     ----------
+    surface
+        Surface that is moved.
     points, rays
         (n, 3) [mm], and unit (n, 3); without rays, residuals are orthogonal distances.
     about

@@ -28,8 +28,14 @@ def read_bounded(file: Path, absent: str | None = None, hint: str = "", largest:
 
     Parameters
     ----------
+    file
+        Path of the file.
     absent
         Name of the expected file, for the error about a missing one; without it a missing file cannot be read.
+    hint
+        Advice that the errors add.
+    largest
+        Largest size [bytes].
 
     Raises
     ------

@@ -131,7 +131,16 @@ def _check_numbers(path: Path, table: Any, field: str = "") -> None:
 def validate(where: str | Path, table: dict[str, Any], model: type[Model], context: Any = None) -> Model:
     """Check a table against a model; raise an :class:`InputError` with the first fault and all missing keys.
 
-    ``context`` is passed to the validators of the model.
+    Parameters
+    ----------
+    where
+        File or object that messages name.
+    table
+        Parsed content of the file.
+    model
+        Type of the document.
+    context
+        Passed to the validators of the model.
     """
     try:
         return model.model_validate(table, context=context)

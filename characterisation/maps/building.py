@@ -72,6 +72,8 @@ def build_map(
 
     Parameters
     ----------
+    tables
+        Patches of each sample.
     attributes
         Written into the map: ``sensor``, ``source``, ``exposure_rule`` and everything else that makes it reproducible.
         The exposure policy is part of a map's identity.

@@ -131,8 +131,14 @@ def local_fit(
 
     Parameters
     ----------
+    data
+        Places and values to fit.
     at, radii
         (q, 3) places; (q, r) radii of the kernel.
+    slopes
+        Prior of the slopes and bends.
+    link
+        Whether the line is that of the value or of its logarithm.
     own, keep
         (q,) a cluster for every place, and whether only this cluster (``own``) or only the others are used. Without
         ``own``, all clusters are used.

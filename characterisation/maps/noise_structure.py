@@ -45,6 +45,8 @@ def noise_structure(
 
     Parameters
     ----------
+    performance_map
+        Map to look up.
     finish, roughness, distance, normals, light
         As in :meth:`~characterisation.maps.performance_map.PerformanceMap.query`.
     """

@@ -287,6 +287,8 @@ class PerformanceMap:
 
         Parameters
         ----------
+        path
+            Path of the file.
         compact
             Compress the file, after rounding values to ``VALUE_BITS`` and errors to ``ERROR_BITS`` of the mantissa
             (Zender, Geosci. Model Dev. 9 (2016) 3199-3211; rounded to nearest). Such a file is read like any other.

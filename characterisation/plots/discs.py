@@ -48,7 +48,23 @@ def disc(axes: Axes, radius: float, colour: str = FIELD) -> Circle:
 
 
 def disc_image(axes: Axes, values: NDArray[np.floating], axis: NDArray[np.floating], largest: float) -> AxesImage:
-    """Draw values (b, a) at the nodes ``axis`` of both coordinates, on a disc of normals up to ``largest`` [rad]."""
+    """Draw values at the nodes of a disc of normals.
+
+    Parameters
+    ----------
+    axes
+        Axes to draw into.
+    values
+        Values (b, a) at the nodes; NaN is left empty.
+    axis
+        Nodes (n,) of both coordinates [1], equidistant, Lambert's equal-area projection.
+    largest
+        Largest incidence angle of the disc [rad].
+
+    See Also
+    --------
+    draw_performance : both quantities of a map, with their scales
+    """
     rim = disc(axes, 2 * math.sin(largest / 2))
     reach = float(axis[-1]) + float(axis[1] - axis[0]) / 2
     shown = axes.imshow(
@@ -105,9 +121,24 @@ def draw_performance(
     largest: float,
     limits: tuple[float, float],
 ) -> None:
-    """Draw F and sigma (b, a) at the nodes ``axis`` into two axes, on discs of normals up to ``largest`` [rad].
+    """Draw F and sigma into two axes, on discs of normals.
 
-    ``limits`` [mm] are the ends of the logarithmic scale of sigma.
+    Parameters
+    ----------
+    pair
+        Axes (2,) of F and of sigma.
+    fraction, sigma
+        F [1] and sigma [mm] (b, a) at the nodes.
+    axis
+        Nodes (n,) of both coordinates [1], equidistant, Lambert's equal-area projection.
+    largest
+        Largest incidence angle of the discs [rad].
+    limits
+        Ends of the logarithmic scale of sigma [mm].
+
+    See Also
+    --------
+    disc_image : values on a single disc
     """
     quantities = (
         (fraction, Normalize(0, 1), SEQUENTIAL, "fraction of points recovered F [1]", "neither"),

@@ -77,7 +77,21 @@ def spread(heights: Sequence[float], step: float) -> list[float]:
 
 
 def scale_bar(axes: Axes, place: tuple[float, float], length: float, label: str, rise: float) -> None:
-    """Draw a bar from a place to the right, with its label ``rise`` above it."""
+    """Draw a bar from a place to the right, with its label above it.
+
+    Parameters
+    ----------
+    axes
+        Axes to draw into.
+    place
+        Left end (x, y) of the bar, in the axes' data units.
+    length
+        Length of the bar, in data units.
+    label
+        Text above the bar.
+    rise
+        Distance of the label above the bar, in data units.
+    """
     x, y = place
     axes.plot([x, x + length], [y, y], color=INK, lw=2.2, solid_capstyle="butt", zorder=6)
     text = axes.text(x, y + rise, label, fontsize=8, va="bottom", zorder=6)

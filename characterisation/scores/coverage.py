@@ -36,6 +36,8 @@ def coverage_interval(z: Floats, confidence: float = 0.95) -> tuple[float, float
     ----------
     z
         (views, repeats) with NaN for missing values.
+    confidence
+        Confidence of the interval, 0..1.
 
     Returns
     -------

@@ -135,6 +135,8 @@ def joined_covariance(
 
     Parameters
     ----------
+    views
+        What each view contributes to the features.
     rigid
         J (p, 6) of each feature.
     known

@@ -56,12 +56,16 @@ def choose_set(
 
     Parameters
     ----------
+    task
+        Features and measurements.
     inputs
         For every view, the expected input quantities of the task's measurements.
     limits
         By measurement, in its unit; the other measurements are ignored.
     least_chance
         A view sees a feature if there are enough points with at least this probability.
+    seconds
+        Time limit of the proof [s]; after it, the greedy set is returned, marked as not exact.
     joining
         Uncertainty of the poses of the views; exact by default.
 

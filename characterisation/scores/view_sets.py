@@ -129,6 +129,8 @@ def fewest_views(
 
     Parameters
     ----------
+    features
+        Information about each feature from every view.
     limits
         l_m (measurements,) in their units.
     seconds

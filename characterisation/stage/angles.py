@@ -148,6 +148,8 @@ def least_motion(
 
     Parameters
     ----------
+    axes
+        Axes of the stage, with their limits.
     candidates
         Angles (n, axes) [rad] that may be solutions, NaN where there is none.
     error

@@ -91,6 +91,8 @@ def deviations(asked: Measurement, outline: Array, nominal: Sequence[Any], point
 
     Parameters
     ----------
+    asked
+        The measurement, from the task file.
     outline
         (k, 3) [mm], part frame.
     nominal

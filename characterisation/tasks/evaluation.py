@@ -195,16 +195,30 @@ def fit_features(
 
     Shapes are fitted to their points in the labelled cloud, without points too far from the nominal surface
     (:func:`characterisation.features.fits.belonging`). Circles and points of edges are fitted to the places where the
-    points of their plane end (:mod:`characterisation.features.edges`). ``sensor_from_part`` (4, 4) places the nominal
-    geometry, from which cylinders, cones and figures start.
+    points of their plane end (:mod:`characterisation.features.edges`).
 
     A feature that cannot be fitted has a :class:`FitError` in place of a fit. This holds for a shape with fewer than
     ``minimum_points`` points or less than a quarter of the recovered points near it, and for any undetermined feature.
 
+    Parameters
+    ----------
+    cloud
+        Organised cloud with the labels of the task's shapes.
+    task
+        Features and their nominal geometry.
+    sensor_from_part
+        (4, 4) places the nominal geometry, from which cylinders, cones and figures start.
+    minimum_points
+        Least number of points of a shape.
+
     Raises
     ------
     InputError
-        If the cloud has no label of that name.
+        If the cloud has no label with the name of a shape.
+
+    See Also
+    --------
+    measure : the measurements from these fits
     """
     return _fits(cloud, task, sensor_from_part, _selected(cloud, task, sensor_from_part, minimum_points))
 
@@ -268,10 +282,31 @@ def _points(selected: _Selected) -> Array:
 def measure(
     cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimum_points: int = 100, propagated: bool = True
 ) -> dict[str, Result]:
-    """Evaluate all measurements of a task in one labelled cloud; arguments and errors of :func:`fit_features`.
+    """Evaluate all measurements of a task in one labelled cloud.
 
-    Each feature is fitted once for all measurements. With ``propagated`` false, the uncertainty is not propagated from
-    the fits, and is NaN.
+    Each feature is fitted once for all measurements, as by :func:`fit_features`.
+
+    Parameters
+    ----------
+    cloud
+        Organised cloud with the labels of the task's shapes.
+    task
+        Features and measurements.
+    sensor_from_part
+        (4, 4) places the nominal geometry.
+    minimum_points
+        Least number of points of a shape.
+    propagated
+        Whether to propagate the uncertainty from the fits; it is NaN otherwise.
+
+    Raises
+    ------
+    InputError
+        If the cloud has no label with the name of a shape.
+
+    See Also
+    --------
+    measure_points : points of several views
     """
     motion = np.asarray(sensor_from_part, float)
     selected = _selected(cloud, task, motion, minimum_points)
@@ -293,10 +328,25 @@ def measure(
 def measure_points(
     points: Mapping[str, ArrayLike], task: Task, minimum_points: int = 100, propagated: bool = True
 ) -> dict[str, Result]:
-    """Evaluate all measurements of a task from points (n, 3) [mm] of its shapes, part frame, of one or several views.
+    """Evaluate all measurements of a task from points of its shapes, of one or several views.
 
     Points of several views have no single viewpoint, so distances are orthogonal, as in coordinate metrology. Circles
     and points of edges, forms and poses require one organised cloud, and are not possible.
+
+    Parameters
+    ----------
+    points
+        Points (n, 3) [mm], part frame, by name of the shape.
+    task
+        Features and measurements.
+    minimum_points
+        Least number of points of a shape.
+    propagated
+        Whether to propagate the uncertainty from the fits; it is NaN otherwise.
+
+    See Also
+    --------
+    measure : a single organised cloud
     """
     fits: dict[str, Fit | FitError] = {}
     given = {name: np.asarray(points.get(name, np.empty((0, 3))), float) for name in task.shapes}

@@ -68,7 +68,21 @@ class Result:
 
 
 def failed(name: str, unit: str, reason: str, points: int = 0, points_given: int = 0) -> Result:
-    """Return the result of a measurement that was not possible, with its reason."""
+    """Return the result of a measurement that was not possible, with its reason.
+
+    Parameters
+    ----------
+    name
+        Name of the result.
+    unit
+        Its unit.
+    reason
+        Why the measurement was not possible.
+    points
+        Number of points that were used.
+    points_given
+        Number of points with the labels of the measurement's shapes, or in its window.
+    """
     return Result(name, unit, math.nan, points=points, points_given=points_given, reason=reason)
 
 

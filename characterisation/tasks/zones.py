@@ -160,6 +160,8 @@ def angularity(feature: Plane, datum: Datum, *, nominal: Sequence[Geometry], out
 
     Parameters
     ----------
+    feature, datum
+        Fitted plane and datum.
     nominal
         Nominal feature and datum.
     outline

@@ -178,6 +178,8 @@ def of_images(
         K (3, 3) [px] of the full imager.
     stated
         (width, height) [px] of the full imager as the file states it.
+    read_out
+        Part of the imager that is read out, and its binning.
     images
         (width, height) [px] of the images, if known.
     """
@@ -223,6 +225,10 @@ def lens_model(
 
     Parameters
     ----------
+    table
+        Table of the calibration file.
+    where
+        File that messages name.
     given
         Model that the sensor file gives.
     straight

@@ -111,6 +111,8 @@ def expose(
     ----------
     electrons
         (..., H, W) mean photo-electrons of each image, finite.
+    imager
+        Properties of the imager.
     fixed_pattern
         Of the camera, from :func:`fixed_pattern`; None is an imager without one.
     noise

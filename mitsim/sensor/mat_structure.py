@@ -40,6 +40,10 @@ def check_mat(file: Path, data: bytes, most: int) -> bool:
 
     Parameters
     ----------
+    file
+        Path of the file, for messages.
+    data
+        Content of the file.
     most
         Largest number of values in the file.
 

@@ -152,9 +152,13 @@ def expose_taps(
     ----------
     electrons
         (P, H, W) correlations: twice the mean photo-electrons of tap A.
+    code
+        Frequencies of the modulation, and the steps of each.
     imager
         ``full_well``, ``read_noise`` and the other temporal sources are those of one tap. The offset of a pixel or
         column is that of the difference. A difference of a full well is full scale.
+    fixed_pattern, noise, rng
+        As for :func:`mitsim.sensor.image_formation.expose`.
     exposure_s
         Of each image [s], for the dark current.
 

@@ -80,6 +80,10 @@ def with_calibration(
 
     Parameters
     ----------
+    path
+        Path of the sensor file.
+    table
+        Its content.
     size
         (width, height) [px] of the cameras' images, if known; cameras without a size get it.
 

@@ -148,6 +148,8 @@ def speckle_field(
     size_px
         Speckle size on the imager [px]. Two pixels at distance d have the correlation exp(-pi d^2 / size^2), whose area
         is size^2; below 0.7 px all pixels are independent.
+    rng
+        Generator of the draws.
 
     Raises
     ------

@@ -38,6 +38,10 @@ def read_yaml(file: Path, data: bytes, allowed: str) -> list[dict[str, Any]]:
 
     Parameters
     ----------
+    file
+        Path of the file, for messages.
+    data
+        Content of the file.
     allowed
         What the file should be, for the message.
 

@@ -122,6 +122,10 @@ def candidate_views(
 
     Parameters
     ----------
+    table
+        Table ``[views]``.
+    sensor
+        Sensor with its working range and its body.
     standoffs
         [mm], ascending: distance of the target from the reference camera along its axis. On a stage it is the distance
         of the stage's origin.

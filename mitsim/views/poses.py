@@ -45,6 +45,10 @@ def write_views(folder: str | Path, candidates: Candidates, table: ViewsTable, s
 
     Parameters
     ----------
+    folder
+        Folder to write.
+    candidates
+        The views, and those that were excluded.
     table
         Names the axes of the stage and defines the robot's flange.
     sensor

@@ -20,6 +20,10 @@ def chosen_standoffs(where: str | Path, table: ViewsTable, sensor: Sensor, radiu
     ----------
     where
         File of the table, for the error.
+    table
+        Table ``[views]``.
+    sensor
+        Sensor with its working range.
     radius_mm
         Radius of a ball around the part.
 
@@ -45,6 +49,10 @@ def characterised_range(
     ----------
     where
         File of the table, for the error.
+    table
+        Table ``[views]``.
+    sensor
+        Sensor with its working range.
     standoffs
         [mm] of the views.
     distances

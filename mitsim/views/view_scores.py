@@ -105,8 +105,18 @@ def score_candidates(
 
     Parameters
     ----------
+    scene
+        Scene with the part.
+    task
+        Features and measurements.
+    views
+        Candidate views.
     predictor
         Casts the rays of the sensor's full grid.
+    performance_map
+        Map of the sensor.
+    minimum_points
+        Least number of points of a shape.
     effects
         Effects beyond the map that the predicted uncertainty includes. V_m includes none.
 

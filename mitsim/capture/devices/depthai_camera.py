@@ -208,9 +208,15 @@ def match_on_device(
     ----------
     left, right
         (H, W) uint8.
+    settings
+        Settings of the matcher.
+    identifier
+        Identifier of the device; by default the first that is found.
     rectified
         Whether the pair is rectified already. If not, the device rectifies it with its stored calibration, so a
         rendered pair must use that calibration: :func:`mitsim.capture.devices.maker_captures.depthai_rig`.
+    package
+        The package ``depthai``; imported by default.
 
     Raises
     ------

@@ -75,6 +75,8 @@ def read_calibration(source: str | Path, size: tuple[int, int] | None = None) ->
 
     Parameters
     ----------
+    source
+        Name of a preset, or path of a file.
     size
         (width, height) [px] of the images: the size of an OpenCV file without one, and the size to which the cameras
         of a DepthAI calibration are scaled.

@@ -34,6 +34,8 @@ def read_depth_image(
 
     Parameters
     ----------
+    path
+        Path of the image.
     calibration
         A preset's name or a file, see :mod:`mitsim.capture.recordings.calibration_file`.
     scale_mm

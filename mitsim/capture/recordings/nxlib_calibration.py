@@ -36,6 +36,8 @@ def nxlib_rig(tree: NxLibTree, size: tuple[int, int] | None = None, *, dynamic: 
 
     Parameters
     ----------
+    tree
+        Node of the camera in the tree of NxLib.
     size
         (width, height) [px] of the raw images; by default ``Sensor/Size``.
     dynamic

@@ -64,6 +64,8 @@ def read_organised_cloud(
 
     Parameters
     ----------
+    path
+        Path of the file.
     calibration
         The camera of the grid, see :mod:`mitsim.capture.recordings.calibration_file`; by default a pinhole is fitted.
         With a rectification, the grid may also be that of the rectified left image, at full or reduced size.

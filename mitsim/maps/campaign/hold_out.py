@@ -167,6 +167,12 @@ def compare(
 
     Parameters
     ----------
+    campaign
+        The campaign of the map.
+    performance_map
+        The map that predicts.
+    shots
+        Shots that the map was not made from.
     take
         Takes a shot.
     repeats
@@ -188,8 +194,12 @@ def compared(
 
     Parameters
     ----------
+    shot
+        The shot to take and to predict.
     prepared
         The sensor, prepared once.
+    performance_map
+        The map that predicts.
     take
         Takes a shot.
     repeats
@@ -252,6 +262,10 @@ def held_out_orders(campaign: Campaign, shots: list[Shot], map_path: Path, repea
 
     Parameters
     ----------
+    campaign
+        The campaign of the map.
+    shots
+        Shots that the map was not made from.
     map_path
         Path of the map, the same on every machine.
     repeats

@@ -54,6 +54,8 @@ def plan_live(
 
     Parameters
     ----------
+    path, file
+        The campaign file, and its content.
     sensor
         Preset or file of the same kind, for name, decoder and imager. The calibration is that of the device in each
         capture.

@@ -68,6 +68,10 @@ def map_with_finishes(
 
     Parameters
     ----------
+    performance_map
+        Map of the sensor.
+    needed
+        Finishes of the scene, and how to characterise them.
     ask
         Answers whether finishes may be characterised now; None if nobody can answer.
 

@@ -158,6 +158,8 @@ def one_finish_campaign(one: OneFinish, distance: float, file: CampaignFile, lay
 
     Parameters
     ----------
+    one
+        The finish, and the sensor that characterises it.
     distance
         [mm].
     file
@@ -180,6 +182,8 @@ def characterise_finish(one: OneFinish, simulated: SimulatedSensor, distance: fl
 
     Parameters
     ----------
+    one
+        The finish, and the sensor that characterises it.
     simulated
         The sensor on the device.
     distance

@@ -211,6 +211,8 @@ def plan_campaign(
     ----------
     path, file
         The campaign file, and its content.
+    sensor
+        Sensor to characterise.
     distances_mm
         Distances if the file has none.
     places

@@ -75,6 +75,8 @@ def measure_captures(campaign: Campaign, shots: Sequence[Shot], source: Source, 
 
     Parameters
     ----------
+    campaign
+        The planned campaign.
     shots
         From :func:`~mitsim.maps.campaign.acquire.found_shots`.
     source

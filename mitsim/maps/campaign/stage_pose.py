@@ -169,6 +169,10 @@ def write_stage_calibration(
 
     Parameters
     ----------
+    path
+        File to write.
+    calibration
+        Calibrated axes, by a board or by the coupon itself.
     names
         Names of the axes, as in the campaign's ``[stage]``.
     board_from_coupon

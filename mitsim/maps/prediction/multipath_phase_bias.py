@@ -122,6 +122,8 @@ def phase_bias(
 ) -> tuple[Floats, Floats]:
     """Return the bias arg(1 + z) (H, W) [rad] of each pixel, and the standard deviation of its phase about the bias.
 
+    Both are 0 without direct light.
+
     Parameters
     ----------
     direct
@@ -132,8 +134,6 @@ def phase_bias(
         (H, W) shape that each pixel shows, -1 for none.
     step
         Number of sensor pixels per pixel along an axis.
-
-    Both results are 0 without direct light.
     """
     size = np.abs(direct)
     # scale first: squares of radiances are too small for single precision

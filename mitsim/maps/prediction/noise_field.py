@@ -77,6 +77,8 @@ def correlated_noise(
 
     Parameters
     ----------
+    scene
+        Scene with the finishes of the shapes.
     performance_map
         Gives noise areas and persistent noise.
     mapped

@@ -31,6 +31,10 @@ def performance(
     ----------
     ideal
         Points of the view.
+    scene
+        Scene with the finishes of the shapes.
+    performance_map
+        Map of the sensor.
     finish
         Replaces the finishes of the scene: matt white, to normalise the view score.
     """
@@ -76,8 +80,14 @@ def expected_points(
 
     Parameters
     ----------
+    view
+        Ideal points of the view.
+    scene
+        Scene with the shapes.
     shape
         Index into the scene's names.
+    performance_map
+        Gives noise areas and persistent noise.
     perturbation
         Effects that flat coupons cannot show (:mod:`mitsim.maps.prediction.perturbation`).
     """

@@ -71,6 +71,8 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
 
     Parameters
     ----------
+    folder
+        Folder of the run.
     task_file
         The task TOML; None uses the one named in the run's study.
 

@@ -63,6 +63,8 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[RobotTar
 
     Parameters
     ----------
+    folder
+        Folder of the run, or of the scores.
     views
         ``best``: the run's set of views, or the best of every measurement; ``all``; or numbers, ``3,12``.
 

@@ -51,6 +51,8 @@ def read_run_scene(folder: str | Path, views: str = "best") -> RunScene:
 
     Parameters
     ----------
+    folder
+        Folder of the run.
     views
         ``best``: views with clouds and best views of a measurement; ``all``; or numbers, ``3,12``.
 

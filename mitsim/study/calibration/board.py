@@ -147,10 +147,25 @@ def board_poses(
 
     The poses are deterministic: the same board and eyes give the same poses.
 
+    Parameters
+    ----------
+    board
+        Calibration board.
+    eyes
+        Cameras and projector by name, the reference camera first.
+    working_range_mm
+        Least and greatest distance of the board [mm].
+    count
+        Number of poses to try. A pose that shows all eyes less than half of the board is left out.
+
     Raises
     ------
     InputError
         If fewer than 6 poses show all eyes half of the board.
+
+    See Also
+    --------
+    seen_by_all : whether points lie in the images of all eyes
     """
     near, far = working_range_mm
     reference = next(iter(eyes.values()))

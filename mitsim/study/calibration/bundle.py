@@ -120,7 +120,23 @@ def second_eye(first: Sequence[Transform], second: Sequence[Transform]) -> Trans
 
 
 def stepped(rig: Rig, places: Sequence[Transform], names: tuple[str, ...], step: Floats) -> tuple[Rig, list[Transform]]:
-    """Return rig and poses of the board after a step (p + 6 poses,) of an adjustment of the parameters ``names``."""
+    """Return rig and poses of the board after a step of an adjustment.
+
+    Parameters
+    ----------
+    rig
+        Rig before the step.
+    places
+        Poses ``sensor_from_board`` before the step.
+    names
+        The p parameters of the rig that are adjusted.
+    step
+        (p + 6 poses,) changes of the parameters, then of each pose: rotation vector [rad], translation [mm].
+
+    See Also
+    --------
+    linearise : the normal matrix of the same parameters
+    """
     turns = step[len(names) :].reshape(-1, 6)
     return moved(rig, names, step[: len(names)]), [
         Transform(Rotation.from_rotvec(turn[:3]).as_matrix() @ place.rotation, place.translation + turn[3:])
@@ -129,7 +145,23 @@ def stepped(rig: Rig, places: Sequence[Transform], names: tuple[str, ...], step:
 
 
 def linearise(rig: Rig, eyes: Mapping[str, Camera], board: Board, views: Sequence[BoardView]) -> Linearised:
-    """Linearise the bundle adjustment of some eyes of a rig, the reference camera first, at its nominal values."""
+    """Linearise the bundle adjustment of some eyes of a rig at its nominal values.
+
+    Parameters
+    ----------
+    rig
+        Nominal rig.
+    eyes
+        Cameras and projector that are calibrated, by name, the reference camera first.
+    board
+        Calibration board, with its imperfections.
+    views
+        Poses of the board, with the noise of its corners.
+
+    See Also
+    --------
+    view_jacobian : the derivatives of a single view
+    """
     projector = "projector" in eyes
     names = tuple(name for name in parameter_names(rig, projector) if name.rpartition(".")[0] in eyes)
     modes, sigma = board.imperfections()
@@ -185,10 +217,25 @@ def homographies(first: Floats, second: Floats, place: Transform) -> Floats:
 def view_jacobian(
     eyes: Mapping[str, Camera], names: tuple[str, ...], place: Transform, corners: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the derivatives of the pixels of corners (n, 3) in the board's frame, in every eye.
+    """Return the derivatives of the pixels of a board's corners in every eye.
 
     They are by the rig's parameters and the six of the pose ``sensor_from_board``, (n, eyes, 2, p + 6), and by the
     point in the sensor frame, (n, eyes, 2, 3).
+
+    Parameters
+    ----------
+    eyes
+        Cameras and projector by name, the reference camera first.
+    names
+        The p parameters of the rig, in the order of the columns.
+    place
+        Pose ``sensor_from_board``.
+    corners
+        (n, 3) corners in the board's frame [mm].
+
+    See Also
+    --------
+    eye_jacobian : the derivatives of the pixels of a single eye
     """
     points = place.points(corners)
     arms = points - place.translation

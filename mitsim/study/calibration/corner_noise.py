@@ -20,10 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.decode.cloud import unknown_code
-from mitsim.decode.grey_levels import grey_level_variance
-from mitsim.decode.matching.reference_matching import reference_geometry
-from mitsim.decode.structured_light.phase_shift import fringe_sigma
+from mitsim.decoding.cloud import unknown_code
+from mitsim.decoding.grey_levels import grey_level_variance
+from mitsim.decoding.matching.reference_matching import reference_geometry
+from mitsim.decoding.structured_light.phase_shift import fringe_sigma
 from mitsim.sensor.image_formation import expose, fixed_pattern
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
@@ -63,10 +63,30 @@ def corner_noise(
     noise: Noise | None = None,
     window_px: int = WINDOW_PX,
 ) -> CornerNoise:
-    """Return the noise of a corner of squares ``square_px`` wide, seen by a camera of the sensor at a distance.
+    """Return the noise of a corner of the board, seen by a camera of the sensor at a distance.
 
-    The white squares have the level of the sensor's exposure rule (:func:`board_level`), in one image. The detector's
-    window extends ``window_px`` to each side, or to the centre of a square.
+    The white squares have the level of the sensor's exposure rule (:func:`board_level`), in one image.
+
+    Parameters
+    ----------
+    sensor
+        Sensor whose reference camera sees the board.
+    distance_mm
+        Distance of the board [mm].
+    square_px
+        Side of a square in the image [px].
+    seed
+        Selects positions, angles and noise of the corners.
+    patches
+        Number of simulated corners.
+    noise
+        Sources of noise that are on; None is all of them.
+    window_px
+        The detector's window extends this far to each side, or to the centre of a square [px].
+
+    See Also
+    --------
+    coordinate_noise : the noise of the projector's coordinate at a corner
     """
     noise = noise or Noise()
     rng = np.random.default_rng(seed)
@@ -125,6 +145,21 @@ def coordinate_noise(sensor: Sensor, distance_mm: float, square_px: float, seed:
 
     Each is averaged over the white half of the local homography's window, as far as the squares extend. A code of one
     axis is assumed to be shown along the other axis too during calibration, as is usual for such rigs.
+
+    Parameters
+    ----------
+    sensor
+        Sensor with a projector.
+    distance_mm
+        Distance of the board [mm].
+    square_px
+        Side of a square in the image [px].
+    seed
+        Selects the noise of a simulated line fit, for a Gray code without fringes.
+
+    See Also
+    --------
+    corner_noise : the noise of the camera's pixel
     """
     window = min(HOMOGRAPHY_WINDOW_PX, 2 * square_px)
     white = window**2 / 2

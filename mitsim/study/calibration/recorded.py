@@ -90,6 +90,8 @@ def calibrate_recorded(
     ----------
     boards
         One for each pose; every eye has the same corners.
+    board
+        Board that was recorded.
     sizes
         Width and height [px] of every eye, the reference camera first; a projector is named ``projector``.
     source

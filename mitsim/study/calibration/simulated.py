@@ -44,7 +44,21 @@ class SimulatedCorners:
 def simulate_corners(
     eyes: Mapping[str, Camera], board: Board, views: Sequence[bundle.BoardView], rng: np.random.Generator
 ) -> SimulatedCorners:
-    """Draw a board and the errors of all its corners, by :func:`mitsim.study.calibration.bundle.linearise`."""
+    """Draw a board and the errors of all its corners.
+
+    The model of the errors is that of :func:`mitsim.study.calibration.bundle.linearise`.
+
+    Parameters
+    ----------
+    eyes
+        Cameras and projector by name, the reference camera first.
+    board
+        Nominal board; its imperfections are drawn.
+    views
+        Poses of the board, with the noise of its corners.
+    rng
+        Generator of the draws.
+    """
     modes, sigma = board.imperfections()
     true = board.corners + np.einsum("m,mni->ni", sigma * rng.standard_normal(len(sigma)), modes)
     pixels: dict[str, list[Floats]] = {name: [] for name in eyes}

@@ -117,7 +117,25 @@ def calibrate(
 
 
 def board_views(sensor: Sensor, eyes: Mapping[str, Camera], board: Board, poses: int, seed: int) -> list[BoardView]:
-    """Return the board's poses, each with the noise of its corners, interpolated between five distances."""
+    """Return the board's poses, each with the noise of its corners, interpolated between five distances.
+
+    Parameters
+    ----------
+    sensor
+        Sensor to calibrate.
+    eyes
+        Cameras and projector by name, the reference camera first.
+    board
+        Calibration board.
+    poses
+        Number of poses to try.
+    seed
+        Selects the noise of the simulated corners.
+
+    See Also
+    --------
+    mitsim.study.calibration.board.board_poses : the poses alone
+    """
     places = board_poses(board, eyes, sensor.working_range_mm, poses)
     focal = sensor.rig.reference.matrix[0, 0]
     distances = np.array([np.linalg.norm(place.translation - sensor.rig.reference.centre) for place, _ in places])

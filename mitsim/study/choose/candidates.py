@@ -48,6 +48,8 @@ def read_candidates(
 
     Parameters
     ----------
+    path
+        Path of the study file.
     sensors
         ``all`` for every preset, the name of a preset, or the path of a sensor TOML file. ``=MAP`` after a name or path
         selects a map: a file, or a sensor whose map comes with mitsim. Paths are relative to the working folder.

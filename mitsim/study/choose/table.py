@@ -39,7 +39,21 @@ from mitsim.study.virtual.plan import map_digest
 def document(
     study: Study, found: Sequence[SensorResult], excluded: Sequence[Excluded], seconds: float, finished: bool
 ) -> ChoiceDocument:
-    """Return all results, best sensor first; ``study`` is the study of any of the sensors."""
+    """Return all results as a document, best sensor first.
+
+    Parameters
+    ----------
+    study
+        Study of any of the sensors.
+    found
+        Results of the compared sensors, in the order of the document.
+    excluded
+        Sensors that cannot be compared; they come last.
+    seconds
+        Duration of the comparison so far [s].
+    finished
+        Whether the comparison is complete.
+    """
     task = study.task
     named_measurements = {
         name: ComparedMeasurement(

@@ -34,7 +34,25 @@ def form_deviation(
     grid: ViewGrid,
     seed: int,
 ) -> NDArray[np.float32]:
-    """Return points (H, W, 3) [mm], sensor frame, displaced by the form of the faces in ``sizes`` (one sigma, mm)."""
+    """Return points (H, W, 3) [mm], sensor frame, displaced along their rays by the form deviation of their faces.
+
+    Parameters
+    ----------
+    points
+        (H, W, 3) points [mm], sensor frame, NaN where there is none. They are not changed.
+    surfaces
+        Shape and normal that each pixel of the grid meets, sensor frame.
+    scene
+        Scene with the shapes.
+    sizes
+        Standard deviation of the form [mm] by name of a shape.
+    world_from_sensor
+        Pose of the sensor.
+    grid
+        View rays of the pixels.
+    seed
+        Selects the form; each face has its own field.
+    """
     out = points.copy()
     for name, size in sizes.items():
         index = scene.names.index(name)

@@ -68,7 +68,19 @@ class TrialRunner(Protocol):
 
 
 def complete(trials: TrialFolder, runner: TrialRunner, jobs: Iterable[Job], label: str) -> None:
-    """Make the jobs whose trials are not finished yet, and keep each in the folder as soon as it is."""
+    """Make the jobs whose trials are not finished yet, and keep each in the folder as soon as it is.
+
+    Parameters
+    ----------
+    trials
+        Folder of the trials of a study.
+    runner
+        Makes the virtual measurements.
+    jobs
+        Requested trials of views.
+    label
+        Name of the work in the line of progress.
+    """
     missing = [job for job in jobs if job.trial not in trials.known(job.view.number)]
     for job, outcome in track(runner.run(runner.in_order(missing)), label, len(missing)):
         trials.add(job.view.number, job.trial, outcome)
@@ -209,7 +221,21 @@ def run_race(
 def standings(
     scores: xr.Dataset, numbers: Sequence[int], trials: TrialFolder, counts: dict[int, int], rules: RaceRules
 ) -> Raced:
-    """Return the state of the race after ``counts`` trials of each view."""
+    """Return the state of the race after some trials of each view.
+
+    Parameters
+    ----------
+    scores
+        Scores of the candidate views, with the variables ``predicted_uncertainty`` and ``chance`` of each measurement.
+    numbers
+        Numbers of the views on the shortlist.
+    trials
+        Folder of the trials.
+    counts
+        Number of trials that are used, by number of a view.
+    rules
+        Margin and confidence of the decision.
+    """
     names = list(trials.measurements)
     most = max(max(counts.values(), default=0), 1)
     errors = np.full((len(names), len(numbers), most), np.inf)

@@ -30,7 +30,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.exposing import LightOnImagers
 from mitsim.capture.simulated.rendering import IndirectImages, Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.decoding.cloud import capture_cloud, sensor_geometry
 from mitsim.maps.campaign.acquire import one_ahead
 from mitsim.maps.prediction import Predictor
 from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
@@ -162,9 +162,18 @@ class RenderedMeasurements:
         return TracedLight(sensor, light, shared.room, drawn, assumed)
 
     def exposed(self, lit: TracedLight, planned: PlannedExposure | None, seed: int, keep: bool = False) -> Capture:
-        """Expose light as planned, or by the sensor's own rule; every ``seed`` gives another capture.
+        """Expose light as planned, or by the sensor's own rule.
 
-        Unless ``keep`` is true, the light is overwritten, since it may be large.
+        Parameters
+        ----------
+        lit
+            Traced light of a view.
+        planned
+            Exposure times and power; None for those of the sensor's rule.
+        seed
+            Selects the noise; every seed gives another capture.
+        keep
+            Whether to keep the light. Otherwise it is overwritten, since it may be large.
         """
         drawn, known = lit.drawn, self.study.sensor.room is not None
         power = drawn.power * (1.0 if planned is None else planned.power)
@@ -248,6 +257,17 @@ def displaced(
     """Return points (H, W, 3) [mm] of a cloud with the errors of the path length and the expansion of the part.
 
     The part expands about its middle.
+
+    Parameters
+    ----------
+    cloud
+        Organised cloud, sensor frame.
+    drawn
+        Drawn errors of a trial: of the path length (offset [mm] and scale) and of the expansion of the part.
+    world_from_sensor
+        Pose of the sensor that the evaluation assumes.
+    centre
+        Middle (3,) of the part [mm], part frame.
     """
     known = cloud.valid
     points = cloud.points[known].astype(float)

@@ -84,6 +84,23 @@ def texture_of(place: Place, camera: Camera, electrons: Floats, light: LightOnIm
 
     It is the ratio of the recorded image to that of a white plate. Outside the image of the reference camera, the value
     of the nearest pixel is repeated.
+
+    Parameters
+    ----------
+    place
+        Pose and extent of the plate.
+    camera
+        Camera that took the image.
+    electrons
+        Recorded plain image (H, W) [e-].
+    light
+        Light of a white plate on the imagers, of the region of the image that shows the plate.
+    name
+        Name of the camera in ``light``.
+
+    See Also
+    --------
+    printed : the same for every pixel of the camera, without a texture
     """
     roi = light.rois[name]
     inside = roi.slices
@@ -107,7 +124,27 @@ def texture_of(place: Place, camera: Camera, electrons: Floats, light: LightOnIm
 def printed(
     light: LightOnImagers, place: Place, camera: Camera, electrons: Floats, name: str, plain: PlainImage
 ) -> LightOnImagers:
-    """Return light with the print of the recorded plain image on the specimen of its only camera."""
+    """Return light with the print of the recorded plain image on the specimen of its only camera.
+
+    Parameters
+    ----------
+    light
+        Light of a white specimen on the imager of the only camera.
+    place
+        Pose and extent of the specimen.
+    camera
+        Camera that took the image.
+    electrons
+        Recorded plain image (H, W) [e-].
+    name
+        Name of the camera in ``light``.
+    plain
+        The images whose largest level is the plain image.
+
+    See Also
+    --------
+    texture_of : the reflectance of the plate instead of the light of its image
+    """
     inside, radiance = light.rois[name].slices, light.radiance[name]
     there = image_mask(place, camera)[inside]
     white = radiance[list(plain.images)].max(axis=0).astype(float)

@@ -34,7 +34,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.exposing import LightOnImagers
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_pattern
+from mitsim.decoding.cloud import capture_pattern
 from mitsim.scene.light_transport.projector_light import ProjectedPatterns
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.noise_sources import Noise
@@ -69,12 +69,18 @@ def rebuild(
 
     Parameters
     ----------
+    real
+        Recorded capture.
     sensor
         Supplies projector, pattern and imager in place of those of the device.
     place
         Pose and extent of the specimen, from :func:`mitsim.twin.finish.specimen.specimen_place`.
+    where
+        Name of the recorded capture in messages.
     projector_on
         If false, the plate has the texture that the reference camera recorded, and even light.
+    seed
+        Selects the noise of the simulation.
 
     Raises
     ------

@@ -50,7 +50,19 @@ class WhiteCouponRenderer:
         return self._simulated.corner_loss[camera]
 
     def white(self, place: Place, camera: str, roi: Roi, pattern: Pattern) -> Floats:
-        """Return electrons per second (h, w) [e-/s] in a region that shows a Lambertian coupon of reflectance 1."""
+        """Return electrons per second (h, w) [e-/s] in a region that shows a Lambertian coupon of reflectance 1.
+
+        Parameters
+        ----------
+        place
+            Pose and size of the coupon.
+        camera
+            Name of the camera.
+        roi
+            Region of the camera's image.
+        pattern
+            Image that the projector shows in place of the sensor's patterns.
+        """
         if pattern not in self._lit:
             self._lit[pattern] = self._one(pattern)
         self._simulated.patterns = self._lit[pattern]

@@ -121,12 +121,20 @@ def fit_dots(
 
     Parameters
     ----------
+    capture
+        Capture of a flat sheet.
     sensor
         With the capture's own cameras and exposure, from :func:`mitsim.twin.compare.rebuild.like`.
+    place
+        Pose and extent of the sheet.
     parameters
         Parameters to vary, without those of the room.
+    where
+        Name of the capture in messages.
     room
         Six terms of the irradiance [W/mm^2] of the room, if known from another capture; otherwise they are fitted too.
+    draws
+        Number and seed of the simulations.
 
     Raises
     ------

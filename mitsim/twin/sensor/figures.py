@@ -74,7 +74,19 @@ class SpecimenField:
 
     @classmethod
     def of(cls, camera: Camera, mask: NDArray[np.bool_], patch_px: int, least_share: float = 0.8) -> SpecimenField:
-        """Divide the specimen's pixels (H, W) of a camera into patches with at least ``least_share`` on it."""
+        """Divide the specimen's pixels of a camera into patches.
+
+        Parameters
+        ----------
+        camera
+            Camera that took the image.
+        mask
+            (H, W) pixels that show the specimen.
+        patch_px
+            Side of a patch [px].
+        least_share
+            Least share of a patch that shows the specimen, 0..1.
+        """
         roi = Roi.around(mask) or Roi(0, 0, 0, 0)
         corners = np.array(patch_corners(mask, patch_px, least_share), int).reshape(-1, 2)
         basis = _basis(camera, corners, patch_px)
@@ -98,10 +110,22 @@ def _basis(camera: Camera, corners: NDArray[np.int64], patch_px: int) -> Floats:
 
 
 def field_figures(levels: Floats, field: SpecimenField, window_px: int, black: float = 0.0) -> FieldFigures:
-    """Return the features of an image's window (h, w) [DN] over the field.
+    """Return the features of an image over the field of the specimen.
 
-    ``window_px``: side of the window of local means, several run lengths of the pattern wide. ``black`` [DN] is
-    subtracted first.
+    Parameters
+    ----------
+    levels
+        Grey levels (h, w) [DN] of the field's window.
+    field
+        Patches of the specimen.
+    window_px
+        Side of the window of local means [px], several run lengths of the pattern wide.
+    black
+        Level that is subtracted first [DN].
+
+    See Also
+    --------
+    patch_figures : the features of every patch
     """
     table = patch_figures(np.asarray(levels, float) - black, field, window_px)
     basis = field.basis if len(table) >= _FEWEST_FOR_TERMS else field.basis[:, :1]

@@ -49,7 +49,18 @@ class InputCapture:
 def read_input_captures(
     folders: Sequence[Path], off: Sequence[Path], dark: Sequence[Path], sensor: Sensor
 ) -> list[InputCapture]:
-    """Read the captures; those of ``off`` and ``dark`` are of that kind, the settings of the others state theirs.
+    """Read the captures from which a sensor is fitted.
+
+    Parameters
+    ----------
+    folders
+        Captures whose settings state their kind: projector on, off, or dark.
+    off
+        Captures with the projector off.
+    dark
+        Captures without any light.
+    sensor
+        Sensor whose technology the captures must have.
 
     Raises
     ------

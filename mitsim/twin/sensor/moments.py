@@ -66,6 +66,8 @@ def match_moments(
         Features (n,) of the recording, finite, and their covariance (n, n).
     simulate
         The forward model.
+    prior
+        Start, spread, derivative steps and bounds of the parameters.
     draws
         Number of simulations to average.
     label

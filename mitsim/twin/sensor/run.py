@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
-from mitsim.decode.cloud import decoder_settings
+from mitsim.decoding.cloud import decoder_settings
 from mitsim.running.progress import say
 from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.pattern import DotPattern
@@ -84,6 +84,10 @@ def fit_sensor(
         Folders of captures with the projector off, and with all light off.
     roi
         Region of the first camera's image that shows the specimen, in all of them; all that is flat if left out.
+    seed
+        Selects the noise of the simulations.
+    draws
+        Number of simulations to average.
 
     Raises
     ------
