@@ -7,9 +7,7 @@ change between versions.
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from mitsim.running.version import __version__ as __version__
@@ -33,25 +31,25 @@ _NAMES = {
     "Transform": "mitsim.sensor.transforms",
     "Truth": "mitsim.capture.simulated.truth",
     "characterise": "mitsim.maps.use",
-    "decode": "mitsim.decode.captures",
+    "decode": "mitsim.decoding.captures",
     "label": "mitsim.study.task_measurement",
-    "load_scene": "mitsim.decode.captures",
-    "load_sensor": "mitsim.decode.captures",
+    "load_scene": "mitsim.decoding.captures",
+    "load_sensor": "mitsim.decoding.captures",
     "look_at": "mitsim.sensor.poses",
     "measure": "mitsim.study.task_measurement",
     "open_study": "mitsim.study.reading",
     "performance_map": "mitsim.maps.use",
     "predict": "mitsim.maps.use",
-    "read_capture": "mitsim.decode.captures",
-    "read_cloud": "mitsim.decode.captures",
+    "read_capture": "mitsim.decoding.captures",
+    "read_cloud": "mitsim.decoding.captures",
     "read_task": "characterisation.tasks.task_reading",
-    "render": "mitsim.decode.captures",
+    "render": "mitsim.decoding.captures",
     "run_study": "mitsim.study.run",
     "score": "mitsim.study.session",
     "statement": "mitsim.study.session",
-    "triangulate": "mitsim.decode.own_code",
-    "write_capture": "mitsim.decode.captures",
-    "write_cloud": "mitsim.decode.captures",
+    "triangulate": "mitsim.decoding.own_code",
+    "write_capture": "mitsim.decoding.captures",
+    "write_cloud": "mitsim.decoding.captures",
 }
 
 if TYPE_CHECKING:
@@ -65,7 +63,7 @@ if TYPE_CHECKING:
     from characterisation.tasks.task_reading import read_task
     from mitsim.capture.capture import Capture
     from mitsim.capture.simulated.truth import Truth
-    from mitsim.decode.captures import (
+    from mitsim.decoding.captures import (
         decode,
         load_scene,
         load_sensor,
@@ -75,7 +73,7 @@ if TYPE_CHECKING:
         write_capture,
         write_cloud,
     )
-    from mitsim.decode.own_code import triangulate
+    from mitsim.decoding.own_code import triangulate
     from mitsim.maps.campaign.plan import CampaignFile
     from mitsim.maps.use import characterise, performance_map, predict
     from mitsim.scene.load import Scene
@@ -126,17 +124,6 @@ __all__ = [
     "write_capture",
     "write_cloud",
 ]
-
-
-class _Interface(ModuleType):
-    """A module whose public names stay: importing the package ``mitsim.decode`` does not replace ``ms.decode``."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in _NAMES and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Interface
 
 
 def __getattr__(name: str) -> Any:

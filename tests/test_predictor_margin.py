@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import EDGE_MARGIN_PX, Predictor
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import load_sensor

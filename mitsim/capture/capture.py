@@ -34,7 +34,7 @@ class Capture:
         Preset or model name (``ensenso-n10``, ``N35-604-16-BL``).
     technology
         Measuring principle, which selects the decoder, such as ``active_stereo``: a key of
-        :data:`mitsim.decode.decoder_registry.TECHNOLOGIES`.
+        :data:`mitsim.decoding.decoder_registry.TECHNOLOGIES`.
     source
         Origin of the images: one of :data:`SOURCES`.
     rig

@@ -47,8 +47,8 @@ def acceptance(
     """
     from characterisation.tasks.result import repeatability
     from mitsim.cli.acceptance_request import cloud_figures, joint_figures, read_artefacts
-    from mitsim.decode.input_clouds import cloud_paths, read_cloud
-    from mitsim.decode.measured_document import measured_document, result_table, result_tables, result_values, summary
+    from mitsim.decoding.input_clouds import cloud_paths, read_cloud
+    from mitsim.decoding.measured_document import measured_document, result_table, result_tables, result_values, summary
     from mitsim.running.progress import say
 
     artefacts = read_artefacts(plane or [], sphere or [], spacing or [])

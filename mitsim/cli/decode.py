@@ -45,8 +45,8 @@ def decode(
     from characterisation.cloud_files import write_cloud
     from mitsim.capture.folder import read_capture
     from mitsim.capture.workspace import written_frame
-    from mitsim.decode.checks.checked_cloud import checked_cloud
-    from mitsim.decode.cloud import decoder_settings, settings_in_words, with_options
+    from mitsim.decoding.checks.checked_cloud import checked_cloud
+    from mitsim.decoding.cloud import decoder_settings, settings_in_words, with_options
     from mitsim.running.progress import say
 
     read = read_capture(capture)

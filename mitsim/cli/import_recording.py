@@ -109,7 +109,7 @@ def import_(
     from mitsim.capture.folder import is_written, write_capture
     from mitsim.capture.recordings.recognise import KINDS, ReadOptions, read_recording
     from mitsim.capture.recordings.recording_files import plain_name
-    from mitsim.decode.checks.sanity import with_warnings
+    from mitsim.decoding.checks.sanity import with_warnings
     from mitsim.running.progress import say
 
     options = ReadOptions(

@@ -169,7 +169,7 @@ def predict(
     Example: mitsim map predict scenes/two_pillars/two_pillars.xml --map ensenso-n10 --position 0 -400 300 -o cloud.ply
     """
     start(variant)
-    from mitsim.decode.captures import load_scene, load_sensor, write_cloud
+    from mitsim.decoding.captures import load_scene, load_sensor, write_cloud
     from mitsim.maps import use as maps
     from mitsim.study import read_map
 

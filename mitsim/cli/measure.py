@@ -24,7 +24,7 @@ from mitsim.cli.options import (
 
 if TYPE_CHECKING:
     from characterisation.tasks.result import Result
-    from mitsim.decode.input_clouds import InputCloud
+    from mitsim.decoding.input_clouds import InputCloud
 
 _WINDOW = "NAME=COLUMN,ROW,WIDTH,HEIGHT"
 
@@ -110,8 +110,8 @@ def clouds(
     """
     from characterisation.tasks.result import NOT_INCLUDED, repeatability
     from mitsim.cli.measure_request import read_request
-    from mitsim.decode.input_clouds import cloud_paths, read_cloud
-    from mitsim.decode.measured_document import measured_document, result_tables, summary
+    from mitsim.decoding.input_clouds import cloud_paths, read_cloud
+    from mitsim.decoding.measured_document import measured_document, result_tables, summary
     from mitsim.running.progress import say
 
     request = read_request(

@@ -26,8 +26,8 @@ from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.result import Result, failed
 from characterisation.tasks.windows import PairKind, Shape, WindowPlan, measure_windows, window_slices
-from mitsim.decode.input_clouds import InputCloud
-from mitsim.decode.plate import Plate, image_on_grid, measure_plate
+from mitsim.decoding.input_clouds import InputCloud
+from mitsim.decoding.plate import Plate, image_on_grid, measure_plate
 from mitsim.report.measured_figures import difference_figure, distance_figure
 from mitsim.running.progress import track_if_long
 

@@ -101,7 +101,7 @@ def render(
     from mitsim.capture.simulated.render_residual import LIMIT, render_residual
     from mitsim.capture.simulated.rendering import Rendering
     from mitsim.capture.simulated.truth import encode_exr, true_images
-    from mitsim.decode import captures as interface
+    from mitsim.decoding import captures as interface
     from mitsim.running.progress import say
     from mitsim.scene.first_hits import sees_nothing
     from mitsim.scene.surface.scatter import Deviation

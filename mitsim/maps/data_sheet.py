@@ -30,7 +30,7 @@ from characterisation.features.fits import fit_plane, fit_sphere
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.rendering import Rendering
-from mitsim.decode.cloud import capture_cloud
+from mitsim.decoding.cloud import capture_cloud
 from mitsim.maps.campaign.acquire import coupon_cloud
 from mitsim.maps.campaign.orders import prepared_sensor
 from mitsim.maps.campaign.plan import coupon_pose

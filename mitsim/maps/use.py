@@ -14,7 +14,7 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import coupon_residuals, in_turn, simulated_source
 from mitsim.maps.campaign.missing_finishes import NeededFinishes, map_with_finishes, seen_finishes
 from mitsim.maps.campaign.orders import worker_source

@@ -1,4 +1,4 @@
-"""Limits of a structured-light decoder, and of a device's own maps; :mod:`mitsim.decode` does the decoding."""
+"""Limits of a structured-light decoder, and of a device's own maps; :mod:`mitsim.decoding` does the decoding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Limits of a stereo matcher; :mod:`mitsim.decode` does the matching."""
+"""Limits of a stereo matcher; :mod:`mitsim.decoding` does the matching."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ Signal chain: a folder of PNG files in the order of the numbers in their names, 
 white -> the same projector as for mitsim's codes: response curve, black level, optics.
 
 mitsim projects the images and does not know what they mean. Two cameras that match dots need no meaning. A coordinate
-of the projector comes from the user's own decoder (:mod:`mitsim.decode.own_code`).
+of the projector comes from the user's own decoder (:mod:`mitsim.decoding.own_code`).
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.statements.statement import Statements
 from characterisation.tasks.evaluation import InputQuantity
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say

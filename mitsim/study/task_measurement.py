@@ -26,7 +26,7 @@ from characterisation.tasks import evaluation
 from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.task_reading import check_features
-from mitsim.decode.input_clouds import margin_of
+from mitsim.decoding.input_clouds import margin_of
 from mitsim.maps.prediction.predictor import EDGE_MARGIN_PX, Predictor
 from mitsim.scene.load import Scene
 from mitsim.sensor.camera import Camera, Rig

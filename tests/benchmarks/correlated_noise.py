@@ -23,7 +23,7 @@ from characterisation.coupon.residual_field import autocorrelation
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.decoding.cloud import capture_cloud, sensor_geometry
 from mitsim.maps.prediction import CharacterisedScene, Predictor
 from mitsim.scene.load import load_scene
 from mitsim.sensor.preset import load_sensor

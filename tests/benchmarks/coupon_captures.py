@@ -35,7 +35,7 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import write_capture
 from mitsim.capture.simulated.rendering import Rendering
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import coupon_cloud, one_ahead
 from mitsim.maps.campaign.plan import coupon_pose
 from mitsim.scene.load import load_scene

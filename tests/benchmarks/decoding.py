@@ -15,10 +15,10 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from mitsim.decode.image_context import ImageContext
-from mitsim.decode.structured_light.decoder import decode_coordinates, decode_structured_light
-from mitsim.decode.structured_light.geometry import structured_light_geometry
-from mitsim.decode.structured_light.phase_shift import fit_phases
+from mitsim.decoding.image_context import ImageContext
+from mitsim.decoding.structured_light.decoder import decode_coordinates, decode_structured_light
+from mitsim.decoding.structured_light.geometry import structured_light_geometry
+from mitsim.decoding.structured_light.phase_shift import fit_phases
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import GrayCode, PhaseShift, roles, value

@@ -20,7 +20,7 @@ from characterisation.coupon.view_frame import view_frame
 from characterisation.maps.lay import lay_angle_deg, mirror_direction
 from characterisation.maps.performance_map import PerformanceMap
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import in_turn, simulated_source
 from mitsim.maps.campaign.finish_cache import kept_finish, made_finish
 from mitsim.maps.campaign.hold_out import random_normals

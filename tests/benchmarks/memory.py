@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import coupon_cloud, simulated_source
 from mitsim.maps.campaign.plan import read_campaign
 from mitsim.sensor.preset import load_sensor

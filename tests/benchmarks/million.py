@@ -34,7 +34,7 @@ def cost(name: str) -> tuple[float, float, int, int, int]:
     from mitsim.capture.capture import Capture
     from mitsim.capture.packed_files import packed
     from mitsim.capture.simulated.simulate import SimulatedSensor
-    from mitsim.decode.cloud import capture_cloud, sensor_geometry
+    from mitsim.decoding.cloud import capture_cloud, sensor_geometry
     from mitsim.scene.load import load_scene
     from mitsim.sensor.preset import load_sensor
     from mitsim.sensor.transforms import look_at

@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import CharacterisedScene, Predictor, performance
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.load import Scene, load_scene, scene_from_dict

@@ -25,7 +25,7 @@ from real_uncertainties import smooth_residuals
 from mitsim.capture.recordings.organised_cloud import read_organised_cloud
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud
+from mitsim.decoding.cloud import capture_cloud
 from mitsim.scene import backend
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.preset import Sensor, load_sensor

@@ -29,8 +29,8 @@ from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.recordings.ensenso import read_ensenso
-from mitsim.decode.cloud import capture_cloud, decoder_settings
-from mitsim.decode.plate import Plate, image_on_grid, plate_dots, plate_scale
+from mitsim.decoding.cloud import capture_cloud, decoder_settings
+from mitsim.decoding.plate import Plate, image_on_grid, plate_dots, plate_scale
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.drift import Drift, drift_modes
 from mitsim.sensor.preset import load_sensor

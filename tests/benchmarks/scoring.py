@@ -13,7 +13,7 @@ import sys
 import time
 from pathlib import Path
 
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
 from mitsim.study import MINIMUM_POINTS, CharacterisationTable, StudyFile, open_study
 from mitsim.study.virtual.screening import screen

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from characterisation.point_cloud import Status
-from mitsim.decode.structured_light.decoder import decode_coordinates
+from mitsim.decoding.structured_light.decoder import decode_coordinates
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_formation import expose
 from mitsim.sensor.light_code import GrayCode, PhaseShift, roles, value

@@ -22,7 +22,7 @@ from mitsim.capture.devices.device_error import DeviceError
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.devices import mount
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign import live as live_module
 from mitsim.maps.campaign.acquire import coupon_cloud, in_turn, measured
 from mitsim.maps.campaign.live import live_source, place_by_place, plan_live

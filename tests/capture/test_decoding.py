@@ -9,7 +9,7 @@ import pytest
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.capture.decoding import SETTINGS_OF, Decoding, read_settings, settings_table
-from mitsim.decode.decoder_registry import TECHNOLOGIES
+from mitsim.decoding.decoder_registry import TECHNOLOGIES
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import GrayCode, PhaseShift
 from mitsim.sensor.modulation import AmplitudeModulation

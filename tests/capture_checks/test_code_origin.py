@@ -11,8 +11,8 @@ from test_sanity import PAIRED, SETTINGS, gray, pair, said, sequence, taken
 
 from characterisation.point_cloud import Status
 from mitsim.capture.decoding import Decoding
-from mitsim.decode.checks.fringe_wave import has_jump
-from mitsim.decode.cloud import capture_cloud
+from mitsim.decoding.checks.fringe_wave import has_jump
+from mitsim.decoding.cloud import capture_cloud
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift
 from mitsim.sensor.transforms import Transform

@@ -13,15 +13,15 @@ from simulated_rigs import LINES, SPECKS, images_seen, surface_seen
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.decode import coded_images
-from mitsim.decode.checks.checked_cloud import checked_cloud
-from mitsim.decode.checks.rig_sanity import measured_row_error, row_error_warnings
-from mitsim.decode.checks.sanity import code_findings, row_error_in_words
-from mitsim.decode.cloud import capture_cloud
-from mitsim.decode.coded_images import CodedImages
-from mitsim.decode.matching.stereo import stereo_geometry
-from mitsim.decode.structured_light import decoder, two_cameras
-from mitsim.decode.structured_light.decoder import decode_coordinates
+from mitsim.decoding import coded_images
+from mitsim.decoding.checks.checked_cloud import checked_cloud
+from mitsim.decoding.checks.rig_sanity import measured_row_error, row_error_warnings
+from mitsim.decoding.checks.sanity import code_findings, row_error_in_words
+from mitsim.decoding.cloud import capture_cloud
+from mitsim.decoding.coded_images import CodedImages
+from mitsim.decoding.matching.stereo import stereo_geometry
+from mitsim.decoding.structured_light import decoder, two_cameras
+from mitsim.decoding.structured_light.decoder import decode_coordinates
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence

@@ -9,7 +9,7 @@ import pytest
 
 from characterisation.files import threads
 from characterisation.files.threads import MOST_THREADS, in_threads, thread_count
-from mitsim.decode.blocks import BLOCK, in_blocks
+from mitsim.decoding.blocks import BLOCK, in_blocks
 from mitsim.maps.prediction.noise_field import averaging_field, persistent_field
 
 

@@ -10,10 +10,10 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
-from mitsim.decode.image_context import ImageContext
-from mitsim.decode.matching import correlation
-from mitsim.decode.matching.correlation import correlate_both_ways
-from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
+from mitsim.decoding.image_context import ImageContext
+from mitsim.decoding.matching import correlation
+from mitsim.decoding.matching.correlation import correlate_both_ways
+from mitsim.decoding.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status, ViewGrid
 from characterisation.region_of_interest import Roi
-from mitsim.decode.device_maps import (
+from mitsim.decoding.device_maps import (
     camera_map_geometry,
     decode_device_map,
     disparity_map_geometry,

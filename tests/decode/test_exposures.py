@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from characterisation.files.errors import InputError
-from mitsim.decode.exposures import MergedExposures, merge_exposures
+from mitsim.decoding.exposures import MergedExposures, merge_exposures
 from mitsim.sensor.image_formation import expose
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise

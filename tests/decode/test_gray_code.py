@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.structured_light.decoder import decode_coordinates
-from mitsim.decode.structured_light.gray_code import binary_of_gray
+from mitsim.decoding.structured_light.decoder import decode_coordinates
+from mitsim.decoding.structured_light.gray_code import binary_of_gray
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, roles, value
 

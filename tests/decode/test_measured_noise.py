@@ -7,10 +7,10 @@ import pytest
 
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.decode.cloud import capture_cloud
-from mitsim.decode.coded_images import decoded_once
-from mitsim.decode.noise import sigma_source
-from mitsim.decode.structured_light.measured_noise import measured_noise
+from mitsim.decoding.cloud import capture_cloud
+from mitsim.decoding.coded_images import decoded_once
+from mitsim.decoding.noise import sigma_source
+from mitsim.decoding.structured_light.measured_noise import measured_noise
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence

@@ -13,10 +13,10 @@ from scipy.stats import norm
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.structured_light.decoder import decode_coordinates
-from mitsim.decode.structured_light.phase_shift import fit_phases
-from mitsim.decode.structured_light.projector_gamma import correct_phase, estimate_gamma, harmonic_ratio
-from mitsim.decode.structured_light.unwrapping import unwrap, unwrapping_path
+from mitsim.decoding.structured_light.decoder import decode_coordinates
+from mitsim.decoding.structured_light.phase_shift import fit_phases
+from mitsim.decoding.structured_light.projector_gamma import correct_phase, estimate_gamma, harmonic_ratio
+from mitsim.decoding.structured_light.unwrapping import unwrap, unwrapping_path
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import PhaseShift, roles, value

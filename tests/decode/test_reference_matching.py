@@ -10,8 +10,8 @@ from scipy.ndimage import map_coordinates
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.image_context import ImageContext
-from mitsim.decode.matching.reference_matching import decode_reference, reference_geometry
+from mitsim.decoding.image_context import ImageContext
+from mitsim.decoding.matching.reference_matching import decode_reference, reference_geometry
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import DiffractionSpots, dot_frames

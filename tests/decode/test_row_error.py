@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift
 
-from mitsim.decode.matching.row_error import MAXIMUM_ROWS, row_error
+from mitsim.decoding.matching.row_error import MAXIMUM_ROWS, row_error
 
 SIDE, DISPARITY = 80, 6.0
 

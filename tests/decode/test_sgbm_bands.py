@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsim.decode.matching import sgbm
-from mitsim.decode.matching.sgbm_bands import (
+from mitsim.decoding.matching import sgbm
+from mitsim.decoding.matching.sgbm_bands import (
     Penalties,
     bytes_by_opencv,
     bytes_of_band,

@@ -11,9 +11,9 @@ from scipy.ndimage import map_coordinates
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from characterisation.region_of_interest import Roi
-from mitsim.decode.image_context import ImageContext
-from mitsim.decode.matching.sgbm import search_range
-from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
+from mitsim.decoding.image_context import ImageContext
+from mitsim.decoding.matching.sgbm import search_range
+from mitsim.decoding.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform

@@ -13,10 +13,10 @@ from simulated_rigs import images_seen, surface_seen
 from characterisation.cloud_files import read_cloud, write_cloud
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.image_context import ImageContext
-from mitsim.decode.structured_light.decoder import decode_structured_light
-from mitsim.decode.structured_light.geometry import structured_light_geometry
-from mitsim.decode.structured_light.two_cameras import decode_structured_light_stereo
+from mitsim.decoding.image_context import ImageContext
+from mitsim.decoding.structured_light.decoder import decode_structured_light
+from mitsim.decoding.structured_light.geometry import structured_light_geometry
+from mitsim.decoding.structured_light.two_cameras import decode_structured_light_stereo
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.decode.image_context import ImageContext
-from mitsim.decode.matching.stereo import stereo_geometry
-from mitsim.decode.structured_light.two_cameras import decode_structured_light_stereo
+from mitsim.decoding.image_context import ImageContext
+from mitsim.decoding.matching.stereo import stereo_geometry
+from mitsim.decoding.structured_light.two_cameras import decode_structured_light_stereo
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager

@@ -14,8 +14,8 @@ from scipy.stats import norm
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.image_context import ImageContext
-from mitsim.decode.time_of_flight import (
+from mitsim.decoding.image_context import ImageContext
+from mitsim.decoding.time_of_flight import (
     decode_time_of_flight,
     joint_path,
     time_of_flight_geometry,

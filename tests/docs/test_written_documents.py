@@ -13,7 +13,7 @@ from characterisation.statements.statement import statement
 from characterisation.tasks.result import Repeatability, Result
 from mitsim.capture.devices.stage_connection import BAUD
 from mitsim.capture.simulated.truth import Truth, encode_exr, read_exr
-from mitsim.decode.measured_document import measured_document
+from mitsim.decoding.measured_document import measured_document
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import UnknownsTable

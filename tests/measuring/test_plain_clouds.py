@@ -13,8 +13,8 @@ from shell import mitsim_here
 from characterisation.cloud_files import write_cloud
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.decode.input_clouds import read_cloud
-from mitsim.decode.plain_clouds import read_plain_cloud
+from mitsim.decoding.input_clouds import read_cloud
+from mitsim.decoding.plain_clouds import read_plain_cloud
 
 WIDTH, HEIGHT = 60, 45
 GRID = ViewGrid(200.0, 200.0, 29.5, 22.0, WIDTH, HEIGHT)

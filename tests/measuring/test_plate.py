@@ -8,8 +8,8 @@ from seen_shapes import cloud_of, plane
 
 from characterisation.features.robust_fit import FitError
 from characterisation.point_cloud import ViewGrid
-from mitsim.decode.dot_centres import dot_centres
-from mitsim.decode.plate import Plate, PlateDots, measure_plate, plate_dots, plate_scale
+from mitsim.decoding.dot_centres import dot_centres
+from mitsim.decoding.plate import Plate, PlateDots, measure_plate, plate_dots, plate_scale
 
 GRID = ViewGrid(900.0, 900.0, 189.5, 179.5, 380, 360)
 PITCH, COUNT = 18.75, 7

@@ -12,7 +12,7 @@ from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.result import Result, repeatability
 from characterisation.tasks.windows import WindowPlan, measure_windows
-from mitsim.decode.measured_document import repeatability_table
+from mitsim.decoding.measured_document import repeatability_table
 
 #: left half a plane, right half one that leans by 30 deg against it; below them a ball and a pin
 LEFT, RIGHT = (Roi(5, 5, 85, 60), Roi(110, 5, 85, 60))

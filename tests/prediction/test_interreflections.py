@@ -9,7 +9,7 @@ import pytest
 from characterisation.point_cloud import Status
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
 from mitsim.maps.prediction.interreflections import InterreflectionEffect, LossCurve, found_share
 from mitsim.maps.prediction.perturbation import SceneView

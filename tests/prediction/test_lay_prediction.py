@@ -17,7 +17,7 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 from characterisation.point_cloud import Status
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign import one_finish, run
 from mitsim.maps.campaign.acquire import in_turn, simulated_source
 from mitsim.maps.campaign.one_finish import OneFinish, characterise_finish, one_finish_campaign, plan_of

@@ -12,7 +12,7 @@ from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 from characterisation.point_cloud import Status
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import CharacterisedScene, Predictor, performance
 from mitsim.scene.load import Scene, load_scene, scene_from_dict
 from mitsim.sensor.preset import load_sensor

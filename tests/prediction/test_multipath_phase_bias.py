@@ -8,7 +8,7 @@ import pytest
 
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.decoding.cloud import capture_cloud, sensor_geometry
 from mitsim.maps.prediction import Ideal, Predictor
 from mitsim.maps.prediction.interreflections import InterreflectionEffect
 from mitsim.maps.prediction.multipath_phase_bias import WINDOW_PX, amplitude, finest_fringe, fringes, phase_bias

@@ -9,7 +9,7 @@ import pytest
 from characterisation.point_cloud import Status
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.decoding.cloud import capture_cloud, sensor_geometry
 from mitsim.maps.prediction import Ideal, Predictor
 from mitsim.maps.prediction.interreflections import InterreflectionEffect
 from mitsim.maps.prediction.multipath_range_bias import path_amplitudes, path_bias, range_bias

@@ -16,7 +16,7 @@ from characterisation.coupon.residual_field import autocorrelation
 from characterisation.maps.building import NODES
 from characterisation.maps.performance_map import SCHEMA_VERSION, PerformanceMap
 from characterisation.maps.tables import FIELDS
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import CharacterisedScene, Predictor
 from mitsim.maps.prediction.noise_field import averaging_field, own_field, persistent_field
 from mitsim.scene.backend import mi

@@ -8,7 +8,7 @@ import pytest
 from characterisation.maps.noise_structure import noise_structure
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import map_path
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
 from mitsim.maps.prediction.perturbation import Perturbation, together
 from mitsim.maps.prediction.point_statistics import ViewPoints, expected_points

@@ -16,10 +16,10 @@ from mitsim.capture.recordings.ensenso import read_ensenso
 from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
 from mitsim.capture.simulated.rendering import Rendering
-from mitsim.decode.cloud import capture_cloud, decoder_settings
-from mitsim.decode.depth_range import surface_beyond
-from mitsim.decode.image_context import ImageContext
-from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
+from mitsim.decoding.cloud import capture_cloud, decoder_settings
+from mitsim.decoding.depth_range import surface_beyond
+from mitsim.decoding.image_context import ImageContext
+from mitsim.decoding.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform

@@ -17,8 +17,8 @@ from characterisation.point_cloud import Status
 from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.recordings.ensenso import ensenso_originals, read_ensenso
-from mitsim.decode.image_context import ImageContext
-from mitsim.decode.matching.stereo import decode_stereo, stereo_geometry
+from mitsim.decoding.image_context import ImageContext
+from mitsim.decoding.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform
 

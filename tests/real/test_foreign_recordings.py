@@ -16,11 +16,11 @@ from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.recordings.recognise import ReadOptions, read_recording
-from mitsim.decode.checks.rig_sanity import row_error_warnings
-from mitsim.decode.checks.sanity import pair_row_error
-from mitsim.decode.cloud import capture_cloud, decoder_settings
-from mitsim.decode.image_context import ImageContext
-from mitsim.decode.matching.stereo import decode_stereo
+from mitsim.decoding.checks.rig_sanity import row_error_warnings
+from mitsim.decoding.checks.sanity import pair_row_error
+from mitsim.decoding.cloud import capture_cloud, decoder_settings
+from mitsim.decoding.image_context import ImageContext
+from mitsim.decoding.matching.stereo import decode_stereo
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recordings"))
 

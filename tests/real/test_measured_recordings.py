@@ -5,9 +5,9 @@ import pytest
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.windows import WindowPlan, measure_windows
 from mitsim.capture.recordings.ensenso import read_ensenso
-from mitsim.decode.cloud import capture_cloud, decoder_settings
-from mitsim.decode.input_clouds import cloud_paths, read_cloud
-from mitsim.decode.plate import Plate, image_on_grid, measure_plate
+from mitsim.decoding.cloud import capture_cloud, decoder_settings
+from mitsim.decoding.input_clouds import cloud_paths, read_cloud
+from mitsim.decoding.plate import Plate, image_on_grid, measure_plate
 
 pytestmark = pytest.mark.real
 

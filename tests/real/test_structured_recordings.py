@@ -17,13 +17,13 @@ from characterisation.point_cloud import Status
 from mitsim.capture.grey_image import read_grey
 from mitsim.capture.recordings.image_folder import read_image_folder
 from mitsim.cli.program import app
-from mitsim.decode.checks.image_sanity import image_warnings
-from mitsim.decode.checks.sanity import code_findings
-from mitsim.decode.cloud import capture_cloud, sensor_geometry
-from mitsim.decode.coded_images import CodedImages
-from mitsim.decode.structured_light.decoder import decode_coordinates
-from mitsim.decode.structured_light.phase_shift import fit_phases
-from mitsim.decode.structured_light.projector_gamma import correct_phase, gamma_from_white
+from mitsim.decoding.checks.image_sanity import image_warnings
+from mitsim.decoding.checks.sanity import code_findings
+from mitsim.decoding.cloud import capture_cloud, sensor_geometry
+from mitsim.decoding.coded_images import CodedImages
+from mitsim.decoding.structured_light.decoder import decode_coordinates
+from mitsim.decoding.structured_light.phase_shift import fit_phases
+from mitsim.decoding.structured_light.projector_gamma import correct_phase, gamma_from_white
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import roles

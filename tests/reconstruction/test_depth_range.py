@@ -16,8 +16,8 @@ from mitsim.capture.folder import write_capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.program import app
-from mitsim.decode.cloud import capture_cloud
-from mitsim.decode.depth_range import _coarse_capture, depths_of, neighbour_agreement, surface_beyond
+from mitsim.decoding.cloud import capture_cloud
+from mitsim.decoding.depth_range import _coarse_capture, depths_of, neighbour_agreement, surface_beyond
 from mitsim.maps.campaign.plan import coupon_pose
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.camera import stereo_rectification
@@ -74,7 +74,7 @@ def test_an_ordinary_capture_is_not_looked_at_twice(taken, monkeypatch):
     def twice(*_):
         raise AssertionError("decoded twice")
 
-    monkeypatch.setattr("mitsim.decode.depth_range.capture_cloud", twice)
+    monkeypatch.setattr("mitsim.decoding.depth_range.capture_cloud", twice)
     assert surface_beyond(capture, cloud, sensor.settings) is None
 
 

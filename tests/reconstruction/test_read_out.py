@@ -16,7 +16,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.decoding.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.load import load_scene
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.preset import load_sensor

@@ -30,7 +30,7 @@ from mitsim.capture.recordings.depthai_calibration import read_depthai_calibrati
 from mitsim.capture.recordings.depthai_frames import read_frames
 from mitsim.capture.recordings.depthai_recording import read_depthai_recording
 from mitsim.capture.recordings.mcap_messages import mcap_messages
-from mitsim.decode.cloud import capture_cloud, decoder_settings
+from mitsim.decoding.cloud import capture_cloud, decoder_settings
 
 needs_depthai = pytest.mark.skipif(find_spec("depthai") is None, reason="no depthai: pip install 'mitsim[depthai]'")
 
@@ -545,7 +545,7 @@ def test_without_the_extra_other_recordings_load_and_these_say_what_to_install(r
     """In a process of its own, where none of its packages can be imported."""
     code = (
         "import sys; sys.modules.update(dict.fromkeys(('mcap', 'mcap_protobuf', 'lz4', 'zstandard', 'google')))\n"
-        "import mitsim.cli.import_recording, mitsim.decode.input_clouds\n"
+        "import mitsim.cli.import_recording, mitsim.decoding.input_clouds\n"
         "from characterisation.files.errors import MissingEnvironmentError\n"
         "from mitsim.capture.recordings.recognise import ReadOptions, read_recording\n"
         "try: read_recording(sys.argv[1], ReadOptions(frame=0))\n"

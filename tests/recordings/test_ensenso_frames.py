@@ -25,7 +25,7 @@ from mitsim.capture.recordings.ensenso import read_ensenso
 from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 from mitsim.capture.workspace import written_frame
 from mitsim.cli.program import app
-from mitsim.decode.device_maps import camera_map_geometry, decode_device_map
+from mitsim.decoding.device_maps import camera_map_geometry, decode_device_map
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, F, CX, CY = 80, 60, 66.0, 37.0, 31.0

@@ -28,7 +28,7 @@ from mitsim.capture.recordings.organised_cloud import read_organised_cloud
 from mitsim.capture.recordings.pinhole_fit import fit_pinhole
 from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
-from mitsim.decode.cloud import capture_cloud, capture_geometry, decoder_settings, sensor_geometry
+from mitsim.decoding.cloud import capture_cloud, capture_geometry, decoder_settings, sensor_geometry
 from mitsim.maps.campaign.acquire import coupon_cloud
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DeviceMapSettings

@@ -18,7 +18,7 @@ from mitsim.capture.grey_image import CHANNELS, read_grey
 from mitsim.capture.recordings.image_count import advice
 from mitsim.capture.recordings.image_folder import read_image_folder
 from mitsim.cli.program import app
-from mitsim.decode.cloud import capture_cloud, decoder_settings
+from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.sensor.light_code import LightCode, patterns, roles, value
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.projector_images import counted

@@ -18,7 +18,7 @@ from mitsim.capture.recordings.robi import read_robi
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.program import app
-from mitsim.decode.cloud import capture_cloud, decoder_settings
+from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.pattern import RandomDots

@@ -9,7 +9,7 @@ import pytest
 
 from characterisation.point_cloud import PointCloud, Status
 from characterisation.tasks.evaluation import measure, read_task
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
 from mitsim.scene import load
 from mitsim.scene.authoring.face import surface_distance

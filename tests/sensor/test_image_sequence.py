@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
-from mitsim.decode.structured_light.decoder import decode_coordinates
+from mitsim.decoding.structured_light.decoder import decode_coordinates
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, patterns, roles

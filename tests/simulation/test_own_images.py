@@ -13,8 +13,8 @@ import mitsim as ms
 from characterisation.point_cloud import Status
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.recordings.image_folder import read_image_folder
-from mitsim.decode.cloud import capture_cloud, decoder_settings, sensor_geometry
-from mitsim.decode.structured_light.decoder import decode_coordinates
+from mitsim.decoding.cloud import capture_cloud, decoder_settings, sensor_geometry
+from mitsim.decoding.structured_light.decoder import decode_coordinates
 from mitsim.sensor.png import encode_png
 from mitsim.sensor.projector_images import ProjectorImages, checked_images
 from mitsim.sensor.transforms import look_at

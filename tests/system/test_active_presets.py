@@ -14,7 +14,7 @@ import pytest
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.decoding.cloud import capture_cloud, sensor_geometry
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.noise_sources import Noise

@@ -9,7 +9,7 @@ import pytest
 
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.decoding.cloud import capture_cloud, sensor_geometry
 from mitsim.maps.campaign.plan import coupon_pose
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.noise_sources import Noise

@@ -12,7 +12,7 @@ from characterisation.cloud_files import read_cloud
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.program import app
-from mitsim.decode.cloud import capture_cloud
+from mitsim.decoding.cloud import capture_cloud
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.noise_sources import Noise

@@ -14,8 +14,8 @@ from characterisation.point_cloud import Status
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud, sensor_geometry
-from mitsim.decode.structured_light.phase_shift import fit_phases
+from mitsim.decoding.cloud import capture_cloud, sensor_geometry
+from mitsim.decoding.structured_light.phase_shift import fit_phases
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict
 from mitsim.sensor.light_code import PhaseShift

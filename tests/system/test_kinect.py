@@ -15,7 +15,7 @@ from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud, decoder_settings, sensor_geometry
+from mitsim.decoding.cloud import capture_cloud, decoder_settings, sensor_geometry
 from mitsim.maps.campaign.acquire import in_turn, simulated_source
 from mitsim.maps.campaign.plan import read_campaign
 from mitsim.maps.campaign.run import run_campaign

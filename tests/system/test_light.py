@@ -13,7 +13,7 @@ from mitsim.capture.simulated.render_residual import render_residual, temporal_n
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.capture.simulated.surface_speckle import finish_contrast
-from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.decoding.cloud import capture_cloud, sensor_geometry
 from mitsim.maps.campaign.acquire import coupon_cloud, simulated_source
 from mitsim.maps.campaign.plan import CampaignFile, plan_campaign
 from mitsim.scene.backend import mi

@@ -20,8 +20,8 @@ from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.decode import decode
-from mitsim.decode.cloud import decoder_settings
-from mitsim.decode.decoder_registry import technology_of
+from mitsim.decoding.cloud import decoder_settings
+from mitsim.decoding.decoder_registry import technology_of
 from mitsim.scene.load import load_scene
 from mitsim.sensor.imager import WrittenImager
 from mitsim.sensor.preset import load_sensor, presets

@@ -18,8 +18,8 @@ from characterisation.point_cloud import Status
 from mitsim.capture.simulated.render_residual import LIMIT, RenderResidual, largest_residual, warn_above_limit
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud
-from mitsim.decode.matching.stereo import stereo_geometry
+from mitsim.decoding.cloud import capture_cloud
+from mitsim.decoding.matching.stereo import stereo_geometry
 from mitsim.maps.campaign.acquire import coupon_cloud, coupon_residuals, in_turn, simulated_source
 from mitsim.maps.campaign.coupons import VARIANTS
 from mitsim.maps.campaign.plan import CampaignFile, coupon_pose, plan_campaign, read_campaign

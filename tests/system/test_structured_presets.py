@@ -11,7 +11,7 @@ from characterisation.features.fits import fit_sphere
 from characterisation.point_cloud import Status
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_cloud, sensor_geometry
+from mitsim.decoding.cloud import capture_cloud, sensor_geometry
 from mitsim.maps.campaign.plan import coupon_pose
 from mitsim.scene.backend import mi
 from mitsim.scene.load import scene_from_dict

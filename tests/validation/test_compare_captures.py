@@ -16,7 +16,7 @@ from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.cli.program import app
-from mitsim.decode.matching.stereo import stereo_geometry
+from mitsim.decoding.matching.stereo import stereo_geometry
 from mitsim.scene.test_targets import plate
 from mitsim.sensor.transforms import look_at
 from mitsim.twin.compare import compare_captures as compare_module

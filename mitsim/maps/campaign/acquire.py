@@ -28,8 +28,8 @@ from mitsim.capture.folder import read_capture, read_settings_and_pose
 from mitsim.capture.simulated.render_residual import RenderResidual, render_residual, warn_above_limit
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
-from mitsim.decode.depth_range import depths_of, range_warning
+from mitsim.decoding.cloud import Geometry, capture_cloud, capture_geometry, sensor_geometry
+from mitsim.decoding.depth_range import depths_of, range_warning
 from mitsim.maps.campaign.plan import Campaign, Shot, view_axes
 from mitsim.maps.campaign.store import Finished
 from mitsim.sensor.preset import Sensor

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import Source, measured, simulated_source
 from mitsim.maps.campaign.coupons import CouponRecipe, load_sample
 from mitsim.maps.campaign.plan import Campaign, Series, Shot

@@ -3,7 +3,7 @@ r"""Bias of a time-of-flight path by interreflections.
 Signal chain: correlations of direct light and of interreflections (:mod:`mitsim.maps.prediction.interreflections`) ->
 complex amplitudes A_1 and A_2 at every frequency -> A_2 relative to the phase of A_1, smoothed over one face -> its
 ratio z to A_1 -> phases with and without arg(1 + z) -> the sensor's decoder
-(:func:`mitsim.decode.time_of_flight.joint_path`) -> bias of the path, and whether the decoder rejects the phases.
+(:func:`mitsim.decoding.time_of_flight.joint_path`) -> bias of the path, and whether the decoder rejects the phases.
 
 A time-of-flight imager adds amplitudes: it measures the phase of A_1 + A_2, where A_2 has travelled a longer path. A
 concave face, or one next to another, therefore appears too far away ("multipath"; Fuchs, ICPR 2010, recalled). The
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.capture.simulated.indirect_light import smoothed
-from mitsim.decode.time_of_flight import joint_path
+from mitsim.decoding.time_of_flight import joint_path
 from mitsim.maps.prediction.predictor import Ideal
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings, sample_variance

@@ -22,7 +22,7 @@ from characterisation.coupon.view_frame import in_frame, view_frame
 from characterisation.files.threads import in_threads
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.region_of_interest import Roi
-from mitsim.decode.cloud import Geometry
+from mitsim.decoding.cloud import Geometry
 from mitsim.maps.prediction.characterised_scene import CharacterisedScene
 from mitsim.maps.prediction.noise_field import correlated_noise
 from mitsim.scene.load import Scene

@@ -37,7 +37,7 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
-from mitsim.decode.cloud import capture_cloud, capture_geometry, decoder_settings
+from mitsim.decoding.cloud import capture_cloud, capture_geometry, decoder_settings
 from mitsim.report.export.run_scene import sensor_from_grid
 from mitsim.running.progress import track
 from mitsim.running.version import __version__

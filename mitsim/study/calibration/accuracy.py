@@ -10,7 +10,7 @@ The decoders' geometry is followed exactly:
 - A pair of cameras: rectified by the nominal rig, disparity to depth on the left rows, row differences discarded.
 - One camera and a stored image: the same with the nominal projector's rays.
 - One camera and a code: the depth on the camera's ray at which the nominal projector has the code's coordinate. That is
-  :mod:`mitsim.decode.structured_light.geometry` without its polynomial.
+  :mod:`mitsim.decoding.structured_light.geometry` without its polynomial.
 - Time of flight: distance along the ray.
 """
 
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.acceptance.vdi_2634 import flatness_error
-from mitsim.decode.structured_light.geometry import MINIMUM_CHANGE_PX
+from mitsim.decoding.structured_light.geometry import MINIMUM_CHANGE_PX
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, axes

@@ -20,10 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsim.decode.cloud import unknown_code
-from mitsim.decode.grey_levels import grey_level_variance
-from mitsim.decode.matching.reference_matching import reference_geometry
-from mitsim.decode.structured_light.phase_shift import fringe_sigma
+from mitsim.decoding.cloud import unknown_code
+from mitsim.decoding.grey_levels import grey_level_variance
+from mitsim.decoding.matching.reference_matching import reference_geometry
+from mitsim.decoding.structured_light.phase_shift import fringe_sigma
 from mitsim.sensor.image_formation import expose, fixed_pattern
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles

@@ -23,7 +23,7 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
 from characterisation.tasks.evaluation import measure
 from characterisation.tasks.folded import folded_values
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import one_ahead
 from mitsim.maps.prediction import CharacterisedScene, Predictor
 from mitsim.maps.prediction.shared_errors import terms

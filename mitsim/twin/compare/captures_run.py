@@ -22,7 +22,7 @@ from characterisation.point_cloud import Status
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.decode.cloud import decoder_settings
+from mitsim.decoding.cloud import decoder_settings
 from mitsim.running.numbers import NONE, rounded, two_digits
 from mitsim.running.progress import say
 from mitsim.twin.compare.compare_captures import ComparedRow, Comparison, compare_captures

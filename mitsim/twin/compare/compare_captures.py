@@ -31,8 +31,8 @@ from scipy.stats import wasserstein_distance
 from characterisation.files.atomic_io import json_values
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
-from mitsim.decode.cloud import Geometry, Settings, capture_geometry
-from mitsim.decode.matching.stereo import StereoGeometry
+from mitsim.decoding.cloud import Geometry, Settings, capture_geometry
+from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.running.numbers import two_digits
 from mitsim.twin.compare.compared_quantities import QUANTITIES, Floats, Quantity
 from mitsim.twin.compare.plain_image import plain_image

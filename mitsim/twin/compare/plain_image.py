@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.capture.capture import Capture
-from mitsim.decode.cloud import capture_pattern
-from mitsim.decode.decoder_registry import projector_size
+from mitsim.decoding.cloud import capture_pattern
+from mitsim.decoding.decoder_registry import projector_size
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
 

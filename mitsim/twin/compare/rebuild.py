@@ -34,7 +34,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.exposing import LightOnImagers
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
-from mitsim.decode.cloud import capture_pattern
+from mitsim.decoding.cloud import capture_pattern
 from mitsim.scene.light_transport.projector_light import ProjectedPatterns
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.noise_sources import Noise

@@ -26,9 +26,9 @@ from characterisation.coupon.residual_field import LARGEST_LAG, autocorrelation
 from characterisation.point_cloud import PointCloud, Status
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
-from mitsim.decode.cloud import Geometry, Settings, capture_cloud
-from mitsim.decode.matching.row_error import row_error
-from mitsim.decode.matching.stereo import StereoGeometry
+from mitsim.decoding.cloud import Geometry, Settings, capture_cloud
+from mitsim.decoding.matching.row_error import row_error
+from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.finish.fine_detail import finest_detail
 from mitsim.twin.finish.place import Place
@@ -263,7 +263,7 @@ def _row_errors(
 ) -> Floats:
     """Return the shift [rows] of the right image that fits best, for each patch with points.
 
-    See :mod:`mitsim.decode.matching.row_error`.
+    See :mod:`mitsim.decoding.matching.row_error`.
     """
     out = np.full(len(places), np.nan)
     if capture.technology == "structured_light" or not isinstance(geometry, StereoGeometry):

@@ -17,7 +17,7 @@ from characterisation.features.robust_fit import FitError
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
-from mitsim.decode.cloud import Settings, capture_cloud, capture_geometry
+from mitsim.decoding.cloud import Settings, capture_cloud, capture_geometry
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.roi import roi_around

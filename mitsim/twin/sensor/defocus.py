@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from mitsim.decode.cloud import capture_cloud, decoder_settings
+from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.twin.sensor.input_captures import InputCapture
 
 Floats = NDArray[np.float64]

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsim.capture.capture import Capture
-from mitsim.decode.cloud import Settings, capture_geometry
-from mitsim.decode.matching.stereo import StereoGeometry
+from mitsim.decoding.cloud import Settings, capture_geometry
+from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.twin.compare.specimen_patches import patch_rows
 from mitsim.twin.finish.place import Place
 

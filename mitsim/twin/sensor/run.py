@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
-from mitsim.decode.cloud import decoder_settings
+from mitsim.decoding.cloud import decoder_settings
 from mitsim.running.progress import say
 from mitsim.sensor.light_code import LightCode
 from mitsim.sensor.pattern import DotPattern

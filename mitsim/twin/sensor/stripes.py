@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from mitsim.decode.cloud import capture_pattern
+from mitsim.decoding.cloud import capture_pattern
 from mitsim.sensor.image_role import Role
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import LightCode, roles

@@ -15,8 +15,8 @@ import numpy as np
 
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
-from mitsim.decode.cloud import Geometry, capture_cloud
-from mitsim.decode.matching.stereo import StereoGeometry
+from mitsim.decoding.cloud import Geometry, capture_cloud
+from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.sensor.preset import Sensor
 
 Decoder = Literal["ours", "sgbm", "sgbm5", "sgbm7", "sgbm9", "sgbm11"]

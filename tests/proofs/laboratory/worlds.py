@@ -24,7 +24,7 @@ from characterisation.region_of_interest import Roi
 from characterisation.tasks.evaluation import measure
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.decode.cloud import sensor_geometry
+from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
 from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation
 from mitsim.sensor.modulation import AmplitudeModulation

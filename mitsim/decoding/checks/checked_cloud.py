@@ -1,0 +1,81 @@
+"""Decode a capture and check it: its cloud, warnings about images, rig and range, and notes on the cloud.
+
+Signal chain: capture and settings -> its images, decoded once -> checks of images and calibration -> cloud -> checks of
+rows and range. ``mitsim decode`` prints the sentences; :func:`mitsim.decode` issues the warnings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from characterisation.point_cloud import PointCloud
+from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Settings
+from mitsim.decoding.checks.rig_sanity import Findings, row_error_warnings
+from mitsim.decoding.checks.sanity import (
+    code_findings,
+    pair_row_error,
+    row_error_in_words,
+    uncalibrated_in_words,
+)
+from mitsim.decoding.coded_images import decoded_once
+from mitsim.decoding.depth_range import range_warning, surface_beyond
+from mitsim.decoding.noise import sigma_source
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.preset import Sensor, presets
+
+
+@dataclass(frozen=True)
+class CheckedCloud:
+    """A decoded ``cloud``; ``warnings`` about its capture, and ``notes`` on its rows and its sigma: one sentence each.
+
+    The warnings that the capture's settings already have come first.
+    """
+
+    cloud: PointCloud
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def checked_cloud(
+    capture: Capture,
+    settings: Settings,
+    imager: Imager | None,
+    *,
+    where: str = "the capture",
+    sensor: Sensor | str | Path | None = None,
+) -> CheckedCloud:
+    """Decode a capture, and check its images, its calibration and its range.
+
+    Parameters
+    ----------
+    capture
+        The capture.
+    settings, imager
+        From :func:`mitsim.decoding.cloud.decoder_settings`.
+    where
+        Name of the capture in warnings.
+    sensor
+        The sensor that the settings belong to; None if they are those of the capture.
+
+    Raises
+    ------
+    InputError
+        If the settings belong to another technology, or the capture is inconsistent.
+    """
+    cloud, images, noise = decoded_once(capture, settings, imager)
+    found = Findings() if images is None else code_findings(images, capture.rig, capture.source == "device")
+    matched = pair_row_error(capture, cloud)
+    warnings = [*capture.settings.get("warnings", []), *found.warnings, *row_error_warnings(matched)]
+    if lost := uncalibrated_in_words(cloud):
+        warnings.append(lost)
+    beyond = surface_beyond(capture, cloud, settings)
+    if beyond is not None:
+        known = f"a coarse search over a wider range finds it in {100 * beyond.share:.0f} % of the pixels"
+        whose = capture.sensor if capture.sensor in presets() else None
+        if sensor is not None:
+            whose = sensor.name if isinstance(sensor, Sensor) else str(sensor)
+        warnings.append(range_warning(f"{where}: a surface", beyond.depths, settings, whose, known))
+    notes = row_error_in_words(capture, settings, found, matched), sigma_source(capture, cloud, noise)
+    return CheckedCloud(cloud, tuple(dict.fromkeys(warnings)), tuple(note for note in notes if note))

@@ -1,0 +1,334 @@
+"""Compare the origin and direction of fringes with the Gray code along the same axis.
+
+Signal chain: lines of pixels -> edges between neighbouring Gray stripes, whose projector coordinates e are multiples
+of the stripe -> the phase there, which is 2 pi e / P if fringes and Gray code count from one origin -> the circular
+mean of the difference, for each period -> the wave, origin and direction of the shifts that explain it.
+
+The comparison needs no fringe order, so it also holds where a wrong origin changes the order by one. With a stripe as
+wide as a fringe, phase and Gray code never contradict each other: a quarter of a period between their origins places a
+quarter of the pixels one period off, and all are valid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.decoding.checks.code_lines import CodeLines
+from mitsim.decoding.structured_light.gray_code import decode_stripes
+from mitsim.decoding.structured_light.phase_shift import fit_phases
+from mitsim.sensor.image_role import Axis, Origin, Role, Wave, offset_in_pixels, origin_shift
+from mitsim.sensor.image_sequence import ImageSequence
+from mitsim.sensor.light_code import GrayCode, LightCode
+
+Floats = NDArray[np.float64]
+
+#: least number of edges, and least share of the changes of a stripe's number that are by one: along a surface one bit
+#: changes at a time, and of bits in another order or exchanged with complements at most two thirds of the changes are
+_ENOUGH, _BY_ONE = 30, 0.75
+
+#: largest deviation of a phase at the edges [cycles]: half of the quarter turn between sine and cosine; and least
+#: length of the mean of unit vectors of the deviations, below which the period itself is doubtful
+_EIGHTH, _CONCENTRATED = 0.125, 0.6
+
+#: an origin is half a pixel off if it is so within this margin, with this standard error or a smaller one [px]: the
+#: error separates half a pixel from none by five standard deviations
+_HALF_PIXEL_MARGIN, _HALF_PIXEL_ERROR = 0.2, 0.1
+
+#: deviation from every usual origin that is reported [px], in addition to five standard errors and the effect of gamma:
+#: half a pixel, which the description of the fringes may be off, and half of that
+_UNUSUAL = 0.75
+
+#: largest gamma of a projector, that of the recording kamino_phaseshift rounded up
+_GAMMA = 2.6
+
+_OTHER_WAVE: dict[Wave, Wave] = {"cosine": "sine", "sine": "cosine"}
+_OTHER_ORIGIN: dict[Origin, Origin] = {"edge": "pixel", "pixel": "edge"}
+
+
+@dataclass(frozen=True)
+class StripeEdges:
+    """Fringes at the edges of Gray stripes along one axis.
+
+    - ``by_one``: share of the changes of the stripe's number that are by one [1]; NaN if there are few.
+    - ``position`` (n,) of the edges from the projector's edge [projector px].
+    - ``cycles`` (periods, n): phase there [cycles].
+    - ``rising``: share of the steps of the phases that rise with the stripe's number [1].
+    """
+
+    by_one: float
+    position: Floats
+    cycles: Floats
+    rising: float
+
+    @property
+    def bits_fit(self) -> bool:
+        """Return whether the Gray bits are in the right order, whatever the fringes say."""
+        return self.by_one >= _BY_ONE
+
+
+def stripe_edges(images: CodeLines, axis: Axis) -> StripeEdges | None:
+    """Return the fringes at the edges of Gray stripes; None if the axis has no Gray bits or no fringes."""
+    code, image_roles, full_scale = images.code, images.image_roles, images.full_scale
+    gray = [role for role in image_roles if role.kind == "gray" and role.axis == axis]
+    phases = [i for i, role in enumerate(image_roles) if role.kind == "phase" and role.axis == axis]
+    if isinstance(code, GrayCode) or not gray or not phases:
+        return None
+    finest = max(gray, key=lambda role: role.index)
+    periods = sorted({image_roles[i].index for i in phases})
+    numbers = [[i for i in phases if image_roles[i].index == index] for index in periods]
+    shifts = [np.array([image_roles[i].shift for i in each]) for each in numbers]
+    threshold = images.settings.minimum_modulation_dn * full_scale / 255
+    found: list[tuple[Floats, Floats, Floats, Floats]] = []
+    for way, part in enumerate(images.lines):
+        fitted = fit_phases(np.concatenate([part[each] for each in numbers]), shifts)
+        white_minus_black = fitted.modulation[-1] / np.float32(code.contrast)
+        middle = fitted.offset + np.float32(0.5 - code.mean) * white_minus_black
+        decoded = decode_stripes(part, image_roles, axis, images.settings.bit_share, (middle, white_minus_black))
+        clear = (decoded.number == decoded.neighbour) & (fitted.modulation.min(axis=0) > threshold)
+        clear &= part[phases].max(axis=0) < full_scale
+        number, turns = decoded.number.astype(float), fitted.phase.astype(float) / (2 * np.pi)
+        if way == 1:
+            number, clear, turns = number.T, clear.T, turns.transpose(0, 2, 1)
+        change = np.where(clear[:, 1:] & clear[:, :-1], np.diff(number, axis=1), 0.0)
+        at_edge = np.abs(change) == 1
+        step = np.diff(turns, axis=2)
+        step -= np.rint(step)
+        position = np.maximum(number[:, 1:], number[:, :-1]) * finest.period - finest.offset
+        # the edge lies anywhere between the two pixels, in the middle on average
+        middle_cycles = turns[:, :, :-1] + step / 2
+        found.append((change[change != 0], position[at_edge], middle_cycles[:, at_edge], (step * change)[:, at_edge]))
+    changes, positions, cycles, rises = (np.concatenate(each, axis=-1) for each in zip(*found, strict=True))
+    enough = len(changes) >= _ENOUGH
+    return StripeEdges(
+        float(np.mean(np.abs(changes) == 1)) if enough else float("nan"),
+        positions,
+        cycles,
+        float(np.mean(rises > 0)) if rises.size else float("nan"),
+    )
+
+
+@dataclass(frozen=True)
+class DescribedFringes:
+    """Fringes of one period as the sensor file describes them: ``period`` [px] and ``shifts`` (N,) delta [rad]."""
+
+    period: float
+    shifts: Floats
+    wave: Wave
+    at: Origin
+
+
+@dataclass(frozen=True)
+class FringeChange:
+    """A change of the description of fringes: other ``wave``, ``at``, sign or order of the shifts, or 180 deg more."""
+
+    wave: bool = False
+    at: bool = False
+    negated: bool = False
+    reverse: bool = False
+    half_turn: bool = False
+
+    @property
+    def mistakes(self) -> float:
+        """Return a weighted number of mistakes that the change corrects, to choose the simplest of those that fit."""
+        return self.wave + self.reverse + 1.1 * self.negated + 2.0 * self.half_turn
+
+    def shifts(self, fringes: DescribedFringes) -> Floats:
+        """Return the shifts delta (N,) [rad] after the change."""
+        wave = _OTHER_WAVE[fringes.wave] if self.wave else fringes.wave
+        at = _OTHER_ORIGIN[fringes.at] if self.at else fringes.at
+        listed = fringes.shifts - origin_shift(fringes.wave, fringes.at, fringes.period)
+        listed = (-listed if self.negated else listed)[:: -1 if self.reverse else 1]
+        return np.asarray(listed + origin_shift(wave, at, fringes.period) + np.pi * self.half_turn)
+
+    def in_words(self, fringes: DescribedFringes) -> str:
+        """Return what to write in the sensor file."""
+        parts = [
+            (self.reverse, "the shifts in the reverse order"),
+            (
+                self.negated,
+                "the shifts with the opposite sign (the numbers of shifts_deg as phases_deg, or vice versa)",
+            ),
+            (self.wave, f'wave = "{_OTHER_WAVE[fringes.wave]}"'),
+            (self.at, f'at = "{_OTHER_ORIGIN[fringes.at]}"'),
+            (self.half_turn, "180 deg more in each shift"),
+        ]
+        return " and ".join(words for changed, words in parts if changed)
+
+
+#: all changes of a description, the simplest first
+CHANGES = sorted(
+    (
+        FringeChange(wave=wave, negated=negated, reverse=reverse, half_turn=half_turn)
+        for wave, negated, reverse, half_turn in product((False, True), repeat=4)
+    ),
+    key=lambda change: change.mistakes,
+)
+
+
+def origin_in_words(edges: StripeEdges, images: CodeLines, axis: Axis) -> str:
+    """Return a warning if fringes and Gray code of an axis do not count from one origin, or not in one direction.
+
+    "" if they agree, or the edges do not tell.
+    """
+    code, image_roles = images.code, images.image_roles
+    every = described(code, image_roles, axis)
+    if not edges.bits_fit or edges.cycles.shape[1] < _ENOUGH:
+        return ""
+    forward = edges.rising > 0.5
+    measured = [
+        PhaseDeviation.of(edges.position, fringes.period, cycles if forward else -cycles)
+        for fringes, cycles in zip(every, edges.cycles, strict=True)
+    ]
+    if min(each.length for each in measured) < _CONCENTRATED:
+        return ""
+    needed = [
+        (fringes.shifts if forward else -fringes.shifts) - 2 * np.pi * each.cycles
+        for fringes, each in zip(every, measured, strict=True)
+    ]
+    change = next(
+        (
+            each
+            for each in CHANGES
+            if all(_off(each.shifts(f), n) < _EIGHTH for f, n in zip(every, needed, strict=True))
+        ),
+        None,
+    )
+    start = f"the fringes and the Gray code of the {axis} do not count from one origin"
+    if change != FringeChange():
+        offset = _fitting_offset(edges, every, image_roles, axis, images.extent(axis))
+        if offset is not None:
+            return f"{start}: they fit if the Gray code has offset_px = {offset} in [pattern]"
+    if change is None or any(each.unusual(edges, f, n) for each, f, n in zip(measured, every, needed, strict=True)):
+        fitting = " and ".join(
+            f"shifts_deg = {_degrees(shifts - origin_shift(fringes.wave, fringes.at, fringes.period))} at "
+            f"{fringes.period:g} px"
+            for fringes, shifts in zip(every, needed, strict=True)
+        )
+        return f"{start}: they fit if the fringes of the {axis} have about {fitting}"
+    change = replace(change, at=_half_a_pixel_off(edges, every, measured, needed))
+    if change == FringeChange():
+        return ""
+    if change.reverse or change.negated:
+        start = f"in the {axis}, the fringes move in the other direction than the Gray code"
+    elif not change.wave and not change.half_turn:
+        start += ", by half a pixel"
+    where = f"the fringes of the {axis} have {change.in_words(every[0])}"
+    if isinstance(code, ImageSequence) or not (change.reverse or change.negated or change.half_turn):
+        return f"{start}: they fit if {where}"
+    return f'{start}: they fit if {where}, in a [pattern] of kind = "image_sequence"'
+
+
+def described(code: LightCode, image_roles: list[Role], axis: Axis) -> list[DescribedFringes]:
+    """Return the fringes of an axis as the sensor file describes them, from the longest period on."""
+    groups = code.fringes(axis) if isinstance(code, ImageSequence) else []
+    out: list[DescribedFringes] = []
+    for index in sorted({role.index for role in image_roles if role.kind == "phase" and role.axis == axis}):
+        own = [role for role in image_roles if (role.kind, role.axis, role.index) == ("phase", axis, index)]
+        wave: Wave = "cosine"
+        at: Origin = "edge"
+        if groups:
+            wave, at = groups[index].wave, groups[index].at
+        elif not isinstance(code, ImageSequence | GrayCode):
+            wave, at = code.wave, code.at
+        out.append(DescribedFringes(own[0].period, np.array([role.shift for role in own]), wave, at))
+    return out
+
+
+@dataclass(frozen=True)
+class PhaseDeviation:
+    """Phase at the edges less that of their coordinate.
+
+    ``cycles``: circular mean [cycles]. ``length`` of the mean of the unit vectors [1].
+    """
+
+    cycles: float
+    length: float
+
+    @classmethod
+    def of(cls, position: Floats, period: float, cycles: Floats) -> PhaseDeviation:
+        """Measure the deviation of ``cycles`` (n,) at edges ``position`` (n,) [px] of fringes of ``period`` [px]."""
+        mean = np.mean(np.exp(2j * np.pi * (cycles - position / period)))
+        return cls(float(np.angle(mean) / (2 * np.pi)), float(np.abs(mean)))
+
+    @property
+    def quarters_removed(self) -> float:
+        """Return the deviation from the nearest quarter turn [cycles]."""
+        return self.cycles - round(4 * self.cycles) / 4
+
+    def error(self, edges: StripeEdges) -> float:
+        """Return the standard error of the mean [cycles]; of n angles it is sqrt(-2 ln length / n)."""
+        return float(np.sqrt(-2 * np.log(self.length) / edges.position.size)) / (2 * np.pi)
+
+    def unusual(self, edges: StripeEdges, fringes: DescribedFringes, shifts: Floats) -> bool:
+        """Return whether neither another wave nor half a pixel nor the projector's gamma explains the deviation."""
+        allowed = _UNUSUAL / fringes.period + 5 * self.error(edges) + gamma_error(edges, fringes.period, shifts)
+        return abs(self.quarters_removed) > allowed
+
+
+def _off(shifts: Floats, needed: Floats) -> float:
+    """Return the largest distance of shifts (N,) [rad] from those needed, apart from whole turns [cycles]."""
+    cycles = (shifts - needed) / (2 * np.pi)
+    return float(np.max(np.abs(cycles - np.rint(cycles))))
+
+
+def _degrees(shifts: Floats) -> list[int]:
+    """Return shifts (N,) [rad] as whole degrees from 0 to 359."""
+    return [int(each) % 360 for each in np.rint(np.degrees(shifts))]
+
+
+def _fitting_offset(
+    edges: StripeEdges, every: list[DescribedFringes], image_roles: list[Role], axis: Axis, extent: int
+) -> str | None:
+    """Return another usual offset of the Gray code with which it fits the fringes as they are described, or None.
+
+    A whole number of quarter periods explains the same edges. It is the fringes that are then said to be wrong.
+    """
+    gray = [role for role in image_roles if role.kind == "gray" and role.axis == axis]
+    stripe, stated = min(role.period for role in gray), gray[0].offset
+    centred = offset_in_pixels("centred", len(gray), stripe, extent)
+    for words, offset in (('"centred"', centred), ("0", 0.0)):
+        if offset == stated or edges.rising <= 0.5:
+            continue
+        position = edges.position + stated - offset
+        deviations = [
+            PhaseDeviation.of(position, fringes.period, cycles).cycles
+            for fringes, cycles in zip(every, edges.cycles, strict=True)
+        ]
+        quarters = [4 * (offset - stated) / fringes.period for fringes in every]
+        if max(map(abs, deviations)) < _EIGHTH / 4 and any(abs(n - round(n)) > 0.1 for n in quarters):
+            return words
+    return None
+
+
+def gamma_error(edges: StripeEdges, period: float, shifts: Floats) -> float:
+    """Return the largest mean phase error at the edges that the gamma of a projector causes [cycles].
+
+    (1 + cos x)^gamma has harmonics c_n with c_(n+1) / c_n = (gamma - n) / (gamma + n + 1), by the binomial series. Of N
+    equal steps, harmonic N - 1 changes the phase x by c_(N-1) / c_1 sin(N x). This averages out over edges at different
+    phases. Unequal steps have the error of three.
+    """
+    steps = len(shifts)
+    turns = np.exp(1j * steps * (shifts - shifts[0]))
+    if np.max(np.abs(turns - 1)) > 1e-3 or len(np.unique(np.round(np.exp(1j * shifts), 6))) < steps:
+        steps, common = 3, 1.0
+    else:
+        common = abs(float(np.mean(np.sin(steps * (2 * np.pi * edges.position / period - shifts[0])))))
+    ratio = float(np.prod([abs(_GAMMA - n) / (_GAMMA + n + 1) for n in range(1, steps - 1)]))
+    return common * ratio / (2 * np.pi)
+
+
+def _half_a_pixel_off(
+    edges: StripeEdges, every: list[DescribedFringes], measured: list[PhaseDeviation], needed: list[Floats]
+) -> bool:
+    """Return whether the edges show that the fringes count from the other of edge and pixel."""
+    for fringes, deviation, shifts in zip(every, measured, needed, strict=True):
+        error = deviation.error(edges) + gamma_error(edges, fringes.period, shifts)
+        side = -0.5 if fringes.at == "edge" else 0.5
+        off = fringes.period * deviation.quarters_removed - side
+        if fringes.period * error > _HALF_PIXEL_ERROR or abs(off) > _HALF_PIXEL_MARGIN:
+            return False
+    return True

@@ -1,0 +1,213 @@
+"""Try the usual origins of a Gray code: the projector's edge, and a code that is centred on the projector.
+
+An offset moves all coordinates along an axis by the same number of pixels. An origin explains a lit pixel if light and
+view ray can meet:
+
+- the light comes from the projector, not from a column or row beyond it;
+- the two meet in front of the camera, within the range of the decoder;
+- with codes along both axes, the ray meets the light of both (the epipolar constraint).
+
+If two origins explain the pixels equally well, depth depends on the one that the sensor file states. A plane does not
+tell either: where the projector's image is parallel to the baseline, an offset turns planes into other planes.
+
+Signal chain: images, every few pixels -> coordinates with each origin -> share of the lit pixels that each explains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.errors import InputError
+from characterisation.point_cloud import Status
+from mitsim.decoding.checks.code_lines import CodeLines
+from mitsim.decoding.checks.rig_sanity import LARGEST_MISS_PX, light_plane_normals
+from mitsim.decoding.coded_images import CodedImages
+from mitsim.decoding.structured_light.decoder import decode_coordinates
+from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.image_role import Axis, Offset
+from mitsim.sensor.image_sequence import GrayImages, ImageSequence
+from mitsim.sensor.light_code import GrayCode, LightCode, axes, roles
+
+Floats = NDArray[np.float64]
+Origins = dict[Axis, Offset]
+
+#: approximate number of pixels evaluated along either side of the image
+_COARSE = 160
+
+#: An origin fits better than the stated one if it leaves at most this share of the pixels that the latter leaves
+#: unexplained, or explains many more; the least difference of the shares that counts.
+_FRACTION, _MANY, _LEAST = 0.25, 0.5, 0.02
+
+#: least share of the lit pixels that an origin explains to be believed
+_EXPLAINED = 0.3
+
+
+def beyond_in_words(lines: CodeLines, axis: Axis) -> str:
+    """Return a warning if another origin of a Gray code leaves far fewer pixels beyond the projector, or ""."""
+    try:
+        others = {
+            words: _share_rejected(replace(lines, code=with_origins(lines.code, origins)), axis)
+            for words, origins in other_origins(lines.code, lines.size).items()
+            if axis in origins
+        }
+        stated = _share_rejected(lines, axis) if others else 0.0
+    except InputError:
+        return ""
+    words = min(others, key=lambda each: others[each], default="")
+    if not words or stated - others[words] < _LEAST or others[words] > _FRACTION * stated:
+        return ""
+    share = 100 * (stated - others[words])
+    return f"{share:.0f} % of the lit pixels decode to {axis} beyond the projector: they fit if {words}"
+
+
+def gray_origin_warning(images: CodedImages, rig: Rig, others_may_be_meant: bool) -> str:
+    """Return a warning if another origin of a Gray code fits the geometry of camera and projector better, or "".
+
+    The images of the first camera count. ``others_may_be_meant``: also warn if another origin fits as well, and the
+    sensor file does not state ``offset_px``.
+    """
+    eye, projector, code, size = rig.reference, rig.projector, images.code, images.size
+    if projector is None:
+        return ""
+    stack = next(iter(images.stacks.values()))
+    step = max(1, min(stack.shape[1:]) // _COARSE)
+    places = np.s_[step // 2 :: step, step // 2 :: step]
+    coarse = np.ascontiguousarray(stack[:, *places])
+    rays = eye.rays(eye.pixel_grid()[places])
+
+    def seen_with(tried: LightCode) -> _Explained:
+        found = decode_coordinates(coarse, tried, size, images.settings, full_scale=images.full_scale)
+        return _Explained.of(eye, projector, rays, found, images.settings)
+
+    try:
+        others = {words: seen_with(with_origins(code, o)) for words, o in other_origins(code, size).items()}
+        stated = seen_with(code) if others else None
+    except InputError:
+        return ""
+    if stated is None:
+        return ""
+    words, best = max(others.items(), key=lambda each: each[1].share)
+    if best.share < _EXPLAINED:
+        return ""
+    gain = best.share - stated.share
+    if gain > _MANY or (gain > _LEAST and 1 - best.share < _FRACTION * (1 - stated.share)):
+        return (
+            f"{100 * stated.share:.0f} % of the lit pixels meet their light, and {100 * best.share:.0f} % at "
+            f"{best.depth:.0f} mm if {words}"
+        )
+    if not others_may_be_meant or abs(gain) > _LEAST or _states_origins(code):
+        return ""
+    return (
+        f"the images do not tell where the Gray code begins: the points are at {stated.depth:.0f} mm if column or row "
+        f"0 has code 0, and at {best.depth:.0f} mm if {words}, as in the programs of Lanman, Moreno and Taubin. "
+        "State offset_px, 0 or as the program shows it"
+    )
+
+
+def with_origins(code: LightCode, origins: Origins) -> LightCode:
+    """Return a code whose Gray bits have other offsets."""
+    if isinstance(code, GrayCode):
+        return code.model_copy(update={"offset_px": next(iter(origins.values()))})
+    if not isinstance(code, ImageSequence):
+        return code
+    images = [
+        group.model_copy(update={"offset_px": origins[group.axis]})
+        if isinstance(group, GrayImages) and group.axis in origins
+        else group
+        for group in code.images
+    ]
+    return code.model_copy(update={"images": images})
+
+
+def other_origins(code: LightCode, size: tuple[int, int]) -> dict[str, Origins]:
+    """Return the usual origins that differ from those stated, by what to write in the sensor file.
+
+    ``size`` (width, height) of the projector [px]. All axes have the same origin, as in a program. Gray codes with
+    fringes are left out: the fringes show their origin.
+    """
+    image_roles = roles(code, *size)
+    fringes = {role.axis for role in image_roles if role.kind == "phase"}
+    stated = {role.axis: role.offset for role in image_roles if role.kind == "gray"}
+    own: list[Axis] = [axis for axis in axes(code) if axis in stated and axis not in fringes]
+    out: dict[str, Origins] = {}
+    for offset in ("centred", 0.0):
+        origins: Origins = dict.fromkeys(own, offset)  # type: ignore[arg-type]
+        tried = {role.axis: role.offset for role in roles(with_origins(code, origins), *size) if role.kind == "gray"}
+        origins = {axis: each for axis, each in origins.items() if tried[axis] != stated[axis]}
+        if origins:
+            out[_in_words(origins)] = origins
+    return out
+
+
+def _states_origins(code: LightCode) -> bool:
+    """Return whether the sensor file states ``offset_px`` of every Gray code without fringes."""
+    if isinstance(code, ImageSequence):
+        groups = [code.gray(axis) for axis in code.axes if not code.fringes(axis)]
+        return all(group.offset_px is not None for each in groups for group in each)
+    return not isinstance(code, GrayCode) or code.offset_px is not None
+
+
+def _in_words(origins: Origins) -> str:
+    """Return what to write in the sensor file."""
+    offset = next(iter(origins.values()))
+    value = f'"{offset}"' if isinstance(offset, str) else f"{offset:g}"
+    return f"the Gray code of the {' and '.join(origins)} has offset_px = {value} in [pattern]"
+
+
+def _share_rejected(lines: CodeLines, axis: Axis) -> float:
+    """Return the share of the lit pixels that have no coordinate along an axis [1]."""
+    parts = [part[axis] for part in lines.decoded()]
+    status, lit = (
+        np.concatenate([each.ravel() for each in all_parts])
+        for all_parts in ([each.status for each in parts], [each.lit for each in parts])
+    )
+    return float(np.mean(status[lit] != Status.VALID)) if lit.mean() > 0.02 else 0.0
+
+
+@dataclass(frozen=True)
+class _Explained:
+    """Share of the lit pixels that an origin explains [1], and their median depth [mm]; NaN without one."""
+
+    share: float
+    depth: float
+
+    @classmethod
+    def of(
+        cls,
+        eye: Camera,
+        projector: Camera,
+        rays: Floats,
+        found: dict[Axis, ProjectorCoordinate],
+        settings: DecoderSettings,
+    ) -> _Explained:
+        """Intersect unit ``rays`` (h, w, 3) of the camera with columns or rows, those across the baseline if coded."""
+        lit = np.all([each.lit for each in found.values()], axis=0)
+        known = np.all([each.status == Status.VALID for each in found.values()], axis=0)
+        if lit.mean() < _LEAST or not known.any():
+            return cls(0.0, float("nan"))
+        start = eye.centre - projector.centre
+        apart = np.abs(projector.sensor_from_camera.inverse().directions(start))
+        across: Axis = "columns" if apart[0] >= apart[1] else "rows"
+        axis = across if across in found else next(iter(found))
+        directions = eye.sensor_from_camera.directions(rays[known])
+        normal = light_plane_normals(projector, found[axis].value[known], axis)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = -np.einsum("ij,ij->i", normal, directions) / (normal @ start)  # 1 / distance along the ray
+            depth = rays[known][:, 2] / inverse
+            explained = (depth >= settings.near_mm) & (depth <= settings.far_mm)
+            points = eye.centre + directions / inverse[:, None]
+        place = projector.project(points[explained])
+        missed = np.zeros(len(place), bool)
+        for other, second in found.items():
+            if other != axis:
+                allowed = LARGEST_MISS_PX + np.sqrt(3) * second.sigma[known][explained]
+                seen = second.value[known][explained]
+                missed |= ~(np.abs(place[:, 0 if other == "columns" else 1] - seen) <= allowed)
+        explained[explained] = ~missed
+        share = float(explained.sum() / lit.sum())
+        return cls(share, float(np.median(depth[explained])) if explained.any() else float("nan"))

@@ -1,0 +1,119 @@
+"""Collect warnings about a capture, one sentence each, for import and decoding; its settings keep them.
+
+A warning is not an error: the capture is still written and decoded according to its sensor file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from characterisation.files.errors import InputError
+from characterisation.point_cloud import PointCloud, Status
+from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Settings
+from mitsim.decoding.checks.gray_origin import gray_origin_warning
+from mitsim.decoding.checks.image_sanity import image_warnings
+from mitsim.decoding.checks.rig_sanity import (
+    Findings,
+    baseline_warning,
+    camera_warnings,
+    measured_row_error,
+    pair_findings,
+)
+from mitsim.decoding.cloud import decoder_settings
+from mitsim.decoding.coded_images import CodedImages
+from mitsim.decoding.matching.stereo import stereo_geometry
+from mitsim.sensor.camera import Rig
+from mitsim.sensor.decoder_settings import DecoderSettings
+
+
+def with_warnings(capture: Capture) -> Capture:
+    """Return the capture with the warnings about it added to those that its settings already have.
+
+    A bracket of exposures is not checked, and images that are missing are reported by decoding.
+    """
+    if capture.technology != "structured_light":
+        return capture
+    images = CodedImages.of(capture, decoder_settings(capture)[0])
+    found = Findings() if images is None else code_findings(images, capture.rig, capture.source == "device")
+    warnings = list(dict.fromkeys([*capture.settings.get("warnings", []), *found.warnings]))
+    return replace(capture, settings=capture.settings | ({"warnings": warnings} if warnings else {}))
+
+
+def code_findings(images: CodedImages, rig: Rig, recorded: bool) -> Findings:
+    """Check coded images and the calibration of their rig; the calibration only if the images match their code.
+
+    The origin of the code is checked in ``recorded`` images: a simulation has the pattern that its file states.
+    """
+    try:
+        coordinates = images.coordinates
+    except InputError:
+        coordinates = {}  # decoding reports the error
+    out = []
+    for name in images.stacks:
+        out += image_warnings(images, name, coordinates.get(name, {}))
+    if out or not coordinates:
+        return Findings(out)
+    if images.settings.triangulate == "cameras":
+        try:
+            return pair_findings(images, rig)
+        except InputError as error:
+            return Findings([str(error)])
+    name, decoded = next(iter(coordinates.items()))
+    if origin := gray_origin_warning(images, rig, recorded):
+        return Findings([f"{name}: {origin}"])
+    along = baseline_warning(rig, images.code)
+    return Findings(([along] if along else []) + camera_warnings(decoded, rig, images.settings))
+
+
+def pair_row_error(capture: Capture, cloud: PointCloud) -> float:
+    """Return the row error [px] of the right image of a matched pair, by its own texture; NaN if unknown."""
+    if capture.technology != "active_stereo" or len(capture.images) < 2:
+        return float("nan")
+    left, right = (stack[0] for stack in list(capture.images.values())[:2])
+    return measured_row_error((left, right), stereo_geometry(capture.rig), cloud)
+
+
+def row_error_in_words(capture: Capture, settings: Settings, found: Findings, matched: float) -> str:
+    """Describe the row error of the second camera, or that it is unknown; "" if only one camera measures.
+
+    Parameters
+    ----------
+    capture
+        Capture that is decoded.
+    settings
+        Settings of its decoder.
+    found
+        Findings of the checks.
+    matched
+        Row error of a pair decoded by a matcher, from :func:`pair_row_error` [px].
+
+    See Also
+    --------
+    pair_row_error : the number
+    """
+    if np.isfinite(matched):
+        return f"row error of the second camera: {matched:+.2f} px"
+    if np.isfinite(found.row_error):
+        return f"row error of the second camera: {found.row_error:+.2f} px, {found.row_error_source}"
+    paired = isinstance(settings, DecoderSettings) and settings.triangulate == "cameras"
+    if capture.technology != "structured_light" or not paired or found.warnings:
+        return ""
+    return (
+        "row error of the second camera: unknown; the code has no rows and the surface too little texture. Project "
+        "rows too, or take one capture of a printed surface"
+    )
+
+
+def uncalibrated_in_words(cloud: PointCloud) -> str:
+    """Describe the pixels without a unique ray or depth by the calibration; "" without such pixels."""
+    share = float(np.mean(cloud.status == Status.UNCALIBRATED))
+    if not share:
+        return ""
+    return (
+        f"{100 * share:.2g} % of the pixels are left out (uncalibrated): the lens distortion of the calibration folds "
+        "over there, so that they have no unique ray or depth. Calibrate with boards that reach the corners, and with "
+        "fewer distortion coefficients"
+    )

@@ -1,0 +1,298 @@
+"""Register how the captures of each technology become clouds: one entry of :data:`TECHNOLOGIES` for each.
+
+An entry has two functions. One prepares the geometry of a rig once, the other
+decodes images to a cloud. The first four technologies decode raw images. For the last three the device has measured a
+map, which is converted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.errors import InputError
+from characterisation.point_cloud import PointCloud
+from characterisation.region_of_interest import Roi
+from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import SETTINGS_OF, Settings
+from mitsim.decoding.device_maps import (
+    DeviceMapGeometry,
+    MapName,
+    camera_map_geometry,
+    decode_device_map,
+    disparity_map_geometry,
+)
+from mitsim.decoding.grey_levels import MeasuredNoise
+from mitsim.decoding.grid_cloud import empty_cloud
+from mitsim.decoding.image_context import ImageContext
+from mitsim.decoding.matching.reference_matching import ReferenceGeometry, decode_reference, reference_geometry
+from mitsim.decoding.matching.stereo import StereoGeometry, decode_stereo, stereo_geometry
+from mitsim.decoding.structured_light.decoder import decode_structured_light
+from mitsim.decoding.structured_light.geometry import StructuredLightGeometry, structured_light_geometry
+from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
+from mitsim.decoding.structured_light.two_cameras import cloud_of_pair, decode_structured_light_stereo
+from mitsim.decoding.time_of_flight import TimeOfFlightGeometry, decode_time_of_flight, time_of_flight_geometry
+from mitsim.sensor.camera import Rig
+from mitsim.sensor.decoder_settings import DecoderSettings
+from mitsim.sensor.image_role import Axis
+from mitsim.sensor.image_sequence import ImageSequence
+from mitsim.sensor.imager import Imager
+from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, LightCode, PhaseShift, roles
+from mitsim.sensor.matcher import MatcherSettings
+from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
+from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
+
+#: range of depths to search if neither a preset nor the recording gives one [mm]
+DEFAULT_RANGE_MM = (300.0, 2000.0)
+
+#: range of depths to accept from a device's own map if none is given: everything [mm]
+DEVICE_RANGE_MM = (1e-3, 1e6)
+
+Geometry = StereoGeometry | ReferenceGeometry | StructuredLightGeometry | TimeOfFlightGeometry | DeviceMapGeometry
+Pattern = DotPattern | LightCode | AmplitudeModulation
+
+#: projector coordinates of structured light, of whole images, by camera and axis
+Coordinates = Mapping[str, Mapping[Axis, ProjectorCoordinate]]
+
+
+@dataclass(frozen=True)
+class Images:
+    """The images of a capture, ready to be decoded.
+
+    Attributes
+    ----------
+    capture
+        The capture.
+    stacks
+        (P, H, W) images [DN] of each camera, that of the reference camera first. Exposures of a bracket are merged.
+    full_scale
+        Value of a saturated pixel [DN].
+    imager
+        The imager, or the noise measured in the images; None if neither is known.
+    roi
+        Region of the cloud's grid to decode; None for all.
+    read_out
+        Region that was read out of each camera, without cameras that were read out completely.
+    coordinates
+        Projector coordinates that structured light was decoded to before; None if it is not decoded yet.
+    """
+
+    capture: Capture
+    stacks: dict[str, NDArray[np.unsignedinteger[Any]]]
+    full_scale: float
+    imager: Imager | MeasuredNoise | None
+    roi: Roi | None
+    read_out: dict[str, Roi]
+    coordinates: Coordinates | None = None
+
+    @property
+    def reference(self) -> tuple[str, NDArray[np.unsignedinteger[Any]]]:
+        """Name and stack of the reference camera."""
+        return next(iter(self.stacks.items()))
+
+    def context(self, roi: Roi | None) -> ImageContext:
+        """Return the properties of the images for a decoder of a region of the cloud's grid; None for the whole."""
+        regions = [self.read_out.get(name) for name in list(self.stacks)[:2]]
+        read_out = (regions[0], regions[-1] if len(regions) > 1 else None)
+        capture = self.capture
+        return ImageContext(capture.sensor, capture.source, self.full_scale, self.imager, roi, read_out)
+
+    def raw_region(self) -> tuple[Roi | None, bool]:
+        """Return the region of the reference camera's raw image to decode, and whether any of it was read out."""
+        region = self.read_out.get(self.reference[0])
+        if region is None or self.roi is None:
+            return region or self.roi, True
+        overlap = region.overlap(self.roi)
+        return overlap, overlap is not None
+
+    def first_images(self, count: int, camera: str | None = None) -> NDArray[np.unsignedinteger[Any]]:
+        """Return the first ``count`` images of a camera, by default the reference; the ambient image follows them.
+
+        Raises
+        ------
+        InputError
+            If there are fewer.
+        """
+        name = camera or self.reference[0]
+        stack = self.stacks[name]
+        if len(stack) < count:
+            raise InputError("capture", "images", f"{len(stack)} of {name}", f"{count}, as the pattern has")
+        return stack[:count]
+
+
+@dataclass(frozen=True)
+class Technology:
+    """How the captures of one kind of sensor become clouds.
+
+    Attributes
+    ----------
+    patterns
+        Kinds of pattern that a capture must name; empty if the decoder does not need one.
+    geometry
+        Function from rig, settings and pattern to the geometry that is prepared once.
+    decode
+        Function from images, geometry, settings and pattern to a cloud.
+    range_mm
+        Default range of depths to search [mm].
+    from_device
+        Whether the device has measured the points. Of a sensor's settings only the range is then used.
+    """
+
+    patterns: tuple[type[Pattern], ...]
+    geometry: Callable[[Rig, Any, Any], Geometry]
+    decode: Callable[[Images, Any, Any, Any], PointCloud]
+    range_mm: tuple[float, float] = DEFAULT_RANGE_MM
+    from_device: bool = False
+
+
+def _stereo(images: Images, geometry: StereoGeometry, settings: MatcherSettings, pattern: None) -> PointCloud:
+    # the ambient image is the last one; SGBM uses one frame
+    ambient = images.capture.decoding.ambient_image
+    left, right = (stack[: len(stack) - ambient] for stack in list(images.stacks.values())[:2])
+    if settings.method == "sgbm":
+        left, right = left[:1], right[:1]
+    return decode_stereo(left, right, geometry, settings, images.context(images.roi))
+
+
+def _reference_geometry(rig: Rig, settings: MatcherSettings, pattern: DotPattern) -> ReferenceGeometry:
+    if settings.reference_mm is None:
+        raise InputError(
+            "matcher settings",
+            "reference_mm",
+            "none",
+            "the depth of the reference plane",
+            "decode with the sensor's own file: --sensor",
+        )
+    return reference_geometry(rig, pattern, settings.reference_mm)
+
+
+def _reference(
+    images: Images, geometry: ReferenceGeometry, settings: MatcherSettings, pattern: DotPattern
+) -> PointCloud:
+    return decode_reference(images.first_images(1), geometry, settings, images.context(images.roi))
+
+
+def projector_size(capture: Capture) -> tuple[int, int]:
+    """Return the width and height of the pattern of a structured-light capture [px].
+
+    Raises
+    ------
+    InputError
+        If the capture has neither a projector nor its size.
+    """
+    projector = capture.rig.projector
+    if projector is not None:
+        return projector.width, projector.height
+    size = capture.decoding.projector_size_px
+    if size is None:
+        raise InputError("rig", "projector", "none", "a projector, or at least the size of its pattern")
+    return size
+
+
+def _structured_light_geometry(rig: Rig, settings: DecoderSettings, code: LightCode) -> Geometry:
+    if settings.triangulate == "cameras":
+        return stereo_geometry(rig)
+    return structured_light_geometry(rig, next(iter(rig.cameras)), code, settings.near_mm, settings.far_mm)
+
+
+def _structured_light(
+    images: Images, geometry: StereoGeometry | StructuredLightGeometry, settings: DecoderSettings, code: LightCode
+) -> PointCloud:
+    size, coordinates = projector_size(images.capture), images.coordinates or {}
+    count = len(roles(code, *size))
+    if isinstance(geometry, StereoGeometry):
+        names, context = list(images.stacks)[:2], images.context(images.roi)
+        if coordinates:
+            return cloud_of_pair(
+                lambda camera, region: coordinates[names[camera]]["columns"].part(region.slices),
+                geometry,
+                code,
+                settings,
+                context,
+            )
+        left, right = (images.first_images(count, name) for name in names)
+        return decode_structured_light_stereo(left, right, geometry, code, settings, size, context)
+    stack = images.first_images(count)
+    roi, any_read_out = images.raw_region()
+    if not any_read_out:
+        return empty_cloud(geometry, images.capture.sensor, images.capture.source)
+    name = images.reference[0]
+    return decode_structured_light(stack, geometry, name, code, settings, images.context(roi), coordinates.get(name))
+
+
+def _time_of_flight_geometry(
+    rig: Rig, settings: TimeOfFlightSettings, code: AmplitudeModulation
+) -> TimeOfFlightGeometry:
+    return time_of_flight_geometry(rig, next(iter(rig.cameras)), settings.near_mm, settings.far_mm)
+
+
+def _time_of_flight(
+    images: Images, geometry: TimeOfFlightGeometry, settings: TimeOfFlightSettings, code: AmplitudeModulation
+) -> PointCloud:
+    stack = images.first_images(code.count)
+    roi, any_read_out = images.raw_region()
+    if not any_read_out:
+        return empty_cloud(geometry, images.capture.sensor, images.capture.source)
+    return decode_time_of_flight(stack, geometry, code, settings, images.context(roi))
+
+
+def _device_technology(name: MapName, prepare: Callable[[Rig], DeviceMapGeometry]) -> Technology:
+    """Return the technology of a device's map ``name``, within the range of any settings."""
+
+    def decode(images: Images, geometry: DeviceMapGeometry, settings: Settings, pattern: None) -> PointCloud:
+        capture = images.capture
+        if name not in capture.derived:
+            raise InputError(
+                f"capture of {capture.sensor}",
+                "derived",
+                ", ".join(capture.derived) or "no map",
+                f"a map of {name}, since its technology is {capture.technology}",
+            )
+        return decode_device_map(
+            name,
+            capture.derived[name],
+            geometry,
+            (settings.near_mm, settings.far_mm),
+            sensor=capture.sensor,
+            source=capture.source,
+            roi=images.roi,
+        )
+
+    return Technology((), lambda rig, settings, pattern: prepare(rig), decode, DEVICE_RANGE_MM, True)
+
+
+TECHNOLOGIES: dict[str, Technology] = {
+    "active_stereo": Technology((), lambda rig, settings, pattern: stereo_geometry(rig), _stereo),
+    "reference_stereo": Technology((RandomDots, DiffractionSpots), _reference_geometry, _reference),
+    "structured_light": Technology(
+        (PhaseShift, GrayCode, GrayCodePhaseShift, ImageSequence),
+        _structured_light_geometry,
+        _structured_light,
+    ),
+    "time_of_flight": Technology((AmplitudeModulation,), _time_of_flight_geometry, _time_of_flight),
+    "depth_map": _device_technology("depth", camera_map_geometry),
+    "disparity_map": _device_technology("disparity", disparity_map_geometry),
+    "point_map": _device_technology("points", camera_map_geometry),
+}
+
+
+def technology_of(name: str) -> Technology:
+    """Return the entry of a technology.
+
+    Raises
+    ------
+    InputError
+        If there is none of this name.
+    """
+    if name not in TECHNOLOGIES:
+        raise InputError("capture", "technology", repr(name), ", ".join(TECHNOLOGIES))
+    return TECHNOLOGIES[name]
+
+
+def accepted_settings(name: str) -> tuple[type[Settings], ...]:
+    """Return the types of settings that a technology decodes with; a device's map uses only the range of any."""
+    return get_args(Settings) if technology_of(name).from_device else (SETTINGS_OF[name],)

@@ -1,0 +1,118 @@
+"""Read the clouds to measure, from cloud files, capture folders and recordings.
+
+Signal chain: path -> cloud file of ``mitsim decode``; or capture folder, decoded; or recording that ``mitsim import``
+reads without options, decoded; or points without a camera (:mod:`mitsim.decoding.plain_clouds`) -> cloud, and its
+capture if there is one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from characterisation import cloud_files
+from characterisation.files.errors import InputError
+from characterisation.point_cloud import PointCloud
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import read_capture
+from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+from mitsim.decoding.cloud import Settings, decoder_settings
+from mitsim.decoding.coded_images import decoded_once
+from mitsim.decoding.plain_clouds import is_plain, read_plain_cloud
+from mitsim.running.progress import say
+from mitsim.sensor.matcher import MatcherSettings
+
+#: suffixes of cloud files that are found in a folder
+_SUFFIXES = (".ply", ".pcd")
+
+#: text that identifies a cloud file of ``mitsim decode``, and the length of the header in which it stands [bytes]
+_MARK, _HEAD = b"\ncomment mitsim ", 4096
+
+
+@dataclass(frozen=True)
+class InputCloud:
+    """A cloud to measure.
+
+    - ``path`` of its file or capture folder.
+    - ``cloud`` in the sensor frame [mm].
+    - ``capture`` that it was decoded from, None for a cloud file of ``mitsim decode``.
+    - ``margin_px``: pixels beside an edge whose points may mix both sides (:func:`margin_of`).
+    """
+
+    path: Path
+    cloud: PointCloud
+    capture: Capture | None
+    margin_px: int = 0
+
+
+def cloud_paths(paths: Iterable[Path]) -> list[Path]:
+    """Return paths of clouds; a folder is replaced by the clouds and captures in it, sorted by name.
+
+    A folder that contains neither is kept.
+    """
+    out: list[Path] = []
+    for path in paths:
+        if not path.is_dir() or (path / "capture.json").exists():
+            out.append(path)
+            continue
+        contained = [
+            one
+            for one in sorted(path.iterdir())
+            if (one / "capture.json").exists() or (one.is_file() and one.suffix.lower() in _SUFFIXES)
+        ]
+        # a folder without them may be a recording as its device saved it
+        out += contained or [path]
+    return out
+
+
+def read_cloud(path: Path, sensor: str | None = None, reference: bool = False) -> InputCloud:
+    """Read a cloud file, or decode a capture folder or recording.
+
+    ``sensor`` is the preset or sensor file whose settings decode it; by default, those of the capture. The points of a
+    ``reference`` may lie anywhere; those of another cloud with a grid lie on the view rays of its camera.
+
+    Raises
+    ------
+    InputError
+        If the path does not exist, or its content cannot be read or decoded.
+    """
+    if path.is_file() and _is_mitsim_ply(path):
+        return InputCloud(path, cloud_files.read_cloud(path), None)
+    if is_plain(path):
+        return _plain(path)
+    if (path / "capture.json").exists():
+        capture = read_capture(path)
+    elif path.exists():
+        try:
+            capture = read_recording(path, ReadOptions()).capture
+        except InputError:
+            if not reference or path.suffix.lower() not in _SUFFIXES:
+                raise
+            return _plain(path)
+    else:
+        raise InputError(
+            path,
+            "",
+            "no such file or folder",
+            "a cloud (.ply, .pcd, .npy, .mat, .xyz), a capture folder, or folders of these",
+        )
+    settings, imager = decoder_settings(capture, sensor)
+    return InputCloud(path, decoded_once(capture, settings, imager)[0], capture, margin_of(settings))
+
+
+def _plain(path: Path) -> InputCloud:
+    cloud, about = read_plain_cloud(path)
+    say(about)
+    return InputCloud(path, cloud, None)
+
+
+def margin_of(settings: Settings) -> int:
+    """Return the margin beside an edge [px] where points may mix both sides: half a matching block plus 1."""
+    return settings.block_size // 2 + 1 if isinstance(settings, MatcherSettings) else 0
+
+
+def _is_mitsim_ply(path: Path) -> bool:
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    return head.startswith(b"ply\n") and _MARK in head

@@ -1,0 +1,260 @@
+"""Match by correlation: all frames of both images of a rectified pair together, or an image and its reference.
+
+Signal chain: strips of both images, a stack of frames each -> products of pixels, summed over the frames and over a
+block, at each disparity of the search range -> correlation -> best and second best, from the left and from the right ->
+sub-pixel step -> :class:`~mitsim.decoding.matching.sgbm.Matches`.
+
+The score is the zero-mean normalised cross-correlation rho of a square block through all F frames. Sources for
+spatio-temporal stereo: Davis, Nehab, Ramamoorthi and Rusinkiewicz, IEEE PAMI 27(2), 2005; Zhang, Curless and Seitz,
+CVPR 2003. The mean is subtracted frame by frame, so the score is independent of a camera's brightness and contrast.
+There is no smoothness term: a block without texture gets no disparity from its neighbours.
+
+The sub-pixel step is the closed form of Psarakis and Evangelidis (ICCV 2005). At a fraction tau between two columns,
+the right block is (1 - tau) R0 + tau R1. The maximum of rho(tau) is at
+
+    tau = (a p - u c) / (u p - a s),    u = b - a,  p = q - c,  s = c - 2 q + e
+
+with the covariances a, b of the left block with R0 and R1, the variances c, e of R0 and R1, and their covariance q.
+
+Interpolation also averages the noise of the right image. This biases tau toward 1/2, by 0.09 px where the noise is a
+third of the pattern's contrast. The share of noise in c and e is therefore subtracted first. It is 1 - rho at the peak
+if both images are equally noisy. This correction is original to mitsim.
+
+A parabola through three values of rho would be biased toward whole pixels by 0.03 to 0.05 px. Without noise its error
+is three times as large.
+
+Many frames are correlated by matrix products (:mod:`mitsim.decoding.matching.correlation_products`). One or two frames
+are correlated disparity by disparity, where the cost is independent of the size of the block.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.threads import in_threads
+from mitsim.decoding.matching.correlation_products import (
+    BLANK_VARIANCE,
+    Floats,
+    PreparedPair,
+    block_mean,
+    block_variance,
+    correlations,
+    lag_covariance,
+    prepare_pair,
+    right_correlations,
+)
+from mitsim.decoding.matching.sgbm import Matches, both_ways_disagreement, pixels_matched_back
+from mitsim.sensor.matcher import MatcherSettings
+
+#: bytes of the correlations that each thread holds at once, if they are computed disparity by disparity
+_VOLUME_BYTES = 24e6
+
+#: least number of frames for which matrix products are faster, and number of rows that they process at once
+_PRODUCT_FRAMES, _PRODUCT_ROWS = 3, 8
+
+#: least peak correlation that is assumed when the share of noise is estimated
+_MINIMUM_PEAK = 0.1
+
+
+def correlate_both_ways(
+    left: Floats,
+    right: Floats,
+    columns: tuple[int, int],
+    first: int,
+    count: int,
+    settings: MatcherSettings,
+    *,
+    noisy_right: bool = True,
+) -> Matches:
+    """Match columns of the left strips to the right strips, and in the reverse direction.
+
+    Parameters
+    ----------
+    left, right
+        (F, h, W) rectified strips [DN of 8 bit], the same rows of both. Each frame has a mean near zero, since a large
+        mean would increase the rounding error.
+    columns
+        First left column to match, and one past the last.
+    first, count
+        Search range, from :func:`mitsim.decoding.matching.sgbm.search_range`.
+    settings
+        Block size and uniqueness. 1 - rho of the best disparity must be lower by this percentage than that of any other
+        disparity more than one pixel away.
+    noisy_right
+        False if the right image is a reference without noise.
+    """
+    height, uniqueness = left.shape[1], settings.uniqueness_percent
+    width = columns[1] - columns[0]
+    if len(left) >= _PRODUCT_FRAMES:
+        pair, rows = prepare_pair(left, right, columns, first, count, settings.block_size), _PRODUCT_ROWS
+    else:
+        pair, rows = None, max(int(_VOLUME_BYTES / (4 * count * (width + 2 * count))), 4)
+
+    def match_rows(start: int) -> tuple[Floats, Floats]:
+        chunk = slice(start, min(start + rows, height))
+        if pair is not None:
+            return _match_products(pair, chunk, uniqueness, noisy_right)
+        reach = settings.block_size // 2
+        around = slice(max(chunk.start - reach, 0), min(chunk.stop + reach, height))
+        inner = slice(chunk.start - around.start, chunk.stop - around.start)
+        search = _Search(columns, first, count)
+        return _match_disparities(left[:, around], right[:, around], inner, search, settings, noisy_right)
+
+    results = in_threads(match_rows, range(0, height, rows))
+    found, back = (np.concatenate(each) for each in zip(*results, strict=True))
+    disagreement, matched_back = both_ways_disagreement(found, back, count), pixels_matched_back(back)
+    return Matches(found + np.float32(first), disagreement, matched_back[:, count : count + width])
+
+
+def _match_products(
+    pair: PreparedPair, rows: slice, uniqueness_percent: int, noisy_right: bool
+) -> tuple[Floats, Floats]:
+    """Match rows of a prepared pair.
+
+    Returns
+    -------
+    disparities
+        (h, w) of the left columns, less ``first``, with the sub-pixel step.
+    back
+        (h, w + 2 count) whole disparities of right columns. Left column begin + i sees right column i + count - k at
+        disparity first + k.
+    """
+    (begin, end), count = pair.columns, pair.count
+    score = correlations(pair, rows)
+    from_right = right_correlations(pair, score)
+    best = from_right.argmax(axis=2)
+    matched = np.take_along_axis(from_right, best[..., None], axis=2)[..., 0] > -1
+    back = np.full((len(score), end - begin + 2 * count), np.nan, np.float32)
+    back[:, 1 : end - begin + count] = np.where(matched, best, np.float32(np.nan))[:, ::-1]
+    from_left = score[:, begin - pair.start : end - pair.start]
+    return _best_disparities(from_left, 2, pair.variance[rows], pair.lag[rows], uniqueness_percent, noisy_right), back
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Search range: left ``columns``, the first and one past the last; ``count`` disparities from ``first`` on."""
+
+    columns: tuple[int, int]
+    first: int
+    count: int
+
+
+def _match_disparities(
+    left: Floats, right: Floats, inner: slice, search: _Search, settings: MatcherSettings, noisy_right: bool
+) -> tuple[Floats, Floats]:
+    """Return the same as :func:`_match_products` for the ``inner`` rows of strips (F, h, W), disparity by disparity."""
+    (begin, end), first, count = search.columns, search.first, search.count
+    block, frames = settings.block_size, len(left)
+    reach, blank = block // 2, np.float32(frames * BLANK_VARIANCE)
+    # right pixels also search left of `begin` and right of `end`
+    low, high = max(begin - count, 0), min(end + count, left.shape[2])
+    left = left[:, :, low:high]
+    right_source = low - first - count - reach + np.arange(left.shape[2] + count + 1 + 2 * reach)
+    exists = ((right_source >= 0) & (right_source < right.shape[2]))[reach:-reach]
+    right = right[:, :, np.clip(right_source, 0, right.shape[2] - 1)]
+    mean_left, mean_right = block_mean(left, block), block_mean(right, block)
+    variance_left, variance_right = block_variance(left, mean_left, block), block_variance(right, mean_right, block)
+    lag = lag_covariance(right, mean_right, block)
+    right, mean_right, variance_right, lag = (
+        each[..., reach:-reach] for each in (right, mean_right, variance_right, lag)
+    )
+    scale_left = 1 / np.sqrt(variance_left[inner] + blank)
+    scale_right = 1 / np.sqrt(variance_right[inner] + blank)
+
+    score = np.full((count, inner.stop - inner.start, left.shape[2]), -1.0, np.float32)
+    best_back = np.full(scale_right.shape, -1.0, np.float32)
+    back = np.full(scale_right.shape, np.nan, np.float32)
+    for k in range(count):
+        # the right pixels that the requested columns see, and all left pixels that see them
+        left_columns = slice(max(begin - count + 1 + k - reach - low, 0), min(end + k + reach - low, left.shape[2]))
+        right_columns = slice(left_columns.start + count - k, left_columns.stop + count - k)
+        products = np.zeros((left.shape[1], left_columns.stop - left_columns.start), np.float32)
+        for left_frame, right_frame in zip(left, right, strict=True):
+            cv2.accumulateProduct(left_frame[:, left_columns], right_frame[:, right_columns], products)
+        rho = np.asarray(cv2.boxFilter(products, -1, (block, block), borderType=cv2.BORDER_REPLICATE))[inner]
+        for left_frame, right_frame in zip(mean_left, mean_right, strict=True):
+            rho -= left_frame[inner, left_columns] * right_frame[inner, right_columns]
+        rho_scaled = score[k][:, left_columns]
+        np.multiply(rho, scale_left[:, left_columns], out=rho_scaled)
+        rho_scaled *= scale_right[:, right_columns]
+        np.copyto(rho_scaled, -1.0, where=~exists[right_columns])
+        better = rho_scaled > best_back[:, right_columns]
+        np.copyto(best_back[:, right_columns], rho_scaled, where=better)
+        np.copyto(back[:, right_columns], np.float32(k), where=better)
+
+    requested, shift = slice(begin - low, end - low), begin - low
+    back_requested = np.full((len(back), end - begin + 2 * count), np.nan, np.float32)
+    known = min(back_requested.shape[1], back.shape[1] - shift)
+    back_requested[:, :known] = back[:, shift : shift + known]
+    right_statistics = (variance_right[inner, shift:], lag[inner, shift:])
+    found = _best_disparities(score[:, :, requested], 0, *right_statistics, settings.uniqueness_percent, noisy_right)
+    return found, back_requested
+
+
+def _best_disparities(
+    score: Floats, axis: int, variance: Floats, lag: Floats, uniqueness_percent: int, noisy_right: bool
+) -> Floats:
+    """Return the best disparities (h, w) less ``first``, NaN if not unique.
+
+    ``score`` holds the correlations of all disparities along ``axis``, and is overwritten. ``variance`` and ``lag`` are
+    those of :func:`_sub_pixel`, for right columns i + count - k.
+    """
+    count = score.shape[axis]
+    best = score.argmax(axis=axis)
+    beside = [np.expand_dims(np.clip(best + step, 0, count - 1), axis) for step in (-1, 0, 1)]
+    lower, peak, upper = (np.take_along_axis(score, k, axis=axis).squeeze(axis) for k in beside)
+    step = _sub_pixel((lower, peak, upper), best, variance, lag, count, noisy_right)
+    for k in beside:
+        np.put_along_axis(score, k, -1.0, axis=axis)
+    unique = (1 - peak) * 100 <= (1 - score.max(axis=axis)) * (100 - uniqueness_percent)
+    return np.where(unique & (peak > 0), best + step, np.nan).astype(np.float32)
+
+
+def _sub_pixel(
+    rho: tuple[Floats, Floats, Floats],
+    best: NDArray[np.intp],
+    variance: Floats,
+    lag: Floats,
+    count: int,
+    noisy_right: bool,
+) -> Floats:
+    """Return the position of the maximum of rho between the best disparity and its neighbours, -1 to 1.
+
+    ``rho`` at one disparity less, at the best, and at one more; ``variance`` of right blocks; ``lag``, the covariance
+    of each right block with that of the column before.
+    """
+    lower, peak, upper = rho
+    column = np.arange(best.shape[1]) + count - best
+
+    def at(values: Floats, shift: int) -> Floats:
+        return np.take_along_axis(values, np.clip(column + shift, 0, values.shape[1] - 1), axis=1)
+
+    variance_here = at(variance, 0)
+    noise = 1 - _peak_height(lower, peak, upper) if noisy_right else np.float32(0.0)
+    best_rho, step = np.full(best.shape, -np.inf, np.float32), np.zeros(best.shape, np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # one disparity more is one column less
+        for sign, score, inside in ((1, upper, best < count - 1), (-1, lower, best > 0)):
+            variance_there, q = at(variance, -sign), at(lag, 0 if sign > 0 else 1)
+            noise_share = noise * (variance_here + variance_there) / 2
+            c, e = variance_here - noise_share, variance_there - noise_share
+            a = peak * np.sqrt(variance_here)
+            u, p, s = score * np.sqrt(variance_there) - a, q - c, c - 2 * q + e
+            tau = np.clip((a * p - u * c) / (u * p - a * s), 0, 1)
+            rho_at_tau = (a + tau * u) / np.sqrt(c + tau * (2 * p + tau * s))
+            better = inside & (score > -1) & np.isfinite(rho_at_tau) & (rho_at_tau > best_rho)
+            step = np.where(better, sign * tau, step)
+            best_rho = np.where(better, rho_at_tau, best_rho)
+    return step.astype(np.float32)
+
+
+def _peak_height(lower: Floats, peak: Floats, upper: Floats) -> Floats:
+    """Return the height of the Gaussian through three neighbouring correlations, limited to 0.1 to 1."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b, c = (np.log(np.maximum(each, np.float32(1e-3))) for each in (lower, peak, upper))
+        height = np.exp(b - (a - c) ** 2 / (8 * (a - 2 * b + c)))
+    return np.clip(np.where(np.isfinite(height), height, peak), _MINIMUM_PEAK, 1)

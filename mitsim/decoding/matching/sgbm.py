@@ -1,0 +1,265 @@
+"""Match a rectified pair by semi-global matching, from the left and from the right, with OpenCV.
+
+Signal chain: 8-bit strips of both images -> columns within the search range, with repeated edges -> SGBM left to right
+-> the same for the mirrored, exchanged pair -> :class:`Matches`.
+
+The method is that of Hirschmueller (IEEE PAMI 30(2), 2008) with OpenCV's block costs. These are Birchfield-Tomasi
+differences of the clipped horizontal gradient, summed over a block. The smoothness penalties are P1 for steps of one
+pixel and P2 for larger ones. Both are scaled by the block's area, as OpenCV documents (P1 = 8 block^2, P2 = 32 block^2
+by default).
+
+Disparities have steps of 1/16 px. They are biased toward whole pixels (pixel locking) by up to 0.14 px at quarters of a
+pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.errors import InputError
+from characterisation.files.threads import in_threads
+from mitsim.decoding.matching.sgbm_bands import (
+    Penalties,
+    bytes_by_opencv,
+    bytes_of_band,
+    fits_16_bits,
+    match_in_bands,
+    rows_in_budget,
+)
+from mitsim.sensor.camera import Rectification
+from mitsim.sensor.matcher import MatcherSettings
+
+_MODES = {
+    "hh": cv2.STEREO_SGBM_MODE_HH,
+    "sgbm": cv2.STEREO_SGBM_MODE_SGBM,
+    "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+}
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Results of both directions for a strip of left pixels (h, w).
+
+    A pixel without a match from the right image is hidden from the right camera. This is Hirschmueller's way to
+    distinguish occlusions from mismatches.
+
+    Attributes
+    ----------
+    disparity
+        x_left - x_right [px], NaN without a unique match.
+    disagreement
+        Difference [px] from the disparity that the right image has at the matched position. NaN if it has none, or the
+        position is outside the image.
+    matched_back
+        Whether the best match of a right pixel is this pixel or one beside it.
+    """
+
+    disparity: NDArray[np.float32]
+    disagreement: NDArray[np.float32]
+    matched_back: NDArray[np.bool_]
+
+
+#: memory for costs and sums of both directions [bytes]. With images, maps and the interpreter the process stays below
+#: 1.5 GB (1.3 GB for 1280 x 1024 pixels from 275 to 3878 mm)
+BUDGET_BYTES = 0.8e9
+
+#: grey levels [DN of 8 bit] to which a local standard deviation is scaled; the range holds +-2.6 of them
+_TARGET_DEVIATION_DN = 48.0
+
+#: added to the local standard deviation [DN], so that noise in areas without texture is not amplified to full contrast
+_DEVIATION_FLOOR_DN = 0.5
+
+
+def local_contrast(image: NDArray[np.uint8], window: int) -> NDArray[np.uint8]:
+    """Return an image (h, w) with its local mean subtracted and its local standard deviation made equal.
+
+    ``window`` is the side of the neighbourhood [px]; 0 returns the image unchanged.
+
+    A surface with a highlight toward one camera only has a different brightness and contrast in the two images. SGBM
+    compares grey levels, and would lose it. Without equal contrast, the effect of the smoothness penalties also depends
+    on the exposure.
+    """
+    if window == 0:
+        return image
+    size = (window, window)
+    values = image.astype(np.float32)
+    mean = cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_REPLICATE)
+    square = cv2.boxFilter(values * values, -1, size, borderType=cv2.BORDER_REPLICATE)
+    deviation = np.sqrt(np.maximum(square - mean * mean, 0))
+    scaled = 128 + _TARGET_DEVIATION_DN * (values - mean) / (deviation + _DEVIATION_FLOOR_DN)
+    return np.asarray(np.clip(np.rint(scaled), 0, 255)).astype(np.uint8)
+
+
+def search_range(rectification: Rectification, settings: MatcherSettings) -> tuple[int, int]:
+    """Return the first disparity [px] and the number of disparities that contain the range of depths.
+
+    The number is a multiple of 16, rounded up at the near end. One pixel is added at each end for the sub-pixel step.
+
+    Raises
+    ------
+    InputError
+        If no pixel of the right image shows anything between ``near_mm`` and ``far_mm``.
+    """
+    limit = rectification.width - 1  # beyond it, no column of an image has its match in the other
+    smallest, largest = (float(rectification.disparity(depth)) for depth in (settings.far_mm, settings.near_mm))
+    if not np.isfinite([smallest, largest]).all() or smallest > limit or largest < -limit:
+        raise InputError(
+            "matcher settings",
+            "near_mm, far_mm",
+            f"{settings.near_mm} to {settings.far_mm} mm",
+            "depths that both cameras can see, at a finite disparity",
+        )
+    first = max(int(np.floor(smallest)) - 1, -limit)
+    last = min(int(np.ceil(largest)) + 1, limit)
+    return first, 16 * -(-(last - first + 1) // 16)
+
+
+def match_both_ways(
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    columns: tuple[int, int],
+    first: int,
+    count: int,
+    settings: MatcherSettings,
+    budget: float = BUDGET_BYTES,
+) -> Matches:
+    """Match columns of the left strip to the right strip, and in the reverse direction.
+
+    Parameters
+    ----------
+    left, right
+        (h, W) rectified strips [DN], the same rows of both.
+    columns
+        First left column to match, and one past the last.
+    first, count
+        Search range, from :func:`search_range`.
+    settings
+        Block size, penalties and uniqueness.
+    budget
+        Memory for costs and sums [bytes]; it does not affect the result. If OpenCV needs more, the directions are
+        matched one after the other, or in bands (:mod:`mitsim.decoding.matching.sgbm_bands`).
+    """
+    begin, end = columns
+    width = end - begin
+    # Shift the right strip by `first`, so that the search starts at 0. Add `count` columns on both sides, since SGBM
+    # finds nothing where part of its range is outside the image. Outside the image, the edge is repeated.
+    source = np.arange(begin - count, end + count)
+    last_column = left.shape[1] - 1
+    padded_left = left[:, np.clip(source, 0, last_column)]
+    padded_right = right[:, np.clip(source - first, 0, last_column)]
+
+    # From the right: only right columns that exist. Uniqueness is required of the left match only; here only the
+    # position counts.
+    start = max(0, count - begin + first)
+    stop = max(start, min(count + width, right.shape[1] + count - begin + first))
+    mirrored_columns = slice(start, stop + count)
+    budget_each, workers = _memory_per_direction(settings, left.shape[0], max(width, stop - start), count, budget)
+    pairs = [(padded_left[:, : count + width], padded_right[:, : count + width], settings.uniqueness_percent)]
+    if start < stop:
+        pairs.append((padded_right[:, mirrored_columns][:, ::-1], padded_left[:, mirrored_columns][:, ::-1], 0))
+    # OpenCV's matcher uses one core, so both directions together take the time of one
+    from_left, *from_right = in_threads(
+        lambda pair: _disparities(pair[0], pair[1], count, settings, pair[2], budget_each), pairs, workers
+    )
+    found = from_left[:, count:]
+    back = np.full((left.shape[0], padded_left.shape[1]), np.nan, np.float32)
+    if from_right:
+        back[:, start:stop] = from_right[0][:, count:][:, ::-1]
+
+    matched_back = pixels_matched_back(back)[:, count : count + width]
+    return Matches(found + np.float32(first), both_ways_disagreement(found, back, count), matched_back)
+
+
+def _sgbm(count: int, penalties: Penalties, mode: int) -> cv2.StereoSGBM:
+    return cv2.StereoSGBM.create(
+        minDisparity=0,
+        numDisparities=count,
+        blockSize=penalties.block,
+        P1=penalties.p1,
+        P2=penalties.p2,
+        disp12MaxDiff=-1,
+        preFilterCap=penalties.cap,
+        uniquenessRatio=penalties.uniqueness,
+        speckleWindowSize=0,
+        speckleRange=0,
+        mode=mode,
+    )
+
+
+def _memory_per_direction(
+    settings: MatcherSettings, height: int, width: int, count: int, budget: float
+) -> tuple[float, int]:
+    """Return the memory [bytes] for each direction, and how many directions are matched at once."""
+    whole = bytes_by_opencv(height, width, count)
+    if settings.mode != "hh" or 2 * whole <= budget:
+        return budget, 2
+    if whole <= budget or not fits_16_bits(_penalties(settings, 0)):
+        return budget, 1
+    rows = rows_in_budget(budget / 2, height, width, count)
+    return (budget / 2, 2) if bytes_of_band(rows, height, width, count) <= budget / 2 else (budget, 1)
+
+
+def _penalties(settings: MatcherSettings, uniqueness: int) -> Penalties:
+    area = settings.block_size**2
+    p1, p2 = round(settings.p1 * area), round(settings.p2 * area)
+    return Penalties(settings.block_size, p1, p2, settings.prefilter_cap, uniqueness)
+
+
+def _disparities(
+    reference: NDArray[np.uint8],
+    other: NDArray[np.uint8],
+    count: int,
+    settings: MatcherSettings,
+    uniqueness: int,
+    budget: float,
+) -> NDArray[np.float32]:
+    """Return disparities from 0 on [px], NaN where the matcher found none (which it writes as -1).
+
+    OpenCV adds the offset of its parabola [1/16 px] to the whole disparity, with a division that rounds toward zero.
+    Negative offsets are therefore one step too large, and zero represents -1.5 to 0.5. The mean bias would be 0.03 px.
+    Here each step becomes the middle of the interval that it represents.
+    """
+    reference, other = np.ascontiguousarray(reference), np.ascontiguousarray(other)
+    height, width = reference.shape[0], reference.shape[1] - count
+    penalties = _penalties(settings, uniqueness)
+    if settings.mode != "hh" or bytes_by_opencv(height, width, count) <= budget or not fits_16_bits(penalties):
+        found = _sgbm(count, penalties, _MODES[settings.mode]).compute(reference, other)
+    else:
+        found = match_in_bands(reference, other, count, penalties, rows_in_budget(budget, height, width, count))
+    sixteenths = found.astype(np.float32)
+    offset = np.mod(sixteenths, 16)  # 0 to 8 are not negative; 9 to 15 are -7 to -1
+    too_large = np.where(offset > 8, np.float32(1), np.where(offset == 0, np.float32(0.5), np.float32(0)))
+    return np.where(sixteenths < 0, np.float32(np.nan), (sixteenths - too_large) / 16)
+
+
+def both_ways_disagreement(found: NDArray[np.float32], back: NDArray[np.float32], count: int) -> NDArray[np.float32]:
+    """Return the least difference [px] between a left match and the matches of the two right pixels at its position.
+
+    Parameters
+    ----------
+    found
+        (h, w) disparities of left pixels, less the first of the range.
+    back
+        (h, w + 2 count) disparities of right pixels.
+    count
+        Number of disparities.
+    """
+    right_column = np.arange(count, count + found.shape[1], dtype=np.float32) - found
+    matched = np.isfinite(found)
+    column = np.floor(np.where(matched, right_column, 0)).astype(np.intp)
+    next_column = np.minimum(column + (right_column > column), back.shape[1] - 1)
+    lower = np.abs(np.take_along_axis(back, column, axis=1) - found)
+    upper = np.abs(np.take_along_axis(back, next_column, axis=1) - found)
+    return np.asarray(np.fmin(lower, upper))
+
+
+def pixels_matched_back(back: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return the left pixels that are the match of a right pixel, or lie beside one."""
+    rows, columns = np.nonzero(np.isfinite(back))
+    matched_back = np.zeros(back.shape, np.uint8)
+    matched_back[rows, columns + np.rint(back[rows, columns]).astype(np.intp)] = 1
+    return np.asarray(cv2.dilate(matched_back, np.ones((1, 3), np.uint8)) > 0)
