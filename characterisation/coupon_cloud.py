@@ -79,6 +79,10 @@ def patch_metrics(
         If the array is not (H, W, 3), has too few points for a plane, or matches no pinhole; or if no disc fits into
         the window.
 
+    See Also
+    --------
+    measure_coupon : a table of all metrics
+
     Notes
     -----
     F and sigma are defined by Kinnell and Justham, "Task Specific Viewpoint Optimisation" (2018).
@@ -131,6 +135,10 @@ def measure_coupon(
     ------
     InputError
         As :func:`patch_metrics`.
+
+    See Also
+    --------
+    patch_metrics : F and sigma alone
 
     Examples
     --------

@@ -105,6 +105,10 @@ def difference_to_surface(
     ------
     InputError
         If the reference has fewer than :data:`NEIGHBOURS` points.
+
+    See Also
+    --------
+    difference_along_rays : two clouds on one grid
     """
     surface = reference.points[reference.valid].astype(np.float64)
     if len(surface) < NEIGHBOURS:

@@ -129,6 +129,11 @@ def sphere_spacing_error(
     ------
     InputError
         As :func:`probing_error`, or if the calibrated distance is not positive.
+
+    See Also
+    --------
+    probing_error : a single sphere
+    flatness_error : a plane
     """
     if not calibrated_distance > 0:
         raise InputError("sphere_spacing_error", "calibrated_distance", calibrated_distance, "a positive length in mm")

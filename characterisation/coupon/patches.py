@@ -163,6 +163,10 @@ def measure_patches(
     InputError
         If both ``angular_pitch`` and ``reference`` are given, ``reference`` has another grid, the disc or the step is
         smaller than 1 px, or the pitch is not positive.
+
+    See Also
+    --------
+    patch_residuals : the residuals of the patches
     """
     _check(cloud, radius_px, step_px, angular_pitch, reference)
     centres = patch_centres(cloud.grid, coupon, radius_px, margin_px, step_px or 2 * radius_px)
@@ -236,6 +240,10 @@ def patch_residuals(cloud: PointCloud, coupon: Coupon, radius_px: float = 6.0, m
     ----------
     cloud, coupon, radius_px, margin_px
         As in :func:`measure_patches`.
+
+    See Also
+    --------
+    measure_patches : the metrics of the patches
     """
     pixels = _pixels(cloud, patch_centres(cloud.grid, coupon, radius_px, margin_px, 2 * radius_px), radius_px)
     points, true = _points_of(cloud, coupon, pixels)

@@ -130,6 +130,10 @@ def fit_edge_point(
     reach
         Distance [mm] from the nominal point, along the line and across it, within which the edge is searched and
         assumed straight.
+
+    See Also
+    --------
+    fit_circle : the edge of a hole
     """
     nominal = nominal.seen_from(cloud.grid.origin).on_moved_plane(plane)
     found = _crossings(cloud, plane, nominal, near, reach)

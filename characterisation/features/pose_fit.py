@@ -74,6 +74,10 @@ def pose_jacobian(surface: Surface, points: Array, rays: Array | None, about: Ar
         (n, 3) [mm], and unit (n, 3); without rays, residuals are orthogonal distances.
     about
         (3,) [mm] centre of the rotation.
+
+    See Also
+    --------
+    fit_pose : the fit that uses these derivatives
     """
     at = surface.meet(points, rays)
     turning = np.cross(at.foot - np.asarray(about, float), at.normal)
@@ -105,6 +109,10 @@ def fit_pose(
     FitError
         If the points leave a motion undetermined, which the message gives in the part frame; or if there are too few,
         or all are at grazing incidence.
+
+    See Also
+    --------
+    pose_jacobian : the derivatives of the residuals
     """
     arrays = {name: np.asarray(rows, float).reshape(-1, 3) for name, rows in points.items()}
     arrays = {name: rows[np.isfinite(rows).all(axis=1)] for name, rows in arrays.items()}

@@ -41,6 +41,10 @@ def read_bounded(file: Path, absent: str | None = None, hint: str = "", largest:
     ------
     InputError
         If it is missing, too large, a folder, a pipe or a device, or cannot be read.
+
+    See Also
+    --------
+    read_text_bounded : text
     """
     try:
         about = file.stat()
@@ -75,6 +79,10 @@ def read_text_bounded(file: Path, absent: str | None = None, hint: str = "", lar
     ------
     InputError
         As :func:`read_bounded`, or if it is not UTF-8.
+
+    See Also
+    --------
+    read_bounded : bytes
     """
     try:
         return read_bounded(file, absent, hint, largest).decode("utf-8-sig")

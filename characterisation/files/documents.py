@@ -141,6 +141,10 @@ def validate(where: str | Path, table: dict[str, Any], model: type[Model], conte
         Type of the document.
     context
         Passed to the validators of the model.
+
+    See Also
+    --------
+    read_toml : a TOML file
     """
     try:
         return model.model_validate(table, context=context)

@@ -162,6 +162,10 @@ class PerformanceMap:
         ------
         InputError
             If the surface was not characterised.
+
+        See Also
+        --------
+        plot : a picture of F and sigma
         """
         normals = np.asarray(normals)
         distance = np.broadcast_to(np.asarray(distance, float), normals.shape[:-1])
@@ -205,6 +209,10 @@ class PerformanceMap:
         ------
         InputError
             If the finish or the distance was not characterised, or ``ax`` is not two axes.
+
+        See Also
+        --------
+        query : the numbers
 
         Examples
         --------
@@ -292,6 +300,10 @@ class PerformanceMap:
         compact
             Compress the file, after rounding values to ``VALUE_BITS`` and errors to ``ERROR_BITS`` of the mantissa
             (Zender, Geosci. Model Dev. 9 (2016) 3199-3211; rounded to nearest). Such a file is read like any other.
+
+        See Also
+        --------
+        load : the inverse
         """
         data = self.data
         # most samples of a map have no lay, and NaN there

@@ -58,6 +58,10 @@ def view_statistics(
     ------
     ValueError
         If shapes differ, a number of points is negative or NaN, or points come without a positive sigma.
+
+    See Also
+    --------
+    score_views : the scores from these inputs
     """
     arrays = [np.asarray(values, float) for values in (n, mean_sigma, n_white, mean_sigma_white, n_only_white)]
     shape = (len(arrays[0]), len(features))
@@ -193,6 +197,10 @@ def write_scores(
         The file.
     scores, extra, order
         As in :func:`score_table`.
+
+    See Also
+    --------
+    score_table : the rows of the file
     """
     rows = score_table(scores, extra, order)
     with atomic_write(path) as whole, whole.open("w", encoding="utf-8", newline="") as file:

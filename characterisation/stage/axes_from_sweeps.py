@@ -87,6 +87,10 @@ def axes_from_normals(
     ------
     InputError
         If no three captures differ in one axis alone, or the normals do not turn about it.
+
+    See Also
+    --------
+    axes_from_rotations : from poses
     """
     directions: list[Floats] = []
     left = normals

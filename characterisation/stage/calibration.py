@@ -149,6 +149,10 @@ def calibrate_with_board(
     ------
     InputError
         If the captures do not determine the axes; the message names the axis.
+
+    See Also
+    --------
+    calibrate_with_coupon : from clouds of a coupon
     """
     poses = np.asarray(poses, float)
     angles, kept = _usable(angles, poses.reshape(len(poses), -1), "poses")

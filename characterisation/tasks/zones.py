@@ -49,6 +49,10 @@ def position(feature: Plane | Axis | PointLike, *datums: Datum, nominal: Sequenc
         Nominal feature, then the nominal datums.
     outline
         (k, 3) [mm], places that span the feature.
+
+    See Also
+    --------
+    angularity : the zone of a plane at an angle
     """
     target, *others = nominal
     motion = np.eye(4)
@@ -175,6 +179,11 @@ def angularity(feature: Plane, datum: Datum, *, nominal: Sequence[Geometry], out
         Nominal feature and datum.
     outline
         (k, 3) [mm], places that span the feature.
+
+    See Also
+    --------
+    parallelism : parallel to the datum
+    perpendicularity : at right angles to the datum
     """
     target, nominal_datum = (direction(one) for one in nominal if isinstance(one, Plane | Cylinder | Cone))
     along = direction(datum) * (1.0 if direction(datum) @ nominal_datum >= 0 else -1.0)

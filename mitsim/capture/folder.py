@@ -77,6 +77,10 @@ def write_capture(
         If the folder is not free or cannot be written, or something in the capture cannot be written to a file.
     OSError
         If the disk is full.
+
+    See Also
+    --------
+    read_capture : the inverse
     """
     return write_packed(packed(capture, folder, vendor=vendor, truth=truth), folder, overwrite=overwrite)
 

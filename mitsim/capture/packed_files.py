@@ -57,6 +57,10 @@ def packed(
     ------
     InputError
         If something in the capture cannot be written to a file.
+
+    See Also
+    --------
+    files_of : with further files by role and name
     """
     extra = {("vendor", name): data for name, data in (vendor or {}).items()}
     extra |= {("truth", f"{camera}.exr"): data for camera, data in (truth or {}).items()}

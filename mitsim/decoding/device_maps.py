@@ -118,6 +118,10 @@ def decode_device_map(
     ------
     InputError
         If the map does not have the grid's size, or the region does not lie in the grid.
+
+    See Also
+    --------
+    mitsim.decoding.cloud.capture_cloud : any capture
     """
     grid = geometry.grid
     if values.shape != (grid.height, grid.width, *((3,) if name == "points" else ())):

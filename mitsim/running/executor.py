@@ -118,6 +118,10 @@ def finished_orders(
         Start the work on an item; return how many items may be in work.
     idle, idle_s
         Called when no item was finished for ``idle_s`` [s].
+
+    See Also
+    --------
+    results_of : in the sequence of the orders
     """
     try:
         while waiting or running:
@@ -211,6 +215,10 @@ def results_of(
         None for this process.
     label
         Of the progress on stderr.
+
+    See Also
+    --------
+    finished_orders : as they are finished
     """
     if workers is None:
         return [work(one) for one in track(orders, label)]

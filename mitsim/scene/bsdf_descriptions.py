@@ -127,6 +127,11 @@ def conductor_bsdf(
         Of the normals; its widths along u and v [1], in the sense of the distribution.
     index, factor
         n and k of the surface [1], and a factor on all reflected light [1].
+
+    See Also
+    --------
+    diffuse_bsdf : a Lambertian surface
+    metal_bsdf : a machined metal
     """
     return {
         "type": "roughconductor",

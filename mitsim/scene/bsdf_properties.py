@@ -31,6 +31,10 @@ def choice(props: Any, where: str, key: str, default: str, known: list[str]) -> 
     ------
     InputError
         If the value is not one of ``known``.
+
+    See Also
+    --------
+    number_within : a number
     """
     value = props.get(key, default)
     if value not in known:
@@ -54,6 +58,10 @@ def number_within(props: Any, where: str, key: str, default: float | None, low: 
     ------
     InputError
         If there is neither a value nor a default, or the value is no number or outside the limits.
+
+    See Also
+    --------
+    choice : a text
     """
     allowed = f"a number from {low:g} to {high:g} {unit}".rstrip()
     value = props.get(key, default)

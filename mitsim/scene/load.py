@@ -132,6 +132,10 @@ def load_scene(
     InputError
         If the file is missing or does not parse, if Mitsuba rejects its content, or if a part in mm cannot have its
         size.
+
+    See Also
+    --------
+    scene_from_dict : from a dictionary
     """
     path = Path(path)
     parameters = parameters or {}

@@ -36,6 +36,11 @@ def ball_on_plate(radius_mm: float, size_mm: float, finish: str, wavelength_nm: 
         One of :data:`FINISHES`.
     wavelength_nm
         Of the sensor.
+
+    See Also
+    --------
+    ball : without the plate
+    plate : without the ball
     """
     sphere = {"type": "sphere", "radius": radius_mm, "center": [0.0, 0.0, radius_mm], "bsdf": FINISHES[finish]}
     return _scene({"plate": _square(size_mm, finish), "ball": sphere}, finish, wavelength_nm)

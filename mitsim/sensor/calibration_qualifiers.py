@@ -89,6 +89,10 @@ def check_intrinsics(focal: tuple[float, float], principal: tuple[float, float],
     ------
     ValueError
         If they cannot; the message names the key of a sensor file, the limits, and the likely cause.
+
+    See Also
+    --------
+    check_camera : the matrix of a camera
     """
     side = max(width, height)
     low, high = (share * side for share in _FOCAL_SHARE)

@@ -137,6 +137,10 @@ def automatic(
     ------
     InputError
         For values outside their range, or without any pixel.
+
+    See Also
+    --------
+    bracket : several exposures
     """
     _check("full_well", full_well, full_well > 0, "over 0 e-")
     _check("level", level, 0 < level <= 1, "over 0, up to 1")
@@ -169,6 +173,10 @@ def bracket(base_s: float, count: int, factor: float, limits_s: tuple[float, flo
     ------
     InputError
         For values outside their range.
+
+    See Also
+    --------
+    automatic : the base exposure
     """
     _check("base_s", base_s, 0 < base_s < np.inf, "over 0 s")
     _check("count", count, count >= 1, "1 or more")

@@ -133,6 +133,10 @@ def expose(
     ------
     ValueError
         For electrons that are not finite, or temporal noise without ``rng``.
+
+    See Also
+    --------
+    mitsim.sensor.modulation.expose_taps : the differences of a time-of-flight camera's taps
     """
     if noise.temporal and rng is None:
         raise ValueError("temporal noise needs a generator: rng")

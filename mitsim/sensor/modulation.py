@@ -167,6 +167,10 @@ def expose_taps(
     numpy.ndarray
         (P, H, W), uint8 up to 8 bits, else uint16; bits and black level are those of
         :func:`mitsim.sensor.image_formation.converter`. Only a pixel with a full tap reaches full scale.
+
+    See Also
+    --------
+    mitsim.sensor.image_formation.expose : grey levels of an ordinary imager
     """
     chip = converter(imager, noise)
     fine = replace(noise, quantisation=False)

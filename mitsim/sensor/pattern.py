@@ -146,6 +146,10 @@ def diffraction_spots(
         (across, down) tiles of whole cells in which the pattern repeats; the last tile ends at the field's edge.
     seed
         Selects the pattern.
+
+    See Also
+    --------
+    random_blobs : random dark and bright areas
     """
     down, across = int(np.ceil(height / cell_px)), int(np.ceil(width / cell_px))
     tile = (int(np.ceil(down / tiles[1])), int(np.ceil(across / tiles[0])))

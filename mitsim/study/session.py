@@ -246,6 +246,10 @@ def statement(
     InputError
         If there is no such view, or a number is out of its range.
 
+    See Also
+    --------
+    score : all views, by prediction
+
     Examples
     --------
     >>> import mitsim as ms

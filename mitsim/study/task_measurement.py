@@ -198,6 +198,10 @@ def measure_task(
     ------
     InputError
         If the statement is for another sensor or view, or lacks a measurement.
+
+    See Also
+    --------
+    measure : a labelled cloud
     """
     if statement is not None:
         statement.check(cloud.sensor, world_from_sensor)

@@ -31,6 +31,10 @@ def chosen_standoffs(where: str | Path, table: ViewsTable, sensor: Sensor, radiu
     ------
     InputError
         For a standoff outside the sensor's working range.
+
+    See Also
+    --------
+    characterised_range : the range in which a view may lie
     """
     near, far = sensor.working_range_mm
     for standoff in table.standoffs:
@@ -62,6 +66,10 @@ def characterised_range(
     ------
     InputError
         For a standoff outside the characterised ``distances`` [mm].
+
+    See Also
+    --------
+    chosen_standoffs : the distances of the views
     """
     for standoff in standoffs:
         if not min(distances) <= standoff <= max(distances):

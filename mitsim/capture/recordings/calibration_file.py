@@ -133,6 +133,10 @@ def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], w
     ------
     InputError
         If no camera has that name, or its size differs.
+
+    See Also
+    --------
+    read_calibration : all cameras
     """
     cameras = calibrated.rig.cameras
     if name is not None and name not in cameras:

@@ -159,6 +159,10 @@ def chosen_frame(frame: int | None, count: int, where: Path, what: str) -> int:
     ------
     InputError
         If there are several and none was chosen, or there is no such frame.
+
+    See Also
+    --------
+    frame_of : a frame by its number or name
     """
     if frame is None and count > 1:
         allowed, hint = "one in a capture", f"choose with --frame 0 to {count - 1}"

@@ -170,6 +170,10 @@ def decode_reference(
     ------
     InputError
         If the image does not fit the calibration, or the region of interest does not lie in the grid.
+
+    See Also
+    --------
+    mitsim.decoding.matching.stereo.decode_stereo : two cameras
     """
     reference_image = np.rint(geometry.reference * (_REFERENCE_LEVEL * context.full_scale)).astype(images.dtype)
     camera_context = replace(context, read_out=(context.read_out[0], None))

@@ -118,6 +118,10 @@ def match_in_bands(
         Number of disparities, 0 to ``count`` - 1. The first ``count`` columns have no disparity.
     penalties, band_rows
         Parameters of the cost, and rows of a band.
+
+    See Also
+    --------
+    bytes_of_band : its memory
     """
     height = len(reference)
     images = _MatchingCosts(reference, other, count, penalties)

@@ -173,6 +173,10 @@ def decode_stereo(
     InputError
         If the images do not fit the calibration, there are several frames for SGBM, or the region of interest does not
         lie in the grid.
+
+    See Also
+    --------
+    mitsim.decoding.matching.reference_matching.decode_reference : one camera and its projector
     """
     geometry = rig if isinstance(rig, StereoGeometry) else stereo_geometry(rig)
     grid, rectification = geometry.grid, geometry.rectification

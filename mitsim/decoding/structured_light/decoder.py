@@ -170,6 +170,10 @@ def decode_structured_light(
     ------
     InputError
         If the images do not fit code and calibration, or the region of interest does not lie in them.
+
+    See Also
+    --------
+    mitsim.decoding.structured_light.two_cameras.decode_structured_light_stereo : two cameras
     """
     if isinstance(rig, StructuredLightGeometry):
         geometry = rig

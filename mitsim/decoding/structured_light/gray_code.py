@@ -251,6 +251,10 @@ def decode_gray_fringes(
         Value of a saturated pixel [DN].
     imager
         As for :func:`mitsim.decoding.structured_light.phase_shift.decode_phase_shift`.
+
+    See Also
+    --------
+    mitsim.decoding.structured_light.phase_shift.decode_fringes : fringes alone
     """
     axis, extent, stripe = coded_axis.axis, coded_axis.extent, coded_axis.stripe
     used = [index for index, role in enumerate(image_roles) if role.kind == "phase" and role.axis == axis]

@@ -168,6 +168,10 @@ def decode_fringes(
     ------
     InputError
         If the fringes are ambiguous over the extent, or gamma has to be corrected from fewer than five steps.
+
+    See Also
+    --------
+    mitsim.decoding.structured_light.gray_code.decode_gray_fringes : with a Gray code
     """
     path = unwrapping_path(fringes.periods, fringes.steps, extent)
     phases = fit_phases(stack, fringes.shifts)

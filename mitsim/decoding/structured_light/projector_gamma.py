@@ -46,6 +46,10 @@ def estimate_gamma(stack: NDArray[np.generic], mean: float, contrast: float, min
     ------
     InputError
         If there are fewer than five shifts, no pixel has the modulation, or no gamma fits.
+
+    See Also
+    --------
+    gamma_from_white : fewer than five steps
     """
     steps = len(stack)
     if steps < 5:
@@ -96,6 +100,10 @@ def gamma_from_white(
     ------
     InputError
         If no used pixel is brighter in white than in black, or no gamma fits.
+
+    See Also
+    --------
+    estimate_gamma : five steps or more
     """
     black_sum = float(black[used].sum(dtype=np.float64))
     range_sum = float(white[used].sum(dtype=np.float64)) - black_sum

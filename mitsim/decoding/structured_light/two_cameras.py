@@ -91,6 +91,10 @@ def decode_structured_light_stereo(
     InputError
         If the code has no columns, the images do not fit code and calibration, or the region of interest does not lie
         in the grid.
+
+    See Also
+    --------
+    mitsim.decoding.structured_light.decoder.decode_structured_light : one camera
     """
     geometry = rig if isinstance(rig, StereoGeometry) else stereo_geometry(rig)
     for name, stack, size in zip(("left", "right"), (left, right), geometry.raw_size, strict=True):
@@ -144,6 +148,10 @@ def cloud_of_pair(
     ------
     InputError
         If the code has no columns, or the region of interest does not lie in the grid.
+
+    See Also
+    --------
+    decode_structured_light_stereo : from images
     """
     if "columns" not in axes(code):
         raise InputError(

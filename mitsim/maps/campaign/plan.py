@@ -217,6 +217,10 @@ def plan_campaign(
         Distances if the file has none.
     places
         Live stage as calibrated at each distance, for captures with the file's ``device``.
+
+    See Also
+    --------
+    read_campaign : the file
     """
     if file.device is not None and places is None:
         hint = "only campaigns and validations of maps take captures with a device"

@@ -181,6 +181,10 @@ def write_stage_calibration(
     centre
         For a calibration with a coupon, (3,): its middle at zero in the sensor's frame [mm]. The calibration determines
         only its plane. The full covariance is unknown and is not written.
+
+    See Also
+    --------
+    read_stage_calibration : the inverse
     """
     covariance: list[list[float]] | None = None
     if isinstance(calibration, CouponCalibration):

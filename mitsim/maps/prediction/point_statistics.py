@@ -90,6 +90,10 @@ def expected_points(
         Gives noise areas and persistent noise.
     perturbation
         Effects that flat coupons cannot show (:mod:`mitsim.maps.prediction.perturbation`).
+
+    See Also
+    --------
+    feature_statistics : numbers and mean sigma of each shape
     """
     ideal, labels, world_from_sensor = view.ideal, view.labels, view.world_from_sensor
     finish = scene.finishes[shape]
@@ -151,6 +155,10 @@ def feature_statistics(
         F and sigma [mm] (n,) of the points, from :func:`performance`.
     shapes
         Indices into the scene's names.
+
+    See Also
+    --------
+    expected_points : the points of one shape
     """
     label = labels.reshape(-1)[ideal.pixel]
     weight = np.where(np.isfinite(sigma), np.nan_to_num(fraction), 0.0)

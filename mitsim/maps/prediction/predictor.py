@@ -231,6 +231,10 @@ class Predictor:
         ------
         InputError
             If the view shows a face whose finish was not characterised.
+
+        See Also
+        --------
+        draw : from F and sigma that were looked up
         """
         predicted = self.look_up(characterised, world_from_sensor, correlated)
         seen, size = predicted.seen, predicted.seen.status.shape
@@ -260,6 +264,10 @@ class Predictor:
             F and sigma [mm] (n,); NaN where the map has no answer. Such points are lost.
         rng
             Random generator.
+
+        See Also
+        --------
+        predict : from the map
         """
         size = (self.grid.height, self.grid.width)
 

@@ -149,6 +149,10 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
     ------
     InputError
         If ``output`` exists, a pattern matches nothing, or a capture cannot be used.
+
+    See Also
+    --------
+    find_sources : the captures of a folder
     """
     output = Path(output).absolute()
     if output.exists():

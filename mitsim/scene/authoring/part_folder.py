@@ -109,6 +109,10 @@ def read_part(
     InputError
         As :func:`~mitsim.scene.authoring.read_step.read_step`, :func:`~mitsim.scene.authoring.read_mesh.read_mesh` and
         :func:`~mitsim.scene.authoring.segment_mesh.segment_mesh`.
+
+    See Also
+    --------
+    write_part : its scene folder
     """
     path = Path(path)
     check_part_file(path, units)
@@ -148,6 +152,10 @@ def write_part(
         As :func:`read_part`; or if the folder exists or cannot be written.
     OSError
         On a full disk, see :func:`~characterisation.files.atomic_io.write_folder`.
+
+    See Also
+    --------
+    read_part : the part without a folder
     """
     path, folder = Path(path), Path(folder).absolute()
     finishing = finishing or Finishing()

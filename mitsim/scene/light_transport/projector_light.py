@@ -257,6 +257,10 @@ class ProjectorLight(Eye):
             Texture coordinate.
         distance
             Distance to the position in the aperture [mm].
+
+        See Also
+        --------
+        emit_photon : a photon of the same light
         """
         position = self.position
         if self.has_aperture:

@@ -66,6 +66,10 @@ def trace(
     -------
     numpy.ndarray
         (P, height, width), or (P + 1, height, width), of the region, float32 [W / (mm^2 sr)].
+
+    See Also
+    --------
+    trace_poses : whole images at several poses
     """
     (images,) = _traced(scene, rays, light, [world_from_sensor], paths, roi or rays.whole, shift)
     return np.asarray(images)

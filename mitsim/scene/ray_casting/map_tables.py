@@ -109,6 +109,10 @@ class MapTables:
             As for :meth:`look_up`.
         along
             Derivative of the point by u, in the view frame; its length does not matter.
+
+        See Also
+        --------
+        look_up : surfaces without a lay
         """
         mean = self.look_up(number, distance, normal, active)
         directed = active & dr.gather(mi.Bool, self.has_lay, number, active)

@@ -81,6 +81,10 @@ def cast(scene: Scene, rays: PixelRays, world_from_sensor: Transform, eyes: NDAr
         The scene, the rays, and the pose of the sensor.
     eyes
         (E, 3) [mm], sensor frame: optical centres of the other cameras and the projector.
+
+    See Also
+    --------
+    shapes_met : the shapes alone
     """
     frame = rays.frame(world_from_sensor)
     surface = scene.mitsuba.ray_intersect(mi.Ray3f(frame.position, frame.to_world(rays.directions)), rays.active)

@@ -46,6 +46,10 @@ def directional_albedo(
         Of the lobe.
     index
         n and k of the material [1]; None for a perfect mirror.
+
+    See Also
+    --------
+    compensation : the factor that restores the lost light
     """
     weights, _ = facets(incidence, alpha_u, alpha_v, distribution, _COUNTS, index)
     return float(weights.sum())
@@ -134,6 +138,10 @@ def compensation(alpha_u: float, alpha_v: float, distribution: Distribution, ref
         Of the lobe.
     reflectance
         F0 at normal incidence [1].
+
+    See Also
+    --------
+    directional_albedo : the share of light that a lobe returns
     """
     kept = directional_albedo(NOMINAL_INCIDENCE, alpha_u, alpha_v, distribution)
     return 1 + reflectance * (1 - kept) / kept

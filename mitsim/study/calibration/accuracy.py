@@ -144,6 +144,10 @@ def accuracy(
         Number of rigs.
     rng
         Source of the draws; each has its own stream.
+
+    See Also
+    --------
+    measured_points : the points of one rig
     """
     volume = measuring_volume(eyes, sensor.working_range_mm)
     bars = volume.points(_BARS)
@@ -186,6 +190,10 @@ def measured_points(sensor: Sensor, points: Floats, true: Rig, path: tuple[float
         Rig that projects the points.
     path
         Offset [mm] and scale error [1] of a time-of-flight path.
+
+    See Also
+    --------
+    accuracy : the errors of many rigs
     """
     nominal, eye = sensor.rig, true.reference
     pixels = eye.project(points)

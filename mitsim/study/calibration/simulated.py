@@ -58,6 +58,11 @@ def simulate_corners(
         Poses of the board, with the noise of its corners.
     rng
         Generator of the draws.
+
+    See Also
+    --------
+    estimate : the calibration from these corners
+    coverage : many of them
     """
     modes, sigma = board.imperfections()
     true = board.corners + np.einsum("m,mni->ni", sigma * rng.standard_normal(len(sigma)), modes)
@@ -178,6 +183,10 @@ def coverage(
         Number of calibrations.
     rng
         Source of the streams.
+
+    See Also
+    --------
+    simulate_corners : one set of corners
     """
     names, sigma, rows = list(stated), np.array(list(stated.values())), []
     for stream in rng.spawn(count):

@@ -177,6 +177,10 @@ def run_race(
         Finished trials, to which those of the race are added.
     rules
         Shortlist, largest number of trials, and the end of the race.
+
+    See Also
+    --------
+    standings : the state after some trials
     """
     numbers = shortlist(scores, rules.shortlist)
     if not numbers:
@@ -235,6 +239,10 @@ def standings(
         Number of trials that are used, by number of a view.
     rules
         Margin and confidence of the decision.
+
+    See Also
+    --------
+    run_race : the whole race
     """
     names = list(trials.measurements)
     most = max(max(counts.values(), default=0), 1)

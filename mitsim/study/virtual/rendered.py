@@ -174,6 +174,10 @@ class RenderedMeasurements:
             Selects the noise; every seed gives another capture.
         keep
             Whether to keep the light. Otherwise it is overwritten, since it may be large.
+
+        See Also
+        --------
+        lit : the light
         """
         drawn, known = lit.drawn, self.study.sensor.room is not None
         power = drawn.power * (1.0 if planned is None else planned.power)

@@ -98,6 +98,10 @@ def specimen_patches(
         Pose and extent of the specimen, in the sensor frame of the capture.
     window_px
         Side of the window of local mean and deviation [px].
+
+    See Also
+    --------
+    patch_rows : the row errors alone
     """
     camera, image = capture.rig.reference, reference_levels(capture).astype(float)
     on_image = image_mask(place, camera, MARGIN_PX)
@@ -160,6 +164,10 @@ def patch_rows(
         Rectified geometry of its pair of cameras.
     place
         Pose and extent of the specimen.
+
+    See Also
+    --------
+    specimen_patches : all quantities of the patches
     """
     cloud, on_grid, places = _cloud_patches(capture, settings, geometry, place)
     valid = _tiles(np.where(on_grid, cloud.valid.astype(float), np.nan), places)

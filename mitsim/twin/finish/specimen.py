@@ -65,6 +65,10 @@ def specimen_place(capture: Capture, settings: Settings, roi: Roi | None, where:
     ------
     InputError
         If the capture has no images, the region is not in the image, or too few points lie in one plane.
+
+    See Also
+    --------
+    place_of : the place of a coupon whose pose may be known
     """
     if not capture.images:
         raise InputError(where, "images", "none", "a capture with images, not only a map of the device")
@@ -138,6 +142,10 @@ def place_of(capture: Capture, sensor: Sensor, size: tuple[float, float], where:
     ------
     InputError
         If no plane is found, or the sensor is behind the coupon.
+
+    See Also
+    --------
+    specimen_place : the estimate without a pose
     """
     if roi is not None:
         return specimen_place(capture, sensor.settings, roi, where)
