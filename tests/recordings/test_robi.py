@@ -117,8 +117,7 @@ def test_one_command_from_the_scene_to_the_verdict(scene, tmp_path):
     done = CliRunner().invoke(
         app,
         [
-            "validate",
-            "captures",
+            "compare",
             str(scene),
             "--frame",
             "0",

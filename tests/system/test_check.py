@@ -251,9 +251,7 @@ def test_a_point_far_beside_the_image_does_not_fold_back_into_it(n10):
     angle = np.radians(np.arange(50, 89))
     points = 500 * np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=-1)
     camera = n10.rig.reference
-    pixels = camera.project(points)
-    folded = (pixels >= 0).all(-1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
-    assert folded.any()
+    assert np.isnan(camera.project(points)).any()
     assert not in_image(camera, points).any()
 
 

@@ -8,9 +8,9 @@ import pytest
 from typer.testing import CliRunner
 
 from characterisation.files.documents import read_toml
-from mitsim.cli.program import app
 from mitsim.maps.prediction.interreflections import LossCurve, Losses, losses
 from tests.proofs import loss_fit
+from tests.proofs.__main__ import app
 from tests.proofs.loss_fit import SeenPoints, fitted_loss, losses_document
 from tests.smaller_sensors import coarse_sensor
 
@@ -70,7 +70,7 @@ def test_the_command_gives_the_shipped_numbers_back_from_a_few_views(coarse_case
     """Two views of a matcher and two of a code: intervals overlap."""
     monkeypatch.setattr(loss_fit, "fitted_loss", partial(fitted_loss, resamples=40))
     out = tmp_path / "losses.toml"
-    given = ["validate", "losses", str(coarse_cases), "-o", str(out), "--views", "2"]
+    given = ["losses", str(coarse_cases), "-o", str(out), "--views", "2"]
     ran = CliRunner().invoke(
         app, [*given, "--only", "balls_on_plate__ensenso-n10", "--only", "balls_on_plate__photoneo"]
     )
