@@ -164,14 +164,28 @@ def check_no_workers(scheduler: str | None, processes: int, allowed: str, hint: 
 
 
 def requested_workers(scheduler: str | None, processes: int) -> Executor | None:
-    """Return what ``--scheduler`` and ``--processes`` ask for; None if this process works alone.
+    """Return the workers of a scheduler, or processes on this machine; None if this process works alone.
 
-    With a CUDA device, one process uses all of it.
+    ``processes`` of 0 means as many as cores and memory allow, or one on a CUDA device, which it uses completely.
+
+    Raises
+    ------
+    InputError
+        If both are given, or the address of the scheduler is not valid.
+    MissingEnvironmentError
+        If no scheduler answers.
     """
-    from mitsim.running.executor import executor_of
+    from mitsim.running import executor
+    from mitsim.running.cluster import Cluster
     from mitsim.scene.backend import cuda_devices
 
-    return executor_of(scheduler, 1 if processes == 0 and cuda_devices() else processes)
+    if scheduler is not None:
+        if processes != 1:
+            raise InputError("--processes", "", processes, "not with --scheduler", "its workers are processes")
+        return Cluster(scheduler)
+    if processes == 0:
+        processes = 1 if cuda_devices() else executor.fitting_processes()
+    return None if processes == 1 else executor.Pool(processes)
 
 
 def pose_of(position: tuple[float, float, float], target: tuple[float, float, float], roll: float, sensor: Any) -> Any:

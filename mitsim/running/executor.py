@@ -24,7 +24,7 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from characterisation.files.errors import InputError, MissingEnvironmentError
+from characterisation.files.errors import MissingEnvironmentError
 from characterisation.files.threads import usable_cores
 from mitsim.running.progress import say, track
 
@@ -57,28 +57,6 @@ class Executor(Protocol):
         MissingEnvironmentError
             If no worker is left.
         """
-
-
-def executor_of(scheduler: str | None, processes: int = 1) -> Executor | None:
-    """Return the workers of a scheduler, or processes on this machine; None if only this process works.
-
-    ``processes`` of 0 means as many as cores and memory allow.
-
-    Raises
-    ------
-    InputError
-        If both are given, or the address of the scheduler is not valid.
-    MissingEnvironmentError
-        If no scheduler answers.
-    """
-    if scheduler is not None:
-        if processes != 1:
-            raise InputError("--processes", "", processes, "not with --scheduler", "its workers are processes")
-        from mitsim.running.cluster import Cluster
-
-        return Cluster(scheduler)
-    count = fitting_processes() if processes == 0 else processes
-    return None if count == 1 else Pool(count)
 
 
 def fitting_processes() -> int:

@@ -14,7 +14,7 @@ from mitsim.capture.devices.device_error import DeviceError
 from mitsim.cli.options import requested_workers
 from mitsim.cli.program import app
 from mitsim.running import executor
-from mitsim.running.executor import Pool, executor_of, fitting_processes, results_of
+from mitsim.running.executor import Pool, fitting_processes, results_of
 from tests.smaller_sensors import coarse_sensor
 
 pytestmark = pytest.mark.timeout(300)
@@ -106,9 +106,9 @@ def test_processes_follow_cores_and_memory(monkeypatch):
     for devices, expected in ((1, type(None)), (0, Pool)):  # one process uses a whole CUDA device
         monkeypatch.setattr("mitsim.scene.backend.cuda_devices", lambda devices=devices: devices)
         assert type(requested_workers(None, 0)) is expected
-    assert executor_of(None, 1) is None and isinstance(executor_of(None, 3), Pool)
+    assert requested_workers(None, 1) is None and isinstance(requested_workers(None, 3), Pool)
     with pytest.raises(InputError, match="--processes"):
-        executor_of("tcp://a:1", 2)
+        requested_workers("tcp://a:1", 2)
 
 
 PLAN = "captures = 2\n[views]\nsubdivisions = 0\nstandoff_mm = 500\n"
