@@ -54,8 +54,8 @@ def modules() -> None:
 
 def help_of_commands() -> None:
     """typer, click and rich."""
-    assert "characterise" in mitsim("--help")
-    for command in ("render", "export", "validate", "fit"):
+    assert "calibrate" in mitsim("--help")
+    for command in ("render", "export", "map", "fit"):
         mitsim(command, "--help")
     mitsim("doctor")
 

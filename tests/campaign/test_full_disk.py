@@ -35,7 +35,7 @@ from mitsim.report.style import write_png
 from mitsim.scene.load import load_scene
 from mitsim.sensor.transforms import look_at
 
-KNOWN = [Path(__file__).with_name("known_command.py"), "characterise"]
+KNOWN = [Path(__file__).with_name("known_command.py"), "map", "make"]
 MITSIM = ["-m", "mitsim"]
 
 _HOLD = (

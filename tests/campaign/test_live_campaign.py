@@ -57,7 +57,7 @@ def rig(tmp_path):
     script = Path(__file__).with_name("emulated_rig.py")
 
     def start(folder):
-        return QuickProcess(script, stage.journal_file, "characterise", file, "-o", tmp_path / folder)
+        return QuickProcess(script, stage.journal_file, "map", "make", file, "-o", tmp_path / folder)
 
     yield stage, start
     stage.end()

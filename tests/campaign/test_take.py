@@ -107,7 +107,8 @@ parameters = {{ Ra = 0.37 }}
 """
     )
     call = [
-        "characterise",
+        "map",
+        "make",
         str(tmp_path / "campaign.toml"),
         "--sensor",
         str(other),

@@ -135,7 +135,8 @@ def test_exposures_that_the_study_gives_are_not_planned_again(chosen):
 def test_the_option_has_one_help_text():
     group = typer.main.get_command(app)
     texts = set()
-    for name in ("run", "budget", "choose"):
-        (option,) = [one for one in group.get_command(None, name).params if "--plan-exposures" in one.opts]
+    study = group.get_command(None, "study")
+    for owner, name in ((group, "run"), (study, "state"), (study, "choose")):
+        (option,) = [one for one in owner.get_command(None, name).params if "--plan-exposures" in one.opts]
         texts.add(option.help)
     assert len(texts) == 1

@@ -52,6 +52,7 @@ def test_render_gives_the_images_of_the_command(workplace):
 
 def test_predict_gives_the_cloud_of_the_command(workplace):
     run(
+        "map",
         "predict",
         "two_pillars.xml",
         "--map",
@@ -93,7 +94,7 @@ def test_statement_has_the_figures_of_the_command(workplace):
     for one in ms.statement(ms.open_study("study.toml"), 4, trials=3, pairs=0, folder="mine"):
         assert one.trials == 3
         assert one.standard_uncertainty == pytest.approx(theirs[one.measurement]["standard_uncertainty"], nan_ok=True)
-    kept, mine = (workplace / one / "trials/view_0004.jsonl" for one in ("study", "state", "mine"))
+    kept, mine = (workplace / one / "trials/view_0004.jsonl" for one in ("budget", "mine"))
     assert kept.read_bytes() == mine.read_bytes()
 
 

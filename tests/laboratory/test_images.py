@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from figures_of_surfaces import mean_run_length
 
 from characterisation.region_of_interest import Roi
-from mitsim.sensor.pattern import RandomDots, mean_run_length
+from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import load_sensor
 from tests.proofs.laboratory.imager import (
     Exposed,

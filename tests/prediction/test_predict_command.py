@@ -19,6 +19,7 @@ def predicted(scenes: Path, folder: Path, *options: str) -> PointCloud:
     done = CliRunner().invoke(
         app,
         [
+            "map",
             "predict",
             str(scenes / "two_pillars/two_pillars.xml"),
             "--map",

@@ -342,7 +342,7 @@ def test_a_measurement_that_no_view_can_make_and_a_run_without_part_or_clouds_ar
     assert words(opened, "status") == f"Only 0 views can make {MEASUREMENTS[0]}."
     press(opened, "ArrowRight")
     assert chosen(opened) == 1
-    for quantity in ("study", "score", "chance", "points"):
+    for quantity in ("score", "chance", "points"):
         choose(opened, f"[value={quantity}]")
     choose(opened, "#sphere-measurement", "1")
     assert words(opened, "path-note").startswith(f"For {FEATURES[1]}. 11 times")

@@ -124,7 +124,7 @@ def test_no_command_takes_a_task_with_such_names(tmp_path, capfd, name, kind, mo
     text = text.replace(f"[{kind}.{old}]", f"[{kind}.{quoted(name)}]", 1)
     (tmp_path / "task.toml").write_text(text, encoding="utf-8")
     for arguments in commands_with(tmp_path, "ensenso-n10"):
-        if arguments[0] in ("run", "score", "budget"):
+        if arguments[0] in ("run", "study"):
             assert command(*arguments) == 2, arguments
             told = capfd.readouterr().err
             assert "task.toml" in told and "a name of at most" in told

@@ -83,7 +83,7 @@ def test_run_leaves_everything(study_folder):
     assert not list(out.rglob("*.partial"))
     assert len(list((out / "clouds").glob("predicted_*.ply"))) >= 2
     assert {"poses.csv", "poses.json"} <= {path.name for path in (out / "poses").iterdir()}
-    for step in ("map", "make", "score views", "race", "state view", "predict clouds", "render pictures"):
+    for step in ("characterise", "score views", "race", "state view", "predict clouds", "render pictures"):
         assert step in done.stderr
     run = json.loads((out / "run.json").read_text())
     assert run["source"] == "simulated"
@@ -157,6 +157,7 @@ def test_a_run_is_exported_for_other_tools(study_folder, tmp_path):
 def test_score_prints_the_best_views_as_the_run_ranked_them(study_folder, tmp_path):
     folder, _ = study_folder
     done = mitsim_here(
+        "study",
         "score",
         folder / "study.toml",
         "--map",
@@ -182,6 +183,7 @@ def test_score_prints_the_best_views_as_the_run_ranked_them(study_folder, tmp_pa
     assert [{key: row[key] for key in scored[0]} for row in ran] == scored
     assert (tmp_path / "scores/poses/poses.json").exists()
     said = mitsim_here(
+        "study",
         "score",
         folder / "study.toml",
         "--map",
@@ -218,6 +220,7 @@ def test_report_and_predict_from_what_run_left(study_folder, tmp_path):
     for name in ("point1_point2_distance", "pillar2_radius", "simulated", "ensenso-n10"):
         assert name in page
     mitsim_here(
+        "map",
         "predict",
         "scenes/two_pillars/two_pillars.xml",
         "--map",

@@ -35,7 +35,7 @@ from mitsim.study import MINIMUM_POINTS
 from mitsim.study.virtual.rendered import displaced
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.study.virtual.trials import Outcome
-from mitsim.study.virtual.world import Trial, World
+from mitsim.study.virtual.world import DrawnValues, Trial
 from tests.proofs.laboratory.cases import Judged
 from tests.proofs.laboratory.decoders import decoded
 from tests.proofs.laboratory.finishes import Surface, surface_of
@@ -134,7 +134,7 @@ class Laboratory:
             out[decoder] = Outcome.of(measure(cloud, self.study.task, pose, MINIMUM_POINTS, False))
         return out
 
-    def light(self, number: int, world: World, true: Transform) -> Light:
+    def light(self, number: int, world: DrawnValues, true: Transform) -> Light:
         """Return the light of a world on the cameras, from the true pose of the sensor."""
         surfaces = self.surfaces(number)
         self.part.finish(surfaces)
@@ -170,7 +170,7 @@ class Laboratory:
         """Return the index of the shape (h, w) at the centre of each pixel, -1 for none."""
         return self.part.shapes_met(rays.origin, rays.middle).reshape(roi.height, roi.width)
 
-    def capture(self, number: int, world: World, true: Transform) -> Capture:
+    def capture(self, number: int, world: DrawnValues, true: Transform) -> Capture:
         """Return the images of a world, with the nominal calibration."""
         sensor, light = self.sensor, self.light(number, world, true)
         base = sensor.exposure.base_s
@@ -206,7 +206,7 @@ class Laboratory:
             world_from_sensor=self.view.world_from_sensor,
         )
 
-    def _patterns(self, world: World) -> NDArray[np.float32]:
+    def _patterns(self, world: DrawnValues) -> NDArray[np.float32]:
         pattern, optics = self.sensor.pattern, self.sensor.projector.optics
         if self.row.mask == "preset" or not isinstance(pattern, RandomDots):
             return self.patterns
