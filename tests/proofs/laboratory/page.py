@@ -13,11 +13,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from characterisation.statements.judgement import Share, within
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import norm
 
 from characterisation.files.atomic_io import atomic_write
+from characterisation.statements.coverage import Share
+from tests.proofs.judgement import within
 from tests.proofs.laboratory.run import Found
 from tests.proofs.tables import markdown, number, write_csv
 
