@@ -161,6 +161,19 @@ def test_the_page_says_which_measurement_is_impossible_and_why(candidates, tmp_p
     assert choice.sensors[1].words.startswith("by screening alone: ")
 
 
+def test_a_measurement_without_a_value_is_tried_from_its_own_best_view(candidates):
+    """Without a tolerance, too: it would count as impossible otherwise. The risk elsewhere is hardly lower."""
+    one = measured(candidates[0], (INF, 0.2, 0.3))
+    view = next(iter(one.stated))
+    leaders = dict(zip(MEASUREMENTS, (1, 1, 0), strict=True))
+    standings = {name: SimpleNamespace(leader=place, risk=np.array([1.0, 0.9])) for name, place in leaders.items()}
+    views = np.array([view, view + 1])
+    one.raced = SimpleNamespace(views=views, standings=standings, leader=lambda name: int(views[leaders[name]]))
+    assert selection._own_views(one, list(MEASUREMENTS), view) == [view + 1]
+    leaders[MEASUREMENTS[0]] = standings[MEASUREMENTS[0]].leader = 0
+    assert selection._own_views(one, list(MEASUREMENTS), view) == []
+
+
 def test_sensors_that_can_measure_nothing_are_last_and_none_is_named_best(candidates):
     one, other = candidates
     nothing = (INF,) * 3

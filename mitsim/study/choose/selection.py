@@ -41,7 +41,7 @@ from mitsim.running.executor import Executor
 from mitsim.running.progress import say
 from mitsim.study import StatementTable
 from mitsim.study.choose.candidates import CandidateSensor
-from mitsim.study.choose.ranking import RankKey, rank_keys, unpromising
+from mitsim.study.choose.ranking import rank_keys, unpromising
 from mitsim.study.session import Session
 from mitsim.study.virtual.plan import map_digest, trial_digest
 from mitsim.study.virtual.race import ALL, Raced, RaceRules
@@ -168,7 +168,7 @@ def choose_sensor(
 
 def _promising(found: list[SensorResult]) -> list[SensorResult]:
     """Return the sensors worth a virtual measurement, best first: at least one if any sensor can measure at all."""
-    keys = _keys(found, [one.screened.tolist() for one in found], [True] * len(found))
+    keys = rank_keys([one.screened for one in found], found[0].has_tolerance, [True] * len(found))
     for one, reason in zip(found, unpromising(keys, any(found[0].has_tolerance)), strict=True):
         one.unpromising = reason
     order = sorted(range(len(found)), key=keys.__getitem__)
@@ -178,13 +178,10 @@ def _promising(found: list[SensorResult]) -> list[SensorResult]:
 def _ordered(found: list[SensorResult]) -> list[SensorResult]:
     """Return measured sensors before screened ones, each by their impossible and then their worst measurements."""
     stated = [bool(one.stated) for one in found]
-    keys = _keys(found, [one.demands() for one in found], stated if any(stated) else [True] * len(found))
+    known = stated if any(stated) else [True] * len(found)
+    keys = rank_keys([one.demands() for one in found], found[0].has_tolerance, known)
     order = sorted(range(len(found)), key=lambda i: (not stated[i], keys[i]))
     return [found[i] for i in order]
-
-
-def _keys(found: list[SensorResult], demands: list[list[float]], known: list[bool]) -> list[RankKey]:
-    return rank_keys(demands, found[0].has_tolerance, known)
 
 
 def _screened(candidate: CandidateSensor, session: Session) -> SensorResult:
@@ -320,14 +317,18 @@ def _is_undecided(one: SensorResult) -> bool:
 
 
 def _own_views(one: SensorResult, names: list[str], view: int) -> list[int]:
-    """Return best views of measurements that do not fit from the common view and have a lower risk elsewhere."""
+    """Return best views of measurements that do not fit from the common view and have a lower risk elsewhere.
+
+    They include those of measurements without a value from the common view, which another view may give.
+    """
     assert one.raced is not None
     out = list[int]()
     place = int(np.flatnonzero(one.raced.views == view)[0])
     for name, known in zip(names, one.stated[view].statements, strict=True):
         standing = one.raced.standings[name]
         better = standing.risk[standing.leader] < _WORTH_STATING * standing.risk[place]
-        if known.verdict not in ("fits", "no tolerance") and better:
+        lost = not math.isfinite(_demand(known)) and standing.leader != place
+        if lost or (known.verdict not in ("fits", "no tolerance") and better):
             out.append(one.raced.leader(name))
     return list(dict.fromkeys(out))
 
