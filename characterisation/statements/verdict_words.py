@@ -18,6 +18,7 @@ class Judged:
     """A measurement and its verdict: standard ``uncertainty`` and ``needed`` one, in its unit; NaN if unknown.
 
     ``fits_corrected`` says whether it would fit with its bias subtracted; ``without_value`` is a share of the trials.
+    ``trials`` is the number of virtual measurements: 0 if the verdict is by screening alone, None if it is not known.
     """
 
     name: str
@@ -27,6 +28,7 @@ class Judged:
     needed: float
     fits_corrected: bool = False
     without_value: float = 0.0
+    trials: int | None = None
 
 
 def result_in_words(judged: Sequence[Judged]) -> str:
@@ -80,7 +82,8 @@ def _ratio(one: Judged) -> float:
 def _why(one: Judged) -> str:
     words = "is undecidable" if one.verdict == "undecidable" else "does not fit"
     if not math.isfinite(one.uncertainty):
-        return f"{one.name} {words}: no virtual measurement gave a value"
+        by = "by screening, no view can make it" if one.trials == 0 else "no virtual measurement gave a value"
+        return f"{one.name} {words}: {by}"
     if one.fits_corrected:
         return f"{one.name} {words} unless its bias is subtracted"
     needed = f", {_two(one.needed)} {one.unit} needed" if math.isfinite(one.needed) else ""

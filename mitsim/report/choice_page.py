@@ -51,6 +51,7 @@ def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
         ],
         "asked": [_asked(choice, name) for name in choice.measurements],
         "rows": [_row(choice, one) for one in taking_part],
+        "incomplete": any(one.impossible for one in taking_part),
         "screened": any(one.status == "screened" for one in taking_part),
         "sensors": [_details(choice, one, tolerances) for one in taking_part if one.status == "stated"],
         "excluded": [{"name": one.name, "why": one.why} for one in choice.sensors if one.status == "excluded"],
@@ -76,6 +77,7 @@ def _row(choice: ChoiceDocument, one: SensorEntry) -> dict[str, Any]:
         "stated": one.status == "stated",
         "why": one.why,
         "fits": f"{one.fits} of {toleranced}" if toleranced else "",
+        "possible": one.possible_in_words,
         "ratio": NONE if one.ratio is None else two_digits(one.ratio),
         "capture": NONE if one.capture is None else f"{rounded(1e3 * one.capture.seconds)}\N{NO-BREAK SPACE}ms",
         "exposures": "" if one.capture is None else _exposures(one),
@@ -91,7 +93,8 @@ def _exposures(one: SensorEntry) -> str:
 
 def _cell(cell: CellEntry, unit: str) -> dict[str, str]:
     if cell.uncertainty is None:
-        return {"u": "none", "view": "no view", "verdict": cell.verdict, "colour": VERDICTS[cell.verdict], "by": "none"}
+        why = f"no value in {cell.trials} trials" if cell.trials else "no view, by screening"
+        return {"u": "none", "view": why, "verdict": cell.verdict, "colour": VERDICTS[cell.verdict], "by": "none"}
     share = "" if cell.share_of_tolerance is None else f"{percent(cell.share_of_tolerance)}; "
     return {
         "u": quantity(cell.uncertainty, unit),

@@ -125,10 +125,13 @@ def of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None) -> FirstSc
     poses: list[tuple[str, ArrayLike]] = [(f"view {one.view}", one.world_from_sensor) for one in best.poses]
     of = sum(one.status != "excluded" for one in choice.sensors)
     caption = f"{best.name}, the best of {of} sensor{'s' if of > 1 else ''}"
+    if best.possible_in_words:
+        caption += f" ({best.possible_in_words})"
     if best.poses:
         caption += f", in view {best.poses[0].view}: {pose_words(best.poses[0])}"
     results = judged(best)
-    lost = "" if any(one.verdict != "no tolerance" for one in results) else losses_in_words(results)
+    made = [one for one in results if math.isfinite(one.uncertainty)]
+    lost = losses_in_words(made) if made and all(one.verdict == "no tolerance" for one in results) else ""
     return FirstScreen(
         with_degree_signs("; ".join(filter(None, [choice.words, lost]))),
         tone_of(results),
@@ -152,7 +155,8 @@ def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[ResultRow]:
             uncertainty=cell.uncertainty,
             share=cell.share_of_tolerance,
             rule=asked.rule,
-            **_same_names(cell, _MEASURED),
+            **_same_names(cell, _MEASURED)
+            | {"without_value": cell.without_value if cell.trials or cell.by != "none" else math.nan},
             **_same_names(cell, _DECIDED),
         ).texts()
         for name, cell in one.measurements.items()

@@ -203,7 +203,8 @@ def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: P
         statement = read_statement(folder / best.name / "statement.json")
         missing = [] if statement is None else [one.name for one in statement.influences if not one.included]
     others = [
-        f"{one.name} ({one.fits}, worst {'–' if one.ratio is None else two_digits(one.ratio)})"
+        f"{one.name} ({one.fits}, worst {'–' if one.ratio is None else two_digits(one.ratio)}"
+        + (f", {one.possible_in_words})" if one.impossible else ")")
         for one in choice.sensors
         if one is not best and one.status == "stated"
     ]

@@ -41,8 +41,9 @@ class ComparedMeasurement(PartialDocument):
 class CellEntry(PartialDocument):
     """One measurement by one sensor from ``view``, in the measurement's unit; null without a value.
 
-    ``by`` is ``statement`` or ``screening``, or ``none`` if no view can make the measurement. ``demand`` is the figure
-    that the decision rule limits to 1. Without a tolerance it is the uncertainty relative to that of the best sensor.
+    ``by`` is ``statement`` or ``screening``, or ``none`` for an impossible measurement: by virtual measurements if
+    ``trials`` is above 0, otherwise by screening. ``demand`` is the figure that the decision rule limits to 1. Without
+    a tolerance it is the uncertainty relative to that of the best sensor.
     """
 
     by: Literal["statement", "screening", "none"] = "none"
@@ -60,6 +61,16 @@ class CellEntry(PartialDocument):
     false_reject: float | None = None
     trials: int = 0
     without_value: float = 1.0
+
+    @property
+    def why_impossible(self) -> str:
+        """Return the reason why the measurement is impossible; empty if it is possible."""
+        if self.by != "none":
+            return ""
+        if not self.trials:
+            return "by screening, no view can make it"
+        some = "no virtual measurement" if self.without_value == 1 else "only one virtual measurement"
+        return f"{some} of {self.trials} gave a value"
 
 
 _Row = tuple[float, float, float, float]
@@ -85,9 +96,10 @@ class CaptureEntry(PartialDocument):
 
 
 class SensorEntry(PartialDocument):
-    """One sensor of the table; ``ratio`` is the largest demand of its measurements, null if one cannot be made.
+    """One sensor of the table; ``ratio`` is the largest demand of its possible measurements, null without any.
 
-    ``status`` is ``stated`` (virtual measurements), ``screened`` (screening only: far from fitting, or out of time) or
+    In a task with tolerances, only measurements with a tolerance count for ``ratio``. ``status`` is ``stated`` (virtual
+    measurements), ``screened`` (screening only: fewer measurements possible, far from fitting, or out of time) or
     ``excluded``; ``why`` gives the reason. ``poses`` starts with the view for all measurements.
     """
 
@@ -102,6 +114,22 @@ class SensorEntry(PartialDocument):
     capture: CaptureEntry | None = None
     measurements: dict[str, CellEntry] = Field(default_factory=dict)
     map_digest: str = ""
+
+    @property
+    def impossible(self) -> dict[str, str]:
+        """Return the reason of every impossible measurement, by name."""
+        return {name: cell.why_impossible for name, cell in self.measurements.items() if cell.why_impossible}
+
+    @property
+    def possible_in_words(self) -> str:
+        """Return how many of the measurements are possible; empty if all are."""
+        every = len(self.measurements)
+        return f"{every - len(self.impossible)} of {every} measurements possible" if self.impossible else ""
+
+    @property
+    def fits_all(self) -> bool:
+        """Return whether all measurements are possible, and no demand exceeds its limit."""
+        return not self.impossible and self.ratio is not None and self.ratio <= 1
 
 
 class ChoiceDocument(PartialDocument):
@@ -155,6 +183,7 @@ def judged(entry: SensorEntry) -> list[Judged]:
             number(cell.needed),
             cell.fits_corrected,
             cell.without_value,
+            cell.trials,
         )
         for name, cell in entry.measurements.items()
     ]

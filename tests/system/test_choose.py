@@ -63,7 +63,9 @@ def test_sensors_are_listed_best_first_with_what_they_fit(chosen):
     assert [line.split()[0] for line in done.stdout.splitlines()[1:3]] == names
     best, last = choice["sensors"][0], choice["sensors"][-1]
     assert best["status"] == "stated" and best["fits"] == len(MEASUREMENTS) and best["ratio"] <= 1
-    assert last["status"] == "screened" and last["why"] == "out by far" and last["ratio"] is None
+    assert last["status"] == "screened" and last["why"] == "fewer measurements possible"
+    assert last["ratio"] == max(cell["demand"] for cell in last["measurements"].values() if cell["by"] != "none")
+    assert "by screening, no view can make it" in last["words"]
     assert {cell["by"] for cell in last["measurements"].values()} == {"screening", "none"}
     for cell in best["measurements"].values():
         low, high = cell["accepted"]
@@ -97,7 +99,8 @@ def test_a_finished_comparison_is_kept_and_overwritten_on_request_from_its_own_t
 def test_page_and_sheet(chosen):
     folder, _, _ = chosen
     page = (folder / "out" / "choice.html").read_text()
-    assert page.count("<svg") == 1 and "fits 3 of 3 tolerances" in page and "screened only: out by far" in page
+    assert page.count("<svg") == 1 and "fits 3 of 3 tolerances" in page
+    assert "screened only: fewer measurements possible" in page and "2 of 3 measurements possible" in page
     done = mitsim_here("report", folder / "out", "--pdf")
     assert done.returncode == 0, done.stderr
     sheet = (folder / "out" / "sheet.pdf").read_bytes()

@@ -1,13 +1,15 @@
 """Compare sensors: screen all of them, and measure the promising ones until every verdict is clear or time is over.
 
-Signal chain: sensors -> scores of all views of each sensor (kept in its folder) -> order by the worst measurement ->
-exclusion of sensors whose demand is far too large -> for the others a short race -> a statement from the view that is
-best for all measurements, with as many trials as its verdicts need -> a statement from a measurement's own best view,
-where the common view does not suffice -> more trials for the leader -> ``choice.json``.
+Signal chain: sensors -> scores of all views of each sensor (kept in its folder) -> order by impossible measurements,
+then by the worst of the others (:mod:`mitsim.study.choose.ranking`) -> exclusion of sensors that can make fewer
+measurements, or whose demand is far too large -> for the others a short race -> a statement from the view that is best
+for all measurements, with as many trials as its verdicts need -> a statement from a measurement's own best view, where
+the common view does not suffice -> more trials for the leader -> ``choice.json``.
 
 Screening includes noise and calibration, but not finish, interreflections at edges and false points. It is therefore
 more often too small than too large, and a sensor is excluded if even the screened demand of its best view exceeds
-:data:`LARGEST_DEMAND`.
+:data:`mitsim.study.choose.ranking.LARGEST_DEMAND`. A measurement that screening excludes for every sensor excludes none
+of them.
 
 Finished work is on the disk, so an interrupted command continues. The sensors are measured one after the other, and the
 memory of each is released before the next.
@@ -39,6 +41,7 @@ from mitsim.running.executor import Executor
 from mitsim.running.progress import say
 from mitsim.study import StatementTable
 from mitsim.study.choose.candidates import CandidateSensor
+from mitsim.study.choose.ranking import rank_keys, unpromising
 from mitsim.study.session import Session
 from mitsim.study.virtual.plan import map_digest, trial_digest
 from mitsim.study.virtual.race import ALL, Raced, RaceRules
@@ -46,9 +49,6 @@ from mitsim.study.virtual.stated import StatedView, statement_document
 from mitsim.views.view_scores import screening_risk
 
 Floats = NDArray[np.float64]
-
-#: demand by screening, relative to the limit of the decision rule, above which a sensor is not measured
-LARGEST_DEMAND = 3.0
 
 #: number of views raced for each measurement, and of trials of each of them
 SHORTLIST, RACE_TRIALS = 3, 8
@@ -71,8 +71,9 @@ class SensorResult:
     """Results of a sensor so far.
 
     ``screened`` (measurement,) is the demand of the best view by screening, ``screened_u`` its uncertainty,
-    ``screened_view`` its number. ``unpromising`` excludes the sensor from measurement. ``stated`` holds statements
-    by view number; the view that is best for all measurements comes first.
+    ``screened_view`` its number. ``unpromising`` is the reason why the sensor is not measured. ``stated`` holds
+    statements by view number; the view that is best for all measurements comes first. A demand is infinite if no view
+    can make the measurement.
     """
 
     candidate: CandidateSensor
@@ -81,26 +82,22 @@ class SensorResult:
     screened: Floats
     screened_u: Floats
     screened_view: NDArray[np.int64]
-    unpromising: bool = False
+    unpromising: str = ""
     stated: dict[int, StatedView] = field(default_factory=dict)
     raced: Raced | None = None
 
     @property
     def ratio(self) -> float:
-        """Return the largest demand of the measurements, each from its best view; infinite if one is impossible."""
-        return max(self.demands(), default=math.inf)
+        """Return the largest demand of the possible measurements that have a limit; NaN if there is none."""
+        limited = self.has_tolerance
+        compared = limited if any(limited) else [True] * len(limited)
+        demands = [one for one, kept in zip(self.demands(), compared, strict=True) if kept and math.isfinite(one)]
+        return max(demands, default=math.nan)
 
     @property
-    def has_tolerances(self) -> bool:
-        """Return whether a measurement of the task has a tolerance."""
-        return any(one.tolerance is not None for one in self.session.study.task.measurements.values())
-
-    @property
-    def screened_demand(self) -> float:
-        """Return the largest screened demand; without tolerances the geometric mean, as no other scale is common."""
-        if self.has_tolerances:
-            return max(self.screened.tolist(), default=math.inf)
-        return float(np.exp(np.mean(np.log(self.screened)))) if np.isfinite(self.screened).all() else math.inf
+    def has_tolerance(self) -> list[bool]:
+        """Return whether each measurement of the task has a tolerance."""
+        return [one.tolerance is not None for one in self.session.study.task.measurements.values()]
 
     def demands(self) -> list[float]:
         """Return the demand of every measurement, each from its best view; infinite for an impossible one."""
@@ -171,24 +168,20 @@ def choose_sensor(
 
 def _promising(found: list[SensorResult]) -> list[SensorResult]:
     """Return the sensors worth a virtual measurement, best first: at least one if any sensor can measure at all."""
-    order = sorted(found, key=lambda one: one.screened_demand)
-    least = 1.0 if order[0].has_tolerances else order[0].screened_demand
-    for place, one in enumerate(order):
-        worst = one.screened_demand
-        one.unpromising = not math.isfinite(worst) or (place > 0 and worst > LARGEST_DEMAND * least)
-    return [one for one in order if not one.unpromising]
+    keys = rank_keys([one.screened for one in found], found[0].has_tolerance, [True] * len(found))
+    for one, reason in zip(found, unpromising(keys, any(found[0].has_tolerance)), strict=True):
+        one.unpromising = reason
+    order = sorted(range(len(found)), key=keys.__getitem__)
+    return [found[i] for i in order if not found[i].unpromising]
 
 
 def _ordered(found: list[SensorResult]) -> list[SensorResult]:
-    """Return measured sensors before screened ones, each by their worst measurement.
-
-    Without tolerances the order is by the mean logarithm of the demands.
-    """
-
-    def demand_of(one: SensorResult) -> float:
-        return one.ratio if one.has_tolerances else float(np.mean(np.log(one.demands())))
-
-    return sorted(found, key=lambda one: (not one.stated, demand_of(one)))
+    """Return measured sensors before screened ones, each by their impossible and then their worst measurements."""
+    stated = [bool(one.stated) for one in found]
+    known = stated if any(stated) else [True] * len(found)
+    keys = rank_keys([one.demands() for one in found], found[0].has_tolerance, known)
+    order = sorted(range(len(found)), key=lambda i: (not stated[i], keys[i]))
+    return [found[i] for i in order]
 
 
 def _screened(candidate: CandidateSensor, session: Session) -> SensorResult:
@@ -302,12 +295,19 @@ def _say(found: list[SensorResult], done: str, end: float) -> None:
     first = _ordered(found)[0]
     names = list(first.candidate.study.task.measurements)
     rows = first.demands()
-    worst = int(np.argmax(rows))
     by = "measured" if first.stated else "by the screening"
-    measurement = first.candidate.study.task.measurements[names[worst]]
-    unit = "times the limit" if measurement.tolerance else measurement.unit
-    demand_in_words = f"{rows[worst]:.2g} {unit} ({names[worst]})"
     left = max(0.0, end - time.monotonic())
+    possible = [m for m, value in enumerate(rows) if math.isfinite(value)]
+    if not possible:
+        say(f"choose: {done}; no sensor can make a measurement {by}; {left:.0f} s left")
+        return
+    limited = [m for m in possible if first.has_tolerance[m]]
+    worst = max(limited or possible, key=rows.__getitem__)
+    measurement = first.candidate.study.task.measurements[names[worst]]
+    unit = "times the limit" if first.has_tolerance[worst] else measurement.unit
+    demand_in_words = f"{rows[worst]:.2g} {unit} ({names[worst]})"
+    if len(possible) < len(rows):
+        demand_in_words += f", {len(possible)} of {len(rows)} measurements possible"
     say(f"choose: {done}; {first.candidate.name} leads {by}, at worst {demand_in_words}; {left:.0f} s left")
 
 
@@ -317,14 +317,18 @@ def _is_undecided(one: SensorResult) -> bool:
 
 
 def _own_views(one: SensorResult, names: list[str], view: int) -> list[int]:
-    """Return best views of measurements that do not fit from the common view and have a lower risk elsewhere."""
+    """Return best views of measurements that do not fit from the common view and have a lower risk elsewhere.
+
+    They include those of measurements without a value from the common view, which another view may give.
+    """
     assert one.raced is not None
     out = list[int]()
     place = int(np.flatnonzero(one.raced.views == view)[0])
     for name, known in zip(names, one.stated[view].statements, strict=True):
         standing = one.raced.standings[name]
         better = standing.risk[standing.leader] < _WORTH_STATING * standing.risk[place]
-        if known.verdict not in ("fits", "no tolerance") and better:
+        lost = not math.isfinite(_demand(known)) and standing.leader != place
+        if lost or (known.verdict not in ("fits", "no tolerance") and better):
             out.append(one.raced.leader(name))
     return list(dict.fromkeys(out))
 

@@ -7,7 +7,7 @@ sensor -> ``choice.json`` and lines of text, best sensor first.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,7 +32,8 @@ from mitsim.study.choice_document import (
     judged,
 )
 from mitsim.study.choose.candidates import Excluded
-from mitsim.study.choose.selection import LARGEST_DEMAND, SensorResult, screened_errors
+from mitsim.study.choose.ranking import LARGEST_DEMAND, relative_to_least
+from mitsim.study.choose.selection import SensorResult, screened_errors
 from mitsim.study.virtual.plan import map_digest
 
 
@@ -95,22 +96,37 @@ def sentence(sensors: Sequence[SensorEntry]) -> str:
     if not able or not able[0].measurements:
         return "no sensor can measure this"
     best = able[0]
-    others = sum(one.ratio is not None and one.ratio <= 1 and one.status == "stated" for one in able[1:])
+    if len(best.impossible) == len(best.measurements):
+        return f"no sensor can measure this: {_reasons(best)}"
+    others = sum(one.fits_all and one.status == "stated" for one in able[1:])
     more = f"; so do{'es' if others == 1 else ''} {others} other{'' if others == 1 else 's'}" if others else ""
     toleranced = any(cell.verdict != "no tolerance" for cell in best.measurements.values())
-    all_fit = best.ratio is not None and best.ratio <= 1
-    return f"{best.name}: {best.words}" + (more if toleranced and all_fit else "")
+    return f"{best.name}: {best.words}" + (more if toleranced and best.fits_all else "")
 
 
 def words(one: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) -> str:
     """Return the result of a sensor in one line."""
+    if len(one.impossible) == len(one.measurements):
+        return f"no measurement is possible: {_reasons(one)}"
     verdicts = [replace(each, unit=named_measurements[each.name].unit) for each in judged(one)]
-    if all(each.verdict == "no tolerance" for each in verdicts):
-        if one.ratio is None:
-            return "not every measurement can be made"
-        least = f"{one.ratio:.2g} times the least uncertainty of all sensors at worst"
-        return least if one.ratio > 1 else "the least uncertainty of all sensors in every measurement"
-    return "by screening alone: " * (one.status == "screened") + result_in_words(verdicts)
+    toleranced = {each.name for each in verdicts if each.verdict != "no tolerance"}
+    if toleranced:
+        result = result_in_words(verdicts)
+    elif one.ratio is not None and one.ratio > 1:
+        result = f"{one.ratio:.2g} times the least uncertainty of all sensors at worst"
+    else:
+        result = "the least uncertainty of all sensors in every " + "possible " * bool(one.impossible) + "measurement"
+    result = "by screening alone: " * (one.status == "screened") + result
+    return "; ".join(filter(None, [result, one.possible_in_words, _reasons(one, toleranced)]))
+
+
+def _reasons(one: SensorEntry, but: Collection[str] = ()) -> str:
+    """Return the reasons of impossible measurements, measurements of one reason together, ``but`` some."""
+    by_reason = dict[str, list[str]]()
+    for name, why in one.impossible.items():
+        if name not in but:
+            by_reason.setdefault(why, []).append(name)
+    return "; ".join(f"{', '.join(names)} impossible ({why})" for why, names in by_reason.items())
 
 
 def as_text(choice: ChoiceDocument) -> str:
@@ -135,7 +151,14 @@ def as_text(choice: ChoiceDocument) -> str:
     )
     lines = [*aligned(rows), "", legend]
     if any(one.status == "screened" for one in choice.sensors):
-        lines.append(f"* by screening alone: its demand there is above {LARGEST_DEMAND:g}, or time was over")
+        least = "" if any(one.tolerance is not None for one in choice.measurements.values()) else " times the best"
+        reasons = f"fewer measurements are possible there, its demand there is above {LARGEST_DEMAND:g}{least}"
+        lines.append(f"* by screening alone: {reasons}, or time was over")
+    lines += [
+        f"{one.name}: {one.possible_in_words}; {_reasons(one)}"
+        for one in choice.sensors
+        if one.status != "excluded" and one.impossible
+    ]
     lines += [f"{one.name} is excluded: {one.why}" for one in choice.sensors if one.status == "excluded"]
     return "\n".join(lines)
 
@@ -145,7 +168,7 @@ _SIGNS = {"fits": "fits", "does not fit": "no", "undecidable": "undecidable", "n
 
 def _cell(cell: CellEntry, measurement: ComparedMeasurement) -> str:
     if cell.uncertainty is None:
-        return "none"
+        return f"no value in {cell.trials}" if cell.trials else "none by screening"
     return f"{cell.uncertainty:.2g} {measurement.unit} ({cell.view}) {_SIGNS[cell.verdict]}".rstrip()
 
 
@@ -153,14 +176,14 @@ def _sensor(one: SensorResult) -> SensorEntry:
     study = one.candidate.study
     names = list(study.task.measurements)
     rows = one.best() if one.stated else [None] * len(names)
-    cells = {name: _stated(rows[m]) if one.stated else _screened(one, m, name) for m, name in enumerate(names)}
+    cells = {name: _cell_of(one, m, name, rows[m]) for m, name in enumerate(names)}
     views = list(dict.fromkeys([*one.stated, *(cell.view for cell in cells.values() if cell.view is not None)]))
     used = {cell.view for cell in cells.values()}
     return SensorEntry(
         name=one.candidate.name,
         given=one.candidate.given,
         status="stated" if one.stated else "screened",
-        why="" if one.stated else "out by far" if one.unpromising else "time was over",
+        why="" if one.stated else one.unpromising or "time was over",
         ratio=json_values(one.ratio),
         words="",
         fits=sum(cell.verdict == "fits" and cell.by == "statement" for cell in cells.values()),
@@ -171,9 +194,24 @@ def _sensor(one: SensorResult) -> SensorEntry:
     )
 
 
-def _stated(row: tuple[int, float, Statement] | None) -> CellEntry:
-    if row is None:
-        return CellEntry()
+def _cell_of(one: SensorResult, m: int, name: str, row: tuple[int, float, Statement] | None) -> CellEntry:
+    if not one.stated:
+        return _screened(one, m, name)
+    return _impossible(one, m, name) if row is None else _stated(row)
+
+
+def _impossible(one: SensorResult, m: int, name: str) -> CellEntry:
+    """Return a cell of virtual measurements that gave too few values, of all stated views together."""
+    statements = [stated.statements[m] for stated in one.stated.values()]
+    trials = sum(each.trials for each in statements)
+    lost = sum(each.trials * each.without_value for each in statements) / trials
+    toleranced = tolerance_of(one.candidate.study.task, name) is not None
+    return CellEntry(
+        verdict="undecidable" if toleranced else "no tolerance", trials=trials, without_value=min(lost, 1.0)
+    )
+
+
+def _stated(row: tuple[int, float, Statement]) -> CellEntry:
     view, demand, one = row
     cell = CellEntry(
         by="statement",
@@ -223,18 +261,16 @@ def _screened(found: SensorResult, m: int, name: str) -> CellEntry:
 
 def _relative(sensors: Sequence[SensorEntry]) -> list[SensorEntry]:
     """Express demands as multiples of the least demand of all measured sensors, for tasks without tolerances."""
-    known = [one for one in sensors if one.status == "stated"] or list(sensors)
-    least = {
-        name: min((one.measurements[name].demand or math.inf for one in known), default=math.inf)
-        for name in (sensors[0].measurements if sensors else ())
-    }
+    known = [one.status == "stated" for one in sensors]
+    rows = [[math.inf if cell.demand is None else cell.demand for cell in one.measurements.values()] for one in sensors]
+    relative = relative_to_least(rows, known if any(known) else [True] * len(known))
     out = list[SensorEntry]()
-    for one in sensors:
+    for one, demands in zip(sensors, relative.tolist(), strict=True):
         cells = {
-            name: cell if cell.demand is None else cell.model_copy(update={"demand": cell.demand / least[name]})
-            for name, cell in one.measurements.items()
+            name: cell.model_copy(update={"demand": json_values(demand)})
+            for (name, cell), demand in zip(one.measurements.items(), demands, strict=True)
         }
-        worst = max(math.inf if cell.demand is None else cell.demand for cell in cells.values())
+        worst = max((demand for demand in demands if math.isfinite(demand)), default=math.nan)
         out.append(one.model_copy(update={"measurements": cells, "ratio": json_values(worst)}))
     return out
 

@@ -142,11 +142,13 @@ def shortlist(scores: xr.Dataset, count: int) -> list[int]:
 def first_of_each(cost: Floats, count: int) -> set[int]:
     """Return the indices of the ``count`` views of least cost, for each measurement and for the mean cost.
 
-    ``cost`` has the shape (measurement, view). Views of infinite cost are excluded.
+    ``cost`` has the shape (measurement, view). Views of infinite cost are excluded. A measurement of infinite cost in
+    all views does not count for the mean.
     """
+    possible = cost[np.isfinite(cost).any(axis=1)]
     return {
         int(i)
-        for row in [*cost, cost.mean(axis=0)]
+        for row in [*possible, *([possible.mean(axis=0)] if len(possible) else [])]
         for i in np.argsort(row, kind="stable")[:count]
         if np.isfinite(row[i])
     }
@@ -260,9 +262,21 @@ def standings(
         mean, covariance = posterior(errors[m], prior_risk(u[m]), chance[m])
         samples.append(sampled(mean, covariance, seed=m))
         found[name] = judge(samples[-1], rules.margin)
-    found[ALL] = judge(combined_risk(np.array(samples), tolerances), rules.margin)
+    possible = possible_measurements(u, errors)
+    found[ALL] = judge(combined_risk(np.array(samples)[possible], tolerances[possible]), rules.margin)
     decided = all(one.confidence >= rules.confidence for one in found.values())
     return Raced(np.array(numbers), found, errors, decided)
+
+
+def possible_measurements(u: Floats, errors: Floats) -> NDArray[np.bool_]:
+    """Return whether each measurement (m,) is possible in a view, by the map or by a trial; all if none is.
+
+    ``u`` (m, v) is the map's, ``errors`` (m, v, trial) are those of the race. An impossible measurement cannot
+    distinguish views, so it does not count for all measurements together.
+    """
+    predicted = (np.isfinite(u) & (u > 0)).any(axis=1)
+    possible = predicted | np.isfinite(errors).any(axis=(1, 2))
+    return np.asarray(possible if possible.any() else np.ones_like(possible))
 
 
 def combined_risk(samples: Floats, tolerances: Floats) -> Floats:

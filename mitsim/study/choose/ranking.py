@@ -1,0 +1,97 @@
+"""Rank sensors by the demands of their measurements: fewest impossible measurements first, then the least worst demand.
+
+Signal chain: demands of every sensor and measurement, infinite where impossible -> without tolerances, multiples of the
+least of all sensors -> number of impossible measurements, then the other demands, largest first -> order.
+
+A measurement that one sensor cannot make counts against this sensor. A measurement that no sensor can make counts
+equally against all of them, and does not hide the others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+#: demand by screening, relative to the limit of the decision rule, above which a sensor is not measured
+LARGEST_DEMAND = 3.0
+
+#: reasons why a sensor is not measured
+NONE_POSSIBLE, FEWER_POSSIBLE, OUT_BY_FAR = "no measurement possible", "fewer measurements possible", "out by far"
+
+#: number of impossible measurements, and the demands of the others, largest first
+RankKey = tuple[int, tuple[float, ...]]
+
+
+def rank_key(demands: Iterable[float], impossible: int | None = None) -> RankKey:
+    """Return the key that sorts sensors, best first, from the demands of one of them.
+
+    Parameters
+    ----------
+    demands
+        Demand of each measurement that is compared; infinite or NaN for an impossible one.
+    impossible
+        Number of impossible measurements, if others than those compared count too; by default that of ``demands``.
+    """
+    every = list(demands)
+    possible = sorted((one for one in every if math.isfinite(one)), reverse=True)
+    return len(every) - len(possible) if impossible is None else impossible, tuple(possible)
+
+
+def rank_keys(demands: ArrayLike, has_tolerance: ArrayLike, known: ArrayLike) -> list[RankKey]:
+    """Return the key of every sensor.
+
+    Parameters
+    ----------
+    demands
+        Demands (sensor, measurement), infinite for an impossible measurement. Without a tolerance, they are in the unit
+        of the measurement.
+    has_tolerance
+        Whether a measurement (measurement,) has a tolerance. If one has, only those with a tolerance are compared: the
+        others have no limit. Impossible ones count with and without tolerance.
+    known
+        Sensors (sensor,) whose least demand is 1 if there are no tolerances.
+    """
+    table, compared = np.asarray(demands, float), np.asarray(has_tolerance, bool)
+    impossible = (~np.isfinite(table)).sum(axis=1)
+    table = table[:, compared] if compared.any() else relative_to_least(table, known)
+    return [rank_key(row, int(count)) for row, count in zip(table.tolist(), impossible, strict=True)]
+
+
+def relative_to_least(demands: ArrayLike, known: ArrayLike) -> Floats:
+    """Return demands (sensor, measurement) as multiples of the least of the ``known`` sensors (sensor,).
+
+    If no known sensor can make a measurement, the least of all sensors counts. Impossible ones stay infinite.
+    """
+    table = np.where(np.isfinite(np.asarray(demands, float)), demands, np.inf)
+    chosen = np.asarray(known, bool)
+    least = np.min(table, axis=0, initial=np.inf, where=chosen[:, None])
+    least = np.where(np.isfinite(least), least, np.min(table, axis=0, initial=np.inf))
+    return np.where(np.isfinite(table), table / np.where(np.isfinite(least), least, 1.0), np.inf)
+
+
+def unpromising(keys: Sequence[RankKey], tolerances: bool) -> list[str]:
+    """Return for each screened sensor the reason against measuring it, empty if it is promising.
+
+    Parameters
+    ----------
+    keys
+        Keys of the sensors by screening.
+    tolerances
+        Whether the demands are relative to a limit; otherwise they are relative to those of the best sensor.
+    """
+    first = min(keys)
+    least = 1.0 if tolerances else max(first[1], default=math.inf)
+
+    def reason(key: RankKey) -> str:
+        if not key[1]:
+            return NONE_POSSIBLE
+        if key[0] > first[0]:
+            return FEWER_POSSIBLE
+        return OUT_BY_FAR if key != first and key[1][0] > LARGEST_DEMAND * least else ""
+
+    return [reason(key) for key in keys]
