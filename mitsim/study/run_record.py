@@ -42,6 +42,17 @@ def own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) ->
     """Return the paths of the files that a report or an export of the run reads.
 
     The index of a capture has the digests of its other files.
+
+    Parameters
+    ----------
+    study
+        Study of the run.
+    drawn
+        Numbers of the views with a predicted cloud.
+    shown
+        Numbers of the views with images and a decoded cloud.
+    stated
+        Whether the run has a statement.
     """
     names = ["map.nc", "scores.csv", "scores.nc", "checks.nc", "part.ply", "stand.npz", TASK]
     names += ["samples.nc"] if study.campaign is not None else []
@@ -54,7 +65,21 @@ def own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) ->
 def run_record(
     study: Study, performance_map: PerformanceMap, raced: Raced, shown: list[int], residual: RenderResidual | None
 ) -> dict[str, Any]:
-    """Return the record of a run, ``run.json``, without its sets of views, its times and the digests of its files."""
+    """Return the record of a run, ``run.json``, without its sets of views, its times and the digests of its files.
+
+    Parameters
+    ----------
+    study
+        Study of the run.
+    performance_map
+        Map that screened the views.
+    raced
+        Race of the promising views.
+    shown
+        Numbers of the views with images and a decoded cloud.
+    residual
+        Largest render noise; None if nothing was rendered for it.
+    """
     finishes = finishes_of_features(study)
     lays = {name: lay_left_out(one.name, one.scatter) for name, one in finishes.items() if one is not None}
     return {
