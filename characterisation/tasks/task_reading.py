@@ -64,11 +64,22 @@ def read_task(path: str | Path) -> Task:
     20.0
     """
     task = read_toml(path, Task)
+    check_task(path, task)
+    return task
+
+
+def check_task(path: str | Path, task: Task) -> None:
+    """Check features and measurements of a task against one another.
+
+    Raises
+    ------
+    InputError
+        For the first that does not match; the error names the key.
+    """
     for name in task.features:
         _check_feature(path, task, name)
     for name in task.measurements:
         _check_measurement(path, task, name)
-    return task
 
 
 def check_features(task: Task, task_path: str | Path, shape_ids: Iterable[str]) -> None:

@@ -80,7 +80,7 @@ def cloud(
 
 @app.command()
 def run(
-    folder: Annotated[Path, typer.Argument(help="Folder of a mitsim run.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run, or of mitsim study choose (best sensor).")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RUN_SUFFIXES)}.")],
     views: Views = "best",
 ) -> None:
@@ -101,6 +101,7 @@ def run(
     from mitsim.running.progress import say
 
     suffix = _suffix(output, RUN_SUFFIXES)
+    folder = _run_in(folder)
     scene = read_run_scene(folder, views)
     scans = [(view, kind, cloud_points(one)) for view in scene.views for kind, one in view.clouds.items()]
     if suffix in (".mcap", ".e57") and not scans:
@@ -125,9 +126,11 @@ def run(
 
 @app.command()
 def results(
-    folder: Annotated[Path, typer.Argument(help="Folder of a mitsim run.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run, or of mitsim study choose (best sensor).")],
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write: {', '.join(RESULT_SUFFIXES)}.")],
-    task: Annotated[Path | None, typer.Option(help="Task TOML file of the run; default: that of its study.")] = None,
+    task: Annotated[
+        Path | None, typer.Option(help="Task TOML file of the run; default: the copy in the folder.")
+    ] = None,
 ) -> None:
     """Write the expected uncertainty of every measurement, and the plan of views, as QIF 3.0, CSV or JSON.
 
@@ -139,7 +142,7 @@ def results(
 
     write = {".qif": write_qif, ".csv": write_results_csv, ".json": write_results_json}
     suffix = _suffix(output, RESULT_SUFFIXES)
-    found = read_results(folder, task)
+    found = read_results(_run_in(folder), task)
     check_file(output)
     write[suffix](found, output)
     views = ", ".join(str(number) for number, *_ in found.plan)
@@ -148,12 +151,15 @@ def results(
 
 @app.command()
 def targets(
-    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim study score.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of mitsim run, study score or study choose (best sensor).")],
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
     robot: Annotated[str, typer.Option(help="Make of the robot: abb, kuka, ur or moveit.")],
     views: Annotated[
         str,
-        typer.Option(help="best (the set of the run, or the best view of each measurement), all, or numbers: 3,12."),
+        typer.Option(
+            help="best (the set of the run, or the best view of each measurement; the stated view first), all, or "
+            "numbers: 3,12."
+        ),
     ] = "best",
 ) -> None:
     """Write views as targets of a robot, in the part frame, in the order and units of its maker.
@@ -170,7 +176,7 @@ def targets(
     if output.suffix.lower() != target_format.suffix:
         allowed = f"a name that ends in {target_format.suffix}: {target_format.what}"
         raise InputError("--output", "", output.name, allowed)
-    found, tool = read_targets(folder, views)
+    found, tool = read_targets(_run_in(folder), views)
     check_file(output)
     with atomic_write(output) as file:
         file.write_text(target_format.write(found, tool), encoding="utf-8")
@@ -239,6 +245,17 @@ def bop(
 
     count = write_bop(find_sources(folder), output, split, objects or ())
     say(f"data set: {output}: {count} images")
+
+
+def _run_in(folder: Path) -> Path:
+    """Return the folder to read: of a comparison of sensors, that of the best one."""
+    from mitsim.running.progress import say
+    from mitsim.study.choice_document import winner_folder
+
+    found = winner_folder(folder)
+    if found != folder:
+        say(f"{folder} compares sensors: the export is of the best, {found.name}")
+    return found
 
 
 def _suffix(output: Path, allowed: tuple[str, ...]) -> str:

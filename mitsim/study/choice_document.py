@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import validate
+from characterisation.files.errors import InputError
 from characterisation.statements.verdict_words import Judged
 from mitsim.study.statement_file import PartialDocument
 
@@ -166,6 +167,26 @@ def read_choice(folder: Path) -> ChoiceDocument | None:
     if not path.exists():
         return None
     return validate(path, read_json_object(path), ChoiceDocument)
+
+
+def winner_folder(folder: Path) -> Path:
+    """Return the folder of the best sensor of a finished comparison; any other folder is returned as it is.
+
+    Raises
+    ------
+    InputError
+        If the comparison is not finished, or no sensor was measured virtually.
+    """
+    choice = None if (folder / "run.json").exists() else read_choice(folder)
+    if choice is None:
+        return folder
+    if not choice.finished:
+        hint = "run the same mitsim study choose again: it continues"
+        raise InputError(folder / CHOICE, "finished", "false", "a finished comparison", hint)
+    if not choice.sensors or choice.sensors[0].status != "stated":
+        found, allowed = "no sensor with a statement", "a best sensor that was measured virtually"
+        raise InputError(folder / CHOICE, "sensors", found, allowed, "give mitsim study choose more --minutes")
+    return folder / choice.sensors[0].name
 
 
 def judged(entry: SensorEntry) -> list[Judged]:

@@ -8,10 +8,7 @@ best view (:mod:`mitsim.study.virtual.stated`) -> predicted clouds, and images, 
 
 from __future__ import annotations
 
-import os
-import platform
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -34,14 +31,12 @@ from mitsim.capture.simulated.render_residual import (
 )
 from mitsim.maps.campaign.acquire import coupon_residuals, in_turn, simulated_source
 from mitsim.maps.campaign.run import run_campaign, write_netcdf
-from mitsim.maps.prediction import performance
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say, track
-from mitsim.running.version import __version__
-from mitsim.scene.surface.lay import lay_left_out
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.study import Study, finishes_of_features
+from mitsim.study import Study
 from mitsim.study.run_files import digests_of
+from mitsim.study.run_record import draw_clouds, own_files, run_record
 from mitsim.study.scoring import pose_columns, score_study
 from mitsim.study.session import Session
 from mitsim.study.view_sets.confirmed_set import (
@@ -55,7 +50,7 @@ from mitsim.study.view_sets.confirmed_set import (
     write_set_csv,
 )
 from mitsim.study.virtual.plan import race_rules
-from mitsim.study.virtual.race import Raced, raced_errors, with_race
+from mitsim.study.virtual.race import raced_errors, with_race
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import statement_document
 
@@ -129,16 +124,16 @@ def run_study(
     chosen = tried[-1].chosen if tried else chosen
     clock.lap("confirm")
     drawn = sorted({*leaders, *_best(scores), *(chosen.views if chosen else ())})
-    _draw(session, performance_map, drawn)
+    draw_clouds(session, performance_map, drawn)
     shown = leaders[: study.file.check.views] if twin is not None else []
     if twin is not None:
         _show(twin, shown, folder, {} if stated is None else {leaders[0]: stated.planned})
         residuals += [_residual(twin, number) for number in shown[:1]]
     clock.lap("pictures")
-    about = _record(study, performance_map, raced, shown, largest_residual(residuals))
+    about = run_record(study, performance_map, raced, shown, largest_residual(residuals))
     about["view_sets"] = [] if chosen is None else [_set_record(study, chosen, tried)]
     about["seconds"] = clock.steps
-    about["files"] = digests_of(folder, _own_files(study, drawn, shown, stated is not None))
+    about["files"] = digests_of(folder, own_files(study, drawn, shown, stated is not None))
     write_json(folder / "run.json", about)
     return [] if stated is None else stated.statements
 
@@ -174,19 +169,6 @@ def _best(scores: xr.Dataset) -> list[int]:
     return sorted({int(view) for view in np.flatnonzero(((ranks <= SHOWN) & able).any(axis=0))})
 
 
-def _draw(session: Session, performance_map: PerformanceMap, numbers: list[int]) -> None:
-    """Write a predicted cloud of each of some views."""
-    study, predictor = session.study, session.predictor
-    for number in track(numbers, "predict clouds"):
-        pose = study.view(number).world_from_sensor
-        surfaces = predictor.surfaces(study.scene, pose)
-        labels, ideal = predictor.labels(study.scene, pose, surfaces), predictor.ideal(surfaces)
-        fraction, sigma = performance(ideal, study.scene, performance_map)
-        rng = np.random.default_rng([study.file.seed, number])
-        cloud = predictor.draw(study.scene, ideal, labels, fraction, sigma, rng)
-        write_cloud(cloud, session.folder / "clouds" / f"predicted_{number:04d}.ply")
-
-
 def _map(study: Study, twin: RenderedMeasurements | None, folder: Path) -> PerformanceMap:
     if study.performance_map is not None:
         study.performance_map.save(folder / "map.nc")
@@ -214,59 +196,6 @@ def _show(
         capture, cloud = renderer.exposed_as(planned.get(number)).at_best_estimates(renderer.study.view(number))
         write_capture(capture, folder / "captures" / f"view_{number:04d}", overwrite=True)
         write_cloud(cloud, folder / "clouds" / f"rendered_{number:04d}.ply")
-
-
-def _own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) -> list[str]:
-    """Return the paths of the files that a report of the run reads.
-
-    The index of a capture has the digests of its other files.
-    """
-    names = ["map.nc", "scores.csv", "scores.nc", "checks.nc", "part.ply", "stand.npz"]
-    names += ["samples.nc"] if study.campaign is not None else []
-    names += ["statement.json"] if stated else []
-    names += [f"clouds/predicted_{view:04d}.ply" for view in drawn]
-    names += [f"clouds/rendered_{view:04d}.ply" for view in shown]
-    return names + [f"captures/view_{view:04d}/capture.json" for view in shown]
-
-
-def _record(
-    study: Study, performance_map: PerformanceMap, raced: Raced, shown: list[int], residual: RenderResidual | None
-) -> dict[str, Any]:
-    """Return the record of a run, ``run.json``, without its sets of views, its times and the digests of its files."""
-    finishes = finishes_of_features(study)
-    lays = {name: lay_left_out(one.name, one.scatter) for name, one in finishes.items() if one is not None}
-    return {
-        "schema_version": 1,
-        "mitsim": __version__,
-        "study": str(study.path),
-        "scene": study.scene.where,
-        "sensor": study.sensor.name,
-        "source": "simulated",
-        "map_source": performance_map.data.attrs.get("source", ""),
-        "exposure_rule": study.sensor.exposure.rule,
-        "seed": study.file.seed,
-        "views": len(study.views),
-        "view_sets": [],
-        "checked_views": shown,
-        "raced_views": len(raced.views),
-        "race_trials": raced.trials,
-        "race_decided": raced.decided,
-        "leaders": raced.leaders(),
-        "confidence": {name: one.confidence for name, one in raced.standings.items()},
-        "light_path_depth": study.file.measure.light_path_depth,
-        "score_light_path_depth": study.file.score.light_path_depth,
-        "render_residual": None if residual is None else asdict(residual),
-        "features": {name: str(one) for name, one in finishes.items()},
-        "lay": {name: left_out for name, left_out in lays.items() if left_out is not None},
-        "measurements": {
-            name: {key: getattr(one, key) for key in ("kind", "nominal", "unit", "features", "tolerance")}
-            for name, one in study.task.measurements.items()
-        },
-        "seconds": {},
-        "python": platform.python_version(),
-        "machine": platform.machine(),
-        "cores": os.cpu_count(),
-    }
 
 
 def _set_record(study: Study, chosen: ViewSet, tried: list[TriedSet]) -> dict[str, Any]:

@@ -22,13 +22,16 @@ from mitsim.running.version import __version__
 #: name of the file that records the owner of a folder's results
 OWNER = "run_of.json"
 
+#: name of the task of a run, a copy: an export needs no file beyond the folder
+TASK = "task.json"
+
 #: folder for results of another study
 EARLIER = "earlier"
 
 #: files that show that a folder holds results, and all files that belong to them; ``run.json`` first, as it names
 #: others
 _KNOWN_BY = ("run.json", "scores.nc", "checks.nc", "statement.json")
-_RESULTS = (*_KNOWN_BY, "report.html", "scores.csv", "part.ply", "stand.npz", "poses", "clouds", "captures")
+_RESULTS = (*_KNOWN_BY, "report.html", "scores.csv", "part.ply", TASK, "stand.npz", "poses", "clouds", "captures")
 
 #: hint for a folder whose files are of several runs
 AGAIN = "run the study again: mitsim run STUDY.toml -o DIR"

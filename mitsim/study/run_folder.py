@@ -18,10 +18,12 @@ from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
+from characterisation.tasks.task_file import Task
+from characterisation.tasks.task_reading import check_task
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.scene.surface.lay import LayLeftOut
-from mitsim.study.run_files import AGAIN, check_own
+from mitsim.study.run_files import AGAIN, TASK, check_own
 from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement
 
 _MADE_BY = "a folder made by mitsim run"
@@ -219,6 +221,17 @@ class Run:
             return None
         self.check("part.ply")
         return _mesh(self.folder / "part.ply")
+
+    def task(self) -> Task:
+        """Return the task that the run had."""
+        path = self.folder / TASK
+        if not self.has(TASK):
+            hint = "give the task: --task FILE"
+            raise InputError(path, "", "no such file", "the copy of its task that a run keeps", hint)
+        self.check(TASK)
+        task = validate(path, read_json_object(path), Task)
+        check_task(path, task)
+        return task
 
     def check(self, name: str) -> None:
         """Check a file against its digest in ``run.json``; raise :class:`InputError` if they differ."""

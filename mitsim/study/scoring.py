@@ -1,7 +1,8 @@
 """Score all candidate views with the performance map, and choose the fewest views that keep limits of uncertainty.
 
 Signal chain: study, map -> score of every view (:mod:`mitsim.study.virtual.screening`) -> fewest views that measure
-together (:mod:`characterisation.scores.task_sets`) -> ``scores.csv``, ``scores.nc``, ``poses/``, ``part.ply``.
+together (:mod:`characterisation.scores.task_sets`) -> ``scores.csv``, ``scores.nc``, ``poses/``, ``part.ply``,
+``task.json``.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import trimesh
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
-from characterisation.files.atomic_io import atomic_write
+from characterisation.files.atomic_io import atomic_write, write_json
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.scores.joining import pose_covariance
 from characterisation.scores.task_sets import SetJoining, choose_set
@@ -25,6 +26,7 @@ from mitsim.maps.campaign.run import write_netcdf
 from mitsim.running.progress import say
 from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.study import Study
+from mitsim.study.run_files import TASK
 from mitsim.study.scene_geometry import write_scene_geometry
 from mitsim.study.session import Session
 from mitsim.study.view_sets.confirmed_set import Search, joining_in_words
@@ -34,24 +36,31 @@ from mitsim.views import write_views
 def score_study(
     session: Session, performance_map: PerformanceMap | None = None
 ) -> tuple[xr.Dataset, ViewSet | None, Search]:
-    """Score all views, choose a set if the study asks for one, and write ``scores``, ``poses`` and ``part.ply``.
+    """Score all views, choose a set if the study asks for one, and write ``scores`` and the inputs.
 
     The map is by default that of the study. Returns the scores, the set, and the function that finds a set for other
     limits.
     """
     study, folder = session.study, session.folder
-    write_views(folder / "poses", study.candidates, study.file.views, study.sensor.name)
     scores, inputs = session.screen(performance_map)
     search = partial(_set_within, study, inputs)
     chosen = _chosen_set(study, search)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")
     write_netcdf(scores, folder / "scores.nc")
+    write_inputs(session)
+    return scores, chosen, search
+
+
+def write_inputs(session: Session) -> None:
+    """Write part, task and poses of a study into its folder, so that exports need no other file."""
+    study, folder = session.study, session.folder
+    write_views(folder / "poses", study.candidates, study.file.views, study.sensor.name)
+    write_json(folder / TASK, study.task.model_dump(mode="json", exclude_unset=True, exclude_none=True))
     write_scene_geometry(folder, study.scene, study.sensor)
     with atomic_write(folder / "part.ply") as file:
         corners = triangles(study.scene)
         mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=True)
         file.write_bytes(trimesh.exchange.ply.export_ply(mesh))
-    return scores, chosen, search
 
 
 def _set_within(study: Study, inputs: list[dict[InputQuantity, Any]], limits: dict[str, float]) -> ViewSet:

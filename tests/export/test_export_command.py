@@ -1,9 +1,11 @@
 """``mitsim export`` as a user runs it: what it writes by the end of a name, and what it says of bad input."""
 
 import json
+import shutil
 
 import pytest
 import trimesh
+from report.choice_run import write_choice
 from report.view_sphere_run import write_expecting_run
 from typer.testing import CliRunner
 
@@ -85,6 +87,34 @@ def test_a_run_is_written_by_the_end_of_the_name(run_folder, tmp_path, suffix):
     said = export("run", run_folder, "-o", tmp_path / f"run{suffix}")
     assert (tmp_path / f"run{suffix}").stat().st_size > 1000
     assert "4 views, 7 clouds" in said
+
+
+@pytest.mark.parametrize("command", [("run",), ("results",), ("targets", "--robot", "ur")])
+def test_of_a_comparison_the_best_sensor_is_exported(run_folder, tmp_path, monkeypatch, command):
+    folder = write_choice(tmp_path / "choice")
+    best = folder / "sensor-a-of-a-long-name"
+    shutil.rmtree(best)
+    shutil.copytree(run_folder, best)
+    poses = [{"view": n, "part_from_sensor": POSE.matrix().tolist()} for n in range(12)]
+    (best / "poses").mkdir()
+    (best / "poses/poses.json").write_text(json.dumps({"views": poses}))
+    monkeypatch.chdir(tmp_path)
+    name = {"run": "out.glb", "results": "out.csv", "targets": "out.script"}[command[0]]
+    if command == ("results",):  # the names of this run could not be in a task: reading gets as far as the task
+        with pytest.raises(InputError, match=rf"{best.name}/task\.json: found no such file"):
+            export(*command, "choice", "-o", name)
+    else:
+        said = export(*command, "choice", "-o", name)
+        assert f"the export is of the best, {best.name}" in said and (tmp_path / name).stat().st_size > 100
+    document = json.loads((folder / "choice.json").read_text())
+    for change, message in (
+        ({"finished": False}, "finished: found false.*mitsim study choose again"),
+        ({"sensors": document["sensors"][2:]}, "no sensor with a statement"),
+    ):
+        (folder / "choice.json").write_text(json.dumps(document | change))
+        with pytest.raises(InputError, match=message):
+            export(*command, "choice", "-o", f"no_{name}")
+    assert not (tmp_path / f"no_{name}").exists()
 
 
 def test_bad_options_of_a_run_are_told(run_folder, tmp_path):

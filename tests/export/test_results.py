@@ -19,8 +19,13 @@ from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.task_reading import read_task
 from mitsim.report.export.qif import NAMESPACE, write_qif
 from mitsim.report.export.results import ExpectedResult, RunResults, read_results, write_results_csv, write_results_json
+from mitsim.study import open_study
+from mitsim.study.run_folder import read_run
+from mitsim.study.scoring import write_inputs
+from mitsim.study.session import Session
 
 from .known_cloud import POSE
+from .test_export_command import export
 
 FOLDER = Path(os.environ.get("MITSIM_REAL_DATA") or Path(__file__).resolve().parents[2].parent / "shared" / "real")
 SCHEMA = FOLDER / "qif/QIFApplications/QIFDocument.xsd"
@@ -282,10 +287,36 @@ def with_names_of_tasks(folder):
     return folder
 
 
+def test_a_study_keeps_its_task_in_the_folder_that_is_exported(tmp_path, monkeypatch):
+    """The folder is moved, the study is gone, and the command runs elsewhere."""
+    monkeypatch.chdir(Path(__file__).parents[2] / "scenes")
+    study = open_study("two_pillars/tolerances.toml")
+    write_inputs(Session(study, tmp_path / "inputs"))
+    before, after = with_names_of_tasks(write_expecting_run(tmp_path / "run")), tmp_path / "moved" / "run"
+    (tmp_path / "task.toml").write_text(TASK)
+    given = read_results(before, tmp_path / "task.toml")
+    (before / "task.json").write_bytes((tmp_path / "inputs" / "task.json").read_bytes())
+    assert read_run(before).task() == study.task
+    with pytest.raises(InputError, match="the task of the run"):
+        read_results(before)
+    own = replace(study, task=read_task(tmp_path / "task.toml"))
+    write_inputs(Session(own, tmp_path / "inputs"))
+    (before / "task.json").write_bytes((tmp_path / "inputs" / "task.json").read_bytes())
+    after.parent.mkdir()
+    before.rename(after)
+    (tmp_path / "task.toml").unlink()
+    monkeypatch.chdir(tmp_path / "moved")
+    assert read_results("run").results == given.results and read_results("run").task == given.task
+    for name in ("out.qif", "out.csv", "out.json"):
+        export("results", "run", "-o", name)
+        assert Path(name).stat().st_size > 300
+    export("run", "run", "-o", "out.glb")
+
+
 def test_results_are_read_from_a_run(tmp_path):
     folder = with_names_of_tasks(write_expecting_run(tmp_path / "run"))
     statement = json.loads((folder / "statement.json").read_text())
-    with pytest.raises(InputError, match=r"study: found .* which does not exist.*--task FILE"):
+    with pytest.raises(InputError, match=r"task\.json: found no such file.*--task FILE"):
         read_results(folder)
     (tmp_path / "task.toml").write_text(TASK)
     found = read_results(folder, tmp_path / "task.toml")
@@ -299,6 +330,14 @@ def test_results_are_read_from_a_run(tmp_path):
     (tmp_path / "other.toml").write_text(TASK.replace("radius & co", "size"))
     with pytest.raises(InputError, match="the task of the run"):
         read_results(folder, tmp_path / "other.toml")
+    as_json = read_task(tmp_path / "task.toml").model_dump(mode="json", exclude_unset=True, exclude_none=True)
+    (folder / "task.json").write_text(json.dumps(as_json | {"measurements": {}}), encoding="utf-8")
+    with pytest.raises(InputError, match=r"task\.json.*measurements"):
+        read_results(folder)
+    as_json["measurements"]["radius & co"]["features"] = ["plane"]  # which has no radius
+    (folder / "task.json").write_text(json.dumps(as_json), encoding="utf-8")
+    with pytest.raises(InputError, match=r"task\.json.*measurements\.radius & co"):
+        read_results(folder)
     (folder / "statement.json").unlink()
     with pytest.raises(InputError, match=r"statement\.json"):
         read_results(folder, tmp_path / "task.toml")

@@ -111,6 +111,14 @@ def test_targets_of_a_run_are_its_set_of_views(tmp_path):
     found, tool = read_targets(folder)
     assert ([one.name for one in found], tool) == (["view_0002", "view_0007"], "sensor")
     np.testing.assert_allclose(found[1].part_from_tool.matrix(), poses[7].matrix())
+    about = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    stated = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
+    leaders = dict(zip(about["leaders"], (9, 4, 11), strict=True))
+    (folder / "run.json").write_text(json.dumps(about | {"view_sets": [], "leaders": leaders}), encoding="utf-8")
+    for view in (9, 11):  # the stated view comes first, the others by number
+        (folder / "statement.json").write_text(json.dumps(stated | {"view": view}), encoding="utf-8")
+        others = [number for number in (4, 9, 11) if number != view]
+        assert [one.name for one in read_targets(folder)[0]] == [f"view_{number:04d}" for number in (view, *others)]
     said = export("targets", folder, "--robot", "ur", "--views", "11,3", "-o", tmp_path / "views.script")
     assert "2 poses of the sensor" in said and "flange_from_sensor" in said
     document["flange_from_sensor"] = np.eye(4).tolist()

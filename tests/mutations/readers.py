@@ -368,6 +368,22 @@ def _read_scene_geometry(path):
     read_scene_geometry(path.parent)
 
 
+def _kept_task(folder):
+    """The copy of its task in the folder of a run."""
+    from characterisation.tasks.task_reading import read_task
+
+    path = _run_folder("run.json")(folder).parent / "task.json"
+    task = read_task(SCENES / "two_pillars" / "task.toml")
+    path.write_text(json.dumps(task.model_dump(mode="json", exclude_unset=True, exclude_none=True)), encoding="utf-8")
+    return path
+
+
+def _read_kept_task(path):
+    from mitsim.study.run_folder import read_run
+
+    read_run(path.parent).task()
+
+
 def _choice(folder):
     sys.path.insert(0, str(ROOT / "tests"))
     from report.choice_run import write_choice
@@ -517,6 +533,7 @@ READERS: dict[str, Reader] = {
     "calibration.json of a capture": Reader(_run_folder("captures/view_0004/calibration.json"), _capture),
     "patches.npy": Reader(_patches, _read_patches),
     "stand.npz": Reader(_run_folder("stand.npz"), _read_scene_geometry),
+    "task.json": Reader(_kept_task, _read_kept_task),
     "choice.json": Reader(_choice, _read_choice),
     "trials": Reader(_trials, _read_trials),
     "plan of many": Reader(_plan_of_many, _read_many),

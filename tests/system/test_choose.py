@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from functools import partial
 from pathlib import Path
 
@@ -105,6 +106,36 @@ def test_page_and_sheet(chosen):
     assert done.returncode == 0, done.stderr
     sheet = (folder / "out" / "sheet.pdf").read_bytes()
     assert sheet.startswith(b"%PDF") and len(re.findall(rb"/Type /Page\b", sheet)) == 1
+
+
+def test_the_best_sensor_is_exported_without_the_study(chosen, tmp_path, monkeypatch):
+    folder, _, _ = chosen
+    shutil.copytree(folder / "out", tmp_path / "moved")
+    choice = json.loads((tmp_path / "moved" / "choice.json").read_text())
+    monkeypatch.chdir(tmp_path)
+    for name in ("study.toml", "task.toml"):
+        (folder / name).rename(folder / f"away_{name}")
+    try:
+        for command, name in (("run", "out.glb"), ("results", "out.json"), ("results", "out.qif")):
+            assert mitsim_here("export", command, "moved", "-o", name, cwd=tmp_path).returncode == 0
+        options = ("--robot", "moveit", "-o", "out.yaml")
+        assert mitsim_here("export", "targets", "moved", *options, cwd=tmp_path).returncode == 0
+        assert mitsim_here("report", "moved/david-sls-3", cwd=tmp_path).returncode == 0
+    finally:
+        for name in ("study.toml", "task.toml"):
+            (folder / f"away_{name}").rename(folder / name)
+    best = choice["sensors"][0]
+    said = json.loads((tmp_path / "out.json").read_text())
+    common = best["poses"][0]
+    assert said["sensor"] == best["name"] and [one["view"] for one in said["plan"]] == [common["view"]]
+    assert said["plan"][0]["part_from_sensor"] == common["world_from_sensor"]
+    for one in said["results"]:
+        cell = best["measurements"][one["measurement"]]
+        if cell["view"] == common["view"]:
+            assert (one["uncertainty"], one["bias"]) == (cell["uncertainty"], cell["bias"])
+    targets = re.findall(r"view_(\d+):", (tmp_path / "out.yaml").read_text())
+    views = {cell["view"] for cell in best["measurements"].values()} | {common["view"]}
+    assert int(targets[0]) == common["view"] and {*map(int, targets)} == views
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Tabulate the results of a run: the expectation of every measurement from the chosen view; as CSV and JSON.
 
-Signal chain: ``run.json``, ``statement.json``, task -> an :class:`ExpectedResult` for every measurement -> CSV, JSON or
-QIF (:mod:`mitsim.report.export.qif`).
+Signal chain: ``run.json``, ``statement.json``, ``task.json`` -> an :class:`ExpectedResult` for every measurement ->
+CSV, JSON or QIF (:mod:`mitsim.report.export.qif`).
 """
 
 from __future__ import annotations
@@ -13,15 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from characterisation.files.atomic_io import atomic_write, write_json
-from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.task_reading import read_task
 from mitsim.report.export.run_scene import view_pose
 from mitsim.running.version import __version__
 from mitsim.sensor.transforms import Transform
-from mitsim.study import StudyFile
-from mitsim.study.run_folder import Run, read_run
+from mitsim.study.run_files import TASK
+from mitsim.study.run_folder import read_run
 from mitsim.study.statement_file import StatedMeasurement
 
 
@@ -74,7 +73,7 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
     folder
         Folder of the run.
     task_file
-        The task TOML; None uses the one named in the run's study.
+        The task TOML; None uses the copy in the run's folder.
 
     Raises
     ------
@@ -84,10 +83,10 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
     run = read_run(folder)
     if run.statement is None:
         raise InputError(Path(folder) / "statement.json", "", "no such file", "a run with a statement")
-    task = read_task(_task_path(run) if task_file is None else task_file)
+    task = run.task() if task_file is None else read_task(task_file)
     if list(task.measurements) != list(run.about.measurements):
         raise InputError(
-            task_file or _task_path(run),
+            task_file or run.folder / TASK,
             "measurements",
             ", ".join(task.measurements),
             f"{', '.join(run.about.measurements)}: the task of the run",
@@ -162,14 +161,3 @@ def _result(name: str, task: Task, stated: StatedMeasurement, view: int) -> Expe
         stated.without_value,
         stated.verdict,
     )
-
-
-def _task_path(run: Run) -> Path:
-    hint = "give the task: --task FILE"
-    study = Path(run.about.study)
-    if not study.is_file():
-        raise InputError(run.folder / "run.json", "study", f"{study}, which does not exist", "a readable study", hint)
-    path = study.parent / read_toml(study, StudyFile).task
-    if not path.is_file():
-        raise InputError(study, "task", f"{path}, which does not exist", "a readable task", hint)
-    return path

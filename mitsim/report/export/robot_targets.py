@@ -66,7 +66,8 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[RobotTar
     folder
         Folder of the run, or of the scores.
     views
-        ``best``: the run's set of views, or the best of every measurement; ``all``; or numbers, ``3,12``.
+        ``best``: the run's set of views, or the best of every measurement, with the view of the statement first;
+        ``all``; or numbers, ``3,12``.
 
     Raises
     ------
@@ -84,8 +85,11 @@ def read_targets(folder: str | Path, views: str = "best") -> tuple[list[RobotTar
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise InputError(path, "", f"a file that cannot be read ({error})", "poses.json of mitsim") from None
     if views == "best":
-        about = read_run(folder).about
+        run = read_run(folder)
+        about, stated = run.about, run.statement
         chosen = sorted({*(about.view_sets[0].views if about.view_sets else about.leaders.values())})
+        if stated is not None:
+            chosen.sort(key=lambda number: number != stated.view)  # stable: the others stay ascending
     else:
         chosen = numbers_of(views, list(known))
     return [RobotTarget(f"view_{number:04d}", poses[number]) for number in chosen], tool

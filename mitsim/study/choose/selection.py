@@ -4,7 +4,8 @@ Signal chain: sensors -> scores of all views of each sensor (kept in its folder)
 then by the worst of the others (:mod:`mitsim.study.choose.ranking`) -> exclusion of sensors that can make fewer
 measurements, or whose demand is far too large -> for the others a short race -> a statement from the view that is best
 for all measurements, with as many trials as its verdicts need -> a statement from a measurement's own best view, where
-the common view does not suffice -> more trials for the leader -> ``choice.json``.
+the common view does not suffice -> more trials for the leader -> its folder, as of a run
+(:mod:`mitsim.study.choose.winner`), and ``choice.json``.
 
 Screening includes noise and calibration, but not finish, interreflections at edges and false points. It is therefore
 more often too small than too large, and a sensor is excluded if even the screened demand of its best view exceeds
@@ -42,6 +43,7 @@ from mitsim.running.progress import say
 from mitsim.study import StatementTable
 from mitsim.study.choose.candidates import CandidateSensor
 from mitsim.study.choose.ranking import rank_keys, unpromising
+from mitsim.study.choose.winner import complete_winner
 from mitsim.study.session import Session
 from mitsim.study.virtual.plan import map_digest, trial_digest
 from mitsim.study.virtual.race import ALL, Raced, RaceRules
@@ -162,8 +164,20 @@ def choose_sensor(
     leader = _ordered(found)[0]
     if leader.stated and time.monotonic() < end:
         _refine_leader(leader, end)
+    _complete(_ordered(found)[0])
     report_results(_ordered(found), True)
     return _ordered(found)
+
+
+def _complete(winner: SensorResult) -> None:
+    """Complete the folder of the best sensor, if it was measured."""
+    if not winner.stated or winner.raced is None:
+        return
+    session = winner.session
+    own = zip(session.study.task.measurements, winner.best(), strict=True)
+    leaders = {ALL: next(iter(winner.stated))} | {name: row[0] for name, row in own if row is not None}
+    complete_winner(session, winner.scores, winner.raced, leaders)
+    session.release()
 
 
 def _promising(found: list[SensorResult]) -> list[SensorResult]:

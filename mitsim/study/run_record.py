@@ -1,0 +1,116 @@
+"""Write what a run folder says of its run: the predicted clouds of its views, and its record ``run.json``.
+
+``mitsim run`` writes them for its study, ``mitsim study choose`` for the sensor that measures best.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from characterisation.cloud_files import write_cloud
+from characterisation.maps.performance_map import PerformanceMap
+from mitsim.capture.simulated.render_residual import RenderResidual
+from mitsim.maps.prediction import performance
+from mitsim.running.progress import track
+from mitsim.running.version import __version__
+from mitsim.scene.surface.lay import lay_left_out
+from mitsim.study import Study, finishes_of_features
+from mitsim.study.run_files import TASK
+from mitsim.study.session import Session
+from mitsim.study.virtual.race import Raced
+
+
+def draw_clouds(session: Session, performance_map: PerformanceMap, numbers: list[int]) -> None:
+    """Write a predicted cloud of each of some views."""
+    study, predictor = session.study, session.predictor
+    for number in track(numbers, "predict clouds"):
+        pose = study.view(number).world_from_sensor
+        surfaces = predictor.surfaces(study.scene, pose)
+        labels, ideal = predictor.labels(study.scene, pose, surfaces), predictor.ideal(surfaces)
+        fraction, sigma = performance(ideal, study.scene, performance_map)
+        rng = np.random.default_rng([study.file.seed, number])
+        cloud = predictor.draw(study.scene, ideal, labels, fraction, sigma, rng)
+        write_cloud(cloud, session.folder / "clouds" / f"predicted_{number:04d}.ply")
+
+
+def own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) -> list[str]:
+    """Return the paths of the files that a report or an export of the run reads.
+
+    The index of a capture has the digests of its other files.
+
+    Parameters
+    ----------
+    study
+        Study of the run.
+    drawn
+        Numbers of the views with a predicted cloud.
+    shown
+        Numbers of the views with images and a decoded cloud.
+    stated
+        Whether the run has a statement.
+    """
+    names = ["map.nc", "scores.csv", "scores.nc", "checks.nc", "part.ply", "stand.npz", TASK]
+    names += ["samples.nc"] if study.campaign is not None else []
+    names += ["statement.json"] if stated else []
+    names += [f"clouds/predicted_{view:04d}.ply" for view in drawn]
+    names += [f"clouds/rendered_{view:04d}.ply" for view in shown]
+    return names + [f"captures/view_{view:04d}/capture.json" for view in shown]
+
+
+def run_record(
+    study: Study, performance_map: PerformanceMap, raced: Raced, shown: list[int], residual: RenderResidual | None
+) -> dict[str, Any]:
+    """Return the record of a run, ``run.json``, without its sets of views, its times and the digests of its files.
+
+    Parameters
+    ----------
+    study
+        Study of the run.
+    performance_map
+        Map that screened the views.
+    raced
+        Race of the promising views.
+    shown
+        Numbers of the views with images and a decoded cloud.
+    residual
+        Largest render noise; None if nothing was rendered for it.
+    """
+    finishes = finishes_of_features(study)
+    lays = {name: lay_left_out(one.name, one.scatter) for name, one in finishes.items() if one is not None}
+    return {
+        "schema_version": 1,
+        "mitsim": __version__,
+        "study": str(study.path),
+        "scene": study.scene.where,
+        "sensor": study.sensor.name,
+        "source": "simulated",
+        "map_source": performance_map.data.attrs.get("source", ""),
+        "exposure_rule": study.sensor.exposure.rule,
+        "seed": study.file.seed,
+        "views": len(study.views),
+        "view_sets": [],
+        "checked_views": shown,
+        "raced_views": len(raced.views),
+        "race_trials": raced.trials,
+        "race_decided": raced.decided,
+        "leaders": raced.leaders(),
+        "confidence": {name: one.confidence for name, one in raced.standings.items()},
+        "light_path_depth": study.file.measure.light_path_depth,
+        "score_light_path_depth": study.file.score.light_path_depth,
+        "render_residual": None if residual is None else asdict(residual),
+        "features": {name: str(one) for name, one in finishes.items()},
+        "lay": {name: left_out for name, left_out in lays.items() if left_out is not None},
+        "measurements": {
+            name: {key: getattr(one, key) for key in ("kind", "nominal", "unit", "features", "tolerance")}
+            for name, one in study.task.measurements.items()
+        },
+        "seconds": {},
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "cores": os.cpu_count(),
+    }
