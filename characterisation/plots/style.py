@@ -119,6 +119,8 @@ def figure_of(axes: Axes) -> Figure:
 def side_bar(axes: Axes, shown: ScalarMappable, label: str) -> None:
     """Add a colour scale to the right of axes, as high as they are, for values that may lie beyond its ends."""
     bar = figure_of(axes).colorbar(shown, cax=axes.inset_axes((1.02, 0.0, 0.03, 1.0)), label=label, extend="both")
+    low, high = sorted((shown.norm.vmin or 0.0, shown.norm.vmax or 1.0))
+    bar.set_ticks([tick for tick in bar.get_ticks() if low <= tick <= high])  # others would be drawn at the ends
     bar.outline.set_visible(False)  # type: ignore[operator]
 
 
