@@ -15,7 +15,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.decoding import coded_images
 from mitsim.decoding.checks.checked_cloud import checked_cloud
-from mitsim.decoding.checks.rig_sanity import measured_row_error, row_error_warnings
+from mitsim.decoding.checks.pair_sanity import measured_row_error, row_error_warnings
 from mitsim.decoding.checks.sanity import code_findings, row_error_in_words
 from mitsim.decoding.cloud import capture_cloud
 from mitsim.decoding.coded_images import CodedImages

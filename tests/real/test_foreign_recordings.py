@@ -16,7 +16,7 @@ from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.recordings.recognise import ReadOptions, read_recording
-from mitsim.decoding.checks.rig_sanity import row_error_warnings
+from mitsim.decoding.checks.pair_sanity import row_error_warnings
 from mitsim.decoding.checks.sanity import pair_row_error
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.decoding.image_context import ImageContext

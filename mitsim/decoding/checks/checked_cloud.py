@@ -12,7 +12,7 @@ from pathlib import Path
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Settings
-from mitsim.decoding.checks.rig_sanity import Findings, row_error_warnings
+from mitsim.decoding.checks.pair_sanity import Findings, row_error_warnings
 from mitsim.decoding.checks.sanity import (
     code_findings,
     pair_row_error,

@@ -1,0 +1,300 @@
+"""Check whether the images of two cameras and their calibration belong together.
+
+Signal chain: coordinates along rectified rows of two cameras that see one code -> disparity, and row error by the other
+coordinate or by the texture of the surface. The pair of a matcher: patches of the images at the disparity of the cloud
+-> row error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from characterisation.point_cloud import PointCloud
+from mitsim.decoding.checks.rig_sanity import COARSE, half_stripe
+from mitsim.decoding.checks.row_texture import rectified, textured_row_error, uniform_light_mean
+from mitsim.decoding.checks.texture_matches import COMPARED_ROWS, LEAST_BLOCKS, texture_matches
+from mitsim.decoding.coded_images import CodedImages
+from mitsim.decoding.matching.row_error import row_error
+from mitsim.decoding.matching.stereo import StereoGeometry, stereo_geometry
+from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
+from mitsim.decoding.structured_light.two_cameras import find_coordinates
+from mitsim.sensor.camera import Rig
+from mitsim.sensor.image_role import Axis
+from mitsim.sensor.light_code import roles
+
+Levels = NDArray[np.unsignedinteger[Any]]
+Floats = NDArray[np.float64]
+
+#: largest row error of a pair [px]; a stereo matcher begins to lose points at about this
+LARGEST_ROW_ERROR = 0.3
+
+#: least share of the first camera's decoded pixels that the second has in the same rows; allowed variation of the row
+#: error over the image [px]
+_LEAST_MATCHED, _LARGEST_SPREAD = 0.1, 0.5
+
+#: row error [px] of a rig that has moved; beyond, the calibration is of another rig
+_MOVED = 6.0
+
+#: half the distances [px] over which the slope of the projector rows is measured, until they span two stripes
+_SLOPE_ROWS = (2.0, 4.0, 8.0, 16.0, 32.0)
+
+#: parts of an image along either side for averaging rows, and least number of pixels of a mean
+_PARTS, _ENOUGH = 6, 30
+
+#: side of a patch for comparing rows [px]; largest and least number of patches
+_PATCH, _MOST, _LEAST = 40, 80, 8
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Findings about a capture: ``warnings``, and ``row_error`` [px] of the second camera; NaN if unknown.
+
+    ``row_error_source``: the source of the row error, "" if unknown.
+    """
+
+    warnings: list[str] = field(default_factory=list)
+    row_error: float = float("nan")
+    row_error_source: str = ""
+
+
+def pair_findings(images: CodedImages, rig: Rig) -> Findings:
+    """Check two cameras that see one code: exchanged, another calibration, or a row error.
+
+    The source of the row error is the code of the rows if present, else the texture of the surface. It is unknown if
+    neither gives it, or the calibration is doubtful.
+    """
+    geometry = stereo_geometry(rig)
+    exchangeable = geometry.raw_size[0] == geometry.raw_size[1]
+    names = " and ".join(list(rig.cameras)[:2])
+    exchanged = (
+        f"the images of {names} fit the calibration if they are exchanged: check whether left and right are exchanged"
+    )
+    found = list(images.coordinates.values())
+    matches = _Matches.of(found, geometry)
+    if matches.decoded < 0.005:
+        return Findings()
+    textures, doubt = None, "check that the calibration belongs to these images"
+    if not np.isfinite(matches.row_error):
+        image_roles = roles(images.code, *images.size)
+        textures = [uniform_light_mean(stack, image_roles, images.full_scale) for stack in images.stacks.values()]
+        columns = found[0]["columns"].value, found[1]["columns"].value
+        contradiction, other_order = _texture_contradiction((textures[0], textures[1]), columns, rig, geometry)
+        if contradiction:
+            fits = exchangeable and other_order
+            return Findings([exchanged if fits else f"{contradiction}: {doubt}"])
+    if matches.doubtful:
+        if exchangeable and not _Matches.of(found[::-1], geometry).doubtful:
+            return Findings([exchanged])
+        return Findings([f"{matches}: {doubt}"])
+    offset, source = matches.row_error, "by the code of the rows"
+    if textures is not None:
+        source = "by the texture of the surface"
+        offset, variation = textured_row_error((textures[0], textures[1]), columns, geometry)
+        if variation > _LARGEST_SPREAD + 0.5 * abs(offset if np.isfinite(offset) else 0.0):
+            swapped = textured_row_error((textures[1], textures[0]), columns[::-1], geometry) if exchangeable else None
+            if swapped is not None and abs(swapped[0]) < LARGEST_ROW_ERROR and not swapped[1] > _LARGEST_SPREAD:
+                return Findings([exchanged])
+            told = (
+                f"the rows of the two cameras vary by {variation:.1f} px over the image, by the texture of the surface"
+            )
+            return Findings([f"{told}: {doubt}"])
+    return Findings(row_error_warnings(offset), offset, source) if np.isfinite(offset) else Findings()
+
+
+def _texture_contradiction(
+    textures: tuple[Floats, Floats], columns: tuple[Floats, Floats], rig: Rig, geometry: StereoGeometry
+) -> tuple[str, bool]:
+    """Describe how texture matched over all rows contradicts the calibration, and whether the other order fits.
+
+    "" if the texture agrees, or does not suffice.
+    """
+    pixels = texture_matches(textures, columns)
+    if len(pixels[0]) < LEAST_BLOCKS:
+        return "", False
+    step = max(1.0, textures[0].shape[0] / COMPARED_ROWS)  # rows are compared to a fraction of this
+    found, other = (_row_errors(*order, rig, geometry) for order in (pixels, pixels[::-1]))
+    if found.fits(step):
+        return "", False
+    return f"{found}, by the texture of the surface", other.fits(step)
+
+
+@dataclass(frozen=True)
+class _RowErrors:
+    """Row error [px] of matched texture: its ``median`` and ``spread``; share that lies ``behind`` the cameras."""
+
+    median: float
+    spread: float
+    behind: float
+
+    def fits(self, step: float) -> bool:
+        """Return whether the calibration explains the matches, whose rows are accurate to a share of ``step`` [px]."""
+        return self.behind <= 0.5 and self.spread <= _LARGEST_SPREAD * step + 0.5 * min(abs(self.median), _MOVED)
+
+    def __str__(self) -> str:
+        if self.behind > 0.5:
+            return f"{100 * self.behind:.0f} % of the common points lie behind the cameras"
+        return f"the rows of the two cameras are {self.spread:.1f} px apart after rectification"
+
+
+def _row_errors(left: Floats, right: Floats, rig: Rig, geometry: StereoGeometry) -> _RowErrors:
+    """Return the row error of raw pixels (n, 2) of the first and second camera that show the same point."""
+    pair, places = geometry.rectification, []
+    for eye, pixels, turn, matrix in zip(
+        rig.cameras.values(),
+        (left, right),
+        (pair.rotation_left, pair.rotation_right),
+        (pair.matrix_left, pair.matrix_right),
+        strict=False,
+    ):
+        rays = eye.rays(pixels) @ turn.T
+        with np.errstate(invalid="ignore", divide="ignore"):
+            places.append((rays / rays[:, 2:]) @ matrix.T)
+    error = places[1][:, 1] - places[0][:, 1]
+    disparity = places[0][:, 0] - places[1][:, 0] + pair.matrix_right[0, 2] - pair.matrix_left[0, 2]
+    known = np.isfinite(error)
+    if known.mean() < 0.5:
+        return _RowErrors(np.inf, np.inf, 1.0)
+    core = _core(error, 1.0)
+    return _RowErrors(
+        float(np.median(error[known])), float(np.sqrt(np.mean(core**2))), float(np.mean(disparity[known] <= 0))
+    )
+
+
+@dataclass(frozen=True)
+class _Matches:
+    """Correspondences of two cameras in the same rectified rows.
+
+    Shares [1]: ``decoded`` of the first camera's pixels, ``matched`` of these, ``behind`` the cameras of the matched.
+    ``row_error`` [px]: median row error of the right image; ``spread`` [px]: its variation over the image. Both are NaN
+    without a code of the rows.
+    """
+
+    decoded: float
+    matched: float
+    behind: float
+    row_error: float
+    spread: float
+
+    @classmethod
+    def of(cls, found: Sequence[Mapping[Axis, ProjectorCoordinate]], geometry: StereoGeometry) -> _Matches:
+        maps, seen = (geometry.map_left, geometry.map_right), (geometry.seen_left, geometry.seen_right)
+        height = geometry.map_left.shape[1]
+        lines = np.arange(2, height - 2, max(1, height // COARSE))
+        u_left, u_right = (
+            rectified(each["columns"].value, positions[:, lines], there[lines])
+            for each, positions, there in zip(found, maps, seen, strict=True)
+        )
+        place = np.stack([find_coordinates(one, other)[0] for one, other in zip(u_left, u_right, strict=True)])
+        matched, decoded = np.isfinite(place), np.isfinite(u_left)
+        shift = geometry.rectification.matrix_right[0, 2] - geometry.rectification.matrix_left[0, 2]
+        disparity = (np.arange(place.shape[1]) - place)[matched] + shift
+        share = float(matched.sum() / max(decoded.sum(), 1))
+        behind = float(np.mean(disparity <= 0)) if matched.any() else 0.0
+        if "rows" not in found[0] or not matched.any():
+            return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
+        offset, slope = _row_by_code(found, geometry, lines, place)
+        # the effect of a stripe, less than a step in depth
+        if not np.isfinite(offset).any():
+            return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
+        edge = 1.5 * (2 * half_stripe(found[0]["rows"]) / abs(slope) + 1)
+        # stripe quantisation averages out over a part of the image
+        row, column = np.nonzero(matched)
+        part = row * _PARTS // len(lines) * _PARTS + column * _PARTS // place.shape[1]
+        means = [
+            float(np.mean(own)) for n in np.unique(part) if (own := _core(offset[part == n], edge)).size >= _ENOUGH
+        ]
+        if len(means) < 4:
+            return cls(float(decoded.mean()), share, behind, np.nan, np.nan)
+        middle = float(np.median(means))
+        return cls(float(decoded.mean()), share, behind, middle, float(np.sqrt(np.mean(np.square(means)))))
+
+    @property
+    def doubtful(self) -> bool:
+        """Return whether the matches contradict this calibration."""
+        return self.matched < _LEAST_MATCHED or self.behind > 0.5 or self.spread > _LARGEST_SPREAD + abs(self.row_error)
+
+    def __str__(self) -> str:
+        if self.behind > 0.5:
+            return f"{100 * self.behind:.0f} % of the common points lie behind the cameras"
+        if self.matched < _LEAST_MATCHED:
+            share = f"{100 * self.matched:.0f} %"
+            return f"only {share} of the first camera's decoded pixels have a match in the second's rectified rows"
+        return f"the rows of the two cameras are {self.spread:.1f} px apart, unevenly, after rectification"
+
+
+def _core(values: Floats, least: float) -> Floats:
+    """Return values (n,) without those far from their median, as at edges; ``least`` distance that counts as far."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return known
+    deviation = np.abs(known - np.median(known))
+    return np.asarray(known[deviation <= max(4 * float(np.median(deviation)), least)])
+
+
+def _row_by_code(
+    found: Sequence[Mapping[Axis, ProjectorCoordinate]],
+    geometry: StereoGeometry,
+    lines: NDArray[np.intp],
+    place: Floats,
+) -> tuple[Floats, float]:
+    """Return the row error [px] of the right image at each match, and projector rows per pixel.
+
+    The error is the projector row of the left image less that of the right, over their slope.
+    """
+    row, column = np.nonzero(np.isfinite(place))
+    at = place[row, column]
+    mine = geometry.map_left[:, lines[row], column]
+
+    def at_right(step: float) -> Floats:
+        raw = np.stack([map_coordinates(each, [lines[row] + step, at], order=1) for each in geometry.map_right])
+        return np.asarray(map_coordinates(found[1]["rows"].value, raw[::-1], order=1, cval=np.nan))
+
+    v = np.asarray(map_coordinates(found[0]["rows"].value, mine[::-1], order=1, cval=np.nan))
+    # a median over less than a stripe is zero
+    for half_distance in _SLOPE_ROWS:
+        slope = (at_right(half_distance) - at_right(-half_distance)) / (2 * half_distance)
+        usual = float(np.nanmedian(slope)) if np.isfinite(slope).any() else float("nan")
+        if abs(usual) * half_distance >= 2 * half_stripe(found[1]["rows"]):
+            break
+    return ((v - at_right(0.0)) / usual if abs(usual) > 1e-3 else np.full(len(v), np.nan)), usual
+
+
+def measured_row_error(images: tuple[Levels, Levels], geometry: StereoGeometry, cloud: PointCloud) -> float:
+    """Return the median row error [px] of the right image of a decoded pair; NaN with too few patches.
+
+    ``images`` (H, W) raw left and right [DN], with texture; ``cloud`` on the rectified left grid.
+    """
+    left, right = (image.astype(float) for image in images)
+    local = (cloud.points.astype(float) - geometry.grid.origin) @ geometry.grid.rotation
+    disparity = geometry.rectification.disparity(local[..., 2])
+    height, width = cloud.status.shape
+    tops, sides = range(0, height - _PATCH + 1, _PATCH), range(0, width - _PATCH + 1, _PATCH)
+    corners = [
+        (row, column)
+        for row in tops
+        for column in sides
+        if cloud.valid[row : row + _PATCH, column : column + _PATCH].mean() >= 0.5
+    ]
+    errors = []
+    for row, column in corners[:: -(-len(corners) // _MOST) or 1]:
+        rows, columns = np.nonzero(cloud.valid[row : row + _PATCH, column : column + _PATCH])
+        rows, columns = rows + row, columns + column
+        errors.append(row_error(left, right, geometry, rows, columns, disparity[rows, columns]))
+    known = np.array(errors)[np.isfinite(errors)] if errors else np.empty(0)
+    return float(np.median(known)) if len(known) >= _LEAST else float("nan")
+
+
+def row_error_warnings(offset: float) -> list[str]:
+    """Return the warning about a row error ``offset`` [px] of a pair, if it is large."""
+    if not abs(offset) > LARGEST_ROW_ERROR:  # nor if it is unknown
+        return []
+    return [
+        f"the rows of the two cameras are {offset:+.2f} px apart after rectification, over {LARGEST_ROW_ERROR:g} px: "
+        "the calibration belongs to another rig, or the rig has moved since"
+    ]
