@@ -41,7 +41,7 @@ from characterisation.features.surfaces import Cone, Cylinder, Plane, unit
 from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.places import between_axes, between_planes, direction, on_axis, place
 from characterisation.tasks.task_file import Measurement
-from characterisation.tasks.zones import datum_motion, feet_on
+from characterisation.tasks.zones import datum_motion, feet_on, largest_distance
 
 Array = NDArray[np.float64]
 Size = Callable[[Array], Array]
@@ -144,12 +144,6 @@ def twice_largest(rows: Array) -> Array:
 def value_range(rows: Array) -> Array:
     """Return the range (...) of deviations (..., k, 1)."""
     return np.asarray(np.ptp(rows[..., 0], axis=-1))
-
-
-def largest_distance(rows: Array) -> Array:
-    """Return the largest distance (...) between two rows of deviations (..., k, m)."""
-    apart = rows[..., :, None, :] - rows[..., None, :, :]
-    return np.asarray(np.sqrt((apart**2).sum(axis=-1)).max(axis=(-2, -1)))
 
 
 def least_range(sideways: Array) -> Size:

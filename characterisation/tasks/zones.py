@@ -141,7 +141,7 @@ def _across(feature: Plane | Axis, datum: Datum, outline: Array) -> float:
     """Return the extent of a feature across the direction of a datum."""
     places, along = feet_on(feature, outline), direction(datum)
     across = places - np.outer(places @ along, along)
-    return least_width(across, along) if isinstance(feature, Plane) else largest_distance(across)
+    return least_width(across, along) if isinstance(feature, Plane) else float(largest_distance(across))
 
 
 def frame_fault(datums: Sequence[Datum]) -> str:
@@ -239,6 +239,7 @@ def least_width(places: Array, normal: Array) -> float:
     return float(np.ptp(places @ across.T, axis=0).min()) if len(across) else 0.0
 
 
-def largest_distance(places: Array) -> float:
-    """Return the largest distance [mm] between places (k, 3): the diameter of the zone that contains a line's feet."""
-    return float(np.linalg.norm(places[:, None] - places[None], axis=-1).max())
+def largest_distance(places: Array) -> Array:
+    """Return the largest distance (...) [mm] between places (..., k, m), the diameter of their zone."""
+    apart = places[..., :, None, :] - places[..., None, :, :]
+    return np.asarray(np.sqrt((apart**2).sum(axis=-1)).max(axis=(-2, -1)))

@@ -18,7 +18,6 @@ import xarray as xr
 from characterisation.cloud_files import write_cloud
 from characterisation.files.atomic_io import write_json
 from characterisation.maps.performance_map import PerformanceMap
-from characterisation.scores.view_score import write_scores
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.statement import Statement
 from mitsim.capture.folder import write_capture
@@ -30,14 +29,14 @@ from mitsim.capture.simulated.render_residual import (
     warn_above_limit,
 )
 from mitsim.maps.campaign.acquire import coupon_residuals, in_turn, simulated_source
-from mitsim.maps.campaign.run import run_campaign, write_netcdf
+from mitsim.maps.campaign.run import run_campaign
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say, track
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
 from mitsim.study.run_files import digests_of
 from mitsim.study.run_record import draw_clouds, own_files, run_record
-from mitsim.study.scoring import pose_columns, score_study
+from mitsim.study.scoring import score_study, write_raced
 from mitsim.study.session import Session
 from mitsim.study.view_sets.confirmed_set import (
     Search,
@@ -50,7 +49,6 @@ from mitsim.study.view_sets.confirmed_set import (
     write_set_csv,
 )
 from mitsim.study.virtual.plan import race_rules
-from mitsim.study.virtual.race import raced_errors, with_race
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import statement_document
 
@@ -110,10 +108,7 @@ def run_study(
     scores, chosen, search = score_study(session, performance_map)
     clock.lap("score")
     raced = session.race(scores, race_rules(study.file.race, minutes))
-    scores = with_race(scores, raced)
-    write_scores(folder / "scores.csv", scores, pose_columns(scores), order="final_rank")
-    write_netcdf(scores, folder / "scores.nc")
-    write_netcdf(raced_errors(raced, study.task), folder / "checks.nc")
+    scores = write_raced(session, scores, raced)
     clock.lap("race")
     leaders = list(dict.fromkeys(raced.leaders().values()))
     stated = session.state(study.view(leaders[0])) if leaders else None

@@ -30,6 +30,7 @@ from mitsim.study.run_files import TASK
 from mitsim.study.scene_geometry import write_scene_geometry
 from mitsim.study.session import Session
 from mitsim.study.view_sets.confirmed_set import Search, joining_in_words
+from mitsim.study.virtual.race import Raced, raced_errors, with_race
 from mitsim.views import write_views
 
 
@@ -49,6 +50,15 @@ def score_study(
     write_netcdf(scores, folder / "scores.nc")
     write_inputs(session)
     return scores, chosen, search
+
+
+def write_raced(session: Session, scores: xr.Dataset, raced: Raced) -> xr.Dataset:
+    """Write the scores with the results of a race, and the errors of its virtual measurements; return the scores."""
+    folder, ranked = session.folder, with_race(scores, raced)
+    write_scores(folder / "scores.csv", ranked, pose_columns(ranked), order="final_rank")
+    write_netcdf(ranked, folder / "scores.nc")
+    write_netcdf(raced_errors(raced, session.study.task), folder / "checks.nc")
+    return ranked
 
 
 def write_inputs(session: Session) -> None:

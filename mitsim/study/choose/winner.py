@@ -5,13 +5,11 @@ from __future__ import annotations
 import xarray as xr
 
 from characterisation.files.atomic_io import write_json
-from characterisation.scores.view_score import write_scores
-from mitsim.maps.campaign.run import write_netcdf
 from mitsim.study.run_files import digests_of
 from mitsim.study.run_record import draw_clouds, own_files, run_record
-from mitsim.study.scoring import pose_columns, write_inputs
+from mitsim.study.scoring import write_inputs, write_raced
 from mitsim.study.session import Session
-from mitsim.study.virtual.race import Raced, raced_errors, with_race
+from mitsim.study.virtual.race import Raced
 
 
 def complete_winner(session: Session, scores: xr.Dataset, raced: Raced, leaders: dict[str, int]) -> None:
@@ -35,10 +33,7 @@ def complete_winner(session: Session, scores: xr.Dataset, raced: Raced, leaders:
     (folder / "clouds").mkdir(exist_ok=True)
     performance_map.save(folder / "map.nc")
     write_inputs(session)
-    ranked = with_race(scores, raced)
-    write_scores(folder / "scores.csv", ranked, pose_columns(ranked), order="final_rank")
-    write_netcdf(ranked, folder / "scores.nc")
-    write_netcdf(raced_errors(raced, study.task), folder / "checks.nc")
+    write_raced(session, scores, raced)
     drawn = sorted(set(leaders.values()))
     draw_clouds(session, performance_map, drawn)
     about = run_record(study, performance_map, raced, [], None) | {"leaders": leaders}

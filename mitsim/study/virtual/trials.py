@@ -73,15 +73,19 @@ class TrialFolder:
     """Trials of one study in a folder, one file for each view; ``digest`` identifies the study.
 
     ``folded`` has the number of deviations of every measurement whose values fold. A kept trial that lacks them is
-    measured again.
+    measured again. ``folded_values`` describes these values, for the errors of parts that deviate.
     """
 
     def __init__(
-        self, folder: str | Path, digest: str, measurements: Sequence[str], folded: Mapping[str, int] | None = None
+        self,
+        folder: str | Path,
+        digest: str,
+        measurements: Sequence[str],
+        folded: Mapping[str, int] | None = None,
+        folded_values: Mapping[str, FoldedValue] | None = None,
     ) -> None:
         self.folder, self.digest, self.measurements = Path(folder), digest, tuple(measurements)
-        self.folded = dict(folded or {})
-        self.folded_values: dict[str, FoldedValue] = {}
+        self.folded, self.folded_values = dict(folded or {}), dict(folded_values or {})
         self._known: dict[int, dict[Trial, Outcome]] = {}
 
     @classmethod
@@ -89,9 +93,7 @@ class TrialFolder:
         """Return the trials of a task in a folder."""
         folded = folded_values(task)
         counts = {name: math.prod(one.shape) for name, one in folded.items()}
-        trials = cls(folder, digest, list(task.measurements), counts)
-        trials.folded_values = folded
-        return trials
+        return cls(folder, digest, list(task.measurements), counts, folded)
 
     def known(self, view: int) -> dict[Trial, Outcome]:
         """Return the finished trials of a view; the file is read once."""
