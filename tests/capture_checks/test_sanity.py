@@ -10,13 +10,14 @@ import pytest
 from pydantic import TypeAdapter
 from simulated_rigs import LINES, SPECKS, images_seen, surface_seen
 
+from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.decoding import coded_images
 from mitsim.decoding.checks.checked_cloud import checked_cloud
 from mitsim.decoding.checks.pair_sanity import measured_row_error, row_error_warnings
-from mitsim.decoding.checks.sanity import code_findings, row_error_in_words
+from mitsim.decoding.checks.sanity import code_findings, row_error_in_words, with_warnings
 from mitsim.decoding.cloud import capture_cloud
 from mitsim.decoding.coded_images import CodedImages
 from mitsim.decoding.matching.stereo import stereo_geometry
@@ -361,6 +362,15 @@ def test_rows_of_two_cameras_by_stripes_higher_than_the_rows_compared(off):
 def test_a_calibration_of_another_pair():
     capture = with_rig(taken(BOTH, pair()), {"left": camera(), "right": camera(60.0, (12.0, -6.0, 0.0))})
     assert said(capture, PAIRED) != ""
+
+
+def test_a_code_of_rows_alone_is_reported_by_the_decoder_of_a_pair():
+    """The import of the capture warns of nothing; its columns were looked up without a check."""
+    capture = taken(sequence(gray("rows"), "white", "black"), pair())
+    capture = replace(capture, decoding=capture.decoding.model_copy(update={"decoder": PAIRED}))
+    assert "warnings" not in with_warnings(capture).settings
+    with pytest.raises(InputError, match="columns"):
+        checked_cloud(capture, PAIRED, None)
 
 
 @pytest.mark.parametrize("off", [-0.8, 0.0, 0.6])

@@ -52,6 +52,8 @@ def code_findings(images: CodedImages, rig: Rig, recorded: bool) -> Findings:
     if out or not coordinates:
         return Findings(out)
     if images.settings.triangulate == "cameras":
+        if any("columns" not in each for each in coordinates.values()):
+            return Findings()  # decoding reports a code that two cameras cannot be matched by
         try:
             return pair_findings(images, rig)
         except InputError as error:
