@@ -26,6 +26,7 @@ from scipy.io.matlab import MatlabOpaque
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError, nearest
 from mitsim.sensor.calibration_programs import Composed, with_usual_names
+from mitsim.sensor.inflated import GZIP, inflated
 from mitsim.sensor.mat_structure import check_mat
 from mitsim.sensor.yaml_values import NotYamlError, read_yaml
 
@@ -214,11 +215,10 @@ def _unpacked(file: Path, data: bytes) -> bytes:
     if data[:2] != b"\x1f\x8b":
         return data
     try:
-        unpack = zlib.decompressobj(31)
-        data = unpack.decompress(data, _LARGEST)
+        data = inflated(data, _LARGEST, GZIP)
     except zlib.error as error:
         raise InputError(file, "", f"a packed file that is damaged ({error})", _KINDS) from None
-    if unpack.unconsumed_tail:
+    if len(data) > _LARGEST:
         raise InputError(file, "size", f"over {_LARGEST} bytes unpacked", f"up to {_LARGEST}")
     return data
 

@@ -17,6 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from characterisation.files.errors import InputError
+from mitsim.sensor.inflated import ZLIB, inflated
 
 #: type codes of data elements (table 1-1 of the format)
 _INT8, _UINT8, _INT32, _UINT32, _MATRIX, _COMPRESSED, _UTF8 = 1, 2, 5, 6, 14, 15, 16
@@ -94,12 +95,11 @@ def _check_variables(read: _Bytes, data: bytes) -> None:
     while len(rest):
         kind, content, rest = read.element(rest)
         if kind == _COMPRESSED:
-            unpack = zlib.decompressobj()
             try:
-                unpacked = unpack.decompress(content, 8 * read.most)
+                unpacked = inflated(content, 8 * read.most, ZLIB)
             except zlib.error as error:
                 raise read.fault(f"packed bytes that do not unpack ({error})") from None
-            if unpack.unconsumed_tail:
+            if len(unpacked) > 8 * read.most:
                 raise InputError(read.file, "size", f"over {8 * read.most:,} bytes unpacked", "fewer")
             kind, content, _ = read.element(memoryview(unpacked))
         if kind != _MATRIX:

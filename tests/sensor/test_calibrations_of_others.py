@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import gzip
+
 import cv2
 import numpy as np
 import pytest
 from scipy.io import savemat
 
 from characterisation.files.errors import InputError
+from mitsim.sensor.calibration_tree import read_tree
 from mitsim.sensor.preset import load_sensor
 
 K1 = np.array([[900.5, 0, 317.2], [0, 901.25, 241.4], [0, 0, 1]])
@@ -212,3 +215,15 @@ def test_files_that_are_nothing_are_refused(tmp_path, name):
         (tmp_path / name).write_bytes(data)
         with pytest.raises(InputError, match=name):
             loaded(tmp_path, ALONE, f'"{name}"')
+
+
+def test_a_packed_calibration_that_is_cut_off_is_refused(tmp_path):
+    """Its first half is YAML too, without the distortion."""
+    storage(tmp_path / "c.yml", A=K1, dist=D1)
+    packed = gzip.compress((tmp_path / "c.yml").read_bytes())
+    (tmp_path / "c.yml.gz").write_bytes(packed)
+    assert read_tree([tmp_path / "c.yml.gz"]).names() == ["A", "dist"]
+    for end in (*range(len(packed) // 2, len(packed), 16), len(packed) - 1):
+        (tmp_path / "c.yml.gz").write_bytes(packed[:end])
+        with pytest.raises(InputError, match="cut off"):
+            read_tree([tmp_path / "c.yml.gz"])

@@ -90,6 +90,16 @@ def test_packed_variables_do_not_unpack_to_gigabytes(tmp_path):
         check_mat(tmp_path / "a.mat", (tmp_path / "a.mat").read_bytes(), 1 << 16)
 
 
+def test_a_packed_variable_that_is_cut_off_is_refused(tmp_path):
+    """All numbers are there, but the end of the stream with its checksum is missing."""
+    savemat(tmp_path / "a.mat", {"K": np.eye(3)}, do_compression=True)
+    data = (tmp_path / "a.mat").read_bytes()
+    (length,) = struct.unpack("<I", data[132:136])
+    cut = data[:132] + struct.pack("<I", length - 4) + data[136:-4]
+    with pytest.raises(InputError, match="cut off"):
+        check_mat(tmp_path / "a.mat", cut, 1 << 20)
+
+
 def test_an_object_of_the_toolbox_gets_the_commands_that_save_it(tmp_path):
     """Of an object MATLAB writes three names and bytes of its own."""
 
