@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.io import loadmat
 
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
@@ -24,7 +23,7 @@ from mitsim.capture.recordings.number_text import number_words
 from mitsim.capture.recordings.organised_cloud import FARTHEST_MM, METRES_UNDER
 from mitsim.capture.recordings.pcd import decode_pcd
 from mitsim.capture.recordings.ply import decode_ply
-from mitsim.sensor.mat_structure import check_mat
+from mitsim.sensor.mat_structure import read_mat
 
 #: most numbers of a MATLAB file: x, y, z and more of 100 million points
 _MOST_NUMBERS = 1_000_000_000
@@ -96,18 +95,16 @@ def _points(path: Path) -> NDArray[np.floating]:
         return _of_text(path, data)
     if suffix not in ARRAYS:
         return decode_ply(data, path).points if data.startswith(b"ply") else decode_pcd(data, path)[0]
-    try:
-        if suffix == ".npy":
-            arrays = {path.name: np.load(io.BytesIO(data), allow_pickle=False)}
-        else:
-            check_mat(path, data, _MOST_NUMBERS)
-            arrays = {k: v for k, v in loadmat(io.BytesIO(data)).items() if isinstance(v, np.ndarray)}
-    except InputError:
-        raise
-    except Exception as error:  # SciPy raises many types of errors for damaged files, and its own for version 7.3
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-        hint = "save(..., '-v7')" if suffix == ".mat" else ""
-        raise InputError(path, "", f"an unreadable file ({reason})", f"a {suffix} file with numbers", hint) from None
+    if suffix == ".npy":
+        try:
+            arrays = {path.name: np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)}
+        except Exception as error:  # NumPy raises many types of errors for damaged files
+            reason = " ".join(str(error).split())[:120] or type(error).__name__
+            hint = "np.save writes such a file, np.savez an archive"
+            raise InputError(path, "", f"an unreadable file ({reason})", "a .npy file with numbers", hint) from None
+    else:
+        read = read_mat(path, data, _MOST_NUMBERS)
+        arrays = {name: value for name, value in read.items() if isinstance(value, np.ndarray)}
     found = _with_three(arrays)
     if found is None:
         shapes = ", ".join(f"{name} {' x '.join(map(str, one.shape))}" for name, one in arrays.items())[:200]

@@ -7,7 +7,6 @@ one tree that records which values were read, so that unread values can be repor
 
 from __future__ import annotations
 
-import math
 import re
 import zlib
 from collections.abc import Iterator
@@ -20,14 +19,13 @@ from zipfile import ZipFile
 
 import cv2
 import numpy as np
-from scipy.io import loadmat, whosmat
 from scipy.io.matlab import MatlabOpaque
 
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError, nearest
 from mitsim.sensor.calibration_programs import Composed, with_usual_names
 from mitsim.sensor.inflated import GZIP, inflated
-from mitsim.sensor.mat_structure import check_mat
+from mitsim.sensor.mat_structure import read_mat
 from mitsim.sensor.yaml_values import NotYamlError, read_yaml
 
 #: names of quantities derived from the rest of a calibration, or that state its quality
@@ -142,19 +140,7 @@ def _read(file: Path) -> list[dict[str, Any]]:
     """Return the names and values of each document of a file."""
     data = read_bounded(file, _KINDS, "" if file.exists() else _beside(file), largest=_LARGEST)
     if file.suffix.lower() == ".mat":
-        checked = check_mat(file, data, _MOST_NUMBERS)
-        try:
-            sizes = [] if checked else [math.prod(shape) for _, shape, _ in whosmat(BytesIO(data))]
-            if sum(sizes) > _MOST_NUMBERS:
-                raise InputError(file, "size", f"{sum(sizes):,} numbers", f"up to {_MOST_NUMBERS:,}")
-            read = loadmat(BytesIO(data), simplify_cells=True)
-        except NotImplementedError:
-            raise InputError(file, "", "a .mat file of version 7.3", "an older version", "save(..., '-v7')") from None
-        except InputError:
-            raise
-        except Exception as error:  # the reader raises any exception on damaged bytes
-            raise InputError(file, "", f"a file that is not MATLAB's ({error})", _KINDS) from None
-        values = {name: value for name, value in read.items() if not name.startswith("__")}
+        values = read_mat(file, data, _MOST_NUMBERS, simplify_cells=True)
         plain = {name: value for name, value in values.items() if not isinstance(value, MatlabOpaque)}
         if values and not plain:
             hint = "save it as a structure: s = toStruct(stereoParams); save('stereo.mat', 's', '-v7')"

@@ -1,4 +1,4 @@
-"""Check the structure of MATLAB files before SciPy reads them, since its C code trusts what a file says.
+"""Read MATLAB files after a check of their structure, since SciPy's C code trusts what a file says.
 
 SciPy looks up the type of a data element in a table without a check of its bounds: one changed bit, such as the mark of
 complex numbers, ends the process. After this check every element has a type that its place allows, lies inside its
@@ -13,8 +13,12 @@ import math
 import struct
 import zlib
 from dataclasses import dataclass
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
+
+from scipy.io import loadmat, whosmat
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.inflated import ZLIB, inflated
@@ -34,6 +38,39 @@ _COMPLEX = 0x0800
 _DEEPEST = 32
 
 _KIND = "a whole file of MATLAB, level 5"
+
+
+def read_mat(file: Path, data: bytes, most: int, **options: bool) -> dict[str, Any]:
+    """Return the variables of a file of version 7 or older, without those of SciPy about the file.
+
+    Parameters
+    ----------
+    file
+        Path of the file, for messages.
+    data
+        Content of the file.
+    most
+        Largest number of values in the file.
+    options
+        Of :func:`scipy.io.loadmat`.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged, larger, or of version 7.3.
+    """
+    checked = check_mat(file, data, most)
+    try:
+        count = 0 if checked else sum(math.prod(shape) for _, shape, _ in whosmat(BytesIO(data)))
+        if count <= most:
+            read = loadmat(BytesIO(data), **options)
+            return {name: value for name, value in read.items() if not name.startswith("__")}
+    except NotImplementedError:
+        raise InputError(file, "", "a .mat file of version 7.3", "an older version", "save(..., '-v7')") from None
+    except Exception as error:  # SciPy raises many types of errors for damaged files
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(file, "", f"an unreadable file ({reason})", "a .mat file", "save(..., '-v7')") from None
+    raise InputError(file, "size", f"{count:,} values", f"up to {most:,}")
 
 
 def check_mat(file: Path, data: bytes, most: int) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 
 import numpy as np
 import pytest
@@ -118,6 +119,20 @@ def test_a_file_that_is_no_cloud_is_refused_in_words(tmp_path, name, content, sa
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=says):
         read_cloud(tmp_path / name)
+
+
+def test_an_archive_of_arrays_under_the_suffix_of_one_is_refused(tmp_path):
+    with (tmp_path / "a.npy").open("wb") as file:
+        np.savez(file, points=plane())
+    with pytest.raises(InputError, match=r"unreadable.*np\.save"):
+        read_cloud(tmp_path / "a.npy")
+
+
+def test_numbers_that_a_file_of_level_4_states_are_bounded(tmp_path):
+    """Its header promises 40000 x 40000 numbers, 12.8 GB, of which none follow."""
+    (tmp_path / "a.mat").write_bytes(struct.pack("<5i", 0, 40_000, 40_000, 0, 2) + b"P\0")
+    with pytest.raises(InputError, match=r"1,600,000,000 values; allowed: up to"):
+        read_cloud(tmp_path / "a.mat")
 
 
 def test_a_list_of_points_has_no_picture(tmp_path):
