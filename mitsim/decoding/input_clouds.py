@@ -16,10 +16,11 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
+from mitsim.capture.recordings.organised_cloud import read_organised_cloud, read_stored_cloud
 from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 from mitsim.decoding.cloud import Settings, decoder_settings
 from mitsim.decoding.coded_images import decoded_once
-from mitsim.decoding.plain_clouds import is_plain, read_plain_cloud
+from mitsim.decoding.plain_clouds import is_array_or_text, plain_cloud, read_plain_cloud
 from mitsim.running.progress import say
 from mitsim.sensor.matcher import MatcherSettings
 
@@ -79,17 +80,22 @@ def read_cloud(path: Path, sensor: str | None = None, reference: bool = False) -
     """
     if path.is_file() and _is_mitsim_ply(path):
         return InputCloud(path, cloud_files.read_cloud(path), None)
-    if is_plain(path):
-        return _plain(path)
+    if is_array_or_text(path):
+        return _plain(path, *read_plain_cloud(path))
     if (path / "capture.json").exists():
         capture = read_capture(path)
-    elif path.exists():
+    elif path.is_file() and path.suffix.lower() in _SUFFIXES:
+        stored = read_stored_cloud(path)
+        if stored.size is None:
+            return _plain(path, *plain_cloud(stored.points, path))
         try:
-            capture = read_recording(path, ReadOptions()).capture
+            capture = read_organised_cloud(stored)
         except InputError:
-            if not reference or path.suffix.lower() not in _SUFFIXES:
+            if not reference:
                 raise
-            return _plain(path)
+            return _plain(path, *plain_cloud(stored.points, path))
+    elif path.exists():
+        capture = read_recording(path, ReadOptions()).capture
     else:
         raise InputError(
             path,
@@ -101,8 +107,7 @@ def read_cloud(path: Path, sensor: str | None = None, reference: bool = False) -
     return InputCloud(path, decoded_once(capture, settings, imager)[0], capture, margin_of(settings))
 
 
-def _plain(path: Path) -> InputCloud:
-    cloud, about = read_plain_cloud(path)
+def _plain(path: Path, cloud: PointCloud, about: str) -> InputCloud:
     say(about)
     return InputCloud(path, cloud, None)
 

@@ -1,7 +1,7 @@
 """Read clouds without a grid, and clouds in arrays and text files, to measure them or to compare with them.
 
-Signal chain: .npy, .mat, text of three columns, PLY or PCD -> x, y, z of every point, on a grid if the array has rows
-and columns -> unit -> cloud.
+Signal chain: .npy, .mat, text of three columns, or points of a PLY or PCD -> x, y, z of every point, on a grid if the
+array has rows and columns -> unit -> cloud.
 
 The points are used as they are: mitsim assumes that their frame is that of the sensor or, for a reference, that of the
 cloud. A cloud without a grid is one row of pixels, and each pixel's ray passes through its point. So it has no windows
@@ -20,9 +20,7 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.recordings.number_text import number_words
-from mitsim.capture.recordings.organised_cloud import FARTHEST_MM, METRES_UNDER
-from mitsim.capture.recordings.pcd import decode_pcd
-from mitsim.capture.recordings.ply import decode_ply
+from mitsim.capture.recordings.organised_cloud import scale_to_mm
 from mitsim.sensor.mat_structure import read_mat
 
 #: most numbers of a MATLAB file: x, y, z and more of 100 million points
@@ -35,43 +33,40 @@ ARRAYS, TEXTS = (".npy", ".mat"), (".xyz", ".txt", ".asc", ".pts", ".csv")
 _LARGEST_TEXT = 256 * 1024**2
 
 
-def is_plain(path: Path) -> bool:
-    """Return whether a file is a cloud that no recording's reader takes: an array, a text, or points without a grid."""
-    suffix = path.suffix.lower()
-    if suffix in (*ARRAYS, *TEXTS):
-        return path.is_file()
-    if suffix not in (".ply", ".pcd") or not path.is_file():
-        return False
-    data = read_bounded(path)
-    if data.startswith(b"ply"):
-        return decode_ply(data, path).size is None
-    return bool(decode_pcd(data, path)[0].shape[0] == 1)
+def is_array_or_text(path: Path) -> bool:
+    """Return whether a file is a cloud in an array or a text, by its suffix."""
+    return path.suffix.lower() in (*ARRAYS, *TEXTS) and path.is_file()
 
 
 def read_plain_cloud(path: Path) -> tuple[PointCloud, str]:
-    """Return a cloud [mm], and a sentence about its unit and its grid.
+    """Return the cloud [mm] of an array or a text, and a sentence about its unit and its grid.
 
     Raises
     ------
     InputError
         If the file holds no points with x, y and z.
     """
-    points = np.array(_points(path), np.float64)
-    points[~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)] = np.nan
-    valid = np.isfinite(points[..., 0])
-    if not valid.any():
-        raise InputError(path, "", "no points", "a cloud with x, y and z")
-    distance = float(np.median(np.linalg.norm(points[valid], axis=-1)))
-    metres = distance < METRES_UNDER
-    points *= 1000.0 if metres else 1.0
-    if np.nanmax(np.abs(points)) > FARTHEST_MM:
-        raise InputError(path, "x, y, z", f"{np.nanmax(np.abs(points)):.3g} mm", f"up to {FARTHEST_MM:g} mm")
+    data = read_bounded(path, "a cloud")
+    suffix = path.suffix.lower()
+    return plain_cloud(_of_text(path, data) if suffix in TEXTS else _of_arrays(path, data, suffix), path)
+
+
+def plain_cloud(stored: NDArray[np.floating], path: Path) -> tuple[PointCloud, str]:
+    """Return the cloud [mm] of points (n, 3) or (H, W, 3) as a file has them, and a sentence about its unit and grid.
+
+    Raises
+    ------
+    InputError
+        If there is no point, or one is too far away.
+    """
+    points = np.array(stored, np.float64)
+    name, distance = scale_to_mm(points, path)
     organised = points.ndim == 3 and min(points.shape[:2]) > 1
     grid = points if organised else points.reshape(1, -1, 3)
     status = np.where(np.isfinite(grid[..., 0]), Status.VALID, Status.NO_SURFACE).astype(np.uint8)
     cloud = PointCloud(grid.astype(np.float32), status, _through(grid), "point-cloud", "device")
     shape = f"{grid.shape[1]} x {grid.shape[0]} points" if organised else f"{grid.shape[1]} points without a grid"
-    unit = f"in {'m' if metres else 'mm'}, which their median distance of {distance:.4g} suggests"
+    unit = f"in {name}, which their median distance of {distance:.4g} suggests"
     return cloud, f"{path.name}: {shape}, {unit}"
 
 
@@ -88,13 +83,8 @@ def _through(points: NDArray[np.float64]) -> ViewGrid:
     return ViewGrid(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, normalised=rays)
 
 
-def _points(path: Path) -> NDArray[np.floating]:
-    """Return the points (n, 3) or (H, W, 3) of a file, in its unit."""
-    suffix, data = path.suffix.lower(), read_bounded(path, "a cloud")
-    if suffix in TEXTS:
-        return _of_text(path, data)
-    if suffix not in ARRAYS:
-        return decode_ply(data, path).points if data.startswith(b"ply") else decode_pcd(data, path)[0]
+def _of_arrays(path: Path, data: bytes, suffix: str) -> NDArray[np.floating]:
+    """Return the points (n, 3) or (H, W, 3) of a file of NumPy or MATLAB, in its unit."""
     if suffix == ".npy":
         try:
             arrays = {path.name: np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)}

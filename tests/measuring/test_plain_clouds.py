@@ -14,6 +14,7 @@ from shell import mitsim_here
 from characterisation.cloud_files import write_cloud
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from mitsim.capture.recordings import organised_cloud
 from mitsim.decoding.input_clouds import read_cloud
 from mitsim.decoding.plain_clouds import read_plain_cloud
 
@@ -104,11 +105,32 @@ def test_a_reference_with_a_grid_may_lie_anywhere(tmp_path):
     assert np.isfinite(read_cloud(path, reference=True).cloud.points[..., 0]).sum() == np.isfinite(moved[..., 0]).sum()
 
 
+@pytest.mark.parametrize("name", ["a.ply", "a.pcd"])
+@pytest.mark.parametrize("organised", [False, True])
+def test_a_cloud_of_another_program_is_decoded_once(tmp_path, monkeypatch, name, organised):
+    """Whether it has a grid follows from the same decoding as its points."""
+    path, calls = save(tmp_path / name, plane()), []
+    if organised:
+        stated = {
+            "a.ply": (b"end_h", b"obj_info num_cols 60\nobj_info num_rows 45\nend_h"),
+            "a.pcd": (b"WIDTH 2700\nHEIGHT 1", b"WIDTH 60\nHEIGHT 45"),
+        }
+        path.write_bytes(path.read_bytes().replace(*stated[name], 1))
+    for decode in ("decode_ply", "decode_pcd"):
+        real = getattr(organised_cloud, decode)
+        monkeypatch.setattr(organised_cloud, decode, lambda *given, real=real: calls.append(real) or real(*given))
+    cloud = read_cloud(path).cloud
+    assert (cloud.grid.height > 1) == organised
+    assert len(calls) == 1
+    assert cloud.valid.sum() == np.isfinite(plane()[..., 0]).sum()
+
+
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
         ("a.npy", b"\x93NUMPY\x01\x00", "unreadable"),
         ("a.mat", b"MATLAB 5.0", "unreadable"),
+        ("a.ply", b"solid of another format\nvertex 1 2 3\n", "a PLY file"),
         ("a.xyz", b"1 2 3\n4 5\n", "equal columns"),
         ("a.xyz", b"", "equal columns"),
         ("a.xyz", b"1 2 3\nfour five six\n1 2 x\n", "equal columns"),

@@ -13,7 +13,7 @@ or the size of a given camera if the number of points matches. A cloud without a
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -50,8 +50,46 @@ FARTHEST_MM = 1e6
 CAMERA_OFF_PX = 1.0
 
 
+@dataclass(frozen=True)
+class StoredCloud:
+    """Points of a PLY or PCD file, as they are in it.
+
+    - ``path`` of the file.
+    - ``points`` (n, 3) of a PLY, (HEIGHT, WIDTH, 3) of a PCD.
+    - ``size`` (width, height) of the grid; None without one.
+    - ``records`` that a capture of them keeps.
+    """
+
+    path: Path
+    points: Points
+    size: tuple[int, int] | None
+    records: dict[str, Any]
+
+
+def read_stored_cloud(path: Path) -> StoredCloud:
+    """Read a PLY or PCD file of another program; what its bytes are counts, not its suffix.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged, neither PLY nor PCD, or was written by mitsim.
+    """
+    data = read_bounded(path, "a PLY or PCD file")
+    if data.startswith(b"ply"):
+        read = decode_ply(data, path)
+        if any(line.startswith("comment mitsim ") for line in read.lines):
+            raise InputError(path, "", "a cloud written by mitsim", "a cloud of another program", "it needs no import")
+        return StoredCloud(path, read.points, read.size, {})
+    if path.suffix.lower() == ".ply" and b"FIELDS" not in data[:4096]:
+        raise InputError(path, "", "a file without the header of a PLY", "a PLY file, whose first line is ply")
+    points, header = decode_pcd(data, path)
+    height, width = points.shape[:2]
+    size = (width, height) if height > 1 else None
+    return StoredCloud(path, points, size, {"viewpoint_of_file": header.get("VIEWPOINT", "")})
+
+
 def read_organised_cloud(
-    path: str | Path,
+    path: str | Path | StoredCloud,
     *,
     calibration: str | Path | None = None,
     unit: str | None = None,
@@ -65,7 +103,7 @@ def read_organised_cloud(
     Parameters
     ----------
     path
-        Path of the file.
+        Path of the file, or the cloud that was read from it.
     calibration
         The camera of the grid, see :mod:`mitsim.capture.recordings.calibration_file`; by default a pinhole is fitted.
         With a rectification, the grid may also be that of the rectified left image, at full or reduced size.
@@ -87,20 +125,16 @@ def read_organised_cloud(
     InputError
         If the file is damaged or has no grid, or no camera at the origin sees its points on the pixels of the grid.
     """
-    path = Path(path)
-    points, read_settings, given = _on_grid(path, calibration, camera)
-    settings: dict[str, Any] = {"imported_from": path.name, "axes_of_file": axes} | read_settings
-    points[~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)] = np.nan
+    stored = path if isinstance(path, StoredCloud) else read_stored_cloud(Path(path))
+    path = stored.path
+    points, given = _on_grid(stored, calibration, camera)
+    settings: dict[str, Any] = {"imported_from": path.name, "axes_of_file": axes} | stored.records
+    settings["unit_of_file"], _ = scale_to_mm(points, path, unit, "check --unit")
     count = int(np.isfinite(points[..., 0]).sum())
     if count < LEAST_POINTS:
         raise InputError(path, "", f"{count} points", f"{LEAST_POINTS} or more")
     if axes == "opengl":
         points *= np.array([1, -1, -1], np.float32)
-    settings["unit_of_file"] = unit or _unit_of(points)
-    farthest = float(np.nanmax(np.abs(points))) * UNITS_MM[settings["unit_of_file"]]
-    if farthest > FARTHEST_MM:
-        raise InputError(path, "x, y, z", f"{farthest:.3g} mm", f"up to {FARTHEST_MM:g} mm", "check --unit")
-    points *= np.float32(UNITS_MM[settings["unit_of_file"]])
     turn = Transform.identity()
     if link is not None:
         tree = NxLibTree(read_bounded(Path(link), "an Ensenso's *_calib.json"), str(link))
@@ -129,42 +163,61 @@ def read_organised_cloud(
 
 
 def _on_grid(
-    path: Path, calibration: str | Path | None, camera: str | None
-) -> tuple[Points, dict[str, Any], Calibrated | None]:
-    """Return the points (H, W, 3) as in the file, its own settings, and the given calibration."""
-    data = read_bounded(path, "a PLY or PCD file")
+    stored: StoredCloud, calibration: str | Path | None, camera: str | None
+) -> tuple[Points, Calibrated | None]:
+    """Return the points (H, W, 3) as in the file, and the given calibration."""
+    size, count = stored.size, stored.points.size // 3
+    given = None if calibration is None else read_calibration(calibration, size)
+    if size is None and given is not None:
+        eye = given.rig.reference if camera is None else given.rig.cameras.get(camera, given.rig.reference)
+        size = eye.width, eye.height
     hint = "save it organised, a point or NaN for each pixel, or give the camera of its pixels: --calibration"
-    if data.startswith(b"ply"):
-        read = decode_ply(data, path)
-        if any(line.startswith("comment mitsim ") for line in read.lines):
-            raise InputError(path, "", "a cloud written by mitsim", "a cloud of another program", "it needs no import")
-        size = read.size
-        given = None if calibration is None else read_calibration(calibration, size)
-        if size is None and given is not None:
-            eye = given.rig.reference if camera is None else given.rig.cameras.get(camera, given.rig.reference)
-            size = eye.width, eye.height
-        if size is None or size[0] * size[1] != len(read.points):
-            found = f"{len(read.points)} points without a grid" if size is None else f"{len(read.points)} points"
-            allowed = "an organised cloud" if size is None else f"{size[0]} x {size[1]}, one for each pixel"
-            raise InputError(path, "", found, allowed, hint)
-        return read.points.reshape(size[1], size[0], 3).copy(), {}, given
-    points, header = decode_pcd(data, path)
-    grid = (points.shape[1], points.shape[0]) if points.shape[0] > 1 else None
-    given = None if calibration is None else read_calibration(calibration, grid)
-    if (
-        points.shape[0] == 1
-        and given is not None
-        and given.rig.reference.width * given.rig.reference.height == (points.shape[1])
-    ):
-        points = points.reshape(given.rig.reference.height, given.rig.reference.width, 3)
-    if points.shape[0] == 1:
-        raise InputError(path, "HEIGHT", "1: a cloud without a grid", "an organised cloud", hint)
-    return points.copy(), {"viewpoint_of_file": header.get("VIEWPOINT", "")}, given
+    if size is None:
+        of_pcd = stored.points.ndim == 3
+        field, found = ("HEIGHT", "1: a cloud") if of_pcd else ("", f"{count} points")
+        raise InputError(stored.path, field, f"{found} without a grid", "an organised cloud", hint)
+    if size[0] * size[1] != count:
+        allowed = f"{size[0]} x {size[1]}, one for each pixel"
+        raise InputError(stored.path, "", f"{count} points", allowed, hint)
+    return stored.points.reshape(size[1], size[0], 3).copy(), given
 
 
-def _unit_of(points: Points) -> str:
+def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = None, hint: str = "") -> tuple[str, float]:
+    """Scale points (..., 3) of a file to mm, in place; missing ones, (0, 0, 0) or without a number, become NaN.
+
+    Parameters
+    ----------
+    points
+        As in the file.
+    path
+        The file, for messages.
+    unit
+        One of :data:`UNITS_MM`; by default metres if the median distance is under :data:`METRES_UNDER`, else
+        millimetres.
+    hint
+        What to do if the points are too far away.
+
+    Returns
+    -------
+    tuple of str and float
+        The unit, and the median distance of the points from the origin in it.
+
+    Raises
+    ------
+    InputError
+        If there is no point, or one is beyond :data:`FARTHEST_MM`.
+    """
+    points[~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)] = np.nan
     seen = points[np.isfinite(points[..., 0])]
-    return "m" if np.median(np.linalg.norm(seen.astype(float), axis=-1)) < METRES_UNDER else "mm"
+    if not len(seen):
+        raise InputError(path, "", "no points", "a cloud with x, y and z")
+    distance = float(np.median(np.linalg.norm(seen.astype(float), axis=-1)))
+    unit = unit or ("m" if distance < METRES_UNDER else "mm")
+    farthest = float(np.abs(seen).max()) * UNITS_MM[unit]
+    if farthest > FARTHEST_MM:
+        raise InputError(path, "x, y, z", f"{farthest:.3g} mm", f"up to {FARTHEST_MM:g} mm", hint)
+    points *= UNITS_MM[unit]
+    return unit, distance
 
 
 def _seen_by(
