@@ -10,6 +10,8 @@ exchanged cameras.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -96,9 +98,8 @@ def _block_offsets(first: Floats, second: Floats) -> tuple[Floats, Floats, Float
         if other.shape[0] < _BLOCK:
             continue
         windows = np.lib.stride_tricks.sliding_window_view(other, _BLOCK, axis=0).swapaxes(1, 2)
-        there = windows.reshape(len(windows), -1)
-        there_known = np.isfinite(there)
-        enough = there_known.mean(axis=1) >= _FILLED
+        strip = _Strip.of(windows.reshape(len(windows), -1))
+        enough = strip.known.mean(axis=1) >= _FILLED
         if not enough.any():
             continue
         for top in range(0, first.shape[0] - _BLOCK + 1, _BLOCK // 2):
@@ -106,7 +107,7 @@ def _block_offsets(first: Floats, second: Floats) -> tuple[Floats, Floats, Float
             known = np.isfinite(own)
             if known.mean() < _FILLED:
                 continue
-            score = _correlations(own, known, there, there_known)
+            score = strip.correlations(own, known)
             score[~enough] = -1
             best = int(np.argmax(score))
             second_best = max(_beside_maximum(score, best), 0.0)
@@ -132,20 +133,38 @@ def _beside_maximum(score: Floats, best: int) -> float:
     return float(max(after.max(initial=-1.0), before.max(initial=-1.0)))
 
 
-def _correlations(own: Floats, known: NDArray[np.bool_], there: Floats, there_known: NDArray[np.bool_]) -> Floats:
-    """Return the correlation coefficients (k,) of a block (n,) with blocks (k, n), over the pixels known in both."""
-    both = (there_known & known).astype(float)
-    a, b = np.where(known, own, 0.0), np.where(there_known, there, 0.0)
-    a = a - a[known].mean()
-    b = b - b.sum(axis=1, keepdims=True) / np.maximum(there_known.sum(axis=1, keepdims=True), 1)
-    a, b = np.where(known, a, 0.0), np.where(there_known, b, 0.0)
-    count = np.maximum(both.sum(axis=1), 1)
-    sum_a, sum_b = both @ a, (b * both).sum(axis=1)
-    covariance = b @ a - sum_a * sum_b / count
-    variance_a, variance_b = both @ (a * a) - sum_a**2 / count, (b * b * both).sum(axis=1) - sum_b**2 / count
-    with np.errstate(divide="ignore", invalid="ignore"):
-        out = covariance / np.sqrt(variance_a * variance_b)
-    return np.where(np.isfinite(out) & (count >= 0.5 * len(own)), out, -1.0)
+@dataclass(frozen=True)
+class _Strip:
+    """Blocks (k, n) at all rows of a strip of columns, ready to be compared with many others.
+
+    ``known``: 1 where a pixel is known, else 0. ``values``: deviations from the mean of the known pixels of a block, 0
+    elsewhere; ``squares`` of them.
+    """
+
+    known: Floats
+    values: Floats
+    squares: Floats
+
+    @classmethod
+    def of(cls, blocks: Floats) -> _Strip:
+        known = np.isfinite(blocks).astype(float)
+        values = np.where(known > 0, blocks, 0.0)
+        values -= values.sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1)
+        values *= known
+        return cls(known, values, values * values)
+
+    def correlations(self, own: Floats, own_known: NDArray[np.bool_]) -> Floats:
+        """Return the correlation coefficients (k,) of a block (n,) with the blocks, over the pixels known in both."""
+        known = own_known.astype(float)
+        a = np.where(own_known, own - own[own_known].mean(), 0.0)
+        count = np.maximum(self.known @ known, 1)
+        sum_a, sum_b = self.known @ a, self.values @ known
+        covariance = self.values @ a - sum_a * sum_b / count
+        variance_a = self.known @ (a * a) - sum_a**2 / count
+        variance_b = self.squares @ known - sum_b**2 / count
+        with np.errstate(divide="ignore", invalid="ignore"):
+            out = covariance / np.sqrt(variance_a * variance_b)
+        return np.where(np.isfinite(out) & (count >= 0.5 * len(own)), out, -1.0)
 
 
 def _smooth(rows: Floats, steps: Floats, offsets: Floats, tolerance: float) -> NDArray[np.bool_]:
