@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decoding.checks.code_lines import CodeLines
-from mitsim.decoding.checks.rig_sanity import LARGEST_MISS_PX, light_plane_normals
+from mitsim.decoding.checks.rig_sanity import LARGEST_MISS_PX, half_stripe, meet_light_planes
 from mitsim.decoding.coded_images import CodedImages
 from mitsim.decoding.structured_light.decoder import decode_coordinates
+from mitsim.decoding.structured_light.geometry import axis_across
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -190,22 +191,18 @@ class _Explained:
         known = np.all([each.status == Status.VALID for each in found.values()], axis=0)
         if lit.mean() < _LEAST or not known.any():
             return cls(0.0, float("nan"))
-        start = eye.centre - projector.centre
-        apart = np.abs(projector.sensor_from_camera.inverse().directions(start))
-        across: Axis = "columns" if apart[0] >= apart[1] else "rows"
-        axis = across if across in found else next(iter(found))
+        axis = axis_across(eye, projector, tuple(found))
         directions = eye.sensor_from_camera.directions(rays[known])
-        normal = light_plane_normals(projector, found[axis].value[known], axis)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inverse = -np.einsum("ij,ij->i", normal, directions) / (normal @ start)  # 1 / distance along the ray
-            depth = rays[known][:, 2] / inverse
+        distance = meet_light_planes(eye, projector, directions, found[axis].value[known], axis)
+        with np.errstate(invalid="ignore"):
+            depth = distance * rays[known][:, 2]
             explained = (depth >= settings.near_mm) & (depth <= settings.far_mm)
-            points = eye.centre + directions / inverse[:, None]
-        place = projector.project(points[explained])
+        points = eye.centre + directions[explained] * distance[explained][:, None]
+        place = projector.project(points)
         missed = np.zeros(len(place), bool)
         for other, second in found.items():
             if other != axis:
-                allowed = LARGEST_MISS_PX + np.sqrt(3) * second.sigma[known][explained]
+                allowed = LARGEST_MISS_PX + half_stripe(second)
                 seen = second.value[known][explained]
                 missed |= ~(np.abs(place[:, 0 if other == "columns" else 1] - seen) <= allowed)
         explained[explained] = ~missed

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import Status
+from mitsim.decoding.structured_light.geometry import offset_from_projector
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
@@ -40,7 +41,7 @@ def baseline_warning(rig: Rig, code: LightCode) -> str:
     """Return a warning if the baseline lies along the stripes of a code with one axis, or ""."""
     if rig.projector is None or len(axes(code)) != 1:
         return ""
-    apart = rig.projector.sensor_from_camera.inverse().directions(rig.reference.centre - rig.projector.centre)
+    apart = offset_from_projector(rig.reference, rig.projector)
     axis = axes(code)[0]
     across, whole = abs(float(apart[0 if axis == "columns" else 1])), float(np.linalg.norm(apart))
     if across >= LEAST_ACROSS * whole:
@@ -139,15 +140,27 @@ def _meeting(eye: Camera, projector: Camera, rays: Floats, coordinates: dict[Axi
         with np.errstate(invalid="ignore", divide="ignore"):
             return along, (off[:, 0] * step[:, 1] - off[:, 1] * step[:, 0]) / np.linalg.norm(step, axis=1)
     ((axis, value),) = coordinates.items()
-    normal = light_plane_normals(projector, value, axis)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return -(normal @ start) / np.einsum("ij,ij->i", normal, rays), np.zeros(len(rays))
+    return meet_light_planes(eye, projector, rays, value, axis), np.zeros(len(rays))
 
 
-def light_plane_normals(projector: Camera, value: Floats, axis: Axis) -> Floats:
-    """Return normals (n, 3), in the sensor frame, of the planes of light of columns or rows ``value`` (n,) [px]."""
+def meet_light_planes(eye: Camera, projector: Camera, rays: Floats, value: Floats, axis: Axis) -> Floats:
+    """Return the distance (n,) [mm] from the camera at which rays meet the planes of light of columns or rows.
+
+    Negative behind the camera, infinite or NaN for a ray along its plane.
+
+    Parameters
+    ----------
+    eye, projector
+        Camera and projector of a rig.
+    rays
+        (n, 3) unit directions from the camera, in the sensor frame.
+    value, axis
+        (n,) columns or rows [projector px].
+    """
     last = (projector.height if axis == "columns" else projector.width) - 1.0
     ends = [np.full_like(value, end) for end in (0.0, last)]
     pixels = [np.stack([value, end] if axis == "columns" else [end, value], axis=-1) for end in ends]
     first, second = (projector.sensor_from_camera.directions(projector.rays_to_fold(each)) for each in pixels)
-    return np.asarray(np.cross(first, second))
+    normal = np.cross(first, second)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(-(normal @ (eye.centre - projector.centre)) / np.einsum("ij,ij->i", normal, rays))

@@ -17,7 +17,7 @@ distortion has no ray. Both are ``undetermined``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -129,10 +129,20 @@ def structured_light_geometry(
     if rig.projector is None:
         raise InputError("rig", "projector", "none", "a calibrated projector, for structured light of one camera")
     camera, projector = rig.cameras[camera_name], rig.projector
-    offset = projector.sensor_from_camera.inverse().directions(camera.centre - projector.centre)
-    code_axes = (code,) if isinstance(code, str) else axes(code)
-    axis = code_axes[0] if len(code_axes) == 1 or abs(offset[0]) >= abs(offset[1]) else code_axes[1]
+    axis = axis_across(camera, projector, (code,) if isinstance(code, str) else axes(code))
     return _prepared(camera_name, camera, projector, axis, near_mm, far_mm)
+
+
+def offset_from_projector(camera: Camera, projector: Camera) -> Floats:
+    """Return the centre (3,) of a camera in the projector's frame [mm]: x across columns, y across rows."""
+    return projector.sensor_from_camera.inverse().directions(camera.centre - projector.centre)
+
+
+def axis_across(camera: Camera, projector: Camera, coded: Sequence[Axis]) -> Axis:
+    """Return the axis of the ``coded`` ones across which projector and camera are farther apart."""
+    offset = np.abs(offset_from_projector(camera, projector))
+    across: Axis = "columns" if offset[0] >= offset[1] else "rows"
+    return across if across in coded else coded[0]
 
 
 @lru_cache(maxsize=1)  # 1 to 2 s for two megapixels, and one study asks several times

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.acceptance.vdi_2634 import flatness_error
-from mitsim.decoding.structured_light.geometry import MINIMUM_CHANGE_PX
+from mitsim.decoding.structured_light.geometry import MINIMUM_CHANGE_PX, axis_across
 from mitsim.sensor.camera import Camera, Rig, stereo_rectification
 from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, axes
@@ -253,7 +253,4 @@ def _component(sensor: Sensor) -> int:
     """Return the axis of the projector along which the decoder measures: 0 its columns, 1 its rows."""
     pattern, projector = sensor.pattern, sensor.rig.projector
     assert isinstance(pattern, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence) and projector is not None
-    both = axes(pattern)
-    apart = projector.sensor_from_camera.inverse().directions(sensor.rig.reference.centre - projector.centre)
-    axis = both[0] if len(both) == 1 or abs(apart[0]) >= abs(apart[1]) else both[1]
-    return 0 if axis == "columns" else 1
+    return 0 if axis_across(sensor.rig.reference, projector, axes(pattern)) == "columns" else 1
