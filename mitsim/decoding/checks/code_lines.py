@@ -45,8 +45,8 @@ class CodeLines:
         """Return the extent of the projector along an axis [px]."""
         return self.size[0] if axis == "columns" else self.size[1]
 
-    def decoded(self) -> list[dict[Axis, ProjectorCoordinate]]:
-        """Return the coordinates of the rows (n, W), and of the columns (H, m).
+    def decoded(self, axis: Axis) -> list[ProjectorCoordinate]:
+        """Return the coordinates along an axis of the rows (n, W), and of the columns (H, m).
 
         Raises
         ------
@@ -54,7 +54,7 @@ class CodeLines:
             If the code is ambiguous over the projector.
         """
         return [
-            decode_coordinates(part, self.code, self.size, self.settings, full_scale=self.full_scale)
+            decode_coordinates(part, self.code, self.size, self.settings, full_scale=self.full_scale, only=axis)[axis]
             for part in self.lines
         ]
 

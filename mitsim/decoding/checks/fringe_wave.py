@@ -49,7 +49,7 @@ def wave_in_words(lines: CodeLines, axis: Axis) -> str:
         return ""
 
     def tried(variant: CodeLines) -> _Trial:
-        rows, columns = (part[axis] for part in variant.decoded())
+        rows, columns = variant.decoded(axis)
         parts = [(rows.value, rows.status), (columns.value.T, columns.status.T)]
         return _Trial.of(parts, variant.extent(axis), along=0 if axis == "columns" else 1)
 

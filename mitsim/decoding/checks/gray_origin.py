@@ -162,7 +162,7 @@ def _in_words(origins: Origins) -> str:
 
 def _share_rejected(lines: CodeLines, axis: Axis) -> float:
     """Return the share of the lit pixels that have no coordinate along an axis [1]."""
-    parts = [part[axis] for part in lines.decoded()]
+    parts = lines.decoded(axis)
     status, lit = (
         np.concatenate([each.ravel() for each in all_parts])
         for all_parts in ([each.status for each in parts], [each.lit for each in parts])

@@ -122,31 +122,29 @@ def _fitting_order(lines: CodeLines, axis: Axis, orders: Iterable[tuple[str, lis
     for name, order in orders:
         rows, columns = (each[order] for each in lines.lines)
         try:
-            found = _smoothness(replace(lines, lines=(rows, columns)).decoded(), axis)[axis]
+            decoded = replace(lines, lines=(rows, columns)).decoded(axis)
         except InputError:
             continue
         # an order may be smooth although most pixels are contradictory, or its pairs are not complements
         if _changed_exposure(rows, lines.image_roles, axis, ""):
             continue
+        found = _smoothness([{axis: each} for each in decoded])[axis]
         if not found.doubtful and found.evenness - found.contradicted > best:
             best, description = found.evenness - found.contradicted, name
     return description
 
 
-def _smoothness(
-    lines: Sequence[Mapping[Axis, ProjectorCoordinate]], only: Axis | None = None
-) -> dict[Axis, Smoothness]:
+def _smoothness(lines: Sequence[Mapping[Axis, ProjectorCoordinate]]) -> dict[Axis, Smoothness]:
     """Return the smoothness of coordinates along decoded rows (n, W), and along decoded columns (H, m)."""
     evenness: dict[Axis, list[float]] = {}
     statuses: dict[Axis, list[NDArray[np.uint8]]] = {}
     lit_pixels: dict[Axis, list[NDArray[np.bool_]]] = {}
     for way, found in enumerate(lines):
         for axis, coordinate in found.items():
-            if only in (None, axis):
-                values = coordinate.value if way == 0 else coordinate.value.T
-                evenness.setdefault(axis, []).append(_evenness(values))
-                statuses.setdefault(axis, []).append(coordinate.status.ravel())
-                lit_pixels.setdefault(axis, []).append(coordinate.lit.ravel())
+            values = coordinate.value if way == 0 else coordinate.value.T
+            evenness.setdefault(axis, []).append(_evenness(values))
+            statuses.setdefault(axis, []).append(coordinate.status.ravel())
+            lit_pixels.setdefault(axis, []).append(coordinate.lit.ravel())
     out: dict[Axis, Smoothness] = {}
     for axis, each in evenness.items():
         status, lit = np.concatenate(statuses[axis]), np.concatenate(lit_pixels[axis])

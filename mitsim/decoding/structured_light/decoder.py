@@ -57,6 +57,7 @@ def decode_coordinates(
     full_scale: float,
     imager: Imager | MeasuredNoise | None = None,
     interpolate: bool = False,
+    only: Axis | None = None,
 ) -> dict[Axis, ProjectorCoordinate]:
     """Return the projector coordinates seen by each pixel, for each axis of any code.
 
@@ -77,6 +78,8 @@ def decode_coordinates(
     interpolate
         For a Gray code without fringes: interpolate columns along rows between the edges of their stripes, instead of
         taking the stripes' centres.
+    only
+        The axis to decode; None for all of the code.
 
     Raises
     ------
@@ -88,6 +91,8 @@ def decode_coordinates(
     check_full_scale(stack, full_scale)
     found: dict[Axis, ProjectorCoordinate] = {}
     for axis in axes(code):
+        if only not in (None, axis):
+            continue
         extent = size[0] if axis == "columns" else size[1]
         shared = [i for i, role in enumerate(image_roles) if role.axis in (axis, None) and role.kind in STRIPE_IMAGES]
         phases = [i for i, role in enumerate(image_roles) if role.axis == axis and role.kind == "phase"]
