@@ -19,7 +19,7 @@ from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Settings
 from mitsim.decoding.cloud import capture_cloud
-from mitsim.decoding.decoder_registry import Coordinates, projector_size
+from mitsim.decoding.decoder_registry import Coordinates, Geometry, projector_size
 from mitsim.decoding.grey_levels import MeasuredNoise
 from mitsim.decoding.noise import fringe_noise
 from mitsim.decoding.structured_light.decoder import decode_coordinates
@@ -110,11 +110,12 @@ class CodedImages:
 
 
 def decoded_once(
-    capture: Capture, settings: Settings, imager: Imager | None
+    capture: Capture, settings: Settings, imager: Imager | None, geometry: Geometry | None = None
 ) -> tuple[PointCloud, CodedImages | None, Imager | MeasuredNoise | None]:
     """Return the cloud of a capture; its coded images, decoded already, if it has any; and the noise of its images.
 
-    The noise is that of the imager or, without one, the noise that fringes show.
+    The noise is that of the imager or, without one, the noise that fringes show. ``geometry`` of the capture's rig, if
+    it is prepared already.
 
     Raises
     ------
@@ -123,6 +124,6 @@ def decoded_once(
     """
     images = CodedImages.of(capture, settings, imager)
     if images is None:
-        return capture_cloud(capture, settings, imager=imager), None, imager
-    cloud = capture_cloud(capture, settings, imager=images.noise, coordinates=images.coordinates)
+        return capture_cloud(capture, settings, geometry, imager=imager), None, imager
+    cloud = capture_cloud(capture, settings, geometry, imager=images.noise, coordinates=images.coordinates)
     return cloud, images, images.noise

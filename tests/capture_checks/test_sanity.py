@@ -15,18 +15,22 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.decoding import coded_images
+from mitsim.decoding.checks import sanity
 from mitsim.decoding.checks.checked_cloud import checked_cloud
-from mitsim.decoding.checks.pair_sanity import measured_row_error, row_error_warnings
+from mitsim.decoding.checks.pair_sanity import Findings, measured_row_error, row_error_warnings
 from mitsim.decoding.checks.sanity import code_findings, row_error_in_words, with_warnings
 from mitsim.decoding.cloud import capture_cloud
 from mitsim.decoding.coded_images import CodedImages
+from mitsim.decoding.matching import stereo
 from mitsim.decoding.matching.stereo import stereo_geometry
 from mitsim.decoding.structured_light import decoder, two_cameras
 from mitsim.decoding.structured_light.decoder import decode_coordinates
-from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.camera import Camera, Rig, stereo_rectification
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_sequence import ImageSequence
+from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, LightCode, PhaseShift, roles
+from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.transforms import Transform
 
 SETTINGS = DecoderSettings(near_mm=50, far_mm=20000)
@@ -413,3 +417,26 @@ def test_cloud_and_checks_decode_the_images_once(monkeypatch, paired):
     assert decoded.warnings == ()
     np.testing.assert_array_equal(decoded.cloud.points, alone.points)
     np.testing.assert_array_equal(decoded.cloud.status, alone.status)
+
+
+@pytest.mark.parametrize("technology", ["structured_light", "active_stereo"])
+def test_cloud_and_checks_share_the_geometry_of_a_pair(monkeypatch, technology):
+    """Maps of rectified images take longer than some decoders."""
+    capture, settings = taken(BOTH, pair()), PAIRED
+    if technology == "active_stereo":
+        images = {name: stack[:1] for name, stack in capture.images.items()}
+        capture = replace(capture, technology=technology, images=images, decoding=Decoding())
+        settings = MatcherSettings(near_mm=300, far_mm=2000)
+    prepared = []
+    monkeypatch.setattr(stereo, "stereo_rectification", lambda *eyes: prepared.append(1) or stereo_rectification(*eyes))
+    checked_cloud(capture, settings, None)
+    assert len(prepared) == 1
+
+
+def test_an_import_checks_with_the_noise_of_the_imager_of_its_settings(monkeypatch):
+    imager = Imager(5, 0.5, 10000, 12, bits=8, f_number=4)
+    stated = Decoding(pattern=CODES["phases"], decoder=SETTINGS, imager=imager)
+    capture, used = replace(taken(CODES["phases"]), decoding=stated), []
+    monkeypatch.setattr(sanity, "code_findings", lambda images, *rest: used.append(images.noise) or Findings())
+    with_warnings(capture)
+    assert used == [imager]

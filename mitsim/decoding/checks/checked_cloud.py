@@ -19,10 +19,14 @@ from mitsim.decoding.checks.sanity import (
     row_error_in_words,
     uncalibrated_in_words,
 )
+from mitsim.decoding.cloud import capture_geometry
 from mitsim.decoding.coded_images import decoded_once
 from mitsim.decoding.depth_range import range_warning, surface_beyond
+from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.decoding.noise import sigma_source
+from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.imager import Imager
+from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.preset import Sensor, presets
 
 
@@ -64,9 +68,10 @@ def checked_cloud(
     InputError
         If the settings belong to another technology, or the capture is inconsistent.
     """
-    cloud, images, noise = decoded_once(capture, settings, imager)
-    found = Findings() if images is None else code_findings(images, capture.rig, capture.source == "device")
-    matched = pair_row_error(capture, cloud)
+    pair = _pair_geometry(capture, settings)
+    cloud, images, noise = decoded_once(capture, settings, imager, pair)
+    found = Findings() if images is None else code_findings(images, capture.rig, capture.source == "device", pair)
+    matched = pair_row_error(capture, cloud, pair)
     warnings = [*capture.settings.get("warnings", []), *found.warnings, *row_error_warnings(matched)]
     if lost := uncalibrated_in_words(cloud):
         warnings.append(lost)
@@ -79,3 +84,16 @@ def checked_cloud(
         warnings.append(range_warning(f"{where}: a surface", beyond.depths, settings, whose, known))
     notes = row_error_in_words(capture, settings, found, matched), sigma_source(capture, cloud, noise)
     return CheckedCloud(cloud, tuple(dict.fromkeys(warnings)), tuple(note for note in notes if note))
+
+
+def _pair_geometry(capture: Capture, settings: Settings) -> StereoGeometry | None:
+    """Return the geometry of two cameras that triangulate, which decoding and checks need; None for another sensor."""
+    if capture.technology == "active_stereo":
+        paired = isinstance(settings, MatcherSettings)
+    else:
+        coded = settings if isinstance(settings, DecoderSettings) else None
+        paired = capture.technology == "structured_light" and coded is not None and coded.triangulate == "cameras"
+    if not paired:
+        return None
+    geometry = capture_geometry(capture, settings)
+    return geometry if isinstance(geometry, StereoGeometry) else None

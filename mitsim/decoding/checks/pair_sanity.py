@@ -21,7 +21,7 @@ from mitsim.decoding.checks.row_texture import rectified, textured_row_error, un
 from mitsim.decoding.checks.texture_matches import COMPARED_ROWS, LEAST_BLOCKS, texture_matches
 from mitsim.decoding.coded_images import CodedImages
 from mitsim.decoding.matching.row_error import row_error
-from mitsim.decoding.matching.stereo import StereoGeometry, stereo_geometry
+from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.decoding.structured_light.two_cameras import find_coordinates
 from mitsim.sensor.camera import Rig
@@ -63,13 +63,12 @@ class Findings:
     row_error_source: str = ""
 
 
-def pair_findings(images: CodedImages, rig: Rig) -> Findings:
+def pair_findings(images: CodedImages, rig: Rig, geometry: StereoGeometry) -> Findings:
     """Check two cameras that see one code: exchanged, another calibration, or a row error.
 
     The source of the row error is the code of the rows if present, else the texture of the surface. It is unknown if
     neither gives it, or the calibration is doubtful.
     """
-    geometry = stereo_geometry(rig)
     exchangeable = geometry.raw_size[0] == geometry.raw_size[1]
     names = " and ".join(list(rig.cameras)[:2])
     exchanged = (

@@ -19,7 +19,7 @@ from mitsim.decoding.checks.pair_sanity import Findings, measured_row_error, pai
 from mitsim.decoding.checks.rig_sanity import baseline_warning, camera_warnings
 from mitsim.decoding.cloud import decoder_settings
 from mitsim.decoding.coded_images import CodedImages
-from mitsim.decoding.matching.stereo import stereo_geometry
+from mitsim.decoding.matching.stereo import StereoGeometry, stereo_geometry
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 
@@ -31,16 +31,25 @@ def with_warnings(capture: Capture) -> Capture:
     """
     if capture.technology != "structured_light":
         return capture
-    images = CodedImages.of(capture, decoder_settings(capture)[0])
+    images = CodedImages.of(capture, *decoder_settings(capture))
     found = Findings() if images is None else code_findings(images, capture.rig, capture.source == "device")
     warnings = list(dict.fromkeys([*capture.settings.get("warnings", []), *found.warnings]))
     return replace(capture, settings=capture.settings | ({"warnings": warnings} if warnings else {}))
 
 
-def code_findings(images: CodedImages, rig: Rig, recorded: bool) -> Findings:
+def code_findings(images: CodedImages, rig: Rig, recorded: bool, geometry: StereoGeometry | None = None) -> Findings:
     """Check coded images and the calibration of their rig; the calibration only if the images match their code.
 
-    The origin of the code is checked in ``recorded`` images: a simulation has the pattern that its file states.
+    Parameters
+    ----------
+    images
+        The images, decoded once.
+    rig
+        Calibration of their cameras and projector.
+    recorded
+        Whether to check the origin of the code: a simulation has the pattern that its file states.
+    geometry
+        Of two cameras that triangulate, if it is prepared already.
     """
     try:
         coordinates = images.coordinates
@@ -55,7 +64,7 @@ def code_findings(images: CodedImages, rig: Rig, recorded: bool) -> Findings:
         if any("columns" not in each for each in coordinates.values()):
             return Findings()  # decoding reports a code that two cameras cannot be matched by
         try:
-            return pair_findings(images, rig)
+            return pair_findings(images, rig, geometry or stereo_geometry(rig))
         except InputError as error:
             return Findings([str(error)])
     name, decoded = next(iter(coordinates.items()))
@@ -65,12 +74,15 @@ def code_findings(images: CodedImages, rig: Rig, recorded: bool) -> Findings:
     return Findings(([along] if along else []) + camera_warnings(decoded, rig, images.settings))
 
 
-def pair_row_error(capture: Capture, cloud: PointCloud) -> float:
-    """Return the row error [px] of the right image of a matched pair, by its own texture; NaN if unknown."""
+def pair_row_error(capture: Capture, cloud: PointCloud, geometry: StereoGeometry | None = None) -> float:
+    """Return the row error [px] of the right image of a matched pair, by its own texture; NaN if unknown.
+
+    ``geometry`` of the pair, if it is prepared already.
+    """
     if capture.technology != "active_stereo" or len(capture.images) < 2:
         return float("nan")
     left, right = (stack[0] for stack in list(capture.images.values())[:2])
-    return measured_row_error((left, right), stereo_geometry(capture.rig), cloud)
+    return measured_row_error((left, right), geometry or stereo_geometry(capture.rig), cloud)
 
 
 def row_error_in_words(capture: Capture, settings: Settings, found: Findings, matched: float) -> str:

@@ -48,7 +48,7 @@ from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import GrayCode, LightCode, axes, check_stack, roles
 
 
-def decode_coordinates(
+def decode_coordinates(  # noqa: PLR0913 - options, all by name
     stack: NDArray[np.generic],
     code: LightCode,
     size: tuple[int, int],
