@@ -15,7 +15,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from characterisation.files.documents import Document
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.png import LONGEST_SIDE_PX
-from mitsim.sensor.transforms import Transform
+from mitsim.sensor.transforms import Transform, is_rotation
 
 Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 Row3 = tuple[Number, Number, Number]
@@ -25,8 +25,7 @@ Side = Annotated[int, Field(ge=1, le=LONGEST_SIDE_PX)]
 
 
 def _rotation(rows: tuple[Row3, Row3, Row3]) -> tuple[Row3, Row3, Row3]:
-    matrix = np.array(rows)
-    if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-6 or np.linalg.det(matrix) < 0:
+    if not is_rotation(np.array(rows), 1e-6):
         raise ValueError("a rotation matrix, by rows")
     return rows
 

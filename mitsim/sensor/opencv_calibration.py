@@ -35,6 +35,7 @@ from mitsim.sensor.calibration_qualifiers import (
     unit_mm,
 )
 from mitsim.sensor.calibration_tree import CalibrationTree, Found, read_tree
+from mitsim.sensor.transforms import is_rotation
 
 
 class EyeKeys(Document):
@@ -316,7 +317,7 @@ def _pose(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[s
         return {}
     if R.size == 3:
         R = np.asarray(Rotation.from_rotvec(R.reshape(3)).as_matrix())
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
+    if not is_rotation(R, 1e-4):
         raise InputError(file, f"rotation of {name}", np.round(R, 4).tolist(), "a rotation matrix, 3 x 3, by rows")
     given = values.calibration_table.to_mm
     T = T * (given or stated or 1.0)

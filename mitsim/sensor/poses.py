@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from characterisation.files.errors import InputError
 from mitsim.sensor import transforms
 from mitsim.sensor.preset import Sensor
-from mitsim.sensor.transforms import Transform
+from mitsim.sensor.transforms import Transform, is_rotation
 
 
 def look_at(
@@ -78,7 +78,6 @@ def as_pose(pose: Transform | ArrayLike, where: str) -> Transform:
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(where, "pose", f"an array {matrix.shape}", "a Transform, or a (4, 4) matrix [mm]")
     moved = Transform.from_matrix(matrix)
-    rigid = np.allclose(moved.rotation @ moved.rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(moved.rotation) > 0
-    if not rigid or not np.allclose(matrix[3], [0, 0, 0, 1]):
+    if not is_rotation(moved.rotation, 1e-4) or not np.allclose(matrix[3], [0, 0, 0, 1]):
         raise InputError(where, "pose", "a matrix that is not a rigid motion", "a rotation and a translation [mm]")
     return moved

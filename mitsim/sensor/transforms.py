@@ -72,6 +72,12 @@ class Transform:
         return directions @ self.rotation.T
 
 
+def is_rotation(matrix: NDArray[np.floating], tolerance: float) -> bool:
+    """Return whether a matrix (3, 3) is a right-handed rotation: no element of R R^T - I exceeds ``tolerance``."""
+    off = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    return bool(off <= tolerance and np.linalg.det(matrix) > 0)  # False for NaN
+
+
 def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike, roll_deg: float = 0.0) -> Transform:
     """Return ``world_from_sensor`` of a sensor at one place that looks at another.
 

@@ -32,7 +32,7 @@ from mitsim.scene.load import Scene
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.poses import as_pose
 from mitsim.sensor.preset import Sensor
-from mitsim.sensor.transforms import Transform
+from mitsim.sensor.transforms import Transform, is_rotation
 from mitsim.study.statement_file import PartialDocument
 
 #: largest difference between the sensor's pose and that of a statement [mm], [deg]
@@ -286,8 +286,7 @@ def _pose(path: Path, matrix: Any) -> Transform:
         pose = Transform.from_matrix(np.array(matrix, float).reshape(4, 4))
     except (TypeError, ValueError):
         raise InputError(path, "world_from_sensor", repr(matrix)[:60], "a 4 x 4 matrix, rows first [mm]") from None
-    orthogonal = np.allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-4)
-    if not orthogonal or np.linalg.det(pose.rotation) < 0 or not np.isfinite(pose.translation).all():
+    if not is_rotation(pose.rotation, 1e-4) or not np.isfinite(pose.translation).all():
         raise InputError(
             path, "world_from_sensor", "a matrix that is not a rigid motion", "a rotation, and a translation in mm"
         )

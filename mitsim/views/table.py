@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from characterisation.files.documents import Document
 from characterisation.stage.angles import StageAxis
-from mitsim.sensor.transforms import Transform
+from mitsim.sensor.transforms import Transform, is_rotation
 
 #: margin around the eyes of a sensor whose body is unknown [mm]; *assumed*
 MARGIN_MM = 30.0
@@ -94,8 +94,7 @@ class FlangeFromSensor(Document):
         if self.quaternion_xyzw is not None and abs(math.hypot(*self.quaternion_xyzw) - 1) > ROUNDED:
             raise ValueError("a quaternion of length 1, in the order x, y, z, w")
         if self.matrix is not None:
-            turn = np.array(self.matrix)[:3, :3]
-            if np.abs(turn @ turn.T - np.eye(3)).max() > ROUNDED or np.linalg.det(turn) < 0:
+            if not is_rotation(np.array(self.matrix)[:3, :3], ROUNDED):
                 raise ValueError("a rigid motion, whose first three rows and columns are a right-handed rotation")
             if self.matrix[3] != (0, 0, 0, 1):
                 raise ValueError("rows of a homogeneous matrix, with the last row [0, 0, 0, 1]")

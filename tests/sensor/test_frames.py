@@ -6,7 +6,14 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mitsim.sensor.transforms import FILM_OFFSET_PX, MITSUBA_FROM_OPENCV, Transform, look_at, mitsuba_to_world
+from mitsim.sensor.transforms import (
+    FILM_OFFSET_PX,
+    MITSUBA_FROM_OPENCV,
+    Transform,
+    is_rotation,
+    look_at,
+    mitsuba_to_world,
+)
 
 degrees = st.tuples(*[st.floats(-180, 180)] * 3)
 place = st.tuples(*[st.floats(-1e4, 1e4)] * 3)
@@ -60,3 +67,12 @@ def test_mitsuba_cameras_have_x_left_and_y_up():
     assert np.array_equal(to_world[:3, 2], [0, 0, 1])
     assert np.array_equal(MITSUBA_FROM_OPENCV @ MITSUBA_FROM_OPENCV, np.eye(3))
     assert FILM_OFFSET_PX == 0.5
+
+
+@given(degrees)
+def test_a_rotation_is_one_up_to_a_tolerance(turn):
+    rotation = Transform.from_degrees(turn, (0, 0, 0)).rotation
+    assert is_rotation(rotation, 1e-12)
+    assert not is_rotation(-rotation, 1e-12)  # a mirror
+    assert is_rotation(1.0004 * rotation, 1e-3) and not is_rotation(1.0006 * rotation, 1e-3)
+    assert not is_rotation(np.full((3, 3), np.nan), 1.0)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.documents import shown
 from characterisation.files.errors import InputError
+from mitsim.sensor.transforms import is_rotation
 
 
 def parsed_json(data: bytes, where: str | Path, what: str) -> Any:
@@ -89,7 +90,7 @@ class JsonFields:
 
 def nearest_rotation(matrix: NDArray[np.float64], tolerance: float) -> NDArray[np.float64] | None:
     """Return the exact rotation nearest to a matrix (3, 3); None if it is farther from one than ``tolerance``."""
-    if not np.abs(matrix @ matrix.T - np.eye(3)).max() <= tolerance or np.linalg.det(matrix) < 0:  # NaN fails too
+    if not is_rotation(matrix, tolerance):
         return None
     u, _, vt = np.linalg.svd(matrix)
     return np.asarray(u @ vt)
