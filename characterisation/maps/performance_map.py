@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from characterisation.files.atomic_io import write_netcdf
+from characterisation.files.checked_files import dataset_digest
 from characterisation.files.datasets import Schema, Variable, read_dataset
 from characterisation.files.errors import InputError
 from characterisation.lambert_projection import inverse_lambert_projection, lambert_projection
@@ -115,6 +116,11 @@ class PerformanceMap:
         )
         # all views of a part query the same few surfaces
         self._surface = lru_cache(maxsize=16)(self._make_surface)
+
+    @cached_property
+    def digest(self) -> str:
+        """Return the SHA-256 of the content."""
+        return dataset_digest(self.data)
 
     @property
     def finishes(self) -> list[str]:

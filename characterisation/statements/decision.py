@@ -9,7 +9,9 @@ whole tolerance.
 
 The value of a zone is the size of a vector, to which the error adds as a vector. Its errors are those of a part at the
 limit of the tolerance, deviating in random directions (:mod:`characterisation.statements.one_sided`). JCGM 106 uses
-the readings of each trial at all values x; the risks are then means of G over the parts that a trial accepts.
+the readings of each trial at all values x; the risks are then means of G over the parts that a trial accepts. Angles of
+nominally 90 deg are at most 90 deg. Only their lower limit can be exceeded, and JCGM 106 uses their deviations from 90
+deg, of which G is that of both signs.
 
 - ISO 14253-1: y is accepted if lower + U <= y <= upper - U. The expanded uncertainty U is the end of the 95 % coverage
   interval of the error that is larger in absolute value. It therefore contains a bias that is not subtracted (ISO/TS
@@ -31,6 +33,7 @@ that its reading is accepted. Just inside, it is falsely rejected with the compl
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -188,9 +191,10 @@ def decide(errors: Errors, tolerance: Tolerance) -> Decided:
     elif low > 1:
         verdict = "undecidable" if limits is None else "does not fit"
     edges = [edge for edge in (tolerance.lower, tolerance.upper) if math.isfinite(edge)]
-    through = [share(_within(edge + stated_errors(taken), limits)) for edge in edges]
+    if _limited_below(taken, tolerance):
+        edges = [tolerance.lower]
+    through = [share(_within(edge + _errors_at(taken, edge), limits)) for edge in edges]
     worst = max(through, key=lambda one: one.value)
-    middle = taken.at(abs(taken.fold - tolerance.middle)) if isinstance(taken, OneSidedErrors) else taken
     risks = None if rule.rule != "jcgm_106" else global_risks(taken, tolerance, limits)
     return Decided(
         WORDS[rule.rule],
@@ -203,9 +207,19 @@ def decide(errors: Errors, tolerance: Tolerance) -> Decided:
         worst.value,
         (worst.low, worst.high),
         1 - min(one.value for one in through),
-        1 - float(_within(tolerance.middle + middle, limits).mean()),
+        1 - float(_within(tolerance.middle + _errors_at(taken, tolerance.middle), limits).mean()),
         *(risks or (None, None)),
     )
+
+
+def _errors_at(errors: Errors, value: float) -> Floats:
+    """Return the errors (n,) of parts of a value."""
+    return errors.at(abs(errors.fold - value)) if isinstance(errors, OneSidedErrors) else errors
+
+
+def _limited_below(errors: Errors, tolerance: Tolerance) -> bool:
+    """Return whether only the lower limit is one that values can exceed: those of a right angle are at most 90 deg."""
+    return isinstance(errors, OneSidedErrors) and errors.fold == 90 and tolerance.upper >= 90
 
 
 def acceptance(errors: Errors, tolerance: Tolerance) -> tuple[float, float] | None:
@@ -221,8 +235,9 @@ def acceptance(errors: Errors, tolerance: Tolerance) -> tuple[float, float] | No
         below, above = max(high, 0.0), max(-low, 0.0)
     else:
         below = above = expanded(errors)
-    room = upper - lower - below - above if math.isfinite(lower) else upper - above
-    return (lower + below, upper - above) if room > 0 else None
+    most = max(upper - above, 90.0) if _limited_below(errors, tolerance) else upper - above
+    room = most - lower - below if math.isfinite(lower) else most
+    return (lower + below, most) if room > 0 else None
 
 
 def expanded(errors: Errors) -> float:
@@ -282,13 +297,19 @@ def global_risks(errors: Errors, tolerance: Tolerance, limits: tuple[float, floa
     They are means over parts of the tolerance's process, with equally likely errors (n,).
     """
     process, lower, upper = tolerance.process.cdf, tolerance.lower, tolerance.upper
+    if isinstance(errors, OneSidedErrors):
+        if math.isinf(lower):
+            return _one_sided_risks(errors, process, upper, limits and limits[1])
+        if _limited_below(errors, tolerance):
+
+            def deviations(size: Floats) -> Floats:
+                return np.asarray(process(90 + size) - process(90 - size))
+
+            return _one_sided_risks(errors, deviations, 90 - lower, limits and 90 - limits[0])
+        errors = errors.stated
     conforming = float(process(upper) - process(lower))
     if limits is None:
         return 0.0, conforming
-    if isinstance(errors, OneSidedErrors):
-        if math.isinf(lower):
-            return _one_sided_risks(errors, tolerance, limits[1])
-        errors = errors.stated
     a, b = limits[0] - errors, limits[1] - errors  # values whose reading lies at a limit
     below = process(np.minimum(lower, b)) - process(a)
     above = process(b) - process(np.maximum(upper, a))
@@ -297,13 +318,21 @@ def global_risks(errors: Errors, tolerance: Tolerance, limits: tuple[float, floa
     return float(consumer.mean()), conforming - float(np.maximum(right, 0.0).mean())
 
 
-def _one_sided_risks(errors: OneSidedErrors, tolerance: Tolerance, limit: float) -> tuple[float, float]:
-    """Return the global risks of accepting readings up to a limit, of a value that folds at 0."""
-    process, upper = tolerance.process.cdf, tolerance.upper
+def _one_sided_risks(
+    errors: OneSidedErrors, process: Callable[[Any], Any], largest: float, limit: float | None
+) -> tuple[float, float]:
+    """Return the global risks of accepting readings of deviations up to a limit, of a value that folds.
+
+    ``process`` is the distribution function of the deviations of the parts, of which those up to ``largest`` conform.
+    No reading is accepted if ``limit`` is None.
+    """
+    conforming = float(process(largest))
+    if limit is None:
+        return 0.0, conforming
     low, high = errors.accepted_parts(limit)
-    accepted = process(np.minimum(upper, high)) - process(np.minimum(upper, low))
-    wrong = process(np.maximum(upper, high)) - process(np.maximum(upper, low))
-    return float(wrong.mean()), float(process(upper) - accepted.mean())
+    accepted = process(np.minimum(largest, high)) - process(np.minimum(largest, low))
+    wrong = process(np.maximum(largest, high)) - process(np.maximum(largest, low))
+    return float(wrong.mean()), float(conforming - accepted.mean())
 
 
 def _least_guard(errors: Errors, tolerance: Tolerance) -> float:

@@ -102,7 +102,7 @@ class OneSidedErrors:
 
     @cached_property
     def table(self) -> tuple[Floats, Floats]:
-        """Return deviations (n, steps) of parts, and the values (n, steps) that the trials measure of them.
+        """Return deviations (n, steps) of parts, and those (n, steps) that the trials measure of them.
 
         They reach to the deviations of parts that no rule accepts.
         """
@@ -112,10 +112,10 @@ class OneSidedErrors:
             self.size(sizes[some, :, None, None] * self._units[some, None] + self.vectors[some, None])
             for some in (slice(first, first + _AT_ONCE) for first in range(0, len(sizes), _AT_ONCE))
         ]
-        return sizes, np.concatenate(values) - self.correction
+        return sizes, np.concatenate(values) - (self.correction if self.fold == 0 else -self.correction)
 
     def accepted_parts(self, limit: float) -> tuple[Floats, Floats]:
-        """Return the smallest and largest deviations (n,) of parts of which each trial reads at most a limit.
+        """Return the smallest and largest deviations (n,) of parts whose deviation each trial reads as at most a limit.
 
         Both are equal where there is no such part.
         """

@@ -23,7 +23,7 @@ from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.exposure import ExposurePolicy, exposure_policy
 from mitsim.sensor.imager import Imager, electrons_per_radiance
 from mitsim.sensor.lens_keys import with_lenses
-from mitsim.sensor.light_code import LightCode, patterns
+from mitsim.sensor.light_code import LightCode, patterns, roles
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.opencv_calibration import with_calibration
@@ -172,6 +172,18 @@ class Sensor:
         x, y = np.moveaxis(rays[..., :2] / rays[..., 2:], -1, 0)
         share = 1 + np.stack([x, y, x * x, x * y, y * y], axis=-1) @ [*self.room.gradient, *self.room.curvature]
         return np.asarray(self.room.irradiance_w_mm2 * np.maximum(share, 0.0))
+
+    @property
+    def frames(self) -> int:
+        """Return the number of images of one measurement with light of the projector."""
+        optics, pattern = self.projector.optics, self.pattern
+        if pattern is None:
+            raise missing_error(f"sensor {self.name}", ["pattern"])
+        if isinstance(pattern, AmplitudeModulation):
+            return pattern.count
+        if isinstance(pattern, DotPattern | ProjectorImages):
+            return pattern.frames
+        return len(roles(pattern, optics.width, optics.height))
 
     def patterns(self) -> NDArray[np.float32]:
         """Return all patterns of one measurement, (P, H, W), values 0..1 in projector pixels.

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import norm
 
 from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
@@ -36,6 +35,7 @@ from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.scene.surface.lay import lays_in_words
 from mitsim.sensor.preset import Sensor, load_sensor
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
+from mitsim.study.screened_errors import screened_errors
 from mitsim.study.tables import ExposureTable, StudyFile
 from mitsim.views import Candidates, View, candidate_views
 from mitsim.views.standoffs import characterised_range, chosen_standoffs
@@ -43,9 +43,6 @@ from mitsim.views.view_scores import MATT_WHITE
 
 #: fewest points on a feature that allow a measurement
 MINIMUM_POINTS = 100
-
-#: equally likely values of a standard normal distribution
-_NORMAL = norm.ppf((np.arange(400) + 0.5) / 400)
 
 
 @dataclass(frozen=True)
@@ -225,7 +222,7 @@ def _with_limits(path: str | Path, file: StudyFile, task: Task) -> StudyFile:
     if file.set.limits:
         return file
     tolerances = {name: tolerance_of(task, name) for name in task.measurements}
-    limits = {name: needed(_NORMAL, one) for name, one in tolerances.items() if one is not None}
+    limits = {name: needed(screened_errors(1.0), one) for name, one in tolerances.items() if one is not None}
     if not limits:
         allowed = "a limit for at least one measurement, or a tolerance in the task"
         raise InputError(path, "set.limits", "none, and no tolerance in the task", allowed)

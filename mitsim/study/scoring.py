@@ -7,12 +7,14 @@ together (:mod:`characterisation.scores.task_sets`) -> ``scores.csv``, ``scores.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 import trimesh
 import xarray as xr
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.atomic_io import atomic_write, write_json
@@ -28,6 +30,7 @@ from mitsim.scene.ray_casting.triangles import triangles
 from mitsim.study import Study
 from mitsim.study.run_files import TASK
 from mitsim.study.scene_geometry import write_scene_geometry
+from mitsim.study.screened_errors import stated_shares
 from mitsim.study.session import Session
 from mitsim.study.view_sets.confirmed_set import Search, joining_in_words
 from mitsim.study.virtual.race import Raced, raced_errors, with_race
@@ -44,7 +47,8 @@ def score_study(
     """
     study, folder = session.study, session.folder
     scores, inputs = session.screen(performance_map)
-    search = partial(_set_within, study, inputs)
+    shares = np.ones(len(study.task.measurements)) if study.file.set is None else stated_shares(study.task)
+    search = partial(set_within, study, inputs, shares)
     chosen = _chosen_set(study, search)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")
     write_netcdf(scores, folder / "scores.nc")
@@ -73,14 +77,31 @@ def write_inputs(session: Session) -> None:
         file.write_bytes(trimesh.exchange.ply.export_ply(mesh))
 
 
-def _set_within(study: Study, inputs: list[dict[InputQuantity, Any]], limits: dict[str, float]) -> ViewSet:
-    """Return the fewest views that keep the limits according to the map."""
+def set_within(
+    study: Study, inputs: list[dict[InputQuantity, Any]], shares: NDArray[np.float64], limits: dict[str, float]
+) -> ViewSet:
+    """Return the fewest views that keep the limits according to the map.
+
+    Parameters
+    ----------
+    study
+        Its task, its table ``set`` and the middle of its part.
+    inputs
+        Expected input quantities of every view.
+    shares
+        (measurements,) of the task: stated over predicted standard uncertainty, from :func:`stated_shares`.
+    limits
+        Stated standard uncertainties by measurement, in its unit; so is the uncertainty of the set.
+    """
     table = study.file.set
     assert table is not None
     joining = SetJoining(
         pose_covariance(*table.pose_known), np.asarray(study.scene.centre, float), table.joining == "best_fit"
     )
-    return choose_set(study.task, inputs, limits, table.least_chance, table.seconds, joining)
+    share_of = dict(zip(study.task.measurements, shares.tolist(), strict=True))
+    predicted = {name: limit / share_of[name] for name, limit in limits.items()}
+    chosen = choose_set(study.task, inputs, predicted, table.least_chance, table.seconds, joining)
+    return replace(chosen, uncertainty=chosen.uncertainty * [share_of[name] for name in limits])
 
 
 def _chosen_set(study: Study, search: Search) -> ViewSet | None:

@@ -11,7 +11,14 @@ from characterisation.statements.decision import Tolerance, acceptance, decide, 
 from characterisation.statements.one_sided import OneSidedErrors
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL, statement
 from characterisation.tasks.decision_table import Decision
-from characterisation.tasks.deviations import form_basis, form_size, largest_distance, twice_largest, value_range
+from characterisation.tasks.deviations import (
+    form_basis,
+    form_size,
+    largest,
+    largest_distance,
+    twice_largest,
+    value_range,
+)
 
 LIMIT, SIGMA, MANY = 20.0, 1.0, 20000
 
@@ -159,6 +166,63 @@ def test_right_angles_fold_at_their_upper_end():
     assert decided.accepted == pytest.approx((89.696, 90.304), abs=0.006)
     assert decided.false_accept == pytest.approx(0.025, abs=0.004)
     assert decided.false_reject_nominal < 0.01
+
+
+def right_angles(components: int, count: int, seed: int, scale: float = 0.05) -> OneSidedErrors:
+    """Errors of an angle of nominally 90 deg; some of the components of its error change it."""
+    rng = np.random.default_rng(seed)
+    vectors, directions = rng.standard_normal((2, count, 1, components))
+    return OneSidedErrors(scale * vectors, directions, largest, 0.2, 90.0)
+
+
+@pytest.mark.parametrize("components", [1, 2, 3])
+def test_a_right_angle_has_one_limit(components):
+    """No part is at 90.2 deg: one at 89.8 deg that is measured too near 90 deg is the only false accept."""
+    rule = Decision(rule="simple_acceptance", uncertainty_ratio=1.0)
+    decided = decide(right_angles(components, MANY, 10), Tolerance(89.8, 90.2, 0.2, rule))
+    true = ncx2.cdf((0.2 / 0.05) ** 2, components, (0.2 / 0.05) ** 2)
+    sigma = math.sqrt(true * (1 - true) / MANY)
+    assert decided.false_accept == pytest.approx(true, abs=4 * sigma)
+    assert decided.false_reject == pytest.approx(1 - true, abs=4 * sigma)
+
+
+def test_perfect_right_angles_are_accepted_whatever_the_limit_above():
+    decided = decide(right_angles(1, 4000, 11), Tolerance(89.8, 90.02, 0.11))
+    low, high = decided.accepted
+    assert low == pytest.approx(89.898, abs=0.01) and high >= 90
+    assert decided.false_accept == pytest.approx(0.025, abs=0.01)
+    # a part in the middle is rejected at the lower limit only
+    assert decided.false_reject_nominal == pytest.approx(norm.cdf((low - 89.91) / 0.05), abs=4 * 0.5 / math.sqrt(4000))
+
+
+@pytest.mark.parametrize("subtract_bias", [False, True])
+@pytest.mark.parametrize("components", [1, 2])
+def test_the_risks_of_right_angles_are_those_of_drawn_parts(components, subtract_bias):
+    """Two million parts of a normal process about 90.02 deg, which are as far below 90 deg where they are above."""
+    rule = Decision(
+        rule="jcgm_106",
+        consumer_risk=0.002,
+        producer_risk=0.2,
+        process_mean=90.02,
+        process_std=0.1,
+        subtract_bias=subtract_bias,
+    )
+    asked, errors = Tolerance(89.8, 90.2, 0.2, rule), right_angles(components, 6000, 12)
+    bias = float(errors.stated.mean()) if subtract_bias else 0.0
+    rng = np.random.default_rng(13)
+    parts = np.abs(asked.process.rvs(2_000_000, random_state=rng) - 90)
+    measured = 0.05 * rng.standard_normal((len(parts), components))
+    measured[:, 0] += parts
+    readings = 90 - np.linalg.norm(measured, axis=1) - bias
+    taken = errors.corrected(bias)
+    for least in (89.8, 89.84):
+        consumer, producer = global_risks(taken, asked, (least, 90.2))
+        assert consumer == pytest.approx(((readings >= least) & (parts > 0.2)).mean(), rel=0.05)
+        assert producer == pytest.approx(((readings < least) & (parts <= 0.2)).mean(), rel=0.05)
+    assert global_risks(taken, asked, None) == (0.0, pytest.approx((parts <= 0.2).mean(), abs=0.002))
+    limits = acceptance(taken, asked)
+    assert limits[0] > 89.8
+    assert global_risks(taken, asked, limits)[0] == pytest.approx(rule.consumer_risk, rel=1e-3)
 
 
 @pytest.mark.parametrize("kind", ["axis", "tilt", "form"])

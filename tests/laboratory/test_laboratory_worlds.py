@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +11,10 @@ import pytest
 import tests.proofs.laboratory.run as run
 from characterisation.files.errors import InputError
 from characterisation.statements.statement import statement
+from characterisation.tasks.folded import folded_values
 from mitsim.scene import backend
-from mitsim.study.virtual.world import Trial
+from mitsim.study.virtual.trials import TrialFolder
+from mitsim.study.virtual.world import STATEMENT_DAYS, Trial
 from tests.proofs.laboratory.cases import Judged, read_cases
 from tests.proofs.laboratory.decoders import decoded
 from tests.proofs.laboratory.page import inside_of, share_inside, write_laboratory_page
@@ -143,20 +144,61 @@ def test_finished_worlds_are_kept_and_a_cut_line_is_made_again(judged, monkeypat
 
     def known(order: run.Order):
         made.append(order.numbers)
-        return [{"ours": run.Outcome(dict.fromkeys(names, 7.0))} for _ in order.numbers]
+        return [{"ours": run.Outcome(dict.fromkeys(names, 7.0), {}, seven(number))} for number in order.numbers]
+
+    def seven(number: int) -> dict[str, list[float]]:
+        """Deviations by 7 along that of the part in a world."""
+        along = {name: one.direction(number) for name, one in folded.items()}
+        return {name: (7 / folded[name].size(rows) * rows).ravel().tolist() for name, rows in along.items()}
 
     names = [one.measurement for one in found[0].statements]
+    folded = folded_values(rows[0].study().task)
     monkeypatch.setattr(run, "make_worlds", known)
     again = run.run_rows(rows, folder)
     assert made == []
     np.testing.assert_array_equal(again[0].errors, found[0].errors)
-    path = folder / "worlds.jsonl"
+    path = folder / "worlds/small__white__preset/ours/view_0099.jsonl"
     text = path.read_text(encoding="utf-8")
+    whole = [Trial(number) for number in range(9)]
+    before = run.kept_worlds(rows, folder)[0]["ours"].errors(rows[0].view, whole)
     path.write_text(text[:-20], encoding="utf-8")
     again = run.run_rows(rows, folder)
-    assert made == [(9,)] and (again[0].errors[:, 9] == 7).all()
-    np.testing.assert_array_equal(again[0].errors[:, :9], found[0].errors[:, :9])
+    assert made == [(9,)]
+    np.testing.assert_allclose(again[0].errors[:, 9], 7)
+    np.testing.assert_array_equal(run.kept_worlds(rows, folder)[0]["ours"].errors(rows[0].view, whole), before)
     path.write_text(text, encoding="utf-8")
+
+
+def test_errors_like_those_of_the_statement_lie_inside_its_intervals(tmp_path, monkeypatch):
+    count = 500
+    rows = read_cases(cases_file(tmp_path, "ensenso-n10"))
+    rows = [replace(row, file=row.file.model_copy(update={"worlds": count})) for row in rows]
+    task = rows[0].study().task
+    folded, rng = folded_values(task), np.random.default_rng(8)
+    drawn = [
+        {name: rng.standard_normal(folded[name].shape if name in folded else ()) for name in task.measurements}
+        for _ in range(count)
+    ]
+
+    def outcome(number: int) -> run.Outcome:
+        values = drawn[number]
+        errors = {name: folded[name].error(one) if name in folded else float(one) for name, one in values.items()}
+        return run.Outcome(errors, {}, {name: values[name].ravel().tolist() for name in folded})
+
+    def stated(row: Judged, folder: Path, workers: None = None):
+        trials = TrialFolder.of(folder / "stated", "digest", task)
+        days = [Trial(STATEMENT_DAYS + number) for number in range(count)]
+        for number, day in enumerate(days):
+            trials.known(row.view)[day] = outcome(number)
+        errors = trials.errors_of_parts(row.view, days)
+        return [statement(name, "", one) for name, one in zip(task.measurements, errors, strict=True)]
+
+    monkeypatch.setattr(run, "make_worlds", lambda order: [{"ours": outcome(number)} for number in order.numbers])
+    monkeypatch.setattr(run, "statement_of", stated)
+    shares = inside_of(run.run_rows(rows, tmp_path)[0]).mean(axis=1)
+    assert len(folded) == 3
+    # the interval is from as many errors as it is judged by
+    np.testing.assert_allclose(shares, 0.95, rtol=0, atol=3.5 * np.sqrt(0.95 * 0.05 * 2 / count))
 
 
 def test_the_page_has_every_row_and_measurement(judged, tmp_path):
@@ -171,12 +213,12 @@ def test_the_page_has_every_row_and_measurement(judged, tmp_path):
 
 def test_a_world_is_the_same_whenever_and_wherever_it_is_made(judged):
     rows, folder, _ = judged
-    line = json.loads((folder / "worlds.jsonl").read_text(encoding="utf-8").splitlines()[4])
-    assert line["world"] == 4
-    again = run.make_worlds(run.Order(rows[0], (4,)))[0]["ours"].errors
-    assert {name: value for name, value in again.items() if np.isfinite(value)} == pytest.approx(
-        {name: value for name, value in line["errors"].items() if value is not None}, rel=1e-6, abs=1e-9
+    kept = run.kept_worlds(rows, folder)[0]["ours"].known(rows[0].view)[Trial(4)]
+    again = run.make_worlds(run.Order(rows[0], (4,)))[0]["ours"]
+    assert {name: value for name, value in again.errors.items() if np.isfinite(value)} == pytest.approx(
+        {name: value for name, value in kept.errors.items() if np.isfinite(value)}, rel=1e-6, abs=1e-9
     )
+    assert again.deviations.keys() == kept.deviations.keys() != set()
 
 
 @pytest.mark.parametrize(

@@ -68,6 +68,13 @@ def test_what_is_wrong_is_told(tmp_path, old, new, field, hint):
     assert str(file) in str(caught.value)
 
 
+@pytest.mark.parametrize("name", presets())
+def test_a_measurement_has_an_image_for_each_pattern_or_delay(name):
+    sensor = load_sensor(name)
+    delays = 0 if sensor.pattern.kind != "amplitude_modulation" else len(sensor.pattern.images()[0])
+    assert sensor.frames == len(sensor.patterns()) + delays > 0
+
+
 def test_an_unknown_preset_names_the_nearest():
     with pytest.raises(InputError, match="did you mean 'ensenso-n10'"):
         load_sensor("ensenso-n11")

@@ -28,14 +28,12 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from characterisation.files.atomic_io import write_json
 from characterisation.files.datasets import Schema, Variable, read_dataset
 from characterisation.files.errors import InputError
 from characterisation.statements.decision import demand, tolerance_of
 from characterisation.statements.statement import Statement
-from characterisation.tasks.folded import folded_values
 from characterisation.tasks.task_file import Task
 from mitsim.maps.campaign.run import write_netcdf
 from mitsim.running.executor import Executor
@@ -44,6 +42,7 @@ from mitsim.study import StatementTable
 from mitsim.study.choose.candidates import CandidateSensor
 from mitsim.study.choose.ranking import rank_keys, unpromising
 from mitsim.study.choose.winner import complete_winner
+from mitsim.study.screened_errors import screened_errors, stated_shares
 from mitsim.study.session import Session
 from mitsim.study.virtual.plan import map_digest, trial_digest
 from mitsim.study.virtual.race import ALL, Raced, RaceRules
@@ -63,9 +62,6 @@ _WORTH_STATING = 0.8
 
 #: fraction of a sensor's time that its race may take
 _RACE_SHARE = 0.4
-
-#: equally likely values of a standard normal distribution, for a screened u
-_NORMAL = norm.ppf((np.arange(400) + 0.5) / 400)
 
 
 @dataclass
@@ -243,20 +239,6 @@ def _kept(path: Path, digest: str) -> xr.Dataset | None:
     except InputError:
         return None
     return scores if scores.attrs.get("digest") == digest else None
-
-
-def stated_shares(task: Task) -> Floats:
-    """Return the stated over the predicted standard uncertainty of every measurement, for errors of equal size.
-
-    Screening predicts the error of a nominal part; the statement of a zone is about a part at its limit.
-    """
-    folded = folded_values(task)
-    return np.array([folded[name].far_share() if name in folded else 1.0 for name in task.measurements])
-
-
-def screened_errors(u: float) -> Floats:
-    """Return errors that represent a screened uncertainty: normal, without bias."""
-    return np.asarray(u * _NORMAL)
 
 
 def _screened_demand(task: Task, name: str, u: float) -> float:

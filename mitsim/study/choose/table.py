@@ -13,13 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from characterisation.files.atomic_io import json_values
-from characterisation.statements.decision import WORDS, decide, tolerance_of
+from characterisation.statements.decision import WORDS, decide, needed, tolerance_of
 from characterisation.statements.statement import Statement
 from characterisation.statements.verdict_words import result_in_words
 from mitsim.running.text_table import aligned
 from mitsim.running.version import __version__
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.preset import Sensor
 from mitsim.study import Study
 from mitsim.study.choice_document import (
@@ -33,7 +32,8 @@ from mitsim.study.choice_document import (
 )
 from mitsim.study.choose.candidates import Excluded
 from mitsim.study.choose.ranking import LARGEST_DEMAND, relative_to_least
-from mitsim.study.choose.selection import SensorResult, screened_errors
+from mitsim.study.choose.selection import SensorResult
+from mitsim.study.screened_errors import screened_errors
 from mitsim.study.virtual.plan import map_digest
 
 
@@ -249,12 +249,12 @@ def _screened(found: SensorResult, m: int, name: str) -> CellEntry:
     cell = CellEntry(by="screening", view=int(found.screened_view[m]), uncertainty=u, demand=demand, without_value=0.0)
     if tolerance is None:
         return cell.model_copy(update={"verdict": "no tolerance"})
-    decided = decide(screened_errors(u), tolerance)
+    errors = screened_errors(u)
     return cell.model_copy(
         update={
             "share_of_tolerance": 1.96 * u / tolerance.size,
-            "verdict": decided.verdict if demand > LARGEST_DEMAND else "not decided",
-            "needed": json_values(decided.needed),
+            "verdict": decide(errors, tolerance).verdict if demand > LARGEST_DEMAND else "not decided",
+            "needed": json_values(needed(errors, tolerance)),
         }
     )
 
@@ -289,9 +289,7 @@ def _pose(study: Study, number: int) -> PoseEntry:
 
 def capture_entry(sensor: Sensor, planned: PlannedExposure | None = None) -> CaptureEntry:
     """Return images and exposures of one capture; the time is exposure time, without readout and transfer."""
-    pattern = sensor.pattern
-    images = pattern.count if isinstance(pattern, AmplitudeModulation) else len(sensor.patterns())
-    images += sensor.ambient_image
+    images = sensor.frames + sensor.ambient_image
     own = sensor.exposure.exposures(None, float(sensor.imager.full_well))
     exposures = own if planned is None else planned.exposures_s
     return CaptureEntry(images=images, exposures_s=list(exposures), seconds=images * float(np.sum(exposures)))

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from characterisation.files.checked_files import dataset_digest
 from characterisation.files.errors import InputError
 from characterisation.tasks.folded import folded_values
 from mitsim.capture.simulated.indirect_light import IndirectLight
@@ -85,7 +84,7 @@ def race_rules(table: RaceTable, minutes: float | None = None) -> RaceRules:
 
 def map_digest(study: Study) -> str:
     """Return sixteen hexadecimal digits of the content of the performance map, or an empty string without a map."""
-    return "" if study.performance_map is None else dataset_digest(study.performance_map.data)[:16]
+    return "" if study.performance_map is None else study.performance_map.digest[:16]
 
 
 def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: bool = False) -> str:

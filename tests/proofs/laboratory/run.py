@@ -1,30 +1,29 @@
 """Run the laboratory: state views with the tool, measure the same views in the laboratory's worlds, and keep both.
 
 Signal chain: rows of cases -> statement of each case, view and kind of scene, from the tool's own trials -> worlds that
-are not kept yet, in this process or several -> one line of ``worlds.jsonl`` for each world and decoder.
+are not kept yet, in this process or several -> a folder of trials for each row and decoder, with a line for each world.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from characterisation.statements.statement import Statement
+from characterisation.tasks.task_file import Task
 from mitsim.maps.campaign.plan import sensor_checksum
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say, track
-from mitsim.study import StatementTable
+from mitsim.study import StatementTable, Study
 from mitsim.study.session import Session
 from mitsim.study.virtual.study_unknowns import study_unknowns
-from mitsim.study.virtual.trials import Outcome
+from mitsim.study.virtual.trials import Outcome, TrialFolder
+from mitsim.study.virtual.world import Trial
 from tests.proofs.laboratory.cases import Judged
 from tests.proofs.laboratory.worlds import Laboratory
 
@@ -33,8 +32,6 @@ VERSION = 1
 
 #: worlds in one order for a worker
 _IN_A_ROW = 5
-
-Key = tuple[str, int, str, str, int, str]
 
 
 @dataclass(frozen=True)
@@ -45,9 +42,16 @@ class Order:
     numbers: tuple[int, ...]
 
 
+#: the kept worlds of a row, by decoder, and worlds of the row to make
+_Missing = tuple[dict[str, TrialFolder], Order]
+
+
 @dataclass(frozen=True)
 class Found:
-    """Statements and errors of one row and decoder: ``errors`` (measurement, world), NaN without a value."""
+    """Statements and errors of one row and decoder: ``errors`` (measurement, world), NaN without a value.
+
+    Errors of a value that folds are those of parts at the limit of their tolerance, as in the statements.
+    """
 
     row: Judged
     decoder: str
@@ -55,46 +59,21 @@ class Found:
     errors: np.ndarray
 
 
-class KeptWorlds:
-    """The finished worlds of a folder, in ``worlds.jsonl``; from the first invalid line on, lines are dropped."""
-
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / "worlds.jsonl"
-        self.known: dict[Key, dict[str, float]] = {}
-        text = self.path.read_text(encoding="utf-8") if self.path.exists() else ""
-        whole = ""
-        for line in text[: text.rfind("\n") + 1].splitlines(keepends=True):
-            try:
-                one = json.loads(line)
-                errors = {name: math.nan if value is None else float(value) for name, value in one["errors"].items()}
-                key = (one["digest"], one["view"], one["family"], one["mask"], one["world"], one["decoder"])
-            except (ValueError, KeyError, TypeError, AttributeError):
-                break  # lines after an invalid line are not trusted either
-            self.known[key] = errors
-            whole += line
-        if whole != text:
-            partial = self.path.with_suffix(".partial")
-            partial.write_text(whole, encoding="utf-8")
-            partial.replace(self.path)
-
-    def add(self, row: Judged, digest: str, number: int, outcomes: dict[str, Outcome]) -> None:
-        """Keep a finished world; it is on the disk when this function returns."""
-        with self.path.open("a", encoding="utf-8") as stream:
-            for decoder, outcome in outcomes.items():
-                errors = {name: value if math.isfinite(value) else None for name, value in outcome.errors.items()}
-                line: dict[str, Any] = {"digest": digest, "case": row.case.name, "view": row.view}
-                line |= {"family": row.family, "mask": row.mask, "world": number, "decoder": decoder, "errors": errors}
-                if outcome.reasons:
-                    line["reasons"] = dict(outcome.reasons)
-                stream.write(json.dumps(line) + "\n")
-                self.known[(digest, row.view, row.family, row.mask, number, decoder)] = dict(outcome.errors)
-            stream.flush()
-            os.fsync(stream.fileno())
+def kept_worlds(rows: Sequence[Judged], folder: Path) -> list[dict[str, TrialFolder]]:
+    """Return the finished worlds of every row, by decoder: world ``number`` is ``Trial(number)``."""
+    known: dict[tuple[str, int, str], tuple[str, Task]] = {}
+    out = []
+    for row in rows:
+        if row.name not in known:
+            study = row.study()
+            known[row.name] = world_digest(row, study), study.task
+        place = folder / "worlds" / f"{row.case.name}__{row.family}__{row.mask}"
+        out.append({decoder: TrialFolder.of(place / decoder, *known[row.name]) for decoder in row.case.decoders})
+    return out
 
 
-def world_digest(row: Judged) -> str:
-    """Return sixteen hexadecimal digits of what determines the worlds of a case."""
-    study = row.study()
+def world_digest(row: Judged, study: Study) -> str:
+    """Return sixteen hexadecimal digits of what determines the worlds of a case; ``study`` is that of the row."""
     content = {
         "version": VERSION,
         "case": row.case.name,
@@ -120,40 +99,38 @@ def statement_of(row: Judged, folder: Path, workers: Executor | None = None) -> 
 
 def run_rows(rows: Sequence[Judged], folder: Path, workers: Executor | None = None) -> list[Found]:
     """State and measure every row; reuse what the folder has."""
-    kept, digests = KeptWorlds(folder), dict[tuple[str, int, str], str]()
-    for row in rows:
-        if row.name not in digests:
-            digests[row.name] = world_digest(row)
+    kept = kept_worlds(rows, folder)
     missing = [
-        Order(row, numbers)
-        for row in rows
-        for numbers in _in_rows([n for n in range(row.file.worlds) if not _is_kept(kept, row, digests[row.name], n)])
+        (trials, Order(row, numbers))
+        for row, trials in zip(rows, kept, strict=True)
+        for numbers in _in_rows([n for n in range(row.file.worlds) if not _is_kept(trials, row.view, n)])
     ]
     if missing:
-        say(f"laboratory: {sum(len(order.numbers) for order in missing)} worlds to make")
-        done = workers.distribute(missing, lambda one: one, make_worlds) if workers else _here(missing)
-        for order, outcomes in track(done, "laboratory", len(missing)):
+        say(f"laboratory: {sum(len(order.numbers) for _, order in missing)} worlds to make")
+        done = workers.distribute(missing, _order_of, make_worlds) if workers else _here(missing)
+        for (trials, order), outcomes in track(done, "laboratory", len(missing)):
             for number, outcome in zip(order.numbers, outcomes, strict=True):
-                kept.add(order.row, digests[order.row.name], number, outcome)
+                for decoder in [one for one in trials if Trial(number) not in trials[one].known(order.row.view)]:
+                    trials[decoder].add(order.row.view, Trial(number), outcome[decoder])
     stated: dict[tuple[str, int, str], tuple[Statement, ...]] = {}
     out = []
-    for row in rows:
+    for row, trials in zip(rows, kept, strict=True):
         if row.name not in stated:
             stated[row.name] = tuple(statement_of(row, folder, workers))
-        names = [one.measurement for one in stated[row.name]]
-        for decoder in row.case.decoders:
-            worlds = [
-                kept.known[(digests[row.name], row.view, row.family, row.mask, number, decoder)]
-                for number in range(row.file.worlds)
-            ]
-            errors = np.array([[world[name] for world in worlds] for name in names])
-            out.append(Found(row, decoder, stated[row.name], errors))
+        worlds = [Trial(number) for number in range(row.file.worlds)]
+        out += [
+            Found(row, decoder, stated[row.name], of_decoder.stated_errors(row.view, worlds))
+            for decoder, of_decoder in trials.items()
+        ]
     return out
 
 
-def _is_kept(kept: KeptWorlds, row: Judged, digest: str, number: int) -> bool:
-    keys = [(digest, row.view, row.family, row.mask, number, decoder) for decoder in row.case.decoders]
-    return all(key in kept.known for key in keys)
+def _is_kept(trials: dict[str, TrialFolder], view: int, number: int) -> bool:
+    return all(Trial(number) in one.known(view) for one in trials.values())
+
+
+def _order_of(missing: _Missing) -> Order:
+    return missing[1]
 
 
 def _in_rows(numbers: Sequence[int]) -> Iterator[tuple[int, ...]]:
@@ -161,9 +138,9 @@ def _in_rows(numbers: Sequence[int]) -> Iterator[tuple[int, ...]]:
         yield tuple(numbers[first : first + _IN_A_ROW])
 
 
-def _here(orders: Sequence[Order]) -> Iterator[tuple[Order, list[dict[str, Outcome]]]]:
-    for order in orders:
-        yield order, make_worlds(order)
+def _here(missing: Sequence[_Missing]) -> Iterator[tuple[_Missing, list[dict[str, Outcome]]]]:
+    for one in missing:
+        yield one, make_worlds(_order_of(one))
 
 
 _prepared: dict[tuple[str, int, str, str], Laboratory] = {}

@@ -1,0 +1,33 @@
+"""Carry the uncertainty that a map predicts of a view over to the one that a statement gives.
+
+Signal chain: predicted standard uncertainty of a nominal part -> times the stated share of a value that folds -> errors
+that represent it, for a decision rule.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from characterisation.tasks.folded import folded_values
+from characterisation.tasks.task_file import Task
+
+Floats = NDArray[np.float64]
+
+#: equally likely values of a standard normal distribution
+_NORMAL = norm.ppf((np.arange(400) + 0.5) / 400)
+
+
+def stated_shares(task: Task) -> Floats:
+    """Return the stated over the predicted standard uncertainty of every measurement, for errors of equal size.
+
+    Screening predicts the error of a nominal part; the statement of a zone is about a part at its limit.
+    """
+    folded = folded_values(task)
+    return np.array([folded[name].far_share() if name in folded else 1.0 for name in task.measurements])
+
+
+def screened_errors(u: float) -> Floats:
+    """Return errors that represent a screened uncertainty: normal, without bias."""
+    return np.asarray(u * _NORMAL)
