@@ -30,14 +30,15 @@ from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of
 from mitsim.capture.recordings.pcd import decode_pcd
 from mitsim.capture.recordings.pinhole_fit import LEAST_POINTS, PINHOLE_RMS_PX, fit_pinhole, off_the_rays
 from mitsim.capture.recordings.ply import decode_ply
+from mitsim.sensor.calibration_qualifiers import UNITS_MM
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import Transform
 
 Points = NDArray[np.float32]
 Axes = Literal["opencv", "opengl"]
 
-#: lengths of one unit [mm]
-UNITS_MM = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1000.0}
+#: units of length of clouds [mm]
+CLOUD_UNITS_MM = {word: UNITS_MM[word] for word in ("um", "mm", "cm", "m")}
 
 #: median distance of the points, in the file's numbers, below which the unit is metres. All sensors here measure
 #: between 20 mm and 20 m
@@ -97,10 +98,10 @@ def read_organised_cloud(
     if axes == "opengl":
         points *= np.array([1, -1, -1], np.float32)
     settings["unit_of_file"] = unit or _unit_of(points)
-    farthest = float(np.nanmax(np.abs(points))) * UNITS_MM[settings["unit_of_file"]]
+    farthest = float(np.nanmax(np.abs(points))) * CLOUD_UNITS_MM[settings["unit_of_file"]]
     if farthest > FARTHEST_MM:
         raise InputError(path, "x, y, z", f"{farthest:.3g} mm", f"up to {FARTHEST_MM:g} mm", "check --unit")
-    points *= np.float32(UNITS_MM[settings["unit_of_file"]])
+    points *= np.float32(CLOUD_UNITS_MM[settings["unit_of_file"]])
     turn = Transform.identity()
     if link is not None:
         tree = NxLibTree(read_bounded(Path(link), "an Ensenso's *_calib.json"), str(link))

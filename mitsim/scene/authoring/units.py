@@ -16,7 +16,7 @@ from mitsim.scene.authoring.part21 import Entity, Enumeration, Reference, StepTe
 from mitsim.sensor.calibration_qualifiers import UNITS_MM
 
 #: units of length that an option may name [mm]
-UNITS = {"mm": 1.0, "m": 1000.0, "inch": 25.4}
+UNITS = {word: UNITS_MM[word] for word in ("mm", "m", "inch")}
 
 #: head of a file in which a comment may state the unit [bytes]
 _HEAD = 4096
@@ -46,6 +46,11 @@ def unit_words(size_mm: float) -> str:
     """Return the name of a unit of ``size_mm``: ``mm``, ``m``, ``inch``, ``foot``; else its size in mm."""
     names = {1e-3: "um", 1.0: "mm", 10.0: "cm", 1000.0: "m", 25.4: "inch", 304.8: "foot"}
     return next((name for size, name in names.items() if math.isclose(size, size_mm)), f"{size_mm:g} mm")
+
+
+def unit_assumed(name: str) -> str:
+    """Return the remark about the file ``name`` that states no unit of length."""
+    return f"{name} states no unit of length: mm assumed; --units m or --units inch changes it"
 
 
 def commented_unit(suffix: str, data: bytes) -> float | None:
