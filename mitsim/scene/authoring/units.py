@@ -79,13 +79,13 @@ def step_units(text: StepText) -> list[float]:
         for values in context.of("GLOBAL_UNIT_ASSIGNED_CONTEXT") or ():
             for one in values if isinstance(values, tuple) else ():
                 unit = text.follow(one)
-                size = unit_size(text, one) if unit is not None and _is_length(text, unit) else None
+                size = unit_size(text, one) if unit is not None and _is_length(unit) else None
                 if size is not None:
                     sizes[round(size, 9)] = None
     return list(sizes)
 
 
-def _is_length(text: StepText, unit: Entity) -> bool:
+def _is_length(unit: Entity) -> bool:
     si = unit.of("SI_UNIT")
     metre = si is not None and any(isinstance(one, Enumeration) and one.name == "METRE" for one in si)
     return unit.has("LENGTH_UNIT") or metre
