@@ -79,7 +79,7 @@ def campaign_and_map() -> None:
     """netCDF, xarray, scipy, matplotlib."""
     Path("campaign.toml").write_text(CAMPAIGN.format(scenes=SCENES.as_posix()))
     mitsim("map", "make", "campaign.toml", "-o", "map")
-    mitsim("compare", "map/map.nc", "ensenso-n10", "-o", "compared")
+    mitsim("map", "compare", "map/map.nc", "ensenso-n10", "-o", "compared")
 
 
 def parts() -> None:

@@ -72,6 +72,31 @@ def atomic_write_named(path: str | Path) -> Iterator[Path]:
             partial.replace(path)
 
 
+@contextmanager
+def atomic_folder(folder: str | Path) -> Iterator[Path]:
+    """Make a folder beside ``folder``; it takes the name when the block ends well, and is gone otherwise.
+
+    Raises
+    ------
+    OSError
+        As :func:`atomic_write`, and if ``folder`` is there with files in it.
+    """
+    folder = Path(folder).absolute()
+    partial = _beside(folder, "partial")
+    try:
+        with _naming(folder):
+            partial.mkdir(parents=True)
+            yield partial
+            partial.rename(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _beside(folder: Path, kind: str) -> Path:
+    """Return a path beside a folder that no other process uses, by which :mod:`mitsim.cli.folder_lock` knows ours."""
+    return folder.with_name(f".{folder.name}.{kind}-{os.getpid()}-{HOST}{uuid.uuid4().hex[:12]}")
+
+
 def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: bool = False) -> None:
     """Write a folder of files by their paths in it, so that it survives a loss of power as a whole or not at all.
 
@@ -85,8 +110,7 @@ def write_folder(folder: str | Path, files: Mapping[str, bytes], *, overwrite: b
         ``errno`` is in :data:`FULL` and its ``filename`` is ``folder``.
     """
     folder = Path(folder).absolute()
-    tag = f"{os.getpid()}-{HOST}{uuid.uuid4().hex[:12]}"
-    partial, old = (folder.with_name(f".{folder.name}.{kind}-{tag}") for kind in ("partial", "old"))
+    partial, old = _beside(folder, "partial"), _beside(folder, "old")
     try:
         with _naming(folder):
             folder.parent.mkdir(parents=True, exist_ok=True)
@@ -155,10 +179,15 @@ def write_netcdf(data: xr.Dataset, path: str | Path, encoding: Mapping[Any, Mapp
             stream.write(SEAL + digest.encode())  # HDF5 reads no byte beyond the end that its own header names
 
 
+def write_text(path: str | Path, text: str) -> None:
+    """Write text as UTF-8 whole or not at all."""
+    with atomic_write(path) as file:
+        file.write_text(text, encoding="utf-8")
+
+
 def write_json(path: str | Path, data: Any) -> None:
     """Write JSON whole or not at all."""
-    with atomic_write(path) as file:
-        file.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(data, indent=2, ensure_ascii=False) + "\n")
 
 
 def json_values(value: Any) -> Any:

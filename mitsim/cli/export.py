@@ -166,7 +166,7 @@ def targets(
 
     Example: mitsim export targets runs/two_pillars --robot kuka -o views.dat
     """
-    from characterisation.files.atomic_io import atomic_write
+    from characterisation.files.atomic_io import write_text
     from mitsim.report.export.robot_targets import ROBOT_FORMATS, read_targets
     from mitsim.running.progress import say
 
@@ -178,8 +178,7 @@ def targets(
         raise InputError("--output", "", output.name, allowed)
     found, tool = read_targets(_run_in(folder), views)
     check_file(output)
-    with atomic_write(output) as file:
-        file.write_text(target_format.write(found, tool), encoding="utf-8")
+    write_text(output, target_format.write(found, tool))
     hint = "" if tool == "flange" else "; make the tool frame the sensor frame, or give [views.flange_from_sensor]"
     say(f"targets: {output}: {len(found)} poses of the {tool} in the part frame{hint}")
 

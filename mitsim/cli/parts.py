@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from characterisation.files.atomic_io import atomic_write
+from characterisation.files.atomic_io import write_text
 from characterisation.files.errors import InputError
 from mitsim.cli.options import (
     Defines,
@@ -83,8 +83,7 @@ def check(
 
         check_file(html)
         text = author_page(checked)
-        with atomic_write(html) as part_of:
-            part_of.write_text(text, encoding="utf-8")
+        write_text(html, text)
         say(f"page: {html}")
     if json:
         about = {"scene": checked.scene.where, "sensor": chosen.name, "world_from_sensor": pose.matrix().tolist()}

@@ -89,7 +89,8 @@ def render(
     from mitsim.sensor.noise_sources import Noise
     from mitsim.study.many_captures import CaptureJob, CaptureSettings, digest_of, origin_of
 
-    settings = CaptureSettings(definitions(define), deviation, seed, samples, depth, Noise.parse(noise), truth)
+    defined = definitions(define)
+    settings = CaptureSettings(defined, deviation, seed, samples, depth, Noise.parse(noise), truth)
     if many is not None:
         _render_many(many, scene, sensor, settings, output, requested_workers(scheduler, processes))
         return
@@ -107,9 +108,9 @@ def render(
     from mitsim.scene.surface.scatter import Deviation
 
     chosen, moved = interface.load_sensor(sensor), Deviation.parse(deviation)
-    loaded = interface.load_scene(scene, chosen, definitions(define), deviation=moved)
+    loaded = interface.load_scene(scene, chosen, defined, deviation=moved)
     pose = pose_of(position, target, roll, chosen)
-    origin = origin_of(scene, chosen, definitions(define))
+    origin = origin_of(scene, chosen, defined)
     digest = CaptureJob(chosen, str(scene), "", 0, pose, settings, origin).digest()
     remove_partial_beside(output)
     if digest_of(output, "render") == digest:

@@ -1,4 +1,4 @@
-"""Commands on a study: run, choose, score, budget, exposures, report."""
+"""Commands on a study: run, choose, score, state, exposures, report."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from characterisation.tasks.result import NOT_INCLUDED, Repeatability, Result
+from mitsim.running.numbers import or_none
 from mitsim.running.version import __version__
 
 #: significant digits of an uncertainty. A value has as many decimals as its uncertainty, at least 3 and at most 6
@@ -97,9 +98,9 @@ def measured_document(
                 "unit": one.unit,
                 "count": one.count,
                 "asked": one.cloud_count,
-                "mean": _number(one.mean),
-                "standard_deviation": _number(one.deviation),
-                "fit_uncertainty": _number(one.uncertainty),
+                "mean": or_none(one.mean),
+                "standard_deviation": or_none(one.deviation),
+                "fit_uncertainty": or_none(one.uncertainty),
             }
             for one in repeatability
         ],
@@ -111,19 +112,15 @@ def result_values(one: Result) -> dict[str, Any]:
     return {
         "name": one.name,
         "unit": one.unit,
-        "value": _number(one.value),
-        "standard_uncertainty": _number(one.uncertainty),
+        "value": or_none(one.value),
+        "standard_uncertainty": or_none(one.uncertainty),
         "uncertainty_from": one.origin,
         "points": one.points,
         "points_given": one.points_given,
-        "nominal": _number(one.nominal),
+        "nominal": or_none(one.nominal),
         "bias": one.bias,
         "reason": one.reason,
     }
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _uncertainty_text(value: float) -> str:

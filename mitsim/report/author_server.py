@@ -17,7 +17,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
-from characterisation.files.atomic_io import atomic_write
+from characterisation.files.atomic_io import atomic_write, write_text
 from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
 from mitsim.scene.authoring.check import read_features
@@ -116,8 +116,7 @@ class AuthorServer:
         before = {name: _bytes(self.folder / name) for name in texts}
         try:
             for name, text in texts.items():
-                with atomic_write(self.folder / name) as part:
-                    part.write_text(text, encoding="utf-8")
+                write_text(self.folder / name, text)
             found = self.check()
         except InputError as error:
             for name, data in before.items():  # restore the files, since the new scene does not load

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from characterisation.files.atomic_io import atomic_write
+from characterisation.files.atomic_io import write_text
 from characterisation.plots.style import BLUE, FIELD, VERMILION, drawing
 from characterisation.point_cloud import Status
 from mitsim.report.cloud_figures import REASONS
@@ -54,8 +54,7 @@ def write_capture_page(folder: Path, preamble: str, table: str, real: Shown, sim
         "\n`u` is the standard uncertainty of the difference, from a block bootstrap over patches. A quantity agrees "
         "if the difference is at most 2 u, or at most the margin.\n",
     ]
-    with atomic_write(page) as file:
-        file.write_text("".join(text), encoding="utf-8")
+    write_text(page, "".join(text))
     return page
 
 

@@ -30,6 +30,9 @@ from mitsim.running.numbers import count, finish_name
 
 Floats = NDArray[np.float64]
 
+#: cells across a disc in which patches are counted
+_CELLS = 61
+
 
 def write_map_figures(performance_map: PerformanceMap, folder: Path) -> list[Path]:
     """Write ``map_fraction.png`` and ``map_noise.png`` into a folder, and return their paths."""
@@ -109,7 +112,7 @@ def colour_bar(
         plain_log_ticks(bar, float(norm.vmin or 0), float(norm.vmax or 1))
 
 
-def patches_figure(patches: xr.Dataset, cells: int = 61) -> Figure:
+def patches_figure(patches: xr.Dataset) -> Figure:
     """Draw the number of patches measured at each orientation, over all distances, a disc for each sample."""
     normal = np.stack([patches["normal_x"].values, patches["normal_y"].values], axis=-1)
     n_z = np.sqrt(np.maximum(1 - (normal**2).sum(-1), 0))
@@ -119,7 +122,7 @@ def patches_figure(patches: xr.Dataset, cells: int = 61) -> Figure:
     number = patches["sample_number"].values
     largest = float(np.arccos(n_z.min())) if len(n_z) else math.radians(75)
     reach = 2 * math.sin(largest / 2)
-    edges = np.linspace(-reach, reach, cells + 1)
+    edges = np.linspace(-reach, reach, _CELLS + 1)
     counts = []
     for sample in range(len(samples)):
         mine = number == sample

@@ -22,7 +22,7 @@ from mitsim.report.placement_figure import face_verdicts, placement_figure
 from mitsim.report.pose_texts import pose_of_view, pose_words
 from mitsim.report.set_words import with_sets
 from mitsim.report.style import Picture, as_svg
-from mitsim.running.numbers import NONE, count, with_degree_signs
+from mitsim.running.numbers import NONE, count, or_nan, with_degree_signs
 from mitsim.study.choice_document import ChoiceDocument, SensorEntry, judged
 from mitsim.study.run_folder import Run
 from mitsim.study.scene_geometry import SceneGeometry
@@ -199,8 +199,8 @@ def _judged(name: str, one: StatedMeasurement) -> Judged:
         name,
         one.unit,
         one.verdict,
-        _or_nan(one.standard_uncertainty),
-        _or_nan(None if decision is None else decision.needed),
+        or_nan(one.standard_uncertainty),
+        or_nan(None if decision is None else decision.needed),
         decision is not None and decision.fits_corrected,
         one.without_value,
     )
@@ -218,7 +218,3 @@ def _picture(
     alt = "The part and the sensor. " + "; ".join(faces)
     drawn = f"{caption}. Drawn to scale; on the right, the part enlarged, from the same viewpoint."
     return Picture(Markup(as_svg(placement_figure(geometry, poses, verdicts), alt)), drawn)
-
-
-def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else value

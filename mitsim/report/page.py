@@ -90,7 +90,7 @@ def page_content(run: Run) -> dict[str, Any]:
         "statement": None if run.statement is None else statement_section(run.statement),
         "stated_pose": None if run.statement is None else pose_texts(pose_of_view(run, run.statement.view)),
         "race_confidence": percent(about.confidence.get(ALL, 0.0)),
-        "answers": [_answer(run, name, agreements[name]) for name in run.measurements],
+        "answers": [_answer(run, name) for name in run.measurements],
         "tolerances": bool(np.isfinite(scores["tolerance"].values).any()),
         "coverage": percent(NORMAL_COVERAGE),
         "agreements": [_agreement_row(name, found) for name, found in agreements.items()],
@@ -151,7 +151,7 @@ def _spread(views: list[int], number: int) -> list[int]:
     return [views[round(last * i / max(number - 1, 1))] for i in range(number)]
 
 
-def _answer(run: Run, name: str, found: Agreement) -> dict[str, Any]:
+def _answer(run: Run, name: str) -> dict[str, Any]:
     """Return the best view of one measurement from the race, or from the screening if none was raced."""
     entry, scores = run.about.measurements[name], run.scores.sel(measurement=name)
     nominal = f"{entry.nominal:g}{'°' if entry.unit == 'deg' else ' ' + entry.unit}"

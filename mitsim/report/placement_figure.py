@@ -22,9 +22,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import distance_transform_edt
 
 from characterisation.plots.labels import label_columns
+from characterisation.plots.part_pictures import EDGE_SHADE, innermost_pixel, viewer_frame
 from characterisation.plots.style import INK, MUTED, PAPER, drawing
 from mitsim.study.scene_geometry import SceneGeometry
 
@@ -136,11 +136,7 @@ def _viewpoint(part_from_sensor: Floats, middle: Floats) -> Floats:
     azimuth = math.atan2(away[1], away[0]) if np.hypot(away[0], away[1]) > 1e-6 else -math.pi / 2
     elevation = math.atan2(away[2], math.hypot(away[0], away[1]))
     low = max(math.radians(_LOWEST_DEG), min(math.radians(28.0), elevation * 0.6))
-    azimuth += math.radians(_ASIDE_DEG)
-    toward = np.array([math.cos(low) * math.cos(azimuth), math.cos(low) * math.sin(azimuth), math.sin(low)])
-    right = np.cross([0.0, 0.0, 1.0], toward)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(toward, right), toward])
+    return viewer_frame(azimuth + math.radians(_ASIDE_DEG), low)
 
 
 def _projected(points: Floats, turn: Floats) -> tuple[Floats, Floats]:
@@ -168,7 +164,7 @@ def _part(
     edge = np.zeros_like(hit)
     edge[:-1] |= shown[:-1] != shown[1:]
     edge[:, :-1] |= shown[:, :-1] != shown[:, 1:]
-    picture[edge & hit, :3] *= 0.55
+    picture[edge & hit, :3] *= EDGE_SHADE
     half = 0.5 / scale
     extent = (
         low[0] - half,
@@ -267,10 +263,7 @@ def _labels(axes: Axes, geometry: SceneGeometry, flat: Floats, depth: Floats, ve
     places = {}
     for number, name in enumerate(geometry.names):
         if name in verdicts and (shown == number).any():
-            inside = distance_transform_edt(np.pad(shown == number, 1))[1:-1, 1:-1]
-            # the point farthest from the edges of the feature
-            row, column = np.unravel_index(int(inside.argmax()), inside.shape)
-            places[name] = low + np.array([column, row]) / scale
+            places[name] = low + np.array(innermost_pixel(shown == number)[::-1]) / scale
     order = sorted(places, key=lambda name: (-list(VERDICTS).index(verdicts[name]), places[name][0]))  # worst first
     label_columns(axes, {name: places[name] for name in order}, low, high)
 

@@ -18,6 +18,7 @@ from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
 from characterisation.plots.labels import round_length, scale_bar
+from characterisation.plots.part_pictures import EDGE_SHADE, shape_edges
 from characterisation.plots.style import FIELD, INK, MUTED, OTHER_SHAPE, SHAPES, bare, drawing
 from mitsim.running.numbers import finish_name
 from mitsim.scene.first_hits import VisibleSurfaces, trace
@@ -115,10 +116,7 @@ def _painted(
     image = colour * shade[..., None]
     share = np.where(clear | ~front, 1.0, _PALE)[..., None]
     image = share * image + (1 - share) * np.array(to_rgb(FIELD))
-    edge = np.zeros(shape.shape, bool)
-    edge[:, 1:] |= shape[:, 1:] != shape[:, :-1]
-    edge[1:] |= shape[1:] != shape[:-1]
-    image[edge] *= 0.55
+    image[shape_edges(shape)] *= EDGE_SHADE
     return np.asarray(image)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mitsim.running.numbers import or_none
 from mitsim.running.text_table import aligned
 from mitsim.scene.authoring.check import SceneFinding
 from mitsim.scene.first_hits import VisibleSurfaces
@@ -58,13 +59,13 @@ def as_data(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[SceneFi
                 "type": shape.kind,
                 "bsdf": shape.bsdf,
                 "finish": finish.name if finish else None,
-                "Ra_um": _or_null(finish.roughness) if finish else None,
-                "alpha_u": _or_null(shape.alpha[0]),
-                "alpha_v": _or_null(shape.alpha[1]),
-                "alpha_factor": _or_null(shape.alpha_factor),
+                "Ra_um": or_none(finish.roughness) if finish else None,
+                "alpha_u": or_none(shape.alpha[0]),
+                "alpha_v": or_none(shape.alpha[1]),
+                "alpha_factor": or_none(shape.alpha_factor),
                 "provenance": shape.provenance or None,
                 "lay": shape.lay,
-                "area_mm2": _or_null(shape.area),
+                "area_mm2": or_none(shape.area),
                 "bounds_mm": shape.bounds.tolist(),
                 "triangles": len(shape.mesh.triangles) if shape.mesh else None,
                 "closed": shape.mesh.closed if shape.mesh else None,
@@ -76,7 +77,7 @@ def as_data(facts: SceneFacts, visible: VisibleSurfaces, found: Sequence[SceneFi
     return {
         "bounds_mm": facts.bounds.tolist(),
         "features": shapes,
-        "emitters": [{"type": kind, "flux_w": _or_null(flux)} for kind, flux in facts.emitters],
+        "emitters": [{"type": kind, "flux_w": or_none(flux)} for kind, flux in facts.emitters],
         "findings": [asdict(one) for one in found],
     }
 
@@ -100,7 +101,3 @@ def _number(value: float, before: str = "") -> str:
 
 def _lengths(values: np.ndarray, between: str) -> str:
     return between.join(f"{round(float(value), 2) + 0.0:g}" for value in values)
-
-
-def _or_null(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -192,15 +192,15 @@ def _short(source: str) -> str:
     return textwrap.shorten(source.split(":")[0].split(" (")[0], 48, placeholder=" ...")
 
 
-def _window_around(cloud: PointCloud, margin: float = 0.2) -> tuple[slice, slice]:
-    """Return the rows and columns of the grid around all points, with a margin relative to their extent."""
+def _window_around(cloud: PointCloud) -> tuple[slice, slice]:
+    """Return the rows and columns of the grid around all points, with a margin of a fifth of their extent."""
     rows, columns = np.nonzero(cloud.valid)
     if not len(rows):
         return slice(0, cloud.grid.height), slice(0, cloud.grid.width)
     cut = []
     for places, size in ((rows, cloud.grid.height), (columns, cloud.grid.width)):
         first, last = np.percentile(places, (1, 99))
-        beyond = margin * (last - first) + 4
+        beyond = 0.2 * (last - first) + 4
         cut.append(slice(max(0, int(first - beyond)), min(size, int(last + beyond) + 1)))
     return cut[0], cut[1]
 

@@ -110,12 +110,11 @@ def pixel_axes(axes: Axes) -> None:
     axes.set(xlabel="column [px]", ylabel="row [px]")
 
 
-def plain_log(axis: Axis, few: bool = False) -> None:
-    """Label a logarithmic axis 0.1, 0.2, 0.5, 1 instead of with powers of ten; with fewer labels if ``few``."""
+def plain_log(axis: Axis) -> None:
+    """Label a logarithmic axis 0.1, 0.2, 0.5, 1 instead of with powers of ten."""
     if axis.get_scale() != "log":
         return
     low, high = axis.get_view_interval()
-    narrow = high < (5 if few else 200) * low
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if narrow else (1,), numticks=4 if few else 12))
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 200 * low else (1,), numticks=12))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(NullLocator())

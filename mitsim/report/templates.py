@@ -12,7 +12,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from characterisation.files.atomic_io import atomic_write
+from characterisation.files.atomic_io import write_text
 from mitsim.report.first_rows import breakable
 
 _FOLDER = Path(__file__).parent
@@ -26,8 +26,7 @@ def rendered(template: str, content: Mapping[str, Any]) -> str:
 def write_page(path: Path, template: str, content: Mapping[str, Any]) -> Path:
     """Write a page atomically, and return its path."""
     text = rendered(template, content)
-    with atomic_write(path) as file:
-        file.write_text(text, encoding="utf-8")
+    write_text(path, text)
     return path
 
 

@@ -1,4 +1,4 @@
-"""Format numbers for readers: with a unit, and with significant digits only."""
+"""Format numbers for readers: with a unit, and with significant digits only; convert those that may be missing."""
 
 from __future__ import annotations
 
@@ -75,3 +75,13 @@ def finish_name(finish: str, roughness: float) -> str:
 def listed(parts: list[str]) -> str:
     """Join words to a list: ``a``, ``a and b``, ``a, b and c``."""
     return " and ".join(filter(None, [", ".join(parts[:-1]), parts[-1]])) if parts else ""
+
+
+def or_none(value: float) -> float | None:
+    """Return a finite number as it is, and None for others, which JSON cannot hold."""
+    return value if math.isfinite(value) else None
+
+
+def or_nan(value: float | None) -> float:
+    """Return a number as it is, and NaN for None."""
+    return math.nan if value is None else value

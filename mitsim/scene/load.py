@@ -173,15 +173,14 @@ def scene_from_dict(description: dict[str, Any], wavelength_nm: float, where: st
     return _wrap(scene, state.finishes, where)
 
 
-def flat_coupon(finish: Finish, half_size: float, turn_deg: float = 0.0) -> Scene:
+def flat_coupon(finish: Finish, half_size: float) -> Scene:
     """Return a scene with a square coupon in a finish that was loaded before.
 
-    The coupon lies in the plane z = 0, centred. Its side is 2 ``half_size`` [mm]. ``turn_deg`` rotates it, with its
-    lay, about its normal.
+    The coupon lies in the plane z = 0, centred. Its side is 2 ``half_size`` [mm].
     """
     assert finish.description is not None
     _prepare()
-    to_world = backend.mi.ScalarTransform4f().rotate([0, 0, 1], turn_deg).scale([half_size, half_size, 1])
+    to_world = backend.mi.ScalarTransform4f().scale([half_size, half_size, 1])
     coupon = {"type": "rectangle", "to_world": to_world, "bsdf": finish.description}
     loaded = backend.mi.load_dict({"type": "scene", "coupon": coupon}, parallel=False, optimize=False)
     _share_kernels(loaded)

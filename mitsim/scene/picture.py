@@ -15,9 +15,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from characterisation.plots.labels import label_columns, round_length, scale_bar
+from characterisation.plots.part_pictures import EDGE_SHADE, innermost_pixel, shape_edges, viewer_frame
 from characterisation.plots.style import INK, OTHER_SHAPE, SHAPES, axes_for, figure_of
 from mitsim.scene.first_hits import Hits, trace
 from mitsim.scene.load import Scene
@@ -43,7 +43,9 @@ def draw_scene(scene: Scene, ax: Any, pose: Transform | None) -> Axes:
     InputError
         If ``ax`` is not one axes.
     """
-    frame = _default_frame() if pose is None else np.array([1.0, -1.0, -1.0])[:, None] * pose.rotation.T
+    frame = (
+        viewer_frame(_AZIMUTH, _ELEVATION) if pose is None else np.array([1.0, -1.0, -1.0])[:, None] * pose.rotation.T
+    )
     corners = np.stack(np.meshgrid(*scene.bounds.T, indexing="ij"), axis=-1).reshape(-1, 3)
     seen = corners @ frame.T
     low, high = seen.min(axis=0), seen.max(axis=0)
@@ -74,26 +76,13 @@ def draw_scene(scene: Scene, ax: Any, pose: Transform | None) -> Axes:
     return axes
 
 
-def _default_frame() -> Floats:
-    """Return rows (3, 3): right, up and toward the viewer."""
-    toward = np.array(
-        [np.cos(_ELEVATION) * np.cos(_AZIMUTH), np.cos(_ELEVATION) * np.sin(_AZIMUTH), np.sin(_ELEVATION)]
-    )
-    right = np.cross([0.0, 0.0, 1.0], toward)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(toward, right), toward])
-
-
 def _shaded(hits: Hits, shape: NDArray[np.int16], frame: Floats) -> Floats:
     """Return the picture (rows, columns, 4): a colour for each shape, shaded by its normal, with dark edges."""
     palette = np.array([to_rgb(SHAPES[i]) if i < len(SHAPES) else to_rgb(OTHER_SHAPE) for i in range(shape.max() + 2)])
     light = np.array([-0.4, 0.35, 0.85]) @ frame
     lit = np.clip(np.nan_to_num(hits.normal) @ (light / np.linalg.norm(light)), 0, 1).reshape(shape.shape)
     image = np.concatenate([palette[shape] * (0.45 + 0.55 * lit)[..., None], (shape >= 0)[..., None]], axis=-1)
-    edge = np.zeros(shape.shape, bool)
-    edge[:, 1:] |= shape[:, 1:] != shape[:, :-1]
-    edge[1:] |= shape[1:] != shape[:-1]
-    image[edge, :3] *= 0.55
+    image[shape_edges(shape), :3] *= EDGE_SHADE
     return np.asarray(image)
 
 
@@ -102,8 +91,7 @@ def _label_places(scene: Scene, shape: NDArray[np.int16], x: Floats, y: Floats) 
     numbers, counts = np.unique(shape[shape >= 0], return_counts=True)
     places = {}
     for number in numbers[np.argsort(-counts, kind="stable")]:
-        inside = distance_transform_edt(np.pad(shape == number, 1))[1:-1, 1:-1]
-        row, column = np.unravel_index(int(inside.argmax()), inside.shape)
+        row, column = innermost_pixel(shape == number)
         places[scene.names[number]] = np.array([x[column], y[row]])
     return places
 

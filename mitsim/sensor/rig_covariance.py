@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from characterisation.files.atomic_io import atomic_write
+from characterisation.files.atomic_io import write_text
 from characterisation.files.documents import Document, read_toml
 from characterisation.files.errors import InputError
 from mitsim.sensor.camera import Rig
@@ -115,8 +115,7 @@ def write_rig_covariance(path: str | Path, covariance: RigCovariance, rig: Rig) 
     lines += ["", "[nominal]", *_rows(dict(zip(covariance.names, nominal, strict=True)), ".10g")]
     if covariance.details:
         lines += ["", "[details]", *_rows(covariance.details, ".6g")]
-    with atomic_write(path) as file:
-        file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def _check_nominal(path: str | Path, rig: Rig, names: tuple[str, ...], nominal: dict[str, float]) -> None:

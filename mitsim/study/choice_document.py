@@ -6,7 +6,6 @@ screening alone.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Literal
 
@@ -16,6 +15,7 @@ from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.statements.verdict_words import Judged
+from mitsim.running.numbers import or_nan
 from mitsim.study.statement_file import PartialDocument
 
 #: name of the file in the folder
@@ -191,17 +191,13 @@ def winner_folder(folder: Path) -> Path:
 
 def judged(entry: SensorEntry) -> list[Judged]:
     """Return the verdicts of a sensor, for their summary in words."""
-
-    def number(value: float | None) -> float:
-        return math.nan if value is None else value
-
     return [
         Judged(
             name,
             "",
             cell.verdict,
-            number(cell.uncertainty),
-            number(cell.needed),
+            or_nan(cell.uncertainty),
+            or_nan(cell.needed),
             cell.fits_corrected,
             cell.without_value,
             cell.trials,

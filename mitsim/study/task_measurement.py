@@ -266,7 +266,7 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
     if "views" in table:
         try:
             known = {int(one["view"]): one["part_from_sensor"] for one in table["views"]}
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, OverflowError, TypeError, ValueError) as error:
             raise InputError(
                 path, "views", f"entries that cannot be read ({error!r})", "a list as mitsim run writes it"
             ) from None
@@ -284,7 +284,7 @@ def read_pose(path: Path, view: int | None = None) -> Transform:
 def _pose(path: Path, matrix: Any) -> Transform:
     try:
         pose = Transform.from_matrix(np.array(matrix, float).reshape(4, 4))
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         raise InputError(path, "world_from_sensor", repr(matrix)[:60], "a 4 x 4 matrix, rows first [mm]") from None
     if not is_rotation(pose.rotation, 1e-4) or not np.isfinite(pose.translation).all():
         raise InputError(

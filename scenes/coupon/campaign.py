@@ -1,6 +1,7 @@
 """The campaign of ``campaign.toml`` as a program: coupons of matt white and ground aluminium before a sensor.
 
-``python scenes/coupon/campaign.py`` gives the map of ``mitsim map make scenes/coupon/campaign.toml -o runs/n10``.
+``python scenes/coupon/campaign.py`` gives the map of ``mitsim map make scenes/coupon/campaign.toml -o runs/n10``,
+and a figure of it.
 """
 
 from pathlib import Path
@@ -23,4 +24,6 @@ CAMPAIGN = ms.CampaignFile(
 
 if __name__ == "__main__":
     sensor = ms.load_sensor("ensenso-n10")
-    ms.characterise(HERE / "campaign.toml", sensor, "runs/n10", file=CAMPAIGN).plot()
+    axes = ms.characterise(HERE / "campaign.toml", sensor, "runs/n10", file=CAMPAIGN).plot()
+    axes[0].figure.savefig("runs/n10/map.png")
+    print("figure: runs/n10/map.png")

@@ -22,4 +22,6 @@ STUDY = ms.StudyFile(
 )
 
 if __name__ == "__main__":
-    ms.run_study(ms.open_study(HERE / "set.toml", STUDY), "runs/set")
+    study = ms.open_study(HERE / "set.toml", STUDY)
+    for statement in ms.run_study(study, "runs/set"):
+        print(f"{statement.measurement}: u = {statement.standard_uncertainty:.2g} {statement.unit}")

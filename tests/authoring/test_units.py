@@ -158,3 +158,25 @@ def test_a_step_file_that_states_its_unit_refuses_another(tmp_path):
         assert not any("unit" in one for one in part.remarks)
     with pytest.raises(InputError, match=r"inch, the unit that pin\.step states"):
         read_part(path, "mm")
+
+
+@needs_step
+@pytest.mark.usefixtures("step_here")
+def test_a_spline_of_a_file_in_metres_is_meshed_as_the_free_form_that_it_is(tmp_path):
+    """Its distance from a plane, 0.02 mm, is over the limit in mm, and would be under it in the numbers of the file."""
+    from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeFace
+    from OCP.GeomAPI import GeomAPI_PointsToBSplineSurface
+    from OCP.gp import gp_Pnt
+    from OCP.TColgp import TColgp_Array2OfPnt
+
+    points = TColgp_Array2OfPnt(1, 9, 1, 9)
+    for row in range(9):
+        for column in range(9):
+            height = 2e-5 * np.sin(np.pi * row / 4) * np.sin(np.pi * column / 4)
+            points.SetValue(row + 1, column + 1, gp_Pnt(0.1 * row / 8, 0.1 * column / 8, height))
+    sheet = BRepBuilderAPI_MakeFace(GeomAPI_PointsToBSplineSurface(points).Surface(), 1e-7).Face()
+    path = without_units(write_step([("sheet", sheet, None)], tmp_path / "sheet.step"))
+    (fine,) = read_part(path, "m", fineness=Fineness(1e-3, 1e-3)).faces
+    (coarse,) = read_part(path, "m", fineness=Fineness(1e-3, 1.0)).faces
+    assert fine.surface is None
+    assert len(coarse.triangles) < len(fine.triangles) / 4

@@ -43,7 +43,7 @@ def main() -> None:
     asked.add_argument("--sensors", nargs="+", default=presets())
     asked.add_argument("--poses", type=int, default=1)
     given = asked.parse_args()
-    print("| sensor | capture | decode | validate map | time |\n|---|---|---|---|---|", flush=True)
+    print("| sensor | capture | decode | map validate | time |\n|---|---|---|---|---|", flush=True)
     for name in given.sensors:
         near, far = load_sensor(name).working_range_mm
         height = (near * far) ** 0.5

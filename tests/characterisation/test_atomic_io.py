@@ -6,7 +6,7 @@ import errno
 
 import pytest
 
-from characterisation.files.atomic_io import atomic_write, atomic_write_named
+from characterisation.files.atomic_io import atomic_folder, atomic_write, atomic_write_named
 
 both = pytest.mark.parametrize("written", [atomic_write, atomic_write_named])
 
@@ -42,3 +42,18 @@ def test_a_file_is_written_by_its_own_name(tmp_path):
         assert file.name == "part.usdc" and file.parent.parent == tmp_path
         file.write_text("whole")
     assert (tmp_path / "part.usdc").read_text() == "whole"
+
+
+def test_a_folder_is_there_whole_or_not_at_all(tmp_path):
+    with pytest.raises(RuntimeError), atomic_folder(tmp_path / "new" / "data") as folder:
+        (folder / "half.txt").write_text("half")
+        raise RuntimeError
+    assert not list((tmp_path / "new").iterdir())
+    with atomic_folder(tmp_path / "new" / "data") as folder:
+        (folder / "whole.txt").write_text("whole")
+        assert not (tmp_path / "new" / "data").exists()
+    assert [p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*.txt")] == ["new/data/whole.txt"]
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["data"]
+    with pytest.raises(OSError, match="No space left") as raised, atomic_folder(tmp_path / "full"):
+        raise OSError(errno.ENOSPC, "No space left on device", "somewhere/else")
+    assert raised.value.filename == str(tmp_path / "full")

@@ -34,7 +34,10 @@ def test_the_studies_and_the_campaign_have_programs():
         "two_pillars/study",
         "two_pillars/set",
         "two_pillars/tolerances",
+        "two_pillars/quick",
         "coupon/campaign",
+        "coupon/quick",
+        "coupon/spread",
     }
 
 

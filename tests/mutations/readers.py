@@ -317,10 +317,16 @@ def _read_mesh(path):
     segment_mesh(mesh.vertices, mesh.triangles, where=str(path))
 
 
-def _poses(folder):
+def _pose(folder):
     path = folder / "pose.json"
     path.write_text(json.dumps({"world_from_sensor": np.eye(4).tolist()}), encoding="utf-8")
     return path
+
+
+def _read_pose(path):
+    from mitsim.study.task_measurement import read_pose
+
+    read_pose(path)
 
 
 def _capture(path):
@@ -531,6 +537,7 @@ READERS: dict[str, Reader] = {
     "statement.json": Reader(_run_folder("statement.json"), _read_run),
     "capture.json": Reader(_run_folder("captures/view_0004/capture.json"), _capture),
     "calibration.json of a capture": Reader(_run_folder("captures/view_0004/calibration.json"), _capture),
+    "pose.json": Reader(_pose, _read_pose),
     "patches.npy": Reader(_patches, _read_patches),
     "stand.npz": Reader(_run_folder("stand.npz"), _read_scene_geometry),
     "task.json": Reader(_kept_task, _read_kept_task),
@@ -567,7 +574,7 @@ READERS: dict[str, Reader] = {
     "mitsim report of run.json": Reader(_run_folder("run.json"), _report),
     "mitsim check": Reader(copied(SCENES / "two_pillars" / "two_pillars.xml"), lambda path: command("check", path)),
     "mitsim part": Reader(_mesh(".stl"), lambda path: command("part", path, "-o", path.parent / "out")),
-    "mitsim compare": Reader(
-        _run_folder("map.nc"), lambda path: command("compare", path, "-o", path.parent / "out"), True
+    "mitsim map compare": Reader(
+        _run_folder("map.nc"), lambda path: command("map", "compare", path, "-o", path.parent / "out"), True
     ),
 }

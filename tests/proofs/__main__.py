@@ -107,7 +107,7 @@ def losses(
     Example: python -m tests.proofs losses scenes/parts/validation.toml -o mitsim/maps/prediction/interreflections.toml
     """
     start(variant)
-    from characterisation.files.atomic_io import atomic_write
+    from characterisation.files.atomic_io import write_text
     from mitsim.running.progress import say
     from tests.proofs.loss_fit import fitted_loss, losses_document, points_of_cases
     from tests.proofs.part_cases import read_part_cases
@@ -124,10 +124,7 @@ def losses(
             "open cases of matching and of coded sensors, with parts that have interreflections",
         ) from problem
     command = f"python -m tests.proofs losses {cases} -o {output}" + (f" --views {views}" if views != 6 else "")
-    with atomic_write(output) as whole:
-        whole.write_text(
-            losses_document(command, [name for of in seen.values() for name in of], found), encoding="utf-8"
-        )
+    write_text(output, losses_document(command, [name for of in seen.values() for name in of], found))
     for kind, loss in found.items():
         print(
             f"{kind}: half {loss.half} {list(loss.half_interval)}, steepness {loss.steepness} "
@@ -160,7 +157,7 @@ def maps(
     start(variant)
     import tempfile
 
-    from characterisation.files.atomic_io import atomic_write
+    from characterisation.files.atomic_io import write_text
     from mitsim.running.progress import say
     from tests.proofs.map_comparison import beyond_map_document, compare_case, judged_table
     from tests.proofs.part_cases import read_part_cases
@@ -180,8 +177,7 @@ def maps(
             "open cases of matching, coded-light and time-of-flight sensors, with kept trials",
             "make the trials first: python -m tests.proofs statements",
         ) from problem
-    with atomic_write(output) as whole:
-        whole.write_text(text, encoding="utf-8")
+    write_text(output, text)
     rows = [
         [
             f"{part}{' (sealed)' if sealed else ''}",

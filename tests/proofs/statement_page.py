@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from characterisation.files.atomic_io import atomic_write
+from characterisation.files.atomic_io import write_text
 from characterisation.plots.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing
 from characterisation.statements.coverage import Share, share
 from mitsim.report.style import write_png
@@ -70,8 +70,7 @@ def write_statement_page(cases: Sequence[JudgedCase], folder: str | Path, preamb
         "in worlds that share eight finishes.\n\n",
         regret_table(choices),
     ]
-    with atomic_write(folder / "statements.md") as file:
-        file.write_text("".join(text), encoding="utf-8")
+    write_text(folder / "statements.md", "".join(text))
     return folder / "statements.md", sensors
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from characterisation.files.atomic_io import atomic_write
+from characterisation.files.atomic_io import write_text
 
 
 def markdown(heads: Sequence[str], body: Sequence[Sequence[str]]) -> str:
@@ -29,5 +29,4 @@ def write_csv(path: Path, head: Sequence[str], rows: Sequence[Sequence[Any]]) ->
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(head)
     writer.writerows([f"{cell:.6g}" if isinstance(cell, float) else cell for cell in row] for row in rows)
-    with atomic_write(path) as file:
-        file.write_text(text.getvalue(), encoding="utf-8")
+    write_text(path, text.getvalue())

@@ -98,13 +98,6 @@ def plain(text: str) -> str:
     return html.unescape(re.sub(r"\s+", " ", text))
 
 
-def set_errors(folder, errors) -> None:
-    """Checks that found these errors (measurement, view, repeat)."""
-    checks = xr.load_dataset(folder / "checks.nc")
-    checks["error"] = (("measurement", "view", "repeat"), errors)
-    write_netcdf(checks, folder / "checks.nc")
-
-
 def test_the_best_view_of_each_measurement_is_the_leader_of_its_race(text, run_folder):
     scores = xr.load_dataset(run_folder / "scores.nc")
     for m, row in enumerate(answers(text)):

@@ -105,11 +105,6 @@ def test_the_image_keeps_every_channel(ball, tmp_path):
     assert len(channels) == 10
 
 
-def floor_scene(half_size):
-    to_world = mi.ScalarTransform4f().scale([half_size, half_size, 1])
-    return scene_from_dict({"floor": {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "matt_white"}}}, 850)
-
-
 def test_truth_is_of_the_camera_as_it_is_and_not_as_it_was_calibrated(n10):
     """A camera turned by 5 mrad about its x axis sees a floor elsewhere than its calibration says."""
     floor = {

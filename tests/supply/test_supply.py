@@ -5,14 +5,12 @@ import importlib.metadata
 import importlib.util
 import subprocess
 import sys
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 #: what is imported where it is found, and asked for nowhere: vendors' SDKs, and packages of the same name as ours
 OF_OTHERS = {"nxlib", "mitsim", "characterisation"}

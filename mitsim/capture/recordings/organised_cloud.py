@@ -30,14 +30,15 @@ from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of
 from mitsim.capture.recordings.pcd import decode_pcd
 from mitsim.capture.recordings.pinhole_fit import LEAST_POINTS, PINHOLE_RMS_PX, fit_pinhole, off_the_rays
 from mitsim.capture.recordings.ply import decode_ply
+from mitsim.sensor.calibration_qualifiers import UNITS_MM
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import Transform
 
 Points = NDArray[np.float32]
 Axes = Literal["opencv", "opengl"]
 
-#: lengths of one unit [mm]
-UNITS_MM = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1000.0}
+#: units of length of clouds [mm]
+CLOUD_UNITS_MM = {word: UNITS_MM[word] for word in ("um", "mm", "cm", "m")}
 
 #: median distance of the points, in the file's numbers, below which the unit is metres. All sensors here measure
 #: between 20 mm and 20 m
@@ -192,7 +193,7 @@ def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = Non
     path
         The file, for messages.
     unit
-        One of :data:`UNITS_MM`; by default metres if the median distance is under :data:`METRES_UNDER`, else
+        One of :data:`CLOUD_UNITS_MM`; by default metres if the median distance is under :data:`METRES_UNDER`, else
         millimetres.
     hint
         What to do if the points are too far away.
@@ -213,10 +214,10 @@ def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = Non
         raise InputError(path, "", "no points", "a cloud with x, y and z")
     distance = float(np.median(np.linalg.norm(seen.astype(float), axis=-1)))
     unit = unit or ("m" if distance < METRES_UNDER else "mm")
-    farthest = float(np.abs(seen).max()) * UNITS_MM[unit]
+    farthest = float(np.abs(seen).max()) * CLOUD_UNITS_MM[unit]
     if farthest > FARTHEST_MM:
         raise InputError(path, "x, y, z", f"{farthest:.3g} mm", f"up to {FARTHEST_MM:g} mm", hint)
-    points *= UNITS_MM[unit]
+    points *= CLOUD_UNITS_MM[unit]
     return unit, distance
 
 

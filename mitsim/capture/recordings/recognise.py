@@ -20,7 +20,7 @@ from mitsim.capture.recordings.depth_image import read_depth_image
 from mitsim.capture.recordings.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
 from mitsim.capture.recordings.ensenso import ensenso_originals, image_sets, read_ensenso
 from mitsim.capture.recordings.image_folder import read_image_folder, size_of_images
-from mitsim.capture.recordings.organised_cloud import UNITS_MM, Axes, read_organised_cloud
+from mitsim.capture.recordings.organised_cloud import CLOUD_UNITS_MM, Axes, read_organised_cloud
 from mitsim.capture.recordings.pose_file import read_pose
 from mitsim.capture.recordings.recording_files import MCAP_MAGIC, frame_of, plain_name
 from mitsim.capture.recordings.robi import is_robi, read_robi
@@ -152,8 +152,8 @@ def _read_cloud(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, by
     axes = next((known for known in AXES if known == (options.axes or AXES[0])), None)
     if axes is None:
         raise InputError("--axes", "", repr(options.axes), " | ".join(AXES))
-    if options.unit is not None and options.unit not in UNITS_MM:
-        raise InputError("--unit", "", repr(options.unit), " | ".join(UNITS_MM))
+    if options.unit is not None and options.unit not in CLOUD_UNITS_MM:
+        raise InputError("--unit", "", repr(options.unit), " | ".join(CLOUD_UNITS_MM))
     capture = read_organised_cloud(
         path,
         calibration=options.cameras,

@@ -173,8 +173,7 @@ def _report_reach(campaign: Campaign, normals: NDArray[np.float64], reached: NDA
         )
     say(f"{(~reached).sum()} of {len(normals)} orientations are beyond the stage: {listed}")
     rows = [f"{n[0]:.6f},{n[1]:.6f},{math.degrees(math.acos(min(1.0, n[2]))):.3f}" for n in normals[~reached]]
-    with atomic_io.atomic_write(listed) as partial:
-        partial.write_text("\n".join(["normal_x,normal_y,incidence_deg", *rows]) + "\n", encoding="utf-8")
+    atomic_io.write_text(listed, "\n".join(["normal_x,normal_y,incidence_deg", *rows]) + "\n")
 
 
 def _finish(

@@ -17,9 +17,6 @@ from __future__ import annotations
 import fnmatch
 import json
 import math
-import os
-import shutil
-import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,7 +29,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
-from characterisation.files.atomic_io import HOST
+from characterisation.files.atomic_io import atomic_folder
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from mitsim.capture.capture import Capture
@@ -157,13 +154,11 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
     output = Path(output).absolute()
     if output.exists():
         raise InputError("--output", "", f"{output}, which exists", "a new folder")
-    output.parent.mkdir(parents=True, exist_ok=True)
-    partial = output.with_name(f".{output.name}.partial-{os.getpid()}-{HOST}{uuid.uuid4().hex[:12]}")
     finishes = list(dict.fromkeys(one.finish for one in sources))
     tables: dict[str, dict[str, dict[str, Any]]] = {one: {"camera": {}, "gt": {}, "gt_info": {}} for one in finishes}
     scenes: dict[str, tuple[Scene, list[Scene]]] = {}
     camera: dict[str, Any] = {}
-    try:
+    with atomic_folder(output) as partial:
         for source in track(sources, "export"):
             capture = read_capture(source.folder)
             if source.finish not in scenes:
@@ -184,9 +179,6 @@ def write_bop(sources: Sequence[Source], output: str | Path, split: str = "train
         _write_json(partial / "finishes.json", {f"{k:06d}": name for k, name in enumerate(finishes, 1)})
         described = _about(sources, finishes, split, [one.names for one in objects])
         (partial / "dataset_info.md").write_text(described, encoding="utf-8")
-        partial.rename(output)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return len(sources)
 
 

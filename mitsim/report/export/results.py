@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from characterisation.files.atomic_io import atomic_write, write_json
+from characterisation.files.atomic_io import write_json, write_text
 from characterisation.files.errors import InputError
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.task_reading import read_task
@@ -109,8 +109,7 @@ def write_results_csv(found: RunResults, path: str | Path) -> None:
     writer = csv.DictWriter(out, list(ExpectedResult.__dataclass_fields__), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    with atomic_write(path) as file:
-        file.write_text(out.getvalue(), encoding="utf-8")
+    write_text(path, out.getvalue())
 
 
 def _in_a_field(tolerance: float | tuple[float, float] | None) -> object:

@@ -31,6 +31,7 @@ from mitsim.scene.first_hits import VisibleSurfaces
 from mitsim.scene.inspect import SceneFacts, ShapeFacts
 from mitsim.scene.mesh_facts import MeshFacts
 from mitsim.scene.surface.processes import PROCESSES
+from mitsim.sensor.calibration_qualifiers import UNITS_MM
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.rig_parameters import eyes
 from mitsim.sensor.transforms import Transform
@@ -59,7 +60,8 @@ _CRACK_PX = 10
 #: shapes whose triangles Mitsuba itself makes
 _STOCK = ("rectangle", "disk", "cube", "sphere", "cylinder")
 
-_UNITS = {"inches": 25.4, "metres": 1000.0}
+#: units in which a part that looks too small may have been modelled [mm]
+_UNITS = {word: UNITS_MM[word] for word in ("inches", "metres")}
 
 
 @dataclass(frozen=True)

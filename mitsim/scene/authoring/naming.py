@@ -156,13 +156,13 @@ def _plane_name(face: Face, surface: Plane, low: Floats, high: Floats) -> str:
             return name
         return f"{name}_at_{'xyz'[along]}{size(at)}mm"
     off = float(np.rad2deg(np.arccos(np.abs(surface.normal).max())))
-    extent = np.sort(_extents(face, surface))
+    extent = np.sort(_extents(face))
     narrow = extent[0] < _CHAMFER_SHARE * float(np.linalg.norm(high - low))
     upright = abs(surface.normal[2]) < np.sqrt(1 - _ALONG**2)  # like the sides of a hexagonal nut
     return f"{'chamfer' if narrow else 'side' if upright else 'slope'}_{degrees(off)}deg"
 
 
-def _extents(face: Face, surface: Plane) -> Floats:
+def _extents(face: Face) -> Floats:
     """Return length and width [mm] of a plane face along its own principal directions."""
     local = face.vertices - face.vertices.mean(axis=0)
     _, _, directions = np.linalg.svd(local, full_matrices=False)

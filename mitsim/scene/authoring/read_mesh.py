@@ -13,7 +13,7 @@ import trimesh
 
 from characterisation.files.errors import InputError, nearest
 from mitsim.scene.authoring.face import Floats, Ints
-from mitsim.scene.authoring.units import UNITS, commented_unit, unit_words
+from mitsim.scene.authoring.units import UNITS, commented_unit, unit_assumed, unit_words
 from mitsim.sensor.calibration_qualifiers import UNITS_MM
 
 STEP = (".step", ".stp", ".p21")
@@ -91,7 +91,7 @@ def _scale(path: Path, scene: Any, units: str | None) -> tuple[float, tuple[str,
     stated = _stated_unit(path, scene)
     if stated is None:
         if units is None:
-            return 1.0, (f"{path.name} states no unit of length: mm assumed; --units m or --units inch changes it",)
+            return 1.0, (unit_assumed(path.name),)
         return UNITS[units], ()
     if units is None or math.isclose(stated, UNITS[units]):
         return stated, ()

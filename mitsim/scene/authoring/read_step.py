@@ -39,7 +39,7 @@ from mitsim.scene.authoring.face import (
 )
 from mitsim.scene.authoring.part21 import StepText, read_step_text
 from mitsim.scene.authoring.segment_mesh import components
-from mitsim.scene.authoring.units import UNITS, step_units, unit_words
+from mitsim.scene.authoring.units import UNITS, step_units, unit_assumed, unit_words
 
 #: default mesh of STEP without a sensor: distance from the true surface [mm], and angle between facets [rad]. The angle
 #: only keeps small round faces round, since the normals are exact
@@ -218,7 +218,7 @@ def _scale(path: Path, text: StepText, units: str | None) -> tuple[float, list[s
     stated = step_units(text)
     if not stated:
         if units is None:
-            return 1.0, [f"{path.name} states no unit of length: mm assumed; --units m or --units inch changes it"]
+            return 1.0, [unit_assumed(path.name)]
         return UNITS[units], []
     if units is not None and not all(math.isclose(one, UNITS[units]) for one in stated):
         words = " and ".join(map(unit_words, stated))

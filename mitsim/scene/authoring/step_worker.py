@@ -125,7 +125,7 @@ def srgb(colour: Any) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def surface_of(face: Any, tolerance: float = SAME_MM) -> dict[str, Any]:
+def surface_of(face: Any, tolerance: float) -> dict[str, Any]:
     """Return the surface of a face as kind and numbers; ``freeform`` if none is simple within ``tolerance``."""
     from OCP.BRep import BRep_Tool
     from OCP.BRepAdaptor import BRepAdaptor_Surface
@@ -187,17 +187,37 @@ def simple(kind: str, surface: Any) -> dict[str, Any]:
     return out
 
 
-def faces_of(shape: Any) -> list[Any]:
-    """Return the faces of a shape."""
+def subshapes(shape: Any, kind: Any, avoid: Any = None) -> list[Any]:
+    """Return the shapes of a kind that a shape has, without those inside shapes of the kind ``avoid``."""
     from OCP.TopAbs import TopAbs_FACE
     from OCP.TopExp import TopExp_Explorer
     from OCP.TopoDS import TopoDS
 
-    explorer, out = TopExp_Explorer(shape, TopAbs_FACE), []
+    explorer = TopExp_Explorer(shape, kind) if avoid is None else TopExp_Explorer(shape, kind, avoid)
+    out = []
     while explorer.More():
-        out.append(TopoDS.Face_s(explorer.Current()))
+        out.append(TopoDS.Face_s(explorer.Current()) if kind == TopAbs_FACE else explorer.Current())
         explorer.Next()
     return out
+
+
+class Surfaces:
+    """The surface of each face of some shapes, as :func:`surface_of` returns it, computed once."""
+
+    def __init__(self, shapes: list[Any], tolerance: float) -> None:
+        from OCP.TopAbs import TopAbs_FACE
+        from OCP.TopTools import TopTools_IndexedMapOfShape
+
+        self.faces = [face for shape in shapes for face in subshapes(shape, TopAbs_FACE)]
+        self._numbers = TopTools_IndexedMapOfShape()
+        self._found: list[dict[str, Any]] = []
+        for face in self.faces:
+            if self._numbers.Add(face) > len(self._found):
+                self._found.append(surface_of(face, tolerance))
+
+    def of(self, face: Any) -> dict[str, Any]:
+        """Return the surface of one of the faces."""
+        return self._found[self._numbers.FindIndex(face) - 1]
 
 
 def mesh_together(faces: list[Any], chord: float, bend: float, delabella: bool = True) -> None:
@@ -272,22 +292,22 @@ def chords(
     return out, expected()
 
 
-def mesh(shapes: list[Any], chord: float, bend: float, others: float, most: int) -> float:
+def mesh(shapes: list[Any], surfaces: Surfaces, chord: float, bend: float, others: float, most: int) -> float:
     """Mesh all faces of shapes, finest first; return the largest chord of a measured face.
 
     If Delabella leaves a face without triangles, the other way meshes it again.
 
     Parameters
     ----------
-    shapes, bend
-        To be meshed, with this angle between facets [rad].
+    shapes, surfaces, bend
+        To be meshed, the surfaces of their faces, and the angle between facets [rad].
     chord, others, most
         As for :func:`chords`; 0 triangles is no limit.
     """
-    faces = [face for shape in shapes for face in faces_of(shape)]
+    faces = surfaces.faces
     if not faces:
         return chord
-    kinds = [surface_of(face)["kind"] for face in faces]
+    kinds = [surfaces.of(face)["kind"] for face in faces]
     measured = np.array([kind in MEASURED for kind in kinds])
     chord_of, planned = np.where(measured, chord, others), np.ones(len(faces))
     if most:
@@ -355,7 +375,7 @@ def convert(
     others_mm: float | None = None,
     most: float = 0,
 ) -> None:
-    """Write the faces of a STEP file as an NPZ of arrays and a JSON text ``faces``.
+    """Write the faces of a STEP file as an NPZ of arrays and a JSON ``text``.
 
     Parameters
     ----------
@@ -371,9 +391,8 @@ def convert(
     from OCP.TCollection import TCollection_ExtendedString
     from OCP.TDocStd import TDocStd_Document
     from OCP.TopAbs import TopAbs_EDGE, TopAbs_FACE, TopAbs_SHELL, TopAbs_SOLID
-    from OCP.TopExp import TopExp, TopExp_Explorer
+    from OCP.TopExp import TopExp
     from OCP.TopLoc import TopLoc_Location
-    from OCP.TopoDS import TopoDS
     from OCP.TopTools import TopTools_IndexedMapOfShape
     from OCP.XCAFDoc import XCAFDoc_DocumentTool
 
@@ -390,14 +409,6 @@ def convert(
     transfer = session.TransferReader()
     colours = XCAFDoc_DocumentTool.ColorTool_s(document.Main())
 
-    def subshapes(shape: Any, kind: Any, avoid: Any = None) -> list[Any]:
-        explorer = TopExp_Explorer(shape, kind) if avoid is None else TopExp_Explorer(shape, kind, avoid)
-        out = []
-        while explorer.More():
-            out.append(TopoDS.Face_s(explorer.Current()) if kind == TopAbs_FACE else explorer.Current())
-            explorer.Next()
-        return out
-
     def entity(face: Any) -> int:
         found = transfer.EntityFromShapeResult(face.Located(TopLoc_Location()), -1)
         name = "" if found is None or not hasattr(found, "Name") else found.Name().ToCString()
@@ -408,13 +419,16 @@ def convert(
     lost = body = 0
     there = bodies(document)
     others = chord_mm if others_mm is None else others_mm
-    largest = mesh([shape for _, shape, _ in there], chord_mm / unit_mm, bend, others / unit_mm, int(most))
+    shapes = [shape for _, shape, _ in there]
+    surfaces = Surfaces(shapes, SAME_MM / unit_mm)
+    largest = mesh(shapes, surfaces, chord_mm / unit_mm, bend, others / unit_mm, int(most))
     for name, shape, part_colour in there:
         edges = TopTools_IndexedMapOfShape()
         TopExp.MapShapes_s(shape, TopAbs_EDGE, edges)
         groups = [(one, subshapes(one, TopAbs_FACE)) for one in subshapes(shape, TopAbs_SOLID)]
         groups += [(one, subshapes(one, TopAbs_FACE)) for one in subshapes(shape, TopAbs_SHELL, TopAbs_SOLID)]
         groups.append((shape, subshapes(shape, TopAbs_FACE, TopAbs_SHELL)))
+        closed = not subshapes(shape, TopAbs_FACE, TopAbs_SOLID)
         for solid, members in groups:
             for face in members:
                 made = triangles_of(face)
@@ -425,13 +439,13 @@ def convert(
                 colour = shape_colour(colours, bare[0]) or shape_colour(colours, bare[1]) or part_colour
                 faces.append(
                     {
-                        **in_mm(surface_of(face, SAME_MM / unit_mm), unit_mm),
+                        **in_mm(surfaces.of(face), unit_mm),
                         "entity": entity(face),
                         "part": name,
                         "body": body,
                         "colour": colour,
                         "edges": sorted({edges.FindIndex(edge) for edge in subshapes(face, TopAbs_EDGE)}),
-                        "closed": not subshapes(shape, TopAbs_FACE, TopAbs_SOLID),
+                        "closed": closed,
                         "counts": [len(made[0]), len(made[2])],
                     }
                 )

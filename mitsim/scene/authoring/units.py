@@ -16,7 +16,7 @@ from mitsim.scene.authoring.part21 import Entity, Enumeration, Reference, StepTe
 from mitsim.sensor.calibration_qualifiers import UNITS_MM
 
 #: units of length that an option may name [mm]
-UNITS = {"mm": 1.0, "m": 1000.0, "inch": 25.4}
+UNITS = {word: UNITS_MM[word] for word in ("mm", "m", "inch")}
 
 #: head of a file in which a comment may state the unit [bytes]
 _HEAD = 4096
@@ -48,6 +48,11 @@ def unit_words(size_mm: float) -> str:
     return next((name for size, name in names.items() if math.isclose(size, size_mm)), f"{size_mm:g} mm")
 
 
+def unit_assumed(name: str) -> str:
+    """Return the remark about the file ``name`` that states no unit of length."""
+    return f"{name} states no unit of length: mm assumed; --units m or --units inch changes it"
+
+
 def commented_unit(suffix: str, data: bytes) -> float | None:
     """Return the unit [mm] in a comment at the head of an STL, OBJ, PLY or OFF file; None without one."""
     mark, head = _COMMENT.get(suffix), data[:_HEAD]
@@ -74,13 +79,13 @@ def step_units(text: StepText) -> list[float]:
         for values in context.of("GLOBAL_UNIT_ASSIGNED_CONTEXT") or ():
             for one in values if isinstance(values, tuple) else ():
                 unit = text.follow(one)
-                size = unit_size(text, one) if unit is not None and _is_length(text, unit) else None
+                size = unit_size(text, one) if unit is not None and _is_length(unit) else None
                 if size is not None:
                     sizes[round(size, 9)] = None
     return list(sizes)
 
 
-def _is_length(text: StepText, unit: Entity) -> bool:
+def _is_length(unit: Entity) -> bool:
     si = unit.of("SI_UNIT")
     metre = si is not None and any(isinstance(one, Enumeration) and one.name == "METRE" for one in si)
     return unit.has("LENGTH_UNIT") or metre

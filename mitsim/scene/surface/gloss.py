@@ -74,10 +74,10 @@ def lobe_gloss(alpha: float, index: tuple[float, float], distribution: Distribut
     return 100 * flux / float(fresnel(np.cos(theta), BLACK_GLASS, 0.0))
 
 
-def base_gloss(reflectance: float, angle_deg: int = 60) -> float:
-    """Return the gloss [GU] of a matt base whose BRDF at the specular direction is ``reflectance`` / pi."""
-    theta = np.radians(angle_deg)
-    within, across = np.radians(APERTURES_DEG[angle_deg])
+def base_gloss(reflectance: float) -> float:
+    """Return the gloss [GU] at 60 deg of a matt base whose BRDF at the specular direction is ``reflectance`` / pi."""
+    theta = np.radians(60)
+    within, across = np.radians(APERTURES_DEG[60])
     # exact over the aperture: the integral of cos(polar) cos^2(across)
     end = min(theta + within / 2, np.pi / 2)
     flux = (np.sin(end) - np.sin(theta - within / 2)) * (across + np.sin(across)) / 2

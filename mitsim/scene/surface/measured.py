@@ -196,14 +196,14 @@ def height_map(heights_um: ArrayLike, spacing_um: float, name: str = "height map
     )
 
 
-def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "", key: str = "height_map") -> HeightMap:
+def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "") -> HeightMap:
     """Read an areal map [um]: a two-dimensional .npy, or a CSV of numbers without a header, row by row.
 
     Parameters
     ----------
     path, spacing_um
         The file, and the spacing of its heights [um].
-    where, key
+    where
         Place that refers to the file, for messages.
 
     See Also
@@ -217,7 +217,7 @@ def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "",
     """
     path = Path(path)
     if path.suffix == ".npy":
-        _there(path, where, key, "a .npy or CSV of heights in um")
+        _there(path, where, "height_map", "a .npy or CSV of heights in um")
         try:
             z = np.lib.format.read_array(io.BytesIO(read_bounded(path)), allow_pickle=False, max_header_size=1000)
         except InputError:
@@ -228,7 +228,7 @@ def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "",
         if z.ndim != 2 or z.dtype.kind not in "fiu":
             raise InputError(path, "", f"an array of shape {z.shape} and type {z.dtype}", "a grid of real numbers")
     else:
-        rows = _rows(path, where, key)
+        rows = _rows(path, where, "height_map")
         z = _numbers(rows, path, len(rows[0]) if rows else 0, 1)
     z = z.astype(float)
     if z.ndim != 2 or min(z.shape) < _SMALLEST_MAP or max(z.shape) > _LARGEST_MAP:

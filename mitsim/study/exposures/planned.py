@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from characterisation.files.atomic_io import atomic_write, write_json
+from characterisation.files.atomic_io import write_json, write_text
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
@@ -196,8 +196,7 @@ def write_plan_csv(path: Path, plan: ExposurePlan) -> None:
         for name, one in result.features.items():
             u = f"{one.u:.4g}" if math.isfinite(one.u) else ""
             lines.append(f"{step},{exposure},{power:g},{name},{one.points:.1f},{one.fraction:.4f},{u}")
-    with atomic_write(path) as file:
-        file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def exposure_in_words(planned: PlannedExposure) -> str:

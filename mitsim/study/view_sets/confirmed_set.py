@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from characterisation.files.atomic_io import atomic_write, json_values
+from characterisation.files.atomic_io import json_values, write_text
 from characterisation.scores.view_sets import ViewSet
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import losses
@@ -221,8 +221,7 @@ def write_set_csv(path: Path, table: SetTable, tried: TriedSet) -> None:
         counts = [text(expected.get(one.measurement)), str(one.trials), text(one.without_value)]
         numbers = map(text, (one.bias, one.standard_uncertainty, *one.interval))
         lines.append(",".join([one.measurement, one.unit, limit, *counts, *numbers, one.verdict]))
-    with atomic_write(path) as file:
-        file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def set_table(table: SetTable, tried: TriedSet) -> str:

@@ -31,6 +31,7 @@ from characterisation.statements.one_sided import OneSidedErrors, stated_errors
 from characterisation.tasks.folded import FoldedValue, folded_values
 from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
+from mitsim.running.numbers import or_nan
 from mitsim.study.virtual.world import GROUPS, Trial
 
 Floats = NDArray[np.float64]
@@ -223,7 +224,7 @@ class TrialFolder:
 
 
 def _numbers(values: Iterable[float | None]) -> list[float]:
-    return [math.nan if value is None else value for value in values]
+    return [or_nan(value) for value in values]
 
 
 def _parsed(line: str) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import norm
 
-from characterisation.files.atomic_io import atomic_write
+from characterisation.files.atomic_io import write_text
 from characterisation.statements.coverage import Share
 from tests.proofs.judgement import within
 from tests.proofs.laboratory.run import Found
@@ -113,8 +113,7 @@ def write_laboratory_page(found: Sequence[Found], folder: Path, source: Path) ->
         f"{table}\n## Measurement by measurement\n\n{measurement_table(found)}"
     )
     path = folder / "laboratory.md"
-    with atomic_write(path) as whole:
-        whole.write_text(text, encoding="utf-8")
+    write_text(path, text)
     rows = []
     for one in found:
         for stated, inside, errors in zip(one.statements, inside_of(one), one.errors, strict=True):
