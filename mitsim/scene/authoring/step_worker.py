@@ -217,7 +217,8 @@ class Surfaces:
 
     def of(self, face: Any) -> dict[str, Any]:
         """Return the surface of one of the faces."""
-        return self._found[self._numbers.FindIndex(face) - 1]
+        found: dict[str, Any] = self._found[self._numbers.FindIndex(face) - 1]
+        return found
 
 
 def mesh_together(faces: list[Any], chord: float, bend: float, delabella: bool = True) -> None:
