@@ -118,7 +118,7 @@ class Scene:
                 continue
             name = shape.bsdf().id()
             if name not in made:
-                moved = replace(finish.deviated(deviation(name)), deviated=finish.deviated)
+                moved = replace(finish.deviated(deviation), deviated=finish.deviated)
                 assert moved.description is not None
                 made[name] = bsdf_of(moved.description, name), moved
             shape.set_bsdf(made[name][0])

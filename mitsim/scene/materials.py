@@ -51,7 +51,7 @@ class Finish:
     - ``scatter`` at the wavelength of the sensor. This and the next two do not count in comparisons.
     - ``light``: the part of the scattering that a map stores.
     - ``description`` of the BSDF for Mitsuba.
-    - ``deviated``: function that returns the same finish for a deviation from its best estimate.
+    - ``deviated``: returns the finish for a function from the id of its BSDF to its deviation from the best estimate.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Finish:
     scatter: Scatter | None = field(default=None, compare=False, repr=False)
     light: Light | None = field(default=None, compare=False, repr=False)
     description: dict[str, Any] | None = field(default=None, compare=False, repr=False)
-    deviated: Callable[[Deviation], Finish] | None = field(default=None, compare=False, repr=False)
+    deviated: Callable[[Callable[[str], Deviation]], Finish] | None = field(default=None, compare=False, repr=False)
 
     def __str__(self) -> str:
         return self.name if math.isnan(self.roughness) else f"{self.name} Ra {self.roughness:g} um"
@@ -210,14 +210,19 @@ def _make_bsdf(props: Any, finish_of: Callable[[Deviation], Finish]) -> Any:
     """
     from mitsim.scene.backend import mi
 
-    finish = finish_of(_current.deviation(props.id()))
+    asked = props.id()
+
+    def deviated(deviation: Callable[[str], Deviation]) -> Finish:
+        return finish_of(deviation(asked))
+
+    finish = deviated(_current.deviation)
     bsdf = mi.load_dict(finish.description, parallel=False)
     name = props.id()
     while not name or name in _current.finishes:
         name = f"{props.id() or 'finish'}_{next(_anonymous)}"
     bsdf.set_id(name)
     if _current is not _OUTSIDE:
-        _current.finishes[name] = replace(finish, deviated=finish_of)
+        _current.finishes[name] = replace(finish, deviated=deviated)
     return bsdf
 
 

@@ -49,9 +49,9 @@ _ONE = 0
 class Candidates:
     """Paths from projector to camera over two and more surfaces, on the host.
 
-    ``pixel`` (n,) is the index in the region, ``weight`` (n,) is w. ``u``, ``v`` [1] and ``length`` [mm] (n,) are what
-    the code depends on. ``material`` (n, m) numbers the drawn finish of each surface, -1 for none. ``toward`` (n, m, 6)
-    are the local directions i and o.
+    ``pixel`` (n,) is the index in the region, ``weight`` (n,) is w. ``code`` (n, 3) is what the code depends on: u, v
+    [1] and L [mm]. ``material`` (n, m) numbers the drawn finish of each surface, -1 for none. ``toward`` (n, m, 6) are
+    the local directions i and o.
     """
 
     pixel: NDArray[np.int32]
@@ -77,6 +77,11 @@ class Candidates:
             pad[1] = (0, surfaces - one.shape[1])
             return np.pad(one, pad, constant_values=fill)
 
+        if not parts:
+            nothing = np.empty((0, surfaces, 6), np.float32)
+            return cls(
+                np.empty(0, np.int32), nothing[:, 0, 0], nothing[:, 0, :3], np.empty((0, surfaces), np.int8), nothing
+            )
         return cls(
             np.concatenate([one.pixel for one in parts]),
             np.concatenate([one.weight for one in parts]),
@@ -104,6 +109,9 @@ class Vertices:
             incoming, outgoing = (mi.Vector3f(*[to_device(c) for c in rows[:, k : k + 3].T]) for k in (0, 3))
             self._parts.append((number, incoming, outgoing))
         self._count = 1 + len(order)
+
+    def __len__(self) -> int:
+        return self._count
 
     def factors(self, bsdfs: Sequence[Any]) -> Any:
         """Return the factor of each surface for these materials; the first is 1."""
@@ -133,6 +141,11 @@ class KeptPaths:
         self._weight = to_device(paths.weight)
         self._uv, self._length = mi.Point2f(*[to_device(paths.code[:, k]) for k in (0, 1)]), to_device(paths.code[:, 2])
         self._places = [mi.UInt32(np.ascontiguousarray(one)) for one in self._vertices.places]
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the paths need on the device."""
+        return 24 * len(self._vertices) + self.count * (16 + 4 * len(self._places))
 
     def codes(self, bsdfs: Sequence[Any], light: ProjectedLight) -> Floats:
         """Return the light (codes, height, width) of each code of a region, for the BSDFs of the drawn finishes.
@@ -173,9 +186,7 @@ def light_of(paths: Candidates, bsdfs: Sequence[Any]) -> NDArray[np.float64]:
     return np.asarray(paths.weight * factors[vertices.places].prod(axis=0))
 
 
-def mattering(
-    paths: Candidates, finishes: Sequence[Sequence[Any]], roi: Roi, count: int, seed: int, surfaces: int
-) -> Candidates:
+def mattering(paths: Candidates, finishes: Sequence[Sequence[Any]], roi: Roi, count: int, seed: int) -> Candidates:
     """Return about ``count`` of the paths, chosen by their light in some finishes, in the order of their pixels.
 
     Parameters
@@ -190,8 +201,6 @@ def mattering(
         Expected number of paths.
     seed
         Of the choice.
-    surfaces
-        Largest number of surfaces of a path.
     """
     size = np.zeros(len(paths))
     for bsdfs in finishes:

@@ -42,10 +42,10 @@ _PHOTONS_FROM = 1 << 31
 
 
 @dataclass(frozen=True)
-class Kept:
-    """How many paths are traced: ``samples`` per pixel (a square number), ``photons``, surfaces (``depth``), ``seed``.
+class Tracing:
+    """How paths are traced: ``samples`` per pixel (a square number), ``photons``, surfaces (``depth``), ``seed``.
 
-    ``drawn`` is the number of the drawn finish of each BSDF of the scene, in its order, or -1; ``bsdfs`` are the ones to
+    ``drawn`` is the number of the drawn finish of each BSDF of the scene, in its order, or -1. ``bsdfs`` are those to
     sample with, in the same order.
     """
 
@@ -100,19 +100,19 @@ class _Tracer:
     """What camera paths and photons of one launch have in common."""
 
     def __init__(
-        self, scene: Scene, rays: CameraRays, projector: Projector, pose: Transform, roi: Roi, kept: Kept
+        self, scene: Scene, rays: CameraRays, projector: Projector, pose: Transform, roi: Roi, tracing: Tracing
     ) -> None:
-        self.scene, self.rays, self.roi, self.kept = scene, rays, roi, kept
+        self.scene, self.rays, self.roi, self.tracing = scene, rays, roi, tracing
         self.camera = Eye(pose @ rays.camera.sensor_from_camera)
         self.projector = ProjectorLight(pose, projector, scene.bounds)
-        self.bsdfs = SceneBsdfs(scene, kept.bsdfs)
-        self.drawn = mi.Int32(np.asarray([*kept.drawn, -1], np.int32))
-        self.all_drawn = min(kept.drawn) >= 0
+        self.bsdfs = SceneBsdfs(scene, tracing.bsdfs)
+        self.drawn = mi.Int32(np.asarray([*tracing.drawn, -1], np.int32))
+        self.all_drawn = min(tracing.drawn) >= 0
         self.has_aperture = rays.aperture_mm > 0
         self.aperture, self.inverse_focus = opaque(0.5 * rays.aperture_mm), opaque(1.0 / rays.focus_mm)
-        self.seed = opaque_index(kept.seed & 0xFFFFFFFF)
-        self.photons_per_sample = opaque(kept.photons / kept.samples)
-        self.samples_per_photon = opaque(kept.samples / kept.photons if kept.photons else 0.0)
+        self.seed = opaque_index(tracing.seed & 0xFFFFFFFF)
+        self.photons_per_sample = opaque(tracing.photons / tracing.samples)
+        self.samples_per_photon = opaque(tracing.samples / tracing.photons if tracing.photons else 0.0)
 
     def random(self, lane: Any, stream: int) -> Any:
         """Return a point of the unit square for each path; ``stream`` numbers the uses."""
@@ -138,16 +138,16 @@ def camera_paths(
     pose: Transform,
     roi: Roi,
     pixels: NDArray[np.integer],
-    kept: Kept,
+    tracing: Tracing,
 ) -> Iterator[Candidates]:
     """Yield the records of camera paths through ``pixels``, indices in the region ``roi``."""
-    one = _Tracer(scene, rays, projector, pose, roi, kept)
+    one = _Tracer(scene, rays, projector, pose, roi, tracing)
     index = mi.UInt32(np.asarray(pixels, np.uint32))
     at_once = max(1, _AT_ONCE // max(1, len(pixels)))
-    for first in range(0, kept.samples, at_once):
-        count = min(at_once, kept.samples - first)
+    for first in range(0, tracing.samples, at_once):
+        count = min(at_once, tracing.samples - first)
         walk = _camera_start(one, index, first, count)
-        for number in range(1, kept.depth + 1):
+        for number in range(1, tracing.depth + 1):
             walk, record = _camera_step(one, walk, number)
             if record is not None:
                 yield record
@@ -156,15 +156,15 @@ def camera_paths(
 
 
 def _camera_start(one: _Tracer, pixels: Any, first: int, count: int) -> _Walk:
-    rays, kept = one.rays, one.kept
+    rays, tracing = one.rays, one.tracing
     lanes = dr.arange(mi.UInt32, dr.width(pixels) * count)
     in_row = opaque_index(dr.width(pixels))
     sample = lanes // in_row + opaque_index(first)
     pixel = dr.gather(mi.UInt32, pixels, lanes % in_row)
     column, row = _place(pixel, one.roi)
     x, y = rays.corners(column, row)
-    lane = pixel * opaque_index(kept.samples) + sample
-    side = opaque_index(round(np.sqrt(kept.samples)))
+    lane = pixel * opaque_index(tracing.samples) + sample
+    side = opaque_index(round(np.sqrt(tracing.samples)))
     inside = one.random(lane, 0)
     per_cell = 1.0 / mi.Float(side)
     a, b = (mi.Float(sample % side) + inside.x) * per_cell, (mi.Float(sample // side) + inside.y) * per_cell
@@ -189,7 +189,7 @@ def _camera_start(one: _Tracer, pixels: Any, first: int, count: int) -> _Walk:
 
 def _camera_step(one: _Tracer, walk: _Walk, number: int) -> tuple[_Walk | None, Candidates | None]:
     """Meet surface ``number`` of each path: return the paths that go on, and the records of those that are lit."""
-    kept, context = one.kept, mi.BSDFContext()
+    tracing, context = one.tracing, mi.BSDFContext()
     surface = one.scene.mitsuba.ray_intersect(mi.Ray3f(walk.origin, walk.direction))
     hit = surface.is_valid()
     length = walk.length + dr.select(hit, surface.t, 0.0)
@@ -214,17 +214,15 @@ def _camera_step(one: _Tracer, walk: _Walk, number: int) -> tuple[_Walk | None, 
         # the finish that was sampled with bounds all that may be drawn: what it does not reflect, none does
         lit = hit & (irradiance > 0) & (value > 0)
         weight = walk.weight * irradiance * one.factor(material, value) / (1.0 + ratio * density)
-        weight *= opaque(1.0 / kept.samples)
+        weight *= opaque(1.0 / tracing.samples)
         record = weight, uv, length + distance, material, toward_camera, toward_projector
     goes_on = mi.Bool(False)
     follower = None
-    if number < kept.depth:
+    if number < tracing.depth:
         even1, even2 = one.random(walk.lane, 4 * number + 1).x, one.random(walk.lane, 4 * number + 2)
         if number == 1:
-            samples = opaque_index(kept.samples)
-            even1, even2 = r3_point(
-                z_order(*_place(walk.pixel, one.roi)) * samples + walk.lane % samples, one.seed, 0
-            )
+            samples = opaque_index(tracing.samples)
+            even1, even2 = r3_point(z_order(*_place(walk.pixel, one.roi)) * samples + walk.lane % samples, one.seed, 0)
         sampled, bsdf_weight = bsdf.sample(context, surface, even1, even2, hit)
         goes_on = hit & (bsdf_weight[0] > 0)
         ray = surface.spawn_ray(surface.to_world(sampled.wo))
@@ -252,13 +250,13 @@ def _camera_step(one: _Tracer, walk: _Walk, number: int) -> tuple[_Walk | None, 
 
 
 def photon_paths(
-    scene: Scene, rays: CameraRays, projector: Projector, pose: Transform, roi: Roi, kept: Kept
+    scene: Scene, rays: CameraRays, projector: Projector, pose: Transform, roi: Roi, tracing: Tracing
 ) -> Iterator[Candidates]:
     """Yield the records of photons that reach the region ``roi`` of a camera."""
-    one = _Tracer(scene, rays, projector, pose, roi, kept)
-    for first in range(0, kept.photons, _AT_ONCE):
-        walk = _photon_start(one, first, min(_AT_ONCE, kept.photons - first))
-        for number in range(1, kept.depth + 1):
+    one = _Tracer(scene, rays, projector, pose, roi, tracing)
+    for first in range(0, tracing.photons, _AT_ONCE):
+        walk = _photon_start(one, first, min(_AT_ONCE, tracing.photons - first))
+        for number in range(1, tracing.depth + 1):
             walk, record = _photon_step(one, walk, number)
             if record is not None:
                 yield record
@@ -268,7 +266,7 @@ def photon_paths(
 
 def _photon_start(one: _Tracer, first: int, count: int) -> _Walk:
     lane = dr.arange(mi.UInt32, count) + opaque_index(first)
-    side = opaque_index(round(np.sqrt(one.kept.photons)))
+    side = opaque_index(round(np.sqrt(one.tracing.photons)))
     in_cell = one.random(lane + opaque_index(_PHOTONS_FROM), 0)
     point = (mi.Point2f(lane % side, lane // side) + in_cell) / mi.Float(side)
     lens = one.disc(lane + opaque_index(_PHOTONS_FROM), 1) if one.projector.has_aperture else None
@@ -278,7 +276,7 @@ def _photon_start(one: _Tracer, first: int, count: int) -> _Walk:
         lane,
         mi.Point3f(origin + dr.zeros(mi.Point3f, count)),
         direction,
-        flux / opaque(one.kept.photons),
+        flux / opaque(one.tracing.photons),
         dr.ones(mi.Float, count),
         dr.zeros(mi.Float, count),
         uv,
@@ -288,7 +286,7 @@ def _photon_start(one: _Tracer, first: int, count: int) -> _Walk:
 
 def _photon_step(one: _Tracer, walk: _Walk, number: int) -> tuple[_Walk | None, Candidates | None]:
     """Meet surface ``number`` of each photon: return the photons that go on, and records of those the camera sees."""
-    kept, context, camera, rays = one.kept, mi.BSDFContext(), one.camera, one.rays
+    tracing, context, camera, rays = one.tracing, mi.BSDFContext(), one.camera, one.rays
     chance = walk.lane + opaque_index(_PHOTONS_FROM)
     surface = one.scene.mitsuba.ray_intersect(mi.Ray3f(walk.origin, walk.direction))
     hit = surface.is_valid()
@@ -318,9 +316,7 @@ def _photon_step(one: _Tracer, walk: _Walk, number: int) -> tuple[_Walk | None, 
             y += in_lens.y * one.inverse_focus
         u, v, seen = rays.distortion.image(x, y, in_front)
         column, row = mi.UInt32(dr.select(seen, u + 0.5, 0.0)), mi.UInt32(dr.select(seen, v + 0.5, 0.0))
-        left, top, width, height = (
-            opaque_index(n) for n in (one.roi.left, one.roi.top, one.roi.width, one.roi.height)
-        )
+        left, top, width, height = (opaque_index(n) for n in (one.roi.left, one.roi.top, one.roi.width, one.roi.height))
         seen &= (column - left < width) & (row - top < height)  # unsigned: differences below 0 become very large
         seen &= ~one.scene.mitsuba.ray_test(shadow_ray(surface, toward, distance), seen)
         toward_camera = surface.to_local(toward)
@@ -335,10 +331,10 @@ def _photon_step(one: _Tracer, walk: _Walk, number: int) -> tuple[_Walk | None, 
         record = weight, walk.code, length + distance, material, toward_camera, toward_projector
     goes_on = mi.Bool(False)
     follower = None
-    if number < kept.depth:
+    if number < tracing.depth:
         even1, even2 = one.random(chance, 4 * number + 1).x, one.random(chance, 4 * number + 2)
         if number == 1:
-            side = opaque_index(round(np.sqrt(kept.photons)))
+            side = opaque_index(round(np.sqrt(tracing.photons)))
             even1, even2 = r3_point(z_order(walk.lane % side, walk.lane // side), one.seed, 1)
         sampled, _ = bsdf.sample(context, surface, even1, even2, hit)
         goes_on = hit & (sampled.pdf > 0) & ~mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
