@@ -134,6 +134,7 @@ class MappedMeasurements:
 
     def _scene(self, finish: int) -> CharacterisedScene:
         if finish not in self._characterised:
+            self._characterised.clear()  # hardly another draw has the same
             drawn = drawn_map(self.performance_map, self.unknowns, finish)
             self._characterised[finish] = CharacterisedScene(self.study.scene, drawn)
         return self._characterised[finish]

@@ -9,7 +9,8 @@ The paths of interreflections are those of the nominal pose and calibration of t
 (:mod:`mitsim.capture.simulated.kept_light`). That light is smooth, and the random pose and calibration shift it by
 about a pixel. Trials sorted by view (:func:`in_order`) trace the paths once for each view. With ``separate_light``,
 every trial renders all of its light at its own pose and calibration. That takes several times as long, and is the
-reference for this approximation. Scenes with emitters, or with finishes inside other BSDFs, are rendered anew for every finish.
+reference for this approximation. The interreflections of scenes with emitters, or with finishes inside other BSDFs, are
+rendered anew for every finish.
 
 Temperature and form displace the decoded points together with the surface, to first order. At 50 um on 500 mm, the
 change of the image position is far below a pixel, and that of the brightness far below a grey level.
