@@ -12,7 +12,7 @@ of the program. Scenes are too small to gain from more threads.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +43,7 @@ class Scene:
     - ``finishes`` of the shapes; None for a stock BSDF, about which nothing is known.
     - ``bounds`` (2, 3): corners of the bounding box [mm], world frame.
     - ``where``: file that it was loaded from, or a description.
+    - ``changeable``: whether :meth:`deviated` can change every finish: none is nested in another BSDF or an instance.
     """
 
     mitsuba: Any = field(repr=False)
@@ -50,6 +51,7 @@ class Scene:
     finishes: tuple[Finish | None, ...]
     bounds: NDArray[np.float64]
     where: str
+    changeable: bool = False
 
     @property
     def shapes(self) -> list[Any]:
@@ -100,6 +102,28 @@ class Scene:
         from mitsim.scene.picture import draw_scene
 
         return draw_scene(self, ax, None if pose is None else as_pose(pose, "plot"))
+
+    def deviated(self, deviation: Callable[[str], Deviation]) -> Scene:
+        """Return the scene with finishes that deviate from their best estimates, by the ids of their BSDFs.
+
+        Geometry is shared: the shapes get new BSDFs *in place*, so this scene must not be used afterwards other than by
+        calling ``deviated`` again. A finish takes about a millisecond, and its numbers are inputs of kernels.
+        """
+        assert self.changeable
+        made: dict[str, tuple[Any, Finish]] = {}
+        finishes: list[Finish | None] = []
+        for shape, finish in zip(self.shapes, self.finishes, strict=True):
+            if finish is None or finish.deviated is None:
+                finishes.append(finish)
+                continue
+            name = shape.bsdf().id()
+            if name not in made:
+                moved = replace(finish.deviated(deviation), deviated=finish.deviated)
+                assert moved.description is not None
+                made[name] = bsdf_of(moved.description, name), moved
+            shape.set_bsdf(made[name][0])
+            finishes.append(made[name][1])
+        return replace(self, finishes=tuple(finishes))
 
     def only(self, *names: str) -> Scene:
         """Return a scene with these shapes alone, in the order given."""
@@ -187,6 +211,14 @@ def flat_coupon(finish: Finish, half_size: float) -> Scene:
     return Scene(loaded, ("coupon",), (finish,), bounds_of(loaded), f"a coupon of {finish}")
 
 
+def bsdf_of(description: dict[str, Any], name: str = "") -> Any:
+    """Return the BSDF of a description, whose numbers are inputs of kernels."""
+    bsdf = backend.mi.load_dict(description, parallel=False)
+    bsdf.set_id(name)
+    _share_kernels(bsdf)
+    return bsdf
+
+
 def _share_kernels(scene: Any) -> None:
     """Make the numbers of materials and the transforms of shapes inputs of a scene's kernels, not constants in them.
 
@@ -231,7 +263,10 @@ def _wrap(scene: Any, finishes: dict[str, Finish], where: str) -> Scene:
         raise InputError(where, "shape", f"a scene {size:g} mm across", "1 mm to 100 m", hint)
     _share_kernels(scene)
     names = tuple(shape.id() or f"shape_{i}" for i, shape in enumerate(shapes))
-    return Scene(scene, names, tuple(finishes.get(s.bsdf().id()) for s in shapes), bounds, where)
+    changeable = all(shape.class_name() != "Instance" for shape in shapes)
+    on_shapes = [shape.bsdf().id() for shape in shapes]
+    changeable = changeable and set(finishes) <= set(on_shapes)
+    return Scene(scene, names, tuple(finishes.get(name) for name in on_shapes), bounds, where, changeable)
 
 
 def _check_xml(path: Path, parameters: dict[str, str]) -> None:

@@ -24,6 +24,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,7 @@ class Finish:
     - ``scatter`` at the wavelength of the sensor. This and the next two do not count in comparisons.
     - ``light``: the part of the scattering that a map stores.
     - ``description`` of the BSDF for Mitsuba.
+    - ``deviated``: returns the finish for a function from the id of its BSDF to its deviation from the best estimate.
     """
 
     name: str
@@ -57,6 +59,7 @@ class Finish:
     scatter: Scatter | None = field(default=None, compare=False, repr=False)
     light: Light | None = field(default=None, compare=False, repr=False)
     description: dict[str, Any] | None = field(default=None, compare=False, repr=False)
+    deviated: Callable[[Callable[[str], Deviation]], Finish] | None = field(default=None, compare=False, repr=False)
 
     def __str__(self) -> str:
         return self.name if math.isnan(self.roughness) else f"{self.name} Ra {self.roughness:g} um"
@@ -153,25 +156,31 @@ def _machined_metal(props: Any) -> Any:
         alpha_factor=number_within(props, where, "alpha_factor", 1.0, 0.1, 10.0, ""),
         wide_angle=number("wide_angle_share", 0.0, 1.0, ""),
     )
-    deviation = _current.deviation(props.id())
-    scatter = machined(face, _current.wavelength_nm, where, deviation)
-    index = refractive_index(face.metal, _current.wavelength_nm)
+    return _make_bsdf(props, partial(_metal_finish, face, where, _current.wavelength_nm))
+
+
+def _metal_finish(face: MachinedFace, where: str, wavelength_nm: float, deviation: Deviation) -> Finish:
+    scatter = machined(face, wavelength_nm, where, deviation)
+    index = refractive_index(face.metal, wavelength_nm)
     reflectance = float(fresnel(1.0, *index))
     reflected = deviation.reflected(reflectance)
-    finish = _finish(
-        "metal", reflectance * reflected, scatter, f"{face.metal}/{face.process_or_default}", face.roughness
-    )
-    return _make_bsdf(props, metal_bsdf(index, scatter, reflected), finish)
+    name = f"{face.metal}/{face.process_or_default}"
+    light = surface_light("metal", reflectance * reflected, scatter, name, face.roughness, wavelength_nm)
+    return Finish(name, face.roughness, scatter, light, metal_bsdf(index, scatter, reflected))
 
 
 def _matt_white(props: Any) -> Any:
     where = _where(props)
     only_known(props, where, ("reflectance",))
     reflectance = number_within(props, where, "reflectance", USUAL_REFLECTANCE["matt_white"], 0.01, 0.99, "")
-    reflectance *= _current.deviation(props.id()).reflected(reflectance)
-    return _make_bsdf(
-        props, diffuse_bsdf(reflectance), _finish("matt", reflectance, matt_white(), "matt_white", math.nan)
-    )
+    return _make_bsdf(props, partial(_white_finish, reflectance, _current.wavelength_nm))
+
+
+def _white_finish(reflectance: float, wavelength_nm: float, deviation: Deviation) -> Finish:
+    reflectance *= deviation.reflected(reflectance)
+    scatter = matt_white()
+    light = surface_light("matt", reflectance, scatter, "matt_white", math.nan, wavelength_nm)
+    return Finish("matt_white", math.nan, scatter, light, diffuse_bsdf(reflectance))
 
 
 def _paint(kind: str, greatest: float, describe: Callable[[float, Scatter], dict[str, Any]]) -> Callable[[Any], Any]:
@@ -181,34 +190,39 @@ def _paint(kind: str, greatest: float, describe: Callable[[float, Scatter], dict
         reflectance = number_within(props, where, "reflectance", USUAL_REFLECTANCE[kind], 0.01, greatest, "")
         gloss = number_within(props, where, "gloss", None, 0.5, 100.0, "GU") if "gloss" in props else None
         alpha = number_within(props, where, "alpha", None, *ALPHA_RANGE[kind], "") if "alpha" in props else None
-        deviation = _current.deviation(props.id())
-        scatter = paint(kind, reflectance, gloss, alpha, where, deviation)
-        reflectance = min(reflectance * deviation.reflected(reflectance), greatest)
-        return _make_bsdf(props, describe(reflectance, scatter), _finish(kind, reflectance, scatter, kind, math.nan))
+        wavelength_nm = _current.wavelength_nm
+
+        def finish(deviation: Deviation) -> Finish:
+            scatter = paint(kind, reflectance, gloss, alpha, where, deviation)
+            reflected = min(reflectance * deviation.reflected(reflectance), greatest)
+            light = surface_light(kind, reflected, scatter, kind, math.nan, wavelength_nm)
+            return Finish(kind, math.nan, scatter, light, describe(reflected, scatter))
+
+        return _make_bsdf(props, finish)
 
     return make
 
 
-def _finish(kind: str, reflectance: float, scatter: Scatter, name: str, roughness: float) -> Finish:
-    return Finish(
-        name, roughness, scatter, surface_light(kind, reflectance, scatter, name, roughness, _current.wavelength_nm)
-    )
-
-
-def _make_bsdf(props: Any, description: dict[str, Any], finish: Finish) -> Any:
-    """Make the BSDF of a description and store its finish under the id of the BSDF.
+def _make_bsdf(props: Any, finish_of: Callable[[Deviation], Finish]) -> Any:
+    """Make the BSDF of a finish and store the finish under the id of the BSDF.
 
     BSDFs inside shapes of a dictionary may all have the id ``bsdf``; those after the first get a number.
     """
     from mitsim.scene.backend import mi
 
-    bsdf = mi.load_dict(description, parallel=False)
+    asked = props.id()
+
+    def deviated(deviation: Callable[[str], Deviation]) -> Finish:
+        return finish_of(deviation(asked))
+
+    finish = deviated(_current.deviation)
+    bsdf = mi.load_dict(finish.description, parallel=False)
     name = props.id()
     while not name or name in _current.finishes:
         name = f"{props.id() or 'finish'}_{next(_anonymous)}"
     bsdf.set_id(name)
     if _current is not _OUTSIDE:
-        _current.finishes[name] = replace(finish, description=description)
+        _current.finishes[name] = replace(finish, deviated=deviated)
     return bsdf
 
 

@@ -8,7 +8,6 @@ used again under the same digest -> scores of all views, race, exposures and sta
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -80,7 +79,7 @@ class Session:
     @cached_property
     def unknowns(self) -> Unknowns:
         """Return the unknowns of the study, prepared for drawing: a calibration may take seconds to simulate."""
-        return replace(study_unknowns(self.study), pooled=not self.separate_light)
+        return study_unknowns(self.study)
 
     @cached_property
     def digest(self) -> str:

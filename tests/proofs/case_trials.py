@@ -1,12 +1,10 @@
 """Trials of a case, of four kinds, each in its own worlds.
 
 - *tool*: the trials of race and statement;
-- *truth*: trials of every candidate, for the risks. They share interreflections and the pool of finishes as the tool's
-  trials do;
-- *choice*: trials of the candidates of a race, for the regret of its choices. Every two worlds have their own finish,
-  so that the finishes of a pool do not decide which view is the best;
-- *apart*: trials of the stated views, for the coverage. Nothing is shared or pooled: every world renders all of its
-  light at its own pose, with its own finish.
+- *truth*: trials of every candidate, for the risks, in the worlds of the race;
+- *choice*: trials of the candidates of a race, for the regret of its choices, in other worlds;
+- *apart*: trials of the stated views, for the coverage. Nothing is shared: every world renders all of its light at its
+  own pose.
 
 All kinds but *tool* may include light paths over more surfaces than the tool.
 """
@@ -24,7 +22,7 @@ from mitsim.running.executor import Executor
 from mitsim.study import Study
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import Job, complete
-from mitsim.study.virtual.world import OWN_FINISH_DAYS, Trial
+from mitsim.study.virtual.world import JUDGING_DAYS, Trial
 from mitsim.views import View
 from tests.proofs.kept_trials import take_up_trials, write_trials
 from tests.proofs.part_cases import PartCase
@@ -89,11 +87,11 @@ def measured_truth(case: PartCase, session: Session) -> NDArray[np.float64]:
 
 
 def measured_choice(case: PartCase, session: Session) -> NDArray[np.float64]:
-    """Measure the candidates of a race in worlds with their own finishes.
+    """Measure the candidates of a race in other worlds than those of the race.
 
     Returns errors (measurement, candidate, world), NaN where a world gave no value.
     """
-    views, worlds = session.study.views[: case.file.raced_candidates], days(case.file.raced_worlds, OWN_FINISH_DAYS)
+    views, worlds = session.study.views[: case.file.raced_candidates], days(case.file.raced_worlds, JUDGING_DAYS)
     measure_worlds(case, "choice", session, views, {view.number: worlds for view in views})
     return np.stack([session.trials.errors(view.number, worlds) for view in views], axis=1)
 

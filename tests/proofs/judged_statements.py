@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.statements.coverage import Share, share
-from mitsim.study.virtual.world import FINISH_DAYS
 from mitsim.views.view_scores import screening_risk
 from tests.proofs.judgement import Regret, falsely_accepted, pooled_share, regret, within
 from tests.proofs.screening_figures import LEAST_MEASURABLE
@@ -30,9 +29,8 @@ RACE, PREDICTED, TALK = "race", "predicted u", "V_m"
 class Choice:
     """The view that somebody chose for a measurement of a case, and its regret.
 
-    ``regret`` is judged in worlds with their own finishes, ``regret_pooled`` in worlds that share a pool of finishes.
-    ``judged``: the best view gives a value in half of the worlds; where it does not, risks are those of a few worlds,
-    and the regret is listed but in no mean.
+    ``regret`` is judged in other worlds than those of the race. ``judged``: the best view gives a value in half of the
+    worlds; where it does not, risks are those of a few worlds, and the regret is listed but in no mean.
     """
 
     case: JudgedCase
@@ -41,7 +39,6 @@ class Choice:
     view: int
     best: int
     regret: Regret
-    regret_pooled: Regret
     judged: bool = True
 
 
@@ -84,7 +81,7 @@ def choices_of(case: JudgedCase) -> list[Choice]:
         return []
     few = case.case.file.raced_candidates
     numbers = case.views[:few].tolist()
-    errors, pooled_errors = case.choice, case.truth[:, :few, : case.case.file.raced_worlds]
+    errors = case.choice
     scores = case.scores.sel(view=numbers)
     risk = screening_risk(scores)
     talk = scores["V_m"].transpose("measurement", "view").values
@@ -98,10 +95,9 @@ def choices_of(case: JudgedCase) -> list[Choice]:
             TALK: int(np.nanargmax(np.where(np.isfinite(talk[m]), talk[m], -1.0))),
         }
         for by, place in picks.items():
-            found = regret(errors[m], place, block=FINISH_DAYS)
+            found = regret(errors[m], place)
             judged = bool(np.isfinite(errors[m, found.best]).mean() >= LEAST_MEASURABLE)
-            before = regret(pooled_errors[m], place)
-            out.append(Choice(case, name, by, numbers[place], numbers[found.best], found, before, judged))
+            out.append(Choice(case, name, by, numbers[place], numbers[found.best], found, judged))
     return out
 
 

@@ -20,7 +20,6 @@ from pydantic import Field, model_validator
 from characterisation.files.documents import Document, read_toml
 from characterisation.files.errors import InputError
 from mitsim.study import Study, StudyFile, open_study
-from mitsim.study.virtual.world import FINISH_DAYS
 from mitsim.views import ViewsTable
 
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
@@ -65,7 +64,7 @@ class PartCasesFile(Document):
     candidates: Annotated[int, Field(ge=2, le=1000)] = 40
     worlds: Annotated[int, Field(ge=2, le=1000)] = 12
     raced_candidates: Annotated[int, Field(ge=2, le=1000)] = 24
-    raced_worlds: Annotated[int, Field(ge=2 * FINISH_DAYS, le=1000, multiple_of=FINISH_DAYS)] = 30
+    raced_worlds: Annotated[int, Field(ge=4, le=1000, multiple_of=2)] = 30
     stated: Annotated[int, Field(ge=1, le=100)] = 2
     stated_worlds: Annotated[int, Field(ge=2, le=1000)] = 45
     seed: Annotated[int, Field(ge=0)] = 1
@@ -166,7 +165,7 @@ def described(path: str | Path, cases: Sequence[PartCase]) -> str:
         "those of a study. The functions of `mitsim run` screen them, race the first "
         f"{file.raced_candidates} (in the cases that are raced), and state {file.stated} views. Each statement is "
         f"judged by {file.stated_worlds} other worlds, in which all light is rendered anew; each choice by "
-        f"{file.raced_worlds} other worlds of every candidate, with {file.raced_worlds // FINISH_DAYS} finishes. "
+        f"{file.raced_worlds} other worlds of every candidate. "
         "Every number is simulated; what the simulator leaves "
         "out ([light](../light.md)) is not in the truth either.\n"
     )

@@ -95,8 +95,6 @@ _REGRET_HEAD = (
     "low",
     "high",
     "median",
-    "unbiased_pooled",
-    "median_pooled",
     "decided",
 )
 
@@ -126,7 +124,5 @@ def _regret_row(one: Choice) -> tuple[Any, ...]:
         found.low,
         found.high,
         found.middle,
-        one.regret_pooled.unbiased,
-        one.regret_pooled.middle,
         decided,
     )

@@ -65,9 +65,7 @@ def write_statement_page(cases: Sequence[JudgedCase], folder: str | Path, preamb
         verdict_table(cases),
         "\n## Regret\n\nRisk of the chosen view over the least of all candidates. *plain*: as estimated; the least of "
         "many estimates is too low by chance. *unbiased*: the best view is sought in half of the worlds, and both are "
-        "judged in the other half; the geometric mean over random halves. *median*: their median. "
-        "Every two worlds have their own finish. *pooled*: judged as before November 2026, "
-        "in worlds that share eight finishes.\n\n",
+        "judged in the other half; the geometric mean over random halves. *median*: their median.\n\n",
         regret_table(choices),
     ]
     write_text(folder / "statements.md", "".join(text))
@@ -92,7 +90,6 @@ def sensor_table(cases: Sequence[JudgedCase], choices: Sequence[Choice]) -> str:
                     _mean_regret([one for one in choices if one.by == by and one.case in mine])
                     for by in (RACE, PREDICTED, TALK)
                 ),
-                _mean_regret([one for one in choices if one.by == RACE and one.case in mine], "regret_pooled"),
             ]
         )
     return markdown(
@@ -104,7 +101,6 @@ def sensor_table(cases: Sequence[JudgedCase], choices: Sequence[Choice]) -> str:
             "mean regret: race",
             PREDICTED,
             TALK,
-            "race, pooled finishes",
         ],
         body,
     )
@@ -173,7 +169,6 @@ def regret_table(choices: Sequence[Choice]) -> str:
                 f"{number(one.regret.unbiased)} ({number(one.regret.low)} to {number(one.regret.high)})",
                 number(one.regret.middle),
                 *(number(other.unbiased) for other in others),
-                number(one.regret_pooled.unbiased),
             ]
         )
     head = [
@@ -190,7 +185,7 @@ def regret_table(choices: Sequence[Choice]) -> str:
         PREDICTED,
         TALK,
     ]
-    return markdown([*head, "pooled"], body)
+    return markdown(head, body)
 
 
 def coverage_figure(cases: Sequence[JudgedCase]) -> Figure:

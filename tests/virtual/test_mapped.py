@@ -20,7 +20,7 @@ from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.stated import budget_groups
 from mitsim.study.virtual.study_unknowns import study_unknowns
-from mitsim.study.virtual.world import BEYOND, FINISHES, Trial
+from mitsim.study.virtual.world import BEYOND, Trial
 from mitsim.views.view_scores import score_candidates
 from tests.smaller_sensors import coarse_sensor
 
@@ -92,7 +92,7 @@ def test_the_map_is_drawn_within_its_own_errors():
     unknowns = study_unknowns(study)
     known = PerformanceMap.load(map_path("ensenso-n10"))
     assert drawn_map(known, unknowns, -1) is known
-    maps = [drawn_map(known, unknowns, number) for number in range(FINISHES)]
+    maps = [drawn_map(known, unknowns, number) for number in range(8)]
     sigma = known.data["ray_noise_std"].values
     size = np.sqrt(
         np.nan_to_num(known.data["ray_noise_std_error"].values) ** 2

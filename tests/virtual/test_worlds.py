@@ -12,11 +12,10 @@ from mitsim.sensor.rig_parameters import parameter_names
 from mitsim.sensor.room_light import room_irradiance
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
 from mitsim.study.virtual.world import (
-    FINISH_DAYS,
-    FINISHES,
     FRESH,
     GROUPS,
-    OWN_FINISH_DAYS,
+    JUDGING_DAYS,
+    SET_DAYS,
     STATEMENT_DAYS,
     Trial,
     Unknowns,
@@ -131,23 +130,33 @@ def test_the_temperature_of_the_sensor_stretches_its_baseline(unknowns):
 
 
 def test_finishes_have_the_spread_of_a_normal_distribution(unknowns):
-    alphas = np.array([finish_deviation(unknowns, number, "plate").alpha for number in range(FINISHES)])
-    assert alphas.mean() == pytest.approx(0, abs=1e-12) and alphas.std() == pytest.approx(1, abs=1e-9)
-    others = np.array([finish_deviation(unknowns, number, "pillar").alpha for number in range(FINISHES)])
-    assert sorted(alphas) == pytest.approx(sorted(others)) and not np.array_equal(alphas, others)
+    """Of 2000 draws, the mean within 4.5 and the standard deviation within 4.5 of its own sigma."""
+    alphas, others = (
+        np.array([finish_deviation(unknowns, number, name).alpha for number in range(2000)])
+        for name in ("plate", "pillar")
+    )
+    assert abs(alphas.mean()) < 4.5 / np.sqrt(2000) and alphas.std() == pytest.approx(1, abs=4.5 / np.sqrt(4000))
+    assert abs(np.corrcoef(alphas, others)[0, 1]) < 4.5 / np.sqrt(2000)
     assert finish_deviation(unknowns, -1, "plate").alpha == 0
     known = replace(unknowns, table=UnknownsTable.model_validate({"finish": {"alpha": 0.0, "wide_angle": 0.5}}))
     assert finish_deviation(known, 3, "plate").alpha == 0
-    days = [unknowns.draw(Trial(day)).finish for day in range(40 * FINISH_DAYS)]
-    assert set(days) <= set(range(FINISHES)) and len(set(days)) == FINISHES
 
 
-def test_a_choice_is_judged_with_other_finishes_than_those_that_made_it(unknowns):
-    own = [unknowns.draw(Trial(OWN_FINISH_DAYS + day)).finish for day in range(8 * FINISH_DAYS)]
-    assert len(set(own)) == 8 and min(own) >= FINISHES
-    assert unknowns.draw(Trial(STATEMENT_DAYS)).finish < FINISHES
-    alphas = [finish_deviation(unknowns, number, "plate").alpha for number in own]
-    assert len(set(alphas)) == 8
+@pytest.mark.parametrize("first", [0, JUDGING_DAYS, STATEMENT_DAYS, SET_DAYS])
+def test_every_day_has_a_finish_of_its_own_and_its_captures_share_it(unknowns, first):
+    days = [unknowns.draw(Trial(first + day)).finish for day in range(200)]
+    assert len(set(days)) == 200
+    assert unknowns.draw(Trial(first, capture=3)).finish == days[0]
+    assert (
+        unknowns.draw(Trial(first, swapped="pose")).finish
+        == days[0]
+        != unknowns.draw(Trial(first, swapped="finish")).finish
+    )
+    assert replace(unknowns, varied=("noise",)).draw(Trial(first)).finish == -1
+    # and the seed of the study decides which
+    assert not set(days) & {
+        replace(unknowns, seed=unknowns.seed + 1).draw(Trial(first + day)).finish for day in range(200)
+    }
 
 
 def test_a_study_overrules_the_sensor_key_by_key():

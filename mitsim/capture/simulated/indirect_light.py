@@ -34,19 +34,64 @@ class IndirectLight:
     smoothing_px: float
 
 
+@dataclass(frozen=True)
+class KeptSettings:
+    """Number of paths of interreflected light that serve all finishes, for each pixel that sees the part.
+
+    - ``samples``: camera paths, a square number.
+    - ``photons``: for each of them.
+    - ``kept``: paths that are evaluated for every finish.
+    - ``smoothing_px``: standard deviation of the filter [px].
+    """
+
+    samples: int
+    photons: float
+    kept: int
+    smoothing_px: float
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """Gaussian filter over the pixels of each shape of an image, prepared for any number of images.
+
+    ``parts`` are the region of each shape with its mask and the filtered mask.
+    """
+
+    taps: NDArray[np.float64]
+    parts: tuple[tuple[tuple[slice, slice], NDArray[np.bool_], Images], ...]
+
+    @classmethod
+    def of(cls, shape: NDArray[np.integer], sigma: float) -> Smoothing:
+        """Return the filter of a standard deviation [px] for an index (h, w) of the shapes, -1 for none."""
+        taps, parts = point_spread(sigma), []
+        for index in np.unique(shape[shape >= 0]):
+            rows, columns = np.nonzero(shape == index)
+            box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+            mask = shape[box] == index
+            parts.append((box, mask, _filtered(mask.astype(np.float32), taps)[mask]))
+        return cls(taps, tuple(parts))
+
+    @property
+    def bytes(self) -> int:
+        """Memory that it needs."""
+        return sum(mask.nbytes + weight.nbytes for _, mask, weight in self.parts)
+
+    def apply(self, image: Images) -> None:
+        """Smooth an image (h, w) in place; pixels outside the shapes are not changed."""
+        for box, mask, weight in self.parts:
+            part = image[box]
+            part[mask] = _filtered(np.where(mask, part, np.float32(0)), self.taps)[mask] / weight
+
+
 def smoothed(light: Images, shape: NDArray[np.integer], sigma: float) -> Images:
     """Return images (P, h, w) smoothed by a Gaussian of ``sigma`` [px], each pixel with others of the same shape.
 
     ``shape`` (h, w) is an index, -1 for none; such pixels are not changed. At the edge of a shape the mean is over
     fewer pixels, so sums are not preserved.
     """
-    taps = point_spread(sigma)
-    out = light.copy()
-    for index in np.unique(shape[shape >= 0]):
-        mask = shape == index
-        weight = _filtered(mask.astype(np.float32), taps)
-        for image, source in zip(out, light, strict=True):
-            image[mask] = _filtered(np.where(mask, source, np.float32(0)), taps)[mask] / weight[mask]
+    smoothing, out = Smoothing.of(shape, sigma), light.copy()
+    for image in out:
+        smoothing.apply(image)
     return out
 
 

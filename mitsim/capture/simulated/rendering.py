@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.region_of_interest import Roi
-from mitsim.capture.simulated.indirect_light import IndirectLight
+from mitsim.capture.simulated.indirect_light import IndirectLight, KeptSettings
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,14 @@ class Rendering:
         None: interreflections are rendered together with direct light. :class:`IndirectLight`: they are rendered
         separately and smoothed. :class:`IndirectImages`: they were rendered before, of the same scene from a near pose;
         their regions and depth apply.
+    kept
+        Numbers of paths of interreflections that are traced once and serve any finish; None for none.
     """
 
     samples: int = 16
     depth: int = 1
     indirect: IndirectLight | IndirectImages | None = None
+    kept: KeptSettings | None = None
 
     @property
     def prerendered(self) -> IndirectImages | None:

@@ -19,6 +19,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mitsim.scene.backend import mi
 from mitsim.scene.device import opaque_index
@@ -32,6 +33,11 @@ _STEPS = [round(2**32 / _ROOT**power) for power in (1, 2, 3)]
 def z_order(column: Any, row: Any) -> Any:
     """Return the position of a pixel along the Z-order curve: the lower 16 bits of column and row, interleaved."""
     return _spread(column) | (_spread(row) << 1)
+
+
+def z_positions(column: NDArray[np.integer], row: NDArray[np.integer]) -> NDArray[np.uint32]:
+    """Return the positions of :func:`z_order` for arrays of the host."""
+    return np.asarray(_spread(column.astype(np.uint32)) | (_spread(row.astype(np.uint32)) << 1), np.uint32)
 
 
 def r3_point(index: Any, seed: Any, stream: int) -> tuple[Any, Any]:

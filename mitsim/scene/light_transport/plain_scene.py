@@ -11,6 +11,7 @@ blend. It takes half as long again to compile, and twice the time for small imag
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -31,11 +32,11 @@ def single_plane(scene: Scene) -> Any | None:
 
 def single_bsdf(scene: Scene) -> Any | None:
     """Return the BSDF that all shapes share; None if there are several."""
-    bsdfs = _distinct_bsdfs(scene)
+    bsdfs = distinct_bsdfs(scene)
     return bsdfs[0] if bsdfs is not None and len(bsdfs) == 1 else None
 
 
-def _distinct_bsdfs(scene: Scene) -> list[Any] | None:
+def distinct_bsdfs(scene: Scene) -> list[Any] | None:
     """Return the BSDFs of a scene, each once; None if there are instances, whose BSDFs Mitsuba does not tell."""
     if any(shape.class_name() == "Instance" for shape in scene.shapes):
         return None
@@ -43,23 +44,31 @@ def _distinct_bsdfs(scene: Scene) -> list[Any] | None:
 
 
 class SceneBsdfs:
-    """The BSDFs of a scene, for indirect calls that compile no others."""
+    """The BSDFs of a scene, for indirect calls that compile no others.
 
-    def __init__(self, scene: Scene) -> None:
-        self._bsdfs = _distinct_bsdfs(scene)
+    ``instead`` are others to call in their place, in the order of :func:`distinct_bsdfs`.
+    """
+
+    def __init__(self, scene: Scene, instead: Sequence[Any] | None = None) -> None:
+        self._bsdfs = distinct_bsdfs(scene)
         if self._bsdfs is None:
             return
         numbers = np.array(dr.reinterpret_array(mi.UInt32, scene.mitsuba.shapes_dr()))
         places = np.zeros(numbers.max() + 1, np.uint32)  # for each of Mitsuba's numbers of shapes
         places[numbers] = [self._bsdfs.index(shape.bsdf()) for shape in scene.shapes]
         self._places = mi.UInt32(places)
+        self._bsdfs = self._bsdfs if instead is None else list(instead)
+
+    def place(self, surface: Any, valid: Any) -> Any:
+        """Return the place of each valid lane's BSDF in the list of the scene's."""
+        return dr.gather(mi.UInt32, self._places, dr.reinterpret_array(mi.UInt32, surface.shape), valid)
 
     def at(self, surface: Any) -> Any:
         """Return the BSDF of each lane's surface, with the methods that light paths need."""
         if self._bsdfs is None:
             return surface.bsdf()
         valid = surface.is_valid()
-        place = dr.gather(mi.UInt32, self._places, dr.reinterpret_array(mi.UInt32, surface.shape), valid)
+        place = self.place(surface, valid)
         return _BsdfOfLane(self._bsdfs, place, valid)
 
 

@@ -10,11 +10,15 @@ cannot be seen.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import qmc
 
+from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import dr, mi
 from mitsim.scene.device import to_device, vectors_to_host
 from mitsim.scene.load import Scene
@@ -22,7 +26,36 @@ from mitsim.scene.ray_casting.raycast import PixelRays, cast
 from mitsim.sensor.transforms import Transform
 
 _ANGLES = 24
-_SAMPLES = 8192
+_SAMPLES = 1024
+
+
+@dataclass(frozen=True)
+class SeenSurfaces:
+    """The shape (h, w) of each pixel of a region, -1 for none, and the cosine (h, w) between its ray and its normal."""
+
+    shape: NDArray[np.integer]
+    cosine: NDArray[np.floating]
+
+    @classmethod
+    def of(cls, scene: Scene, rays: PixelRays, world_from_sensor: Transform, roi: Roi | None = None) -> SeenSurfaces:
+        """Return what the rays of a region meet, by default of the whole image."""
+        surfaces = cast(scene, rays, world_from_sensor, np.empty((0, 3)))
+        directions = vectors_to_host(rays.directions).reshape(*rays.size, 3)
+        some = slice(None) if roi is None else roi.slices
+        cosine = np.abs((surfaces.normal[some] * directions[some]).sum(axis=-1))
+        return cls(surfaces.shape[some], cosine)
+
+    def room_radiance(self, albedos: list[NDArray[np.float64]]) -> NDArray[np.float32]:
+        """Return the radiance (h, w) [1/sr] per unit of irradiance on a surface with a free view.
+
+        It is 0 outside the part. ``albedos`` of the scene's shapes come from :func:`directional_albedos`.
+        """
+        out = np.zeros(self.shape.shape, np.float32)
+        cosines = _cosines()
+        for index, albedo in enumerate(albedos):
+            pixels = self.shape == index
+            out[pixels] = np.interp(self.cosine[pixels], cosines[::-1], albedo[::-1]) / np.pi
+        return out
 
 
 def room_radiance(
@@ -37,15 +70,7 @@ def room_radiance(
     albedos
         Of the scene's shapes, from :func:`directional_albedos`.
     """
-    surfaces = cast(scene, rays, world_from_sensor, np.empty((0, 3)))
-    out = np.zeros(surfaces.shape.shape, np.float32)
-    cosines = _cosines()
-    directions = vectors_to_host(rays.directions).reshape(*rays.size, 3)
-    for index, albedo in enumerate(albedos):
-        pixels = surfaces.shape == index
-        cosine = np.abs((surfaces.normal[pixels] * directions[pixels]).sum(axis=-1))
-        out[pixels] = np.interp(cosine, cosines[::-1], albedo[::-1]) / np.pi
-    return out
+    return SeenSurfaces.of(scene, rays, world_from_sensor).room_radiance(albedos)
 
 
 def directional_albedos(scene: Scene) -> list[NDArray[np.float64]]:
@@ -62,19 +87,24 @@ def directional_albedo(bsdf: Any) -> NDArray[np.float64]:
     """Return the share of light from all sides that a BSDF returns toward some angles, (m,), grazing angles last.
 
     By reciprocity it equals the share of light from that angle that is returned to all sides. It is the mean weight of
-    samples of the BSDF, over the azimuth too, with a fixed seed.
+    samples of the BSDF at low-discrepancy points, over the azimuth too, with a fixed seed.
     """
     cosines = _cosines()
     count = len(cosines) * _SAMPLES
-    random = mi.PCG32(size=count, initstate=7)
+    azimuth, sample1, *sample2 = (to_device(np.tile(one, len(cosines))) for one in _points().T)
     cosine = to_device(np.repeat(cosines, _SAMPLES))
-    azimuth = 2 * dr.pi * random.next_float32()
     sine = dr.sqrt(1 - dr.square(cosine))
     surface = dr.zeros(mi.SurfaceInteraction3f, count)
+    azimuth *= 2 * dr.pi
     surface.wi = mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), cosine)
-    sample1, sample2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
-    _, weight = bsdf.sample(mi.BSDFContext(), surface, sample1, sample2)
+    _, weight = bsdf.sample(mi.BSDFContext(), surface, sample1, mi.Point2f(*sample2))
     return np.asarray(np.array(weight[0], float).reshape(len(cosines), _SAMPLES).mean(axis=1))
+
+
+@cache
+def _points() -> NDArray[np.float64]:
+    """Return points (n, 4) that fill the unit cube evenly, below 1 in single precision."""
+    return np.minimum(qmc.Sobol(4, seed=7).random(_SAMPLES), 1 - 2.0**-24)
 
 
 def _cosines() -> NDArray[np.float64]:

@@ -46,6 +46,9 @@ Floats = NDArray[np.float64]
 #: distance interpolates between them
 _POINTS = 600
 
+#: number of drawn maps that are kept: views are compared with the same draws
+_MAPS = 32
+
 #: reason of a measurement without a value that screening rates as impossible
 _NOT_PREDICTED = "by the map, too few points are recovered in this view"
 
@@ -134,6 +137,8 @@ class MappedMeasurements:
 
     def _scene(self, finish: int) -> CharacterisedScene:
         if finish not in self._characterised:
+            if len(self._characterised) >= _MAPS:
+                self._characterised.pop(next(iter(self._characterised)))
             drawn = drawn_map(self.performance_map, self.unknowns, finish)
             self._characterised[finish] = CharacterisedScene(self.study.scene, drawn)
         return self._characterised[finish]

@@ -16,7 +16,7 @@ import numpy as np
 
 from characterisation.files.errors import InputError
 from characterisation.tasks.folded import folded_values
-from mitsim.capture.simulated.indirect_light import IndirectLight
+from mitsim.capture.simulated.indirect_light import IndirectLight, KeptSettings
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.maps.campaign.plan import sensor_checksum
 from mitsim.running.version import __version__
@@ -29,7 +29,7 @@ from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.world import BEYOND, Unknowns
 
 #: part of the digest of a trial; increased if the same draw gives a different measurement
-TRIAL_VERSION = 2
+TRIAL_VERSION = 3
 
 #: keys of a task that concern the verdict, not the measurement
 _NO_PART_OF_A_TRIAL: Any = {"decision": True, "measurements": {"__all__": {"decision"}}}
@@ -37,12 +37,19 @@ _NO_PART_OF_A_TRIAL: Any = {"decision": True, "measurements": {"__all__": {"deci
 #: standard deviation of the smoothing of interreflections [px], see simulation/indirect_light.py
 _SMOOTHING_PX = 1.5
 
+#: paths of interreflections that all trials of a view share: for matchers, whose images are few and coarse, and for
+#: fringes and time of flight. Measured on the two pillars, see tests/benchmarks/kept_paths.py
+_KEPT_MATCHER, _KEPT = KeptSettings(36, 4.0, 32, 1.5), KeptSettings(16, 4.0, 8, 2.5)
+
 
 def rendering_of(study: Study) -> Rendering:
     """Return the settings for rendering the virtual measurements of a study."""
     table = study.file.measure
-    samples = 4 if isinstance(study.sensor.settings, MatcherSettings) else 16
-    return Rendering(table.samples_per_pixel, table.light_path_depth, IndirectLight(samples, _SMOOTHING_PX))
+    is_matcher = isinstance(study.sensor.settings, MatcherSettings)
+    indirect, kept = (
+        (IndirectLight(4, _SMOOTHING_PX), _KEPT_MATCHER) if is_matcher else (IndirectLight(16, _SMOOTHING_PX), _KEPT)
+    )
+    return Rendering(table.samples_per_pixel, table.light_path_depth, indirect, kept)
 
 
 def measured_by(study: Study) -> str:
@@ -131,8 +138,8 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: 
         content["deviations"] = {name: one.shape for name, one in folded.items()}
     if named := named_digests(Path(study.scene.where), {name: str(value) for name, value in file.parameters.items()}):
         content["files"] = named
-    if separate_light or not unknowns.pooled:
-        content["apart"] = [separate_light, unknowns.pooled]
+    if separate_light:
+        content["apart"] = True
     if source == "map":
         content["map"] = map_digest(study)
         content["score"] = file.score.model_dump(mode="json")  # effects outside the map are multiples of a screened u

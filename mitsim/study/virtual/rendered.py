@@ -1,14 +1,16 @@
 """Virtual measurements by rendering: one sensor and one part in any number of random draws.
 
 Signal chain: view and trial -> draw (:mod:`mitsim.study.virtual.world`) -> images of the part by the *true* sensor:
-direct light traced for every trial, interreflections rendered once for a view and finish, room light, power, exposure,
-noise -> cloud, decoded with the *nominal* calibration -> errors other than light: path, temperature and form of the
-part -> measurement at the assumed pose -> error of every measurement.
+direct light traced for every trial, interreflections on the kept paths of the view with the finish of the trial, room
+light, power, exposure, noise -> cloud, decoded with the *nominal* calibration -> errors other than light: path,
+temperature and form of the part -> measurement at the assumed pose -> error of every measurement.
 
-Interreflections are rendered at the nominal pose and calibration of the view. They are smooth, and the random pose and
-calibration shift them by about a pixel. Trials sorted by finish (:func:`in_order`) render them once for each finish.
-With ``separate_light``, every trial renders all of its light at its own pose and calibration. That takes two to three
-times as long, and is the reference for this approximation.
+The paths of interreflections are those of the nominal pose and calibration of the view
+(:mod:`mitsim.capture.simulated.kept_light`). That light is smooth, and the random pose and calibration shift it by
+about a pixel. Trials sorted by view (:func:`in_order`) trace the paths once for each view. With ``separate_light``,
+every trial renders all of its light at its own pose and calibration. That takes several times as long, and is the
+reference for this approximation. The interreflections of scenes with emitters, or with finishes inside other BSDFs, are
+rendered anew for every finish.
 
 Temperature and form displace the decoded points together with the surface, to first order. At 50 um on 500 mm, the
 change of the image position is far below a pixel, and that of the brightness far below a grey level.
@@ -17,7 +19,7 @@ change of the image position is far below a pixel, and that of the brightness fa
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -25,18 +27,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import PointCloud
+from characterisation.region_of_interest import Roi
 from characterisation.tasks.evaluation import measure
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.exposing import LightOnImagers
+from mitsim.capture.simulated.kept_light import KeptLight, can_be_kept, keep_light
 from mitsim.capture.simulated.rendering import IndirectImages, Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import capture_cloud, sensor_geometry
 from mitsim.maps.campaign.acquire import one_ahead
 from mitsim.maps.prediction import Predictor
-from mitsim.scene.light_transport.room_light import directional_albedos, room_radiance
+from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
+from mitsim.scene.light_transport.room_light import SeenSurfaces, directional_albedos
 from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.scene.ray_casting.triangles import hull_corners
+from mitsim.scene.surface.scatter import Deviation
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
@@ -56,14 +62,27 @@ _MARGIN_PX = 12
 _PLACEMENTS = 3.0
 
 
-@dataclass(frozen=True)
-class _SharedLight:
-    """Light of a view that is the same in all draws of one finish: interreflections, and the light of the room."""
+#: memory of the paths of views that are kept for later trials [bytes]
+_KEPT_BYTES = 1 << 29
 
-    view: int
-    finish: int
-    indirect: IndirectImages
-    room: dict[str, NDArray[np.float32]]
+#: finishes in whose light the paths to keep are chosen, beside the best estimate: numbers of draws
+_PROBING_FINISHES = (101, 102, 103, 104)
+
+
+@dataclass(frozen=True)
+class _ViewLight:
+    """What all draws of a view share, by camera: regions, surfaces that are seen, paths of interreflections."""
+
+    rois: dict[str, Roi]
+    seen: dict[str, SeenSurfaces]
+    kept: dict[str, KeptLight]
+
+    @property
+    def bytes(self) -> int:
+        """Memory that it needs."""
+        return sum(one.bytes for one in self.kept.values()) + sum(
+            one.shape.nbytes + one.cosine.nbytes for one in self.seen.values()
+        )
 
 
 @dataclass(frozen=True)
@@ -104,8 +123,9 @@ class RenderedMeasurements:
         corners = hull_corners(study.scene)
         reach = _PLACEMENTS * unknowns.table.pose.placement_mm if "pose" in unknowns.varied else 0.0
         self.corners = np.concatenate([corners + step for step in reach * _CUBE_CORNERS])
-        self._scenes: dict[int, tuple[Scene, list[Floats]]] = {}
-        self._cached: _SharedLight | None = None
+        self._finished: tuple[int, Scene, list[Floats]] | None = None
+        self._own_scene: Scene | None = None
+        self._views: dict[int, _ViewLight] = {}
         self._has_form = any(unknowns.table.form.features.values())
 
     def exposed_as(self, planned: PlannedExposure | None) -> RenderedMeasurements:
@@ -115,8 +135,8 @@ class RenderedMeasurements:
         return other
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
-        """Return the jobs sorted by finish and view: a finish is loaded once, and shared light is rendered once."""
-        return sorted(jobs, key=lambda job: (self.unknowns.draw(job.trial).finish, job.view.number))
+        """Return the jobs sorted by view: paths are traced once for each view."""
+        return sorted(jobs, key=lambda job: job.view.number)
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
         """Yield the outcome of every virtual measurement, job by job.
@@ -153,13 +173,18 @@ class RenderedMeasurements:
         """Trace the light of one draw in a view, which all of its exposures share."""
         true, assumed = (motion.inverse() @ view.world_from_sensor for motion in (drawn.placed, drawn.assumed))
         sensor = self.simulated.recalibrated(drawn.rig, drawn.unit)
-        scene = self._scene(drawn.finish)[0]
         if self.separate_light:
-            shared = self._render_shared_light(sensor, true, view, drawn.finish, drawn.seed)
+            source, pose, shared = sensor, true, self._shared(sensor, true, view, False)
         else:
-            shared = self._shared_with(view, drawn.finish)
-        light = sensor.light(scene, true, seed=drawn.seed, rendering=replace(self.rendering, indirect=shared.indirect))
-        return TracedLight(sensor, light, shared.room, drawn, assumed)
+            source, pose, shared = self.simulated, view.world_from_sensor, self._view_light(view)
+        scene, albedos = self._scene(drawn.finish)
+        indirect = self._indirect(source, scene, pose, view, drawn, shared)
+        room = {
+            name: source.apply_lens(one.room_radiance(albedos), name, shared.rois[name])
+            for name, one in shared.seen.items()
+        }
+        light = sensor.light(scene, true, seed=drawn.seed, rendering=replace(self.rendering, indirect=indirect))
+        return TracedLight(sensor, light, room, drawn, assumed)
 
     def exposed(self, lit: TracedLight, planned: PlannedExposure | None, seed: int, keep: bool = False) -> Capture:
         """Expose light as planned, or by the sensor's own rule.
@@ -208,47 +233,81 @@ class RenderedMeasurements:
 
     def _scene(self, finish: int) -> tuple[Scene, list[Floats]]:
         """Return the part in the finishes of a number, and the directional albedos of its shapes."""
-        if finish not in self._scenes:
-            self._scenes.clear()  # Dr.Jit compiles a material call for the materials of every scene in memory
+        if self._finished is None or self._finished[0] != finish:
+            self._finished = None  # Dr.Jit compiles a material call for the materials of every scene in memory
+            scene = self._part(partial(finish_deviation, self.unknowns, finish))
+            self._finished = finish, scene, directional_albedos(scene)
+        return self._finished[1:]
+
+    def _part(self, deviation: Callable[[str], Deviation]) -> Scene:
+        """Return the part with finishes that deviate, in a scene of its own; a later call changes an earlier scene."""
+        if self._own_scene is None or not self._own_scene.changeable:
             file, scene = self.study.file, self.study.scene
-            if finish >= 0:
-                parameters = {name: str(value) for name, value in file.parameters.items()}
-                wavelength_nm = self.study.sensor.wavelength_nm
-                drawn = partial(finish_deviation, self.unknowns, finish)
-                scene = load_scene(scene.where, wavelength_nm, parameters, drawn)
-            self._scenes[finish] = scene, directional_albedos(scene)
-        return self._scenes[finish]
+            parameters = {name: str(value) for name, value in file.parameters.items()}
+            self._own_scene = load_scene(scene.where, self.study.sensor.wavelength_nm, parameters, deviation)
+        return self._own_scene.deviated(deviation) if self._own_scene.changeable else self._own_scene
 
-    def _shared_with(self, view: View, finish: int) -> _SharedLight:
-        if self._cached is None or (self._cached.view, self._cached.finish) != (view.number, finish):
-            self._cached = None  # release the memory first
-            pose, seed = view.world_from_sensor, self.unknowns.seed
-            self._cached = self._render_shared_light(self.simulated, pose, view, finish, seed)
-        return self._cached
+    def _view_light(self, view: View) -> _ViewLight:
+        """Return what all draws of a view share, made at its nominal pose and calibration on first use."""
+        if view.number not in self._views:
+            made = self._shared(self.simulated, view.world_from_sensor, view, self._keeps_paths)
+            while self._views and made.bytes + sum(one.bytes for one in self._views.values()) > _KEPT_BYTES:
+                self._views.pop(next(iter(self._views)))  # that was not used for the longest time
+            self._views[view.number] = made
+        used = self._views.pop(view.number)
+        self._views[view.number] = used
+        return used
 
-    def _render_shared_light(
-        self, simulated: SimulatedSensor, pose: Transform, view: View, finish: int, seed: int
-    ) -> _SharedLight:
-        """Render interreflections and room light from a pose of a view, with the draws of a seed."""
-        scene, albedos = self._scene(finish)
+    @property
+    def _keeps_paths(self) -> bool:
+        return self.rendering.depth > 1 and self.rendering.kept is not None and can_be_kept(self.study.scene)
+
+    def _shared(self, simulated: SimulatedSensor, pose: Transform, view: View, keeps_paths: bool) -> _ViewLight:
+        """Return regions and seen surfaces from a pose of a view, and the paths of interreflections."""
+        scene = self.study.scene
+        around = view.world_from_sensor.inverse().points(self.corners)
+        rois, seen, kept = {}, {}, {}
+        for name, camera in simulated.sensor.rig.cameras.items():
+            roi = rois[name] = roi_around(camera, around, _MARGIN_PX) or simulated.rays[name].whole
+            seen[name] = SeenSurfaces.of(scene, simulated.pixel_rays(name), pose, roi)
+        if keeps_paths:
+            numbers = (-1, *_PROBING_FINISHES) if "finish" in self.unknowns.varied else (-1,)
+            some = (partial(finish_deviation, self.unknowns, number) for number in numbers)
+            finishes = [distinct_bsdfs(self._part(deviation)) or [] for deviation in some]
+            self._finished = None
+            seed = _seed_of(self.unknowns.seed, view.number)
+            kept = keep_light(simulated, scene, pose, rois, self.rendering, finishes, seed)
+        return _ViewLight(rois, seen, kept)
+
+    def _indirect(
+        self,
+        simulated: SimulatedSensor,
+        scene: Scene,
+        pose: Transform,
+        view: View,
+        drawn: DrawnValues,
+        shared: _ViewLight,
+    ) -> IndirectImages:
+        """Return the interreflections of a draw: on the kept paths, or rendered from a pose."""
         how = self.rendering.indirect_settings
         assert how is not None  # rendering_of a study
-        around = view.world_from_sensor.inverse().points(self.corners)
-        images, rois, room = {}, {}, {}
-        for index, (name, camera) in enumerate(simulated.sensor.rig.cameras.items()):
-            roi = roi_around(camera, around, _MARGIN_PX) or simulated.rays[name].whole
-            stream = np.random.SeedSequence([seed, view.number, finish + 1, index])
-            if self.rendering.depth > 1:
-                seed_of_render = int(stream.generate_state(1)[0])
-                images[name] = simulated.indirect_radiance(
-                    scene, pose, name, how, seed=seed_of_render, depth=self.rendering.depth, roi=roi
-                )
-            else:
+        images = {}
+        for index, (name, roi) in enumerate(shared.rois.items()):
+            if self.rendering.depth == 1:
                 images[name] = np.zeros((0, roi.height, roi.width), np.float32)
-            lit = room_radiance(scene, albedos, simulated.pixel_rays(name), pose)[roi.slices]
-            rois[name], room[name] = roi, simulated.apply_lens(lit, name, roi)
-        indirect = IndirectImages(images, rois, how, self.rendering.depth)
-        return _SharedLight(view.number, finish, indirect, room)
+            elif shared.kept:
+                images[name] = shared.kept[name].images(scene, simulated)
+            else:
+                seed = drawn.seed if self.separate_light else self.unknowns.seed
+                seed = _seed_of(seed, view.number, drawn.finish + 1, index)
+                images[name] = simulated.indirect_radiance(
+                    scene, pose, name, how, seed=seed, depth=self.rendering.depth, roi=roi
+                )
+        return IndirectImages(images, shared.rois, how, self.rendering.depth)
+
+
+def _seed_of(*numbers: int) -> int:
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
 
 #: corners of a cube, which widen the box of a part by a shift in any direction

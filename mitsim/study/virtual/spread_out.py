@@ -1,6 +1,6 @@
 """Distribute virtual measurements to workers: processes on this machine, or those of a Dask cluster.
 
-Signal chain: jobs sorted by view and finish -> runs of jobs that share light, as plain values -> a worker, which
+Signal chain: jobs sorted by view -> runs of jobs that share light, as plain values -> a worker, which
 prepares the study's sensor once (:class:`mitsim.study.virtual.rendered.RenderedMeasurements`) -> errors of every trial.
 
 A trial depends only on study, view and trial number, so every worker gives the same result. If a worker dies, another
@@ -31,7 +31,7 @@ _IN_A_ROW = 8
 
 @dataclass(frozen=True)
 class TrialOrder:
-    """Jobs of one view and finish as plain values."""
+    """Jobs of one view as plain values."""
 
     path: str
     file: StudyFile
@@ -62,7 +62,7 @@ class SpreadMeasurements:
         return other
 
     def in_order(self, jobs: Iterable[Job]) -> list[Job]:
-        """Return the jobs sorted by view and finish."""
+        """Return the jobs sorted by view."""
         return self.renderer.in_order(jobs)
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Outcome]]:
@@ -72,9 +72,8 @@ class SpreadMeasurements:
             yield from zip(order.jobs, results, strict=True)
 
     def _rows(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, ...]]:
-        """Yield runs of jobs that share light, at most :data:`_IN_A_ROW` each."""
-        draw = self.renderer.unknowns.draw
-        for _, some in groupby(jobs, key=lambda job: (job.view.number, draw(job.trial).finish)):
+        """Yield runs of jobs of one view, at most :data:`_IN_A_ROW` each."""
+        for _, some in groupby(jobs, key=lambda job: job.view.number):
             row = tuple(some)
             for first in range(0, len(row), _IN_A_ROW):
                 yield row[first : first + _IN_A_ROW]

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import ndtri
 
 from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation
 from mitsim.sensor.camera import Rig
@@ -44,14 +43,8 @@ GROUPS = (*COMMON, *FRESH, BEYOND)
 #: seed of the stream of finishes, different from those of the groups
 _FINISH_STREAM = 8
 
-#: size of the pool of finishes that trials share, since interreflections must be rendered for each finish
-FINISHES = 8
-
-#: number of successive days that share a finish, for the same reason
-FINISH_DAYS = 2
-
-#: Days of a race start at 0. First day of draws that judge the choice of a view; their finishes are not of the pool.
-OWN_FINISH_DAYS = 1 << 19
+#: days of a race start at 0; first day of draws that judge the choice of a view
+JUDGING_DAYS = 1 << 19
 
 #: first day of the draws of a statement
 STATEMENT_DAYS = 1 << 20
@@ -105,9 +98,7 @@ class Unknowns:
 
     ``table`` holds their sizes. ``rig`` is nominal. ``calibration`` is the covariance of the calibration, with the
     drift since then. ``expansion`` of the part is in 1/K. ``centre`` (3,) [mm] is the point about which the part
-    rotates. Groups that are not in ``varied`` keep their best estimate. With ``pooled``, finishes come from a pool of
-    :data:`FINISHES`; else every draw has its own. The days from :data:`OWN_FINISH_DAYS` on have
-    their own as well: they judge a choice that the pool made.
+    rotates. Groups that are not in ``varied`` keep their best estimate.
     """
 
     table: UnknownsTable
@@ -118,7 +109,6 @@ class Unknowns:
     centre: NDArray[np.float64]
     seed: int
     varied: tuple[str, ...] = GROUPS
-    pooled: bool = True
 
     def draw(self, trial: Trial) -> DrawnValues:
         """Draw the values of a trial."""
@@ -134,7 +124,7 @@ class Unknowns:
         return DrawnValues(
             rig=moved(self.rig, names, values),
             path=path_error(names, values),
-            finish=self._finish(streams["finish"], trial.day) if "finish" in self.varied else -1,
+            finish=_seed(streams["finish"]) if "finish" in self.varied else -1,
             form=_seed(streams["form"]) if "form" in self.varied else 0,
             room=room,
             power=power,
@@ -150,15 +140,9 @@ class Unknowns:
     def _stream(self, group: str, trial: Trial) -> np.random.Generator:
         day = trial.day + (_ELSEWHERE if trial.swapped == group else 0)
         place = [day, trial.capture] if group in FRESH else [day]
-        if group == "finish" and self.pooled:
-            place = [day // FINISH_DAYS]
         if group not in self.varied:
             place = [0]
         return np.random.default_rng(np.random.SeedSequence([self.seed, GROUPS.index(group), *place]))
-
-    def _finish(self, rng: np.random.Generator, day: int) -> int:
-        pooled = self.pooled and not OWN_FINISH_DAYS <= day < STATEMENT_DAYS
-        return int(rng.integers(FINISHES)) if pooled else FINISHES + _seed(rng)
 
     def _geometry(self, rng: np.random.Generator, sensor_kelvin: float) -> tuple[tuple[str, ...], NDArray[np.float64]]:
         """Return names and errors of the rig's parameters, due to calibration and temperature."""
@@ -202,21 +186,13 @@ class Unknowns:
 def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
     """Return the deviation of a finish, given by its BSDF's id, from its best estimate in the finishes of a number.
 
-    Deviations are quantiles of the normal distribution, scaled to variance 1. Their order is random for each finish,
-    and for alpha, wide-angle share and reflectance (Latin hypercube sampling: McKay et al. 1979). The number -1 is the
-    best estimate. A number beyond the pool of :data:`FINISHES` seeds a normal draw.
+    The number seeds a normal draw for each finish; -1 is the best estimate.
     """
-    ranges = unknowns.table.finish
     if number < 0:
         return Deviation()
-    if number >= FINISHES:
-        seeded = np.random.default_rng(np.random.SeedSequence([number, _FINISH_STREAM, zlib.crc32(finish.encode())]))
-        drawn = np.clip(seeded.standard_normal(3), -LARGEST_DEVIATION, LARGEST_DEVIATION).tolist()
-        return _deviation(ranges, *drawn)
-    quantiles = ndtri((np.arange(FINISHES) + 0.5) / FINISHES)
-    quantiles = np.clip(quantiles / quantiles.std(), -LARGEST_DEVIATION, LARGEST_DEVIATION)
-    rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, _FINISH_STREAM, zlib.crc32(finish.encode())]))
-    return _deviation(ranges, *(float(quantiles[rng.permutation(FINISHES)[number]]) for _ in range(3)))
+    seeded = np.random.default_rng(np.random.SeedSequence([number, _FINISH_STREAM, zlib.crc32(finish.encode())]))
+    drawn = np.clip(seeded.standard_normal(3), -LARGEST_DEVIATION, LARGEST_DEVIATION).tolist()
+    return _deviation(unknowns.table.finish, *drawn)
 
 
 def _deviation(ranges: FinishUnknowns, alpha: float, wide_angle: float, reflectance: float) -> Deviation:

@@ -1,0 +1,117 @@
+"""Interreflections of one view for any finish: paths traced once, evaluated and smoothed for every draw.
+
+Signal chain: scene with finishes to sample with -> candidates of each camera
+(:mod:`mitsim.scene.light_transport.kept_tracing`) -> paths that matter
+(:mod:`mitsim.scene.light_transport.kept_paths`); then for each draw: BSDFs -> light of each code -> Gaussian filter
+over the pixels of one shape -> images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+
+from characterisation.files.threads import in_threads
+from characterisation.region_of_interest import Roi
+from mitsim.capture.simulated.indirect_light import Smoothing
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.scene.light_transport.ambient import has_emitters
+from mitsim.scene.light_transport.kept_paths import Candidates, KeptPaths, broad, mattering
+from mitsim.scene.light_transport.kept_tracing import Tracing, camera_paths, photon_paths
+from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
+from mitsim.scene.load import Scene, bsdf_of
+from mitsim.scene.ray_casting.raycast import shapes_met
+from mitsim.sensor.transforms import Transform
+
+
+@dataclass(frozen=True)
+class KeptLight:
+    """Interreflected light of one camera's region, for any finish."""
+
+    paths: KeptPaths
+    smoothing: Smoothing
+    ambient_image: bool
+
+    @property
+    def bytes(self) -> int:
+        """Memory that it needs."""
+        return self.paths.bytes + self.smoothing.bytes
+
+    def images(self, scene: Scene, simulated: SimulatedSensor) -> NDArray[np.float32]:
+        """Return the radiance (P, h, w) in the finishes of a scene, before the lens [W / (mm^2 sr)].
+
+        Like :meth:`~mitsim.capture.simulated.simulate.SimulatedSensor.indirect_radiance`, one more image is the light
+        of other sources, if the sensor takes an ambient image.
+        """
+        light = simulated.patterns
+        codes = self.paths.codes(distinct_bsdfs(scene) or [], light)
+        in_threads(self.smoothing.apply, codes)
+        images = light.images(list(codes))
+        if self.ambient_image:
+            images.append(np.zeros_like(images[0]))
+        return np.asarray(images, np.float32)
+
+
+def can_be_kept(scene: Scene) -> bool:
+    """Whether paths of a scene can be kept: all finishes can be changed, and the scene has no emitters."""
+    return scene.changeable and not has_emitters(scene)
+
+
+def keep_light(
+    simulated: SimulatedSensor,
+    scene: Scene,
+    world_from_sensor: Transform,
+    rois: dict[str, Roi],
+    rendering: Rendering,
+    finishes: Sequence[Sequence[Any]],
+    seed: int,
+) -> dict[str, KeptLight]:
+    """Trace the interreflections that each camera sees.
+
+    Parameters
+    ----------
+    simulated, scene, world_from_sensor
+        The sensor, the scene in its best estimates, and the pose.
+    rois
+        Region of each camera's image.
+    rendering
+        Numbers of paths and surfaces.
+    finishes
+        Finishes that may be drawn, each as the BSDFs of the scene in the order of
+        :func:`~mitsim.scene.light_transport.plain_scene.distinct_bsdfs`. Paths are kept by their light in these.
+    seed
+        Of all random numbers.
+    """
+    bsdfs, settings = distinct_bsdfs(scene), rendering.kept
+    assert settings is not None
+    assert bsdfs is not None  # can_be_kept
+    described = {
+        shape.bsdf().id(): finish.description
+        for shape, finish in zip(scene.shapes, scene.finishes, strict=True)
+        if finish is not None and finish.description is not None
+    }
+    drawn = [number if one.id() in described else -1 for number, one in enumerate(bsdfs)]
+    sampled = [bsdf_of(broad(described[one.id()])) if one.id() in described else one for one in bsdfs]
+    out = {}
+    for index, (camera, roi) in enumerate(rois.items()):
+        shape = shapes_met(scene, simulated.pixel_rays(camera), world_from_sensor)[roi.slices]
+        # a pixel at the edge of the part may see it although its centre does not
+        pixels = np.flatnonzero(binary_dilation(shape >= 0, np.ones((3, 3))))
+        photons = int(np.ceil(np.sqrt(settings.photons * settings.samples * len(pixels)))) ** 2
+        own = int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
+        tracing = Tracing(settings.samples, photons, rendering.depth, own, drawn, sampled)
+        rays, projector = simulated.rays[camera], simulated.patterns.projector
+        candidates: list[Candidates] = []
+        if len(pixels):
+            candidates += camera_paths(scene, rays, projector, world_from_sensor, roi, pixels, tracing)
+            candidates += photon_paths(scene, rays, projector, world_from_sensor, roi, tracing)
+        joined = Candidates.joined(candidates, rendering.depth)
+        paths = KeptPaths(mattering(joined, finishes, roi, settings.kept * len(pixels), own), roi)
+        out[camera] = KeptLight(paths, Smoothing.of(shape, settings.smoothing_px), simulated.sensor.ambient_image)
+    return out

@@ -1,0 +1,261 @@
+"""Keep the paths of interreflected light of one view, and evaluate them for any finish without tracing.
+
+Signal chain: *broad* finishes -> camera paths and photons, traced once
+(:mod:`mitsim.scene.light_transport.kept_tracing`) -> candidates: pixel, weight, code coordinate, and the two directions
+at each surface -> the few that matter (this module) -> BSDFs of a drawn finish at the kept directions -> product along
+each path -> sum over the paths of each pixel.
+
+A path through the surfaces x_1 (at the camera) ... x_n (at the projector) carries
+
+    radiance = w * f_1(i_1, o_1) * ... * f_n(i_n, o_n) * code(u, v, L)
+
+where f_k is the BSDF with its cosine, i_k points along the path toward the camera and o_k toward the projector. The
+weight w holds everything else: arriving light, densities of the directions, and the balance heuristic between camera
+paths and photons. Densities and heuristic are those of the finish that the paths were *sampled* with. They are
+functions of the path alone, so the estimate is unbiased for every other finish (importance sampling: Kahn and Marshall
+1953). Its variance is small if the sampled finish is broader than the others: a defensive mixture (Hesterberg,
+Technometrics 37, 1995; :func:`broad`).
+
+Most candidates carry next to nothing. Each is kept with the probability p = min(1, c / t), and its weight is divided by
+p (Russian roulette: Arvo and Kirk, SIGGRAPH 1990). Here c is the root mean square of its light over some finishes that
+may be drawn, which makes the variance over those finishes least for a number of paths. Decisions are systematic along a
+Z-order curve of the pixels: any part of the image keeps as many paths as it should, within one.
+
+A material whose finish is never drawn, such as a stock BSDF of the scene's author, is part of the weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.region_of_interest import Roi
+from mitsim.scene.backend import dr, mi
+from mitsim.scene.device import to_device
+from mitsim.scene.light_transport.low_discrepancy import z_positions
+from mitsim.scene.light_transport.projector_light import ProjectedLight
+
+Floats = NDArray[np.float32]
+
+#: index of the factor 1 among the factors of a path, for surfaces whose BSDF is part of the weight
+_ONE = 0
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Paths from projector to camera over two and more surfaces, on the host.
+
+    ``pixel`` (n,) is the index in the region, ``weight`` (n,) is w. ``code`` (n, 3) is what the code depends on: u, v
+    [1] and L [mm]. ``material`` (n, m) numbers the drawn finish of each surface, -1 for none. ``toward`` (n, m, 6) are
+    the local directions i and o.
+    """
+
+    pixel: NDArray[np.int32]
+    weight: Floats
+    code: Floats
+    material: NDArray[np.int8]
+    toward: Floats
+
+    def __len__(self) -> int:
+        return len(self.pixel)
+
+    def chosen(self, index: NDArray[np.integer] | NDArray[np.bool_], weight: Floats | None = None) -> Candidates:
+        """Return some of the paths, with other weights if given."""
+        kept = self.weight[index] if weight is None else weight
+        return Candidates(self.pixel[index], kept, self.code[index], self.material[index], self.toward[index])
+
+    @classmethod
+    def joined(cls, parts: Sequence[Candidates], surfaces: int) -> Candidates:
+        """Return the paths of several parts, as if all had the largest number of surfaces."""
+
+        def wide(one: NDArray[Any], fill: int) -> NDArray[Any]:
+            pad = [(0, 0)] * one.ndim
+            pad[1] = (0, surfaces - one.shape[1])
+            return np.pad(one, pad, constant_values=fill)
+
+        if not parts:
+            nothing = np.empty((0, surfaces, 6), np.float32)
+            return cls(
+                np.empty(0, np.int32), nothing[:, 0, 0], nothing[:, 0, :3], np.empty((0, surfaces), np.int8), nothing
+            )
+        return cls(
+            np.concatenate([one.pixel for one in parts]),
+            np.concatenate([one.weight for one in parts]),
+            np.concatenate([one.code for one in parts]),
+            np.concatenate([wide(one.material, -1) for one in parts]),
+            np.concatenate([wide(one.toward, 0) for one in parts]),
+        )
+
+
+class Vertices:
+    """The surfaces of paths, sorted by material: their BSDFs are evaluated with one call for each material."""
+
+    def __init__(self, material: NDArray[np.int8], toward: Floats) -> None:
+        flat = material.ravel()
+        order = np.argsort(flat, kind="stable")
+        order = order[np.searchsorted(flat[order], 0) :]
+        place = np.zeros(len(flat), np.uint32)
+        place[order] = np.arange(1, len(order) + 1, dtype=np.uint32)
+        #: place of the factor of each surface of a path, (m, n)
+        self.places = place.reshape(material.shape).T
+        directions = toward.reshape(-1, 6)
+        self._parts: list[tuple[int, Any, Any]] = []
+        for number in np.unique(flat[order]).tolist():
+            rows = directions[order[flat[order] == number]]
+            incoming, outgoing = (mi.Vector3f(*[to_device(c) for c in rows[:, k : k + 3].T]) for k in (0, 3))
+            self._parts.append((number, incoming, outgoing))
+        self._count = 1 + len(order)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def factors(self, bsdfs: Sequence[Any]) -> Any:
+        """Return the factor of each surface for these materials; the first is 1."""
+        out, values, first = dr.ones(mi.Float, self._count), [], 1
+        for number, incoming, outgoing in self._parts:
+            surface = dr.zeros(mi.SurfaceInteraction3f, dr.width(incoming))
+            surface.wi = incoming
+            values.append(bsdfs[number].eval(mi.BSDFContext(), surface, outgoing, True)[0])
+        dr.eval(values)
+        for value in values:
+            dr.scatter(out, value, dr.arange(mi.UInt32, first, first + dr.width(value)))
+            first += dr.width(value)
+        return out
+
+
+class KeptPaths:
+    """The paths of one camera's region, ready on the device for any finish."""
+
+    def __init__(self, paths: Candidates, roi: Roi) -> None:
+        self.roi, self.count = roi, len(paths)
+        self._vertices = Vertices(paths.material, paths.toward)
+        pixels, first, counts = np.unique(paths.pixel, return_index=True, return_counts=True)
+        if len(paths) and (np.diff(paths.pixel) != 0).sum() + 1 != len(pixels):
+            raise ValueError("paths of one pixel must follow one another")
+        self._pixels = pixels
+        self._first, self._counts = mi.UInt32(first.astype(np.uint32)), mi.UInt32(counts.astype(np.uint32))
+        self._weight = to_device(paths.weight)
+        self._uv, self._length = mi.Point2f(*[to_device(paths.code[:, k]) for k in (0, 1)]), to_device(paths.code[:, 2])
+        self._places = [mi.UInt32(np.ascontiguousarray(one)) for one in self._vertices.places]
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the paths need on the device."""
+        return 24 * len(self._vertices) + self.count * (16 + 4 * len(self._places))
+
+    def codes(self, bsdfs: Sequence[Any], light: ProjectedLight) -> Floats:
+        """Return the light (codes, height, width) of each code of a region, for the BSDFs of the drawn finishes.
+
+        Each pixel sums its paths in their order, so that the same paths give the same bytes.
+        """
+        out = np.zeros((light.codes, self.roi.height * self.roi.width), np.float32)
+        if not self.count:
+            return out.reshape(light.codes, self.roi.height, self.roi.width)
+        factors = self._vertices.factors(bsdfs)
+        radiance = self._weight
+        for places in self._places:
+            radiance = radiance * dr.gather(mi.Float, factors, places)
+        dr.eval(radiance)
+        last = self._first + self._counts
+
+        def running(k: Any, *sums: Any) -> Any:
+            return k < last
+
+        def step(k: Any, *sums: Any) -> Any:
+            carried = dr.gather(mi.Float, radiance, k)
+            uv, length = dr.gather(mi.Point2f, self._uv, k), dr.gather(mi.Float, self._length, k)
+            values = light.values(uv, length, mi.Bool(True))
+            return (k + 1, *[s + carried * value for s, value in zip(sums, values, strict=True)])
+
+        start = (mi.UInt32(self._first), *[dr.zeros(mi.Float, len(self._pixels)) for _ in range(light.codes)])
+        _, *sums = dr.while_loop(start, running, step, label="kept_paths")
+        dr.eval(sums)
+        for row, values in zip(out, sums, strict=True):
+            row[self._pixels] = np.asarray(values)
+        return out.reshape(light.codes, self.roi.height, self.roi.width)
+
+
+def light_of(paths: Candidates, bsdfs: Sequence[Any]) -> NDArray[np.float64]:
+    """Return the radiance (n,) of each path for a code of 1, for the BSDFs of the drawn finishes."""
+    vertices = Vertices(paths.material, paths.toward)
+    factors = np.asarray(vertices.factors(bsdfs), np.float64)
+    return np.asarray(paths.weight * factors[vertices.places].prod(axis=0))
+
+
+def mattering(paths: Candidates, finishes: Sequence[Sequence[Any]], roi: Roi, count: int, seed: int) -> Candidates:
+    """Return about ``count`` of the paths, chosen by their light in some finishes, in the order of their pixels.
+
+    Parameters
+    ----------
+    paths
+        Candidates.
+    finishes
+        For each finish that may be drawn, the BSDFs of the drawn materials.
+    roi
+        Region of the pixels.
+    count
+        Expected number of paths.
+    seed
+        Of the choice.
+    """
+    size = np.zeros(len(paths))
+    for bsdfs in finishes:
+        size += light_of(paths, bsdfs) ** 2
+    size = np.sqrt(size / max(len(finishes), 1))
+    order = np.argsort(z_positions(paths.pixel % roi.width, paths.pixel // roi.width), kind="stable")
+    probability = np.minimum(size[order] / _threshold(size, count), 1.0)
+    reached = np.cumsum(probability) + np.random.default_rng(seed).random()
+    kept = np.flatnonzero(np.floor(reached) > np.floor(np.concatenate([[0.0], reached[:-1]])))
+    index = order[kept]
+    return paths.chosen(index, (paths.weight[index] / probability[kept]).astype(np.float32))
+
+
+def _threshold(size: NDArray[np.float64], count: int) -> float:
+    """Return t with sum min(1, c / t) = ``count`` for the sizes c; tiny if all can be kept."""
+    positive = np.sort(size[size > 0])[::-1]
+    if len(positive) <= count:
+        return float(positive[-1]) if len(positive) else 1.0
+    rest = np.cumsum(positive[::-1])[::-1]  # of this and all smaller ones
+    kept_whole = np.arange(len(positive))  # number of larger ones, kept with certainty
+    free = count - kept_whole
+    possible = free > 0
+    candidates = rest[possible] / free[possible]
+    # the first at which this one would be kept with a probability of 1 or less
+    return float(candidates[np.argmax(candidates >= positive[possible])])
+
+
+def broad(description: dict[str, Any]) -> dict[str, Any]:
+    """Return a finish to sample with, for a finish given by its description, that covers others about it.
+
+    Every lobe of microfacets becomes GGX of a larger width, whose tail decreases slowly, and a part of the light is
+    scattered to all sides. A coherent lobe keeps its width, which is that of the form of a face.
+    """
+    return {"type": "blendbsdf", "weight": _DIFFUSE_SHARE, "first": _wider(description), "second": _DIFFUSE}
+
+
+_DIFFUSE = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}
+
+#: share of the samples that go to all sides
+_DIFFUSE_SHARE = 0.2
+
+#: factor on the width of lobes
+_WIDER = 1.25
+
+
+def _wider(description: dict[str, Any]) -> dict[str, Any]:
+    out = {}
+    for key, value in description.items():
+        if key == "mirror" or not isinstance(value, dict):
+            out[key] = value
+        else:
+            out[key] = _wider(value)
+    if "distribution" in out:
+        out["distribution"] = "ggx"
+        for key in ("alpha", "alpha_u", "alpha_v"):
+            if key in out:
+                out[key] = min(_WIDER * out[key], 1.0)
+    return out
