@@ -173,7 +173,8 @@ def _reference_geometry(rig: Rig, settings: MatcherSettings, pattern: DotPattern
 def _reference(
     images: Images, geometry: ReferenceGeometry, settings: MatcherSettings, pattern: DotPattern
 ) -> PointCloud:
-    return decode_reference(images.first_images(1), geometry, settings, images.context(images.roi))
+    # a capture states the mask of the device that took it, which the device knows
+    return decode_reference(images.first_images(1), geometry.showing(pattern), settings, images.context(images.roi))
 
 
 def projector_size(capture: Capture) -> tuple[int, int]:

@@ -117,6 +117,17 @@ class PoseUnknowns(Document):
     told_deg: Annotated[float, Field(ge=0, le=2)] = 0.05
 
 
+class UnitUnknowns(Document):
+    """The device at hand, of all devices of its type.
+
+    ``mask`` of random dots: ``another`` for each device, since each has its own realisation of the pattern; ``own`` if
+    the sensor file has the mask of this device, by its ``seed``. Images of the user's own are always those of this
+    device. The fixed pattern of the imager is drawn in either case.
+    """
+
+    mask: Literal["another", "own"] = "another"
+
+
 class UnknownsTable(Document):
     """All groups of unknowns."""
 
@@ -126,6 +137,7 @@ class UnknownsTable(Document):
     light: LightUnknowns = LightUnknowns()
     temperature: TemperatureUnknowns = TemperatureUnknowns()
     pose: PoseUnknowns = PoseUnknowns()
+    unit: UnitUnknowns = UnitUnknowns()
 
 
 def unknowns_of(*tables: UnknownsTable) -> UnknownsTable:

@@ -38,6 +38,7 @@ from mitsim.scene.load import Scene, load_scene
 from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.scene.ray_casting.triangles import hull_corners
 from mitsim.sensor.exposure import PlannedExposure
+from mitsim.sensor.pattern import DotPattern, another_mask
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, Study
@@ -152,7 +153,7 @@ class RenderedMeasurements:
     def lit(self, view: View, drawn: DrawnValues) -> TracedLight:
         """Trace the light of one draw in a view, which all of its exposures share."""
         true, assumed = (motion.inverse() @ view.world_from_sensor for motion in (drawn.placed, drawn.assumed))
-        sensor = self.simulated.recalibrated(drawn.rig, drawn.unit)
+        sensor = self.simulated.recalibrated(drawn.rig, drawn.unit or None, self._mask(drawn.unit))
         scene = self._scene(drawn.finish)[0]
         if self.separate_light:
             shared = self._render_shared_light(sensor, true, view, drawn.finish, drawn.seed)
@@ -160,6 +161,12 @@ class RenderedMeasurements:
             shared = self._shared_with(view, drawn.finish)
         light = sensor.light(scene, true, seed=drawn.seed, rendering=replace(self.rendering, indirect=shared.indirect))
         return TracedLight(sensor, light, shared.room, drawn, assumed)
+
+    def _mask(self, unit: int) -> DotPattern | None:
+        """Return the mask of dots of a unit; None for that of the sensor file."""
+        pattern = self.study.sensor.pattern
+        redrawn = unit > 0 and self.unknowns.table.unit.mask == "another"
+        return another_mask(pattern, unit) if redrawn and isinstance(pattern, DotPattern) else None
 
     def exposed(self, lit: TracedLight, planned: PlannedExposure | None, seed: int, keep: bool = False) -> Capture:
         """Expose light as planned, or by the sensor's own rule.
