@@ -146,8 +146,8 @@ def allowed_images(
     """
     if technology not in ("active_stereo", "structured_light"):
         raise InputError(where, "pattern", f"images, for {technology}", "images for active_stereo or structured_light")
-    if pattern.count > 1 and matcher is not None and matcher.method != "correlation":
-        hint = 'set method = "correlation" in [matcher], which matches all images at once'
+    if pattern.count > 1 and matcher is not None and matcher.method == "sgbm":
+        hint = 'set method = "correlation" in [matcher], which matches all images at once, or "census"'
         raise InputError(where, "pattern", f"{pattern.count} images, for matcher.method {matcher.method}", "one", hint)
     return pattern
 
