@@ -34,6 +34,7 @@ from mitsim.decoding.matching.stereo import StereoGeometry, decode_stereo, stere
 from mitsim.decoding.structured_light.decoder import decode_structured_light
 from mitsim.decoding.structured_light.geometry import StructuredLightGeometry, structured_light_geometry
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
+from mitsim.decoding.structured_light.smoothing import smoothed_along_rays
 from mitsim.decoding.structured_light.two_cameras import cloud_of_pair, decode_structured_light_stereo
 from mitsim.decoding.time_of_flight import TimeOfFlightGeometry, decode_time_of_flight, time_of_flight_geometry
 from mitsim.sensor.camera import Rig
@@ -201,6 +202,12 @@ def _structured_light_geometry(rig: Rig, settings: DecoderSettings, code: LightC
 
 
 def _structured_light(
+    images: Images, geometry: StereoGeometry | StructuredLightGeometry, settings: DecoderSettings, code: LightCode
+) -> PointCloud:
+    return smoothed_along_rays(_structured_light_cloud(images, geometry, settings, code), settings.smoothing_px)
+
+
+def _structured_light_cloud(
     images: Images, geometry: StereoGeometry | StructuredLightGeometry, settings: DecoderSettings, code: LightCode
 ) -> PointCloud:
     size, coordinates = projector_size(images.capture), images.coordinates or {}

@@ -291,7 +291,7 @@ def test_a_statement_from_a_few_trials(coarse_n10, tmp_path):
     view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
     stated = session.state(view)
     assert [one.measurement for one in stated.statements] == list(study.task.measurements)
-    groups = budget_groups(session.unknowns, "render")
+    groups = budget_groups(session.unknowns, "render", study.sensor)
     assert "form" not in groups and {line.group for line in stated.statements[0].budget} <= set(groups)
     # a second start has nothing left to do, and says the same to the last bit
 

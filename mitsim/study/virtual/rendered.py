@@ -42,6 +42,7 @@ from mitsim.sensor.pattern import DotPattern, another_mask
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, Study
+from mitsim.study.virtual.drawn_decoder import drawn_decoder
 from mitsim.study.virtual.form import form_deviation
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.trials import Outcome
@@ -199,13 +200,17 @@ class RenderedMeasurements:
         )
         return replace(lit.sensor.expose(light, seed), rig=self.study.sensor.rig)
 
-    def unlabelled_cloud(self, capture: Capture) -> PointCloud:
-        """Decode a capture of this sensor with its nominal calibration, without path, temperature and form errors."""
+    def unlabelled_cloud(self, capture: Capture, decoder: int = 0) -> PointCloud:
+        """Decode a capture of this sensor with its nominal calibration, without path, temperature and form errors.
+
+        ``decoder`` is the seed of a drawn decoder, 0 for that of the sensor file.
+        """
         sensor = self.study.sensor
-        return capture_cloud(capture, sensor.settings, self.geometry, imager=sensor.imager)
+        settings = drawn_decoder(sensor, self.unknowns.table.decoder, decoder)
+        return capture_cloud(capture, settings, self.geometry, imager=sensor.imager)
 
     def _cloud(self, captured: _Captured) -> PointCloud:
-        scene, cloud = self.study.scene, self.unlabelled_cloud(captured.capture)
+        scene, cloud = self.study.scene, self.unlabelled_cloud(captured.capture, captured.drawn.decoder)
         points = displaced(cloud, captured.drawn, captured.assumed, scene.centre)
         if captured.surfaces is not None:
             form = self.unknowns.table.form.features
