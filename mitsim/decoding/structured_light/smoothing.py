@@ -1,6 +1,6 @@
 """Average the distances of neighbouring points, as makers of structured-light sensors do.
 
-Signal chain: cloud -> inverse distance of each point along its ray -> Gaussian mean over the decoded neighbours on the
+Signal chain: cloud -> inverse depth of each point along the axis of the grid -> Gaussian mean over the decoded neighbours on the
 same surface -> points on the same rays.
 
 On a plane the inverse depth is linear in the image, so that a symmetric mean keeps its place (Hartley and Zisserman,
@@ -16,7 +16,7 @@ import numpy as np
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
 
-#: relative difference of distances beyond which neighbours belong to different surfaces; assumed
+#: relative difference of depths beyond which neighbours belong to different surfaces; assumed
 _STEP = 0.01
 
 #: radius of the mean in its standard deviations
@@ -34,7 +34,7 @@ def smoothed_along_rays(cloud: PointCloud, width_px: float) -> PointCloud:
         return cloud
     inside = region.slices
     ray = cloud.points[inside].astype(float) - cloud.grid.origin
-    inverse = 1 / np.linalg.norm(ray, axis=-1)
+    inverse = 1 / (ray @ cloud.grid.rotation[:, 2])
     height, width = inverse.shape
     reach = int(np.ceil(_REACH * width_px))
     padded = np.pad(inverse, reach, constant_values=np.nan)
@@ -52,7 +52,7 @@ def smoothed_along_rays(cloud: PointCloud, width_px: float) -> PointCloud:
             weights += weight * near
             squares += weight**2 * near
     with np.errstate(invalid="ignore", divide="ignore"):
-        scale = weights / total * inverse  # new distance over the old one
+        scale = weights / total * inverse  # new depth over the old one
         noise = np.sqrt(squares) / weights
     points, sigma = cloud.points.copy(), None if cloud.sigma is None else cloud.sigma.copy()
     points[inside] = cloud.grid.origin + ray * scale[..., None]
