@@ -274,9 +274,8 @@ def _check_dots(file: SensorFile) -> None:
     if len(file.cameras) != cameras or file.matcher is None or file.decoder is not None:
         number = {1: "one camera", 2: "two cameras"}[cameras]
         raise ValueError(f"{file.technology} needs {number} and [matcher], and has no [decoder]")
-    own = isinstance(file.pattern, ImageFolder) and file.technology == "active_stereo"
-    if file.pattern is not None and not isinstance(file.pattern, DotPattern) and not own:
-        kinds = "random_dots, diffraction_spots or images" if cameras == 2 else "random_dots or diffraction_spots"
+    if file.pattern is not None and not isinstance(file.pattern, DotPattern | ImageFolder):
+        kinds = "random_dots, diffraction_spots or images"
         raise ValueError(f"{file.technology} needs a pattern of kind {kinds}, not {file.pattern.kind}")
     if (
         isinstance(file.pattern, DotPattern)

@@ -36,7 +36,11 @@ from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import DotPattern, dot_frames
 from mitsim.sensor.point_spread import point_spread
+from mitsim.sensor.projector_images import ImagesDescription, ProjectorImages, described
 from mitsim.sensor.transforms import Transform
+
+#: a pattern of dots, or the image of one unit's mask
+Mask = DotPattern | ProjectorImages
 
 #: number of samples of the reference along each side of a pixel
 _SAMPLES_PER_SIDE = 3
@@ -56,7 +60,7 @@ class ReferenceGeometry:
     reference
         (H, W) 0..1 on the rectified grid.
     pattern
-        The pattern of dots in the reference.
+        The mask of dots in the reference.
     samples
         (n, 2, H * W) projector rows and columns [px] that are averaged in each pixel of the reference.
     projector_size
@@ -67,7 +71,7 @@ class ReferenceGeometry:
 
     pair: StereoGeometry
     reference: NDArray[np.float32]
-    pattern: DotPattern
+    pattern: Mask
     samples: NDArray[np.float32]
     projector_size: tuple[int, int]
     blur_px: float
@@ -87,21 +91,29 @@ class ReferenceGeometry:
         """(3,) unit vector from camera to projector in the sensor frame."""
         return self.pair.baseline
 
-    def showing(self, pattern: DotPattern) -> ReferenceGeometry:
-        """Return the geometry for another mask of dots: that of another device of the same type."""
-        if pattern == self.pattern:
+    def showing(self, pattern: DotPattern | ImagesDescription) -> ReferenceGeometry:
+        """Return the geometry for another mask of dots: that of another device of the same type.
+
+        Raises
+        ------
+        InputError
+            If the mask is an image of which only the description is known.
+        """
+        if pattern == described(self.pattern):
             return self
+        if isinstance(pattern, ImagesDescription):
+            raise unknown_mask()
         image = _reference_image(pattern, self.projector_size, self.samples, self.reference.shape, self.blur_px)
         return replace(self, reference=image, pattern=pattern)
 
 
-def reference_geometry(rig: Rig, pattern: DotPattern, reference_mm: float, blur_px: float = 0.5) -> ReferenceGeometry:
+def reference_geometry(rig: Rig, pattern: Mask, reference_mm: float, blur_px: float = 0.5) -> ReferenceGeometry:
     """Rectify the camera of a rig toward its projector, and compute its reference image.
 
     Parameters
     ----------
     rig, pattern
-        The rig with its projector, and the pattern of dots.
+        The rig with its projector, and the mask of dots: a pattern, or an image of the user's own.
     reference_mm
         Depth Z0 of the reference plane along the axis of the rectified camera [mm].
     blur_px
@@ -167,15 +179,22 @@ def reference_geometry(rig: Rig, pattern: DotPattern, reference_mm: float, blur_
     return ReferenceGeometry(replace(pair, seen_right=seen), reference, pattern, samples, size, blur_px)
 
 
+def unknown_mask() -> InputError:
+    """Return the error that the image of a mask is in the sensor file, not in the capture."""
+    return InputError(
+        "capture", "pattern", "an image of the user's own", "the mask itself", "name the sensor file that has it: --sensor"
+    )
+
+
 def _reference_image(
-    pattern: DotPattern,
+    pattern: Mask,
     size: tuple[int, int],
     samples: NDArray[np.float32],
     shape: tuple[int, ...],
     blur_px: float,
 ) -> NDArray[np.float32]:
     """Return the image (H, W) of a pattern at the samples (n, 2, H * W) of each pixel, blurred by the lens."""
-    field = dot_frames(pattern, *size)[0]
+    field = pattern.patterns()[0] if isinstance(pattern, ProjectorImages) else dot_frames(pattern, *size)[0]
     image = np.mean([map_coordinates(field, each, order=1, mode="constant") for each in samples], axis=0)
     kernel = point_spread(blur_px)
     blurred = cv2.sepFilter2D(
