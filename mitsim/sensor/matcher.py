@@ -14,8 +14,9 @@ class MatcherSettings(DepthSettings):
 
     - ``near_mm``, ``far_mm``: range of accepted depths along the axis of the rectified left camera.
     - ``method``: ``sgbm`` of one frame; ``census`` (semi-global matching of codes) or ``correlation`` of all frames at
-      once. ``contrast_window_px``, ``mode`` and ``prefilter_cap`` apply to ``sgbm`` only; ``p1`` and ``p2`` not to
+      once. ``contrast_window_px`` and ``prefilter_cap`` apply to ``sgbm`` only; ``p1``, ``p2`` and ``mode`` not to
       ``correlation``.
+    - ``mode``: paths of semi-global matching. ``hh``: all eight. ``sgbm``: one pass, five; ``3way``: one pass, three.
     - ``contrast_window_px``: odd window over which local brightness and contrast are equalised before matching; 0 for
       none.
     - ``census_window_px``, odd: side of the window of a census code.
@@ -27,7 +28,8 @@ class MatcherSettings(DepthSettings):
     - ``minimum_contrast_dn``: least standard deviation in the neighbourhood of an accepted match [DN of 8 bit, that is
       1/255 of full scale].
     - ``sub_pixel``: fit between whole disparities. ``method`` is that of the method: a parabola, for ``correlation`` a
-      closed form. ``parabola`` and ``equiangular`` (two lines) of three costs; ``sgbm`` has the parabola only.
+      closed form. ``parabola`` and ``equiangular`` (two lines) of three costs. ``sgbm`` has the parabola only, with
+      corrected steps; ``opencv`` leaves its disparities as OpenCV rounds them.
     - ``median_px``: side of a median filter of the disparities; 0 for none.
     - ``speckle_px``: regions of up to so many pixels are removed, 0 for none; neighbours within ``speckle_range_px`` of
       disparity belong to one region.
@@ -49,7 +51,7 @@ class MatcherSettings(DepthSettings):
     mode: Literal["hh", "sgbm", "3way"] = "hh"
     prefilter_cap: int = Field(default=63, ge=1, le=127)
     minimum_contrast_dn: float = Field(default=1.5, ge=0)
-    sub_pixel: Literal["method", "parabola", "equiangular"] = Field(default="method", repr=False)
+    sub_pixel: Literal["method", "parabola", "equiangular", "opencv"] = Field(default="method", repr=False)
     median_px: Literal[0, 3, 5, 7] = Field(default=0, repr=False)
     speckle_px: int = Field(default=0, ge=0, le=100_000, repr=False)
     speckle_range_px: float = Field(default=1.0, gt=0, le=100, repr=False)
@@ -85,6 +87,7 @@ class MatcherSettings(DepthSettings):
     def _check_method(self) -> MatcherSettings:
         if self.block_size < 3 and self.method != "census":
             raise ValueError(f"block_size from 3 for method {self.method}")
-        if self.sub_pixel == "equiangular" and self.method == "sgbm":
-            raise ValueError("sub_pixel method or parabola for method sgbm")
+        other = ("equiangular",) if self.method == "sgbm" else ("opencv",)
+        if self.sub_pixel in other:
+            raise ValueError(f"another sub_pixel than {self.sub_pixel} for method {self.method}")
         return self

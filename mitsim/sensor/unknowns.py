@@ -171,9 +171,10 @@ class DecoderUnknowns(Document):
     - ``methods`` of two cameras: several frames are not matched by ``sgbm``. One camera keeps its method.
     - ``blocks_px`` of ``sgbm``, ``sums_px`` of ``census``; ``block_factor`` of the sensor's own block for
       ``correlation``.
-    - ``census_windows_px``, ``contrast_windows_px``, ``prefilter_caps``, ``p1``, ``p2_over_p1``,
+    - ``census_windows_px``, ``contrast_windows_px``, ``prefilter_caps``, ``modes``, ``p1``, ``p2_over_p1``,
       ``uniqueness_percent``, ``left_right_px``, ``sub_pixel``, ``medians_px``, ``speckles_px``,
-      ``disparity_steps_px``: as in :class:`mitsim.sensor.matcher.MatcherSettings`.
+      ``disparity_steps_px``: as in :class:`mitsim.sensor.matcher.MatcherSettings`. A method draws among the sub-pixel
+      fits that it has.
     - ``thresholds``: factor of the sensor's least contrast or modulation, and of the uniqueness of ``correlation``.
     - ``smoothings_px`` of structured light.
 
@@ -187,12 +188,18 @@ class DecoderUnknowns(Document):
     block_factor: Factors = (0.6, 1.4)
     census_windows_px: list[Literal[3, 5, 7, 9]] = [5, 7, 9]
     contrast_windows_px: list[ContrastWindow] = [0, 11]
-    prefilter_caps: list[Annotated[int, Field(ge=1, le=127)]] = [31, 63]
+    prefilter_caps: list[Annotated[int, Field(ge=1, le=127)]] = [15, 31, 63]
+    modes: list[Literal["hh", "sgbm", "3way"]] = ["hh", "sgbm", "3way"]
     p1: Factors = (4.0, 16.0)
     p2_over_p1: Annotated[Factors, AfterValidator(_from_one)] = (2.0, 8.0)
     uniqueness_percent: Annotated[tuple[Percent, Percent], AfterValidator(_in_order)] = (5.0, 15.0)
     left_right_px: Annotated[tuple[NotNegative, NotNegative], AfterValidator(_in_order)] = (0.5, 2.0)
-    sub_pixel: list[Literal["method", "parabola", "equiangular"]] = ["method", "parabola", "equiangular"]
+    sub_pixel: list[Literal["method", "parabola", "equiangular", "opencv"]] = [
+        "method",
+        "parabola",
+        "equiangular",
+        "opencv",
+    ]
     medians_px: list[Literal[0, 3, 5, 7]] = [0, 3, 5]
     speckles_px: list[Annotated[int, Field(ge=0, le=100_000)]] = [0, 100]
     disparity_steps_px: list[Annotated[float, Field(ge=0, le=1)]] = []

@@ -88,6 +88,31 @@ def test_brightness_and_contrast_of_one_eye_do_not_matter(gain, offset):
     assert np.nanmean(np.abs(other[inner] - plain[inner])) < 0.05
 
 
+def sloping(down: float) -> tuple[np.ndarray, np.ndarray]:
+    """A pair whose disparity changes by ``down`` from row to row, 17 px in the middle row."""
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
+    smooth = gaussian_filter(np.random.default_rng(4).standard_normal((HEIGHT, WIDTH + 120)), 1.2, mode="wrap")
+    values = 120 + 30 * smooth / smooth.std()
+    disparity = 17 + down * (rows - HEIGHT / 2)
+    images = (map_coordinates(values, [rows, columns + 40 + shift], order=5) for shift in (0.0, disparity))
+    return tuple(np.clip(np.rint(each), 0, 255).astype(np.uint8)[None] for each in images)
+
+
+def test_one_pass_follows_a_slope_late_and_eight_paths_do_not():
+    truth = {down: (17 + down * (np.arange(HEIGHT) - HEIGHT / 2))[8:-8, None] for down in (0.12, -0.12)}
+    mean = {
+        (mode, down): np.nanmean(matched(sloping(down), mode=mode).disparity[8:-8, 50:-10] - truth[down])
+        for mode in ("hh", "sgbm", "3way")
+        for down in truth
+    }
+    for mode in ("sgbm", "3way"):  # behind the rows above: too small where disparity grows, too large where it falls
+        assert mean[mode, 0.12] < -0.015 and mean[mode, -0.12] > 0.015
+        assert abs(mean["hh", 0.12]) < 0.5 * abs(mean[mode, 0.12])
+    images = sloping(0.12)
+    one_pass, bands = matched(images, mode="3way"), matched(images, mode="3way", budget=4e5)
+    np.testing.assert_array_equal(one_pass.disparity, bands.disparity)
+
+
 def test_bands_change_nothing():
     images = drawn(18.6)
     whole, bands = matched(images), matched(images, budget=4e5)
@@ -128,6 +153,7 @@ def test_offsets_of_minima_are_exact_for_their_own_shape():
 def test_settings_that_a_method_does_not_have_are_refused():
     with pytest.raises(ValidationError, match="block_size"):
         MatcherSettings(near_mm=1, far_mm=2, block_size=1)
-    with pytest.raises(ValidationError, match="sub_pixel"):
-        MatcherSettings(near_mm=1, far_mm=2, sub_pixel="equiangular")
+    for method, fit in (("sgbm", "equiangular"), ("census", "opencv"), ("correlation", "opencv")):
+        with pytest.raises(ValidationError, match="sub_pixel"):
+            MatcherSettings(near_mm=1, far_mm=2, method=method, sub_pixel=fit)
     assert MatcherSettings(near_mm=1, far_mm=2, method="census", block_size=1).support_px == 7

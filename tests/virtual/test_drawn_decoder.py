@@ -38,11 +38,12 @@ def test_drawn_matchers_lie_inside_the_stated_ranges(name):
             assert within(ranges.uniqueness_percent, one.uniqueness_percent)
         assert one.median_px in ranges.medians_px and one.speckle_px in ranges.speckles_px
         assert one.disparity_step in (ranges.disparity_steps_px or [own.disparity_step])
-        assert one.census_window_px in ranges.census_windows_px
+        assert one.census_window_px in ranges.census_windows_px and one.mode in ranges.modes
         assert (one.near_mm, one.far_mm, one.reference_mm) == (own.near_mm, own.far_mm, own.reference_mm)
     # every choice occurs: one of two is missing in 120 draws with a probability of 2^-119, one of four with 1e-15
     assert {one.method for one in drawn} == set(ranges.methods)
     assert {one.median_px for one in drawn} == set(ranges.medians_px)
+    assert {one.mode for one in drawn} == set(ranges.modes)
     middle = np.mean([math.log(one.p1) for one in drawn])
     spread = math.log(ranges.p1[1] / ranges.p1[0]) / math.sqrt(12)
     assert abs(middle - np.mean(np.log(ranges.p1))) < 4 * spread / math.sqrt(len(drawn))

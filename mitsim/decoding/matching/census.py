@@ -1,8 +1,8 @@
 """Match a rectified pair by census codes and semi-global matching, as depth cameras do in hardware.
 
 Signal chain: 8-bit strips of both images, a stack of frames each -> code of each pixel: which pixels of a window are
-darker than its middle -> number of different bits at each disparity, summed over the frames and over a block -> eight
-paths (:mod:`mitsim.decoding.matching.sgbm_bands`) -> best disparity, uniqueness, sub-pixel step, and the best left match
+darker than its middle -> number of different bits at each disparity, summed over the frames and over a block -> paths
+(:mod:`mitsim.decoding.matching.sgbm_bands`) -> best disparity, uniqueness, sub-pixel step, and the best left match
 of each right pixel by the same sums -> :class:`~mitsim.decoding.matching.sgbm.Matches`.
 
 Sources: Zabih and Woodfill, ECCV 1994, for the code; Hirschmueller, IEEE PAMI 30(2), 2008, for the paths. A code does
@@ -119,7 +119,7 @@ def match_census_both_ways(
     back = np.full((height, width + 2 * count), np.nan, np.float32)
     exists = (source - first >= 0) & (source - first < whole)
     rows = rows_in_budget(budget, height, width, count)
-    for row, total in summed_paths(BlockCosts(_CensusCosts(reference, other, count), penalties), rows):
+    for row, total in summed_paths(BlockCosts(_CensusCosts(reference, other, count), penalties), rows, settings.mode):
         found[row] = _best_disparities(total, penalties.uniqueness, fit)
         back[row, : width + count][exists] = _best_of_right(total)[exists]
         del total  # a view of a whole band, which would live on beside the next

@@ -208,7 +208,7 @@ def _best_disparities(
     best = score.argmax(axis=axis)
     beside = [np.expand_dims(np.clip(best + step, 0, count - 1), axis) for step in (-1, 0, 1)]
     lower, peak, upper = (np.take_along_axis(score, k, axis=axis).squeeze(axis) for k in beside)
-    if settings.sub_pixel == "method":
+    if settings.sub_pixel in ("method", "opencv"):
         step = _sub_pixel((lower, peak, upper), best, variance, lag, count, noisy_right)
     else:
         inside = (best > 0) & (best < count - 1)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import cv2
 import numpy as np
@@ -26,6 +26,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 Costs = NDArray[np.int16]
+Mode = Literal["hh", "sgbm", "3way"]
 
 #: largest cost of a pixel: 2 x 127 from the gradient, and a quarter of 255 grey levels
 _LARGEST_PIXEL_COST = 2 * 127 + 63
@@ -144,9 +145,14 @@ class PixelCosts(Protocol):
         """Return the costs (w, count) of a row."""
 
 
-def summed_paths(images: BlockCosts, band_rows: int) -> Iterator[tuple[int, Costs]]:
-    """Yield each row, in any order, with the sum (w, count) of its eight paths, in bands of rows."""
+def summed_paths(images: BlockCosts, band_rows: int, mode: Mode = "hh") -> Iterator[tuple[int, Costs]]:
+    """Yield each row, in any order, with the sum (w, count) of its paths, in bands of rows.
+
+    ``mode``: all eight paths for ``hh``. One pass over the image, as in hardware, has none from below: both along the
+    row and the three from above for ``sgbm``, or the one straight from above for ``3way``.
+    """
     height = images.pixels.height
+    from_above, from_below = (1,) if mode == "3way" else (0, 1, 2), mode == "hh"
     begins = list(range(0, height, band_rows))
     saved = []
     above = images.zero_paths()
@@ -156,7 +162,7 @@ def summed_paths(images: BlockCosts, band_rows: int) -> Iterator[tuple[int, Cost
         if begin == begins[-1]:
             break
         for cost in images.costs(begin, begin + band_rows):
-            above.advance(cost, images.penalties, scratch)
+            above.advance(cost, images.penalties, scratch, from_above)
     below = images.zero_paths()
     for begin in reversed(begins):
         end = min(begin + band_rows, height)
@@ -164,10 +170,11 @@ def summed_paths(images: BlockCosts, band_rows: int) -> Iterator[tuple[int, Cost
         total = _horizontal_paths(cost, images.penalties)
         above = saved.pop()
         for row in range(end - begin):
-            above.advance(cost[row], images.penalties, scratch, total[row])
+            above.advance(cost[row], images.penalties, scratch, from_above, total[row])
         del above
         for row in reversed(range(end - begin)):
-            below.advance(cost[row], images.penalties, scratch, total[row])
+            if from_below:
+                below.advance(cost[row], images.penalties, scratch, from_above, total[row])
             yield begin + row, total[row]
         del cost, total
 
@@ -185,10 +192,17 @@ class _Paths:
     def copy(self) -> _Paths:
         return _Paths(self.paths.copy(), self.least.copy())
 
-    def advance(self, cost: Costs, penalties: Penalties, scratch: Costs, total: Costs | None = None) -> None:
+    def advance(
+        self,
+        cost: Costs,
+        penalties: Penalties,
+        scratch: Costs,
+        directions: tuple[int, ...],
+        total: Costs | None = None,
+    ) -> None:
         """Advance to the next row with the given cost (w, count), and add the paths to a total (w, count)."""
         width = len(cost)
-        for direction in range(3):
+        for direction in directions:
             before = slice(direction, direction + width)
             path = _next_path_costs(
                 self.paths[direction, before], self.least[direction, before], cost, penalties, scratch

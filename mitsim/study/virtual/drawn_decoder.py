@@ -94,7 +94,8 @@ def _matcher(
     if method == "correlation":  # it compares other numbers than costs
         own = settings.uniqueness_percent if settings.method == "correlation" else 15
         uniqueness = min(round(own * factor), 100)
-    sub_pixel = draw.one_of(unknowns.sub_pixel, "method")
+    foreign = {"sgbm": ("parabola", "equiangular"), "census": ("method", "opencv"), "correlation": ("opencv",)}[method]
+    sub_pixel = draw.one_of([fit for fit in unknowns.sub_pixel if fit not in foreign], "method")
     return {
         "method": method,
         "block_size": max(blocks[method], 3 if method != "census" else 1),
@@ -105,7 +106,8 @@ def _matcher(
         "left_right_px": draw.between(unknowns.left_right_px),
         "contrast_window_px": draw.one_of(unknowns.contrast_windows_px, settings.contrast_window_px),
         "prefilter_cap": draw.one_of(unknowns.prefilter_caps, settings.prefilter_cap),
-        "sub_pixel": "method" if method == "sgbm" else sub_pixel,
+        "mode": draw.one_of(unknowns.modes, settings.mode),
+        "sub_pixel": sub_pixel,
         "median_px": draw.one_of(unknowns.medians_px, settings.median_px),
         "speckle_px": draw.one_of(unknowns.speckles_px, settings.speckle_px),
         "disparity_step": draw.one_of(unknowns.disparity_steps_px, settings.disparity_step),
@@ -133,8 +135,11 @@ def decoder_numbers(settings: Settings) -> dict[str, float]:
         "left_right": settings.left_right_px,
         "contrast": float(settings.method == "sgbm" and settings.contrast_window_px > 0),
         "cap": float(settings.prefilter_cap),
+        "one_pass": float(settings.method != "correlation" and settings.mode != "hh"),
+        "three_paths": float(settings.method != "correlation" and settings.mode == "3way"),
         "equiangular": float(settings.sub_pixel == "equiangular"),
-        "parabola": float(settings.sub_pixel == "parabola"),
+        "parabola": float(settings.method == "correlation" and settings.sub_pixel == "parabola"),
+        "opencv": float(settings.sub_pixel == "opencv"),
         "median": float(settings.median_px),
         "speckle": float(settings.speckle_px > 0),
         "step": settings.disparity_step,
