@@ -282,7 +282,9 @@ def _check_dots(file: SensorFile) -> None:
         and file.pattern.frames > 1
         and (file.matcher.method == "sgbm" or file.technology != "active_stereo")
     ):
-        raise ValueError('pattern.shifts_px needs technology "active_stereo" and matcher.method "correlation" or "census"')
+        raise ValueError(
+            'pattern.shifts_px needs technology "active_stereo" and matcher.method "correlation" or "census"'
+        )
     if (file.matcher.reference_mm is None) == (file.technology == "reference_stereo"):
         raise ValueError("matcher.reference_mm is for reference_stereo, which needs it")
 

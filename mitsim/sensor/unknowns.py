@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from characterisation.files.documents import Document
 from mitsim.sensor.drift import Drift
@@ -182,29 +182,34 @@ class DecoderUnknowns(Document):
     """
 
     known: bool = False
-    methods: list[Literal["sgbm", "census", "correlation"]] = ["sgbm", "census", "correlation"]
-    blocks_px: list[OddBlock] = [5, 7, 9, 11]
-    sums_px: list[OddSum] = [1, 3, 5]
+    methods: list[Literal["sgbm", "census", "correlation"]] = Field(
+        default=["sgbm", "census", "correlation"], max_length=20
+    )
+    blocks_px: list[OddBlock] = Field(default=[5, 7, 9, 11], max_length=20)
+    sums_px: list[OddSum] = Field(default=[1, 3, 5], max_length=20)
     block_factor: Factors = (0.6, 1.4)
-    census_windows_px: list[Literal[3, 5, 7, 9]] = [5, 7, 9]
-    contrast_windows_px: list[ContrastWindow] = [0, 11]
-    prefilter_caps: list[Annotated[int, Field(ge=1, le=127)]] = [15, 31, 63]
-    modes: list[Literal["hh", "sgbm", "3way"]] = ["hh", "sgbm", "3way"]
+    census_windows_px: list[Literal[3, 5, 7, 9]] = Field(default=[5, 7, 9], max_length=20)
+    contrast_windows_px: list[ContrastWindow] = Field(default=[0, 11], max_length=20)
+    prefilter_caps: list[Annotated[int, Field(ge=1, le=127)]] = Field(default=[15, 31, 63], max_length=20)
+    modes: list[Literal["hh", "sgbm", "3way"]] = Field(default=["hh", "sgbm", "3way"], max_length=20)
     p1: Factors = (4.0, 16.0)
     p2_over_p1: Annotated[Factors, AfterValidator(_from_one)] = (2.0, 8.0)
     uniqueness_percent: Annotated[tuple[Percent, Percent], AfterValidator(_in_order)] = (5.0, 15.0)
     left_right_px: Annotated[tuple[NotNegative, NotNegative], AfterValidator(_in_order)] = (0.5, 2.0)
-    sub_pixel: list[Literal["method", "parabola", "equiangular", "opencv"]] = [
-        "method",
-        "parabola",
-        "equiangular",
-        "opencv",
-    ]
-    medians_px: list[Literal[0, 3, 5, 7]] = [0, 3, 5]
-    speckles_px: list[Annotated[int, Field(ge=0, le=100_000)]] = [0, 100]
-    disparity_steps_px: list[Annotated[float, Field(ge=0, le=1)]] = []
+    sub_pixel: list[Literal["method", "parabola", "equiangular", "opencv"]] = Field(
+        default=["method", "parabola", "equiangular", "opencv"], max_length=20
+    )
+    medians_px: list[Literal[0, 3, 5, 7]] = Field(default=[0, 3, 5], max_length=20)
+    speckles_px: list[Annotated[int, Field(ge=0, le=100_000)]] = Field(default=[0, 100], max_length=20)
+    disparity_steps_px: list[Annotated[float, Field(ge=0, le=1)]] = Field(default=[], max_length=20)
     thresholds: Factors = (0.5, 2.0)
-    smoothings_px: list[Annotated[float, Field(ge=0, le=10)]] = []
+    smoothings_px: list[Annotated[float, Field(ge=0, le=10)]] = Field(default=[], max_length=20)
+
+    @model_validator(mode="after")
+    def _check_penalties(self) -> DecoderUnknowns:
+        if self.p1[1] * self.p2_over_p1[1] > 1000:
+            raise ValueError("p1 times p2_over_p1 up to 1000, the largest p2")
+        return self
 
 
 class UnknownsTable(Document):

@@ -3,8 +3,8 @@
     python tests/benchmarks/decoders.py [scene.xml] [masks]
 
 The part is rendered with the preset's own mask of dots and with those of other units, with the same noise. Every
-capture is decoded by the preset's own matcher, by census codes of 7 x 7 px, by correlation, and by OpenCV's SGBM with the
-settings of OpenCV's sample and blocks of 5 to 11 px. The columns are:
+capture is decoded by the preset's own matcher, by census codes of 7 x 7 px, by correlation, and by OpenCV's SGBM with
+the settings of OpenCV's sample and blocks of 5 to 11 px. The columns are:
 
 - points recovered on the plate and on the pillars, of the pixels of the left camera that show them,
 - mean height of the plate's points [mm] with the preset's mask, the mean over masks, and the standard deviation of the

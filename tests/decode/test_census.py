@@ -113,6 +113,12 @@ def test_one_pass_follows_a_slope_late_and_eight_paths_do_not():
     np.testing.assert_array_equal(one_pass.disparity, bands.disparity)
 
 
+def test_large_blocks_of_many_frames_do_not_overflow():
+    found = matched(drawn(15.0, 6), block_size=15, census_window_px=9, p1=100, p2=1000).disparity[12:-12, 50:-16]
+    assert np.isfinite(found).mean() > 0.97
+    assert np.abs(found - 15).max() < 0.5
+
+
 def test_bands_change_nothing():
     images = drawn(18.6)
     whole, bands = matched(images), matched(images, budget=4e5)

@@ -55,9 +55,7 @@ def test_a_matcher_applies_its_filters_to_the_points_it_accepts():
     filtered = decode(
         rig,
         images,
-        SETTINGS.model_copy(
-            update={"uniqueness_percent": 0, "p1": 0.1, "p2": 0.2, "median_px": 5, "speckle_px": 60}
-        ),
+        SETTINGS.model_copy(update={"uniqueness_percent": 0, "p1": 0.1, "p2": 0.2, "median_px": 5, "speckle_px": 60}),
     )
     assert not (filtered.valid & ~plain.valid).any()
     assert filtered.valid.sum() > 0.9 * plain.valid.sum()

@@ -30,7 +30,9 @@ def test_drawn_matchers_lie_inside_the_stated_ranges(name):
         assert one.method in ranges.methods
         blocks = {"sgbm": ranges.blocks_px, "census": ranges.sums_px}.get(one.method)
         assert one.block_size % 2 == 1
-        assert within(ranges.block_factor, one.block_size / own.block_size) if blocks is None else one.block_size in blocks
+        assert (
+            within(ranges.block_factor, one.block_size / own.block_size) if blocks is None else one.block_size in blocks
+        )
         assert within(ranges.p1, one.p1) and within(ranges.p2_over_p1, one.p2 / one.p1)
         assert within(ranges.thresholds, one.minimum_contrast_dn / own.minimum_contrast_dn)
         assert within(ranges.left_right_px, one.left_right_px)
@@ -87,10 +89,18 @@ def test_fringe_decoders_draw_their_threshold_and_a_stated_smoothing():
 def test_an_empty_list_keeps_the_setting_and_a_study_narrows_the_sensors_ranges():
     sensor = load_sensor("ensenso-n10")
     lists = ("methods", "blocks_px", "contrast_windows_px", "prefilter_caps", "medians_px", "speckles_px", "sub_pixel")
-    kept = DecoderUnknowns.model_validate(dict.fromkeys(lists, []))
+    kept = DecoderUnknowns.model_validate({key: [] for key in lists})
     for seed in SEEDS[:20]:
         one = drawn_decoder(sensor, kept, seed)
-        for key in ("method", "block_size", "contrast_window_px", "prefilter_cap", "median_px", "speckle_px", "sub_pixel"):
+        for key in (
+            "method",
+            "block_size",
+            "contrast_window_px",
+            "prefilter_cap",
+            "median_px",
+            "speckle_px",
+            "sub_pixel",
+        ):
             assert getattr(one, key) == getattr(sensor.matcher, key)
     narrower = type(sensor.unknowns).model_validate({"decoder": {"blocks_px": [7]}})
     table = unknowns_of(sensor.unknowns, narrower).decoder
@@ -101,7 +111,14 @@ def test_an_empty_list_keeps_the_setting_and_a_study_narrows_the_sensors_ranges(
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("p1", [8, 4]), ("p2_over_p1", [0.5, 4]), ("blocks_px", [6]), ("contrast_windows_px", [3]), ("methods", ["bm"])],
+    [
+        ("p1", [8, 4]),
+        ("p1", [8, 400]),
+        ("p2_over_p1", [0.5, 4]),
+        ("blocks_px", [6]),
+        ("contrast_windows_px", [3]),
+        ("methods", ["bm"]),
+    ],
 )
 def test_ranges_that_no_matcher_can_have_are_refused(key, value):
     with pytest.raises(ValueError, match=key):

@@ -226,7 +226,10 @@ def test_another_unit_has_another_mask_unless_the_file_has_its_own(coarse_n10):
 
 def test_masks_of_other_units_share_the_kernels(coarse_n10):
     sensor = SimulatedSensor(load_sensor(coarse_n10))
-    scene, pose = load_scene(SCENES / "matt_white.xml", 850.0), look_at((0.0, -300.0, 450.0), (0.0, 0.0, 20.0), (0, 0, 1))
+    scene, pose = (
+        load_scene(SCENES / "matt_white.xml", 850.0),
+        look_at((0.0, -300.0, 450.0), (0.0, 0.0, 20.0), (0, 0, 1)),
+    )
 
     def kernels_of(one):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

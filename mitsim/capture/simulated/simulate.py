@@ -95,8 +95,8 @@ class SimulatedSensor:
     def recalibrated(self, rig: Rig, unit: int | None = None, mask: DotPattern | None = None) -> SimulatedSensor:
         """Return a sensor of the same type with a calibration close to this one's.
 
-        Without another mask, the patterns of the projector are shared: they need most memory on the device. Speckle is still drawn for the
-        pixels of this sensor's rig, because a small change does not affect its statistics.
+        Without another mask, the patterns of the projector are shared: they need most memory on the device. Speckle is
+        still drawn for the pixels of this sensor's rig, because a small change does not affect its statistics.
 
         Parameters
         ----------

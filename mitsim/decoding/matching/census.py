@@ -14,6 +14,8 @@ terms of which authors state them.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
@@ -61,9 +63,9 @@ def census_words(image: NDArray[np.uint8], window: int) -> list[Words]:
 class _CensusCosts:
     """Number of different bits of the codes of both images, over all words."""
 
-    def __init__(self, reference: list[Words], other: list[Words], count: int) -> None:
+    def __init__(self, reference: list[Words], other: list[Words], count: int, shift: int) -> None:
         self.height, self.width, self.count = len(reference[0]), reference[0].shape[1] - count, count
-        self.reference = reference
+        self.reference, self.shift = reference, shift
         self.compared = [beside_each_other(each, count) for each in other]
 
     def row(self, row: int) -> Costs:
@@ -71,7 +73,7 @@ class _CensusCosts:
         total = np.zeros((self.width, self.count), np.int16)
         for one, other in zip(self.reference, self.compared, strict=True):
             total += np.bitwise_count(one[row, self.count :, None] ^ other[row])
-        return total
+        return total >> self.shift
 
 
 def match_census_both_ways(
@@ -109,7 +111,9 @@ def match_census_both_ways(
         [word[:, np.clip(at, 0, whole - 1)] for frame in frames for word in census_words(frame, window)]
         for frames, at in ((left, source), (right, source - first))
     )
-    scale = settings.block_size**2 * len(left) * (window**2 - 1) / _BITS
+    bits = settings.block_size**2 * len(left) * (window**2 - 1)
+    shift = _shift(bits, (settings.p1 + settings.p2) * bits / _BITS)
+    scale = bits / _BITS / 2**shift
     p1 = max(round(settings.p1 * scale), 1)
     penalties = Penalties(
         settings.block_size, p1, max(round(settings.p2 * scale), p1 + 1), 0, settings.uniqueness_percent
@@ -119,12 +123,23 @@ def match_census_both_ways(
     back = np.full((height, width + 2 * count), np.nan, np.float32)
     exists = (source - first >= 0) & (source - first < whole)
     rows = rows_in_budget(budget, height, width, count)
-    for row, total in summed_paths(BlockCosts(_CensusCosts(reference, other, count), penalties), rows, settings.mode):
+    for row, total in summed_paths(
+        BlockCosts(_CensusCosts(reference, other, count, shift), penalties), rows, settings.mode
+    ):
         found[row] = _best_disparities(total, penalties.uniqueness, fit)
         back[row, : width + count][exists] = _best_of_right(total)[exists]
         del total  # a view of a whole band, which would live on beside the next
     matched_back = pixels_matched_back(back)[:, count : count + width]
     return Matches(found + np.float32(first), both_ways_disagreement(found, back, count), matched_back)
+
+
+def _shift(bits: int, penalties: float) -> int:
+    """Return the power of two by which costs are divided, so that sums fit into 16 bits.
+
+    A path costs up to all bits of a block and the penalties. The sum of eight paths of a match, which differs in less
+    than half of its bits, must not saturate.
+    """
+    return max(math.ceil(math.log2(max(bits + penalties, 4 * bits) / _LARGEST)), 0)
 
 
 def _best_disparities(total: Costs, uniqueness: int, fit: Fit) -> NDArray[np.float32]:

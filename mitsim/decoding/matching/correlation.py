@@ -47,8 +47,8 @@ from mitsim.decoding.matching.correlation_products import (
     prepare_pair,
     right_correlations,
 )
-from mitsim.decoding.matching.sub_pixel import offset_of_minimum
 from mitsim.decoding.matching.sgbm import Matches, both_ways_disagreement, pixels_matched_back
+from mitsim.decoding.matching.sub_pixel import offset_of_minimum
 from mitsim.sensor.matcher import MatcherSettings
 
 #: bytes of the correlations that each thread holds at once, if they are computed disparity by disparity
@@ -208,11 +208,12 @@ def _best_disparities(
     best = score.argmax(axis=axis)
     beside = [np.expand_dims(np.clip(best + step, 0, count - 1), axis) for step in (-1, 0, 1)]
     lower, peak, upper = (np.take_along_axis(score, k, axis=axis).squeeze(axis) for k in beside)
-    if settings.sub_pixel in ("method", "opencv"):
+    fit = settings.sub_pixel
+    if fit == "method" or fit == "opencv":
         step = _sub_pixel((lower, peak, upper), best, variance, lag, count, noisy_right)
     else:
         inside = (best > 0) & (best < count - 1)
-        step = np.where(inside, offset_of_minimum(-lower, -peak, -upper, settings.sub_pixel), np.float32(0))
+        step = np.where(inside, offset_of_minimum(-lower, -peak, -upper, fit), np.float32(0))
     for k in beside:
         np.put_along_axis(score, k, -1.0, axis=axis)
     unique = (1 - peak) * 100 <= (1 - score.max(axis=axis)) * (100 - settings.uniqueness_percent)

@@ -182,7 +182,11 @@ def reference_geometry(rig: Rig, pattern: Mask, reference_mm: float, blur_px: fl
 def unknown_mask() -> InputError:
     """Return the error that the image of a mask is in the sensor file, not in the capture."""
     return InputError(
-        "capture", "pattern", "an image of the user's own", "the mask itself", "name the sensor file that has it: --sensor"
+        "capture",
+        "pattern",
+        "an image of the user's own",
+        "the mask itself",
+        "name the sensor file that has it: --sensor",
     )
 
 

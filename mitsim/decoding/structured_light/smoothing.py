@@ -1,7 +1,7 @@
 """Average the distances of neighbouring points, as makers of structured-light sensors do.
 
-Signal chain: cloud -> inverse depth of each point along the axis of the grid -> Gaussian mean over the decoded neighbours on the
-same surface -> points on the same rays.
+Signal chain: cloud -> inverse depth of each point along the axis of the grid -> Gaussian mean over the decoded
+neighbours on the same surface -> points on the same rays.
 
 On a plane the inverse depth is linear in the image, so that a symmetric mean keeps its place (Hartley and Zisserman,
 Multiple View Geometry, 2nd ed., section 13.1). Edges and small radii become rounder, as with makers' filters.

@@ -68,7 +68,8 @@ def influences(table: UnknownsTable, source: str, depth: int) -> list[Influence]
             "fixed pattern and mask of dots of another unit",
             rendered,
             ("drawn" if table.unit.mask == "another" else "drawn; the mask is that of the sensor file")
-            if rendered else "that of the unit that the map was made with",
+            if rendered
+            else "that of the unit that the map was made with",
         ),
         Influence(
             "interreflections",
