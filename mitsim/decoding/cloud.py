@@ -188,7 +188,8 @@ def with_options(settings: Settings, block: int | None, contrast: float | None) 
 def sensor_geometry(sensor: Sensor) -> Geometry:
     """Return the geometry that is prepared once for all captures of a sensor."""
     technology = technology_of(sensor.technology)
-    if technology.patterns and isinstance(sensor.pattern, ProjectorImages):
+    unknown = technology.patterns and not issubclass(ProjectorImages, technology.patterns)
+    if unknown and isinstance(sensor.pattern, ProjectorImages):
         raise unknown_code(f"sensor {sensor.name}", sensor.pattern.count)
     pattern = sensor.pattern if isinstance(sensor.pattern, technology.patterns) else None
     return technology.geometry(sensor.rig, sensor.settings, pattern)
@@ -204,6 +205,16 @@ def capture_geometry(capture: Capture, settings: Settings) -> Geometry:
     """
     technology = technology_of(capture.technology)
     return technology.geometry(capture.rig, settings, capture_pattern(capture))
+
+
+def stored_geometry(capture: Capture, settings: Settings, sensor: Sensor | str | Path | None) -> Geometry | None:
+    """Return the geometry of a capture of one camera whose sensor file has the image of its mask; None for another."""
+    if capture.technology != "reference_stereo" or not isinstance(capture.decoding.pattern, ImagesDescription):
+        return None
+    loaded = load_sensor(sensor, "decoding") if isinstance(sensor, str | Path) else sensor
+    pattern = None if loaded is None else loaded.pattern
+    known = isinstance(pattern, ProjectorImages) and pattern.description == capture.decoding.pattern
+    return technology_of(capture.technology).geometry(capture.rig, settings, pattern) if known else None
 
 
 def unknown_code(where: str, count: int) -> InputError:
@@ -224,14 +235,14 @@ def capture_pattern(capture: Capture) -> Pattern | None:
     Raises
     ------
     InputError
-        If it has no pattern, one of another technology, or images of the user's own.
+        If it has no pattern, one of another technology, or images of the user's own in place of a code.
     """
     technology, pattern = technology_of(capture.technology), capture.decoding.pattern
     if not technology.patterns:
         return None
     if pattern is None:
         raise InputError(_where(capture), "pattern", "nothing", "a value: this key is required")
-    if isinstance(pattern, ImagesDescription):
+    if isinstance(pattern, ImagesDescription) and not issubclass(ImagesDescription, technology.patterns):
         raise unknown_code(f"capture of {capture.sensor}", pattern.count)
     if not isinstance(pattern, technology.patterns):
         raise InputError("capture", "settings.pattern.kind", pattern.kind, f"a kind that {capture.technology} has")

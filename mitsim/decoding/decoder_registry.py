@@ -29,11 +29,17 @@ from mitsim.decoding.device_maps import (
 from mitsim.decoding.grey_levels import MeasuredNoise
 from mitsim.decoding.grid_cloud import empty_cloud
 from mitsim.decoding.image_context import ImageContext
-from mitsim.decoding.matching.reference_matching import ReferenceGeometry, decode_reference, reference_geometry
+from mitsim.decoding.matching.reference_matching import (
+    ReferenceGeometry,
+    decode_reference,
+    reference_geometry,
+    unknown_mask,
+)
 from mitsim.decoding.matching.stereo import StereoGeometry, decode_stereo, stereo_geometry
 from mitsim.decoding.structured_light.decoder import decode_structured_light
 from mitsim.decoding.structured_light.geometry import StructuredLightGeometry, structured_light_geometry
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
+from mitsim.decoding.structured_light.smoothing import smoothed_along_rays
 from mitsim.decoding.structured_light.two_cameras import cloud_of_pair, decode_structured_light_stereo
 from mitsim.decoding.time_of_flight import TimeOfFlightGeometry, decode_time_of_flight, time_of_flight_geometry
 from mitsim.sensor.camera import Rig
@@ -45,6 +51,7 @@ from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, LightCode, Ph
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
+from mitsim.sensor.projector_images import ImagesDescription, ProjectorImages
 
 #: range of depths to search if neither a preset nor the recording gives one [mm]
 DEFAULT_RANGE_MM = (300.0, 2000.0)
@@ -53,7 +60,7 @@ DEFAULT_RANGE_MM = (300.0, 2000.0)
 DEVICE_RANGE_MM = (1e-3, 1e6)
 
 Geometry = StereoGeometry | ReferenceGeometry | StructuredLightGeometry | TimeOfFlightGeometry | DeviceMapGeometry
-Pattern = DotPattern | LightCode | AmplitudeModulation
+Pattern = DotPattern | LightCode | AmplitudeModulation | ProjectorImages | ImagesDescription
 
 #: projector coordinates of structured light, of whole images, by camera and axis
 Coordinates = Mapping[str, Mapping[Axis, ProjectorCoordinate]]
@@ -158,7 +165,11 @@ def _stereo(images: Images, geometry: StereoGeometry, settings: MatcherSettings,
     return decode_stereo(left, right, geometry, settings, images.context(images.roi))
 
 
-def _reference_geometry(rig: Rig, settings: MatcherSettings, pattern: DotPattern) -> ReferenceGeometry:
+def _reference_geometry(
+    rig: Rig, settings: MatcherSettings, pattern: DotPattern | ProjectorImages | ImagesDescription
+) -> ReferenceGeometry:
+    if isinstance(pattern, ImagesDescription):
+        raise unknown_mask()
     if settings.reference_mm is None:
         raise InputError(
             "matcher settings",
@@ -171,9 +182,10 @@ def _reference_geometry(rig: Rig, settings: MatcherSettings, pattern: DotPattern
 
 
 def _reference(
-    images: Images, geometry: ReferenceGeometry, settings: MatcherSettings, pattern: DotPattern
+    images: Images, geometry: ReferenceGeometry, settings: MatcherSettings, pattern: DotPattern | ImagesDescription
 ) -> PointCloud:
-    return decode_reference(images.first_images(1), geometry, settings, images.context(images.roi))
+    # a capture states the mask of the device that took it, which the device knows
+    return decode_reference(images.first_images(1), geometry.showing(pattern), settings, images.context(images.roi))
 
 
 def projector_size(capture: Capture) -> tuple[int, int]:
@@ -200,6 +212,12 @@ def _structured_light_geometry(rig: Rig, settings: DecoderSettings, code: LightC
 
 
 def _structured_light(
+    images: Images, geometry: StereoGeometry | StructuredLightGeometry, settings: DecoderSettings, code: LightCode
+) -> PointCloud:
+    return smoothed_along_rays(_structured_light_cloud(images, geometry, settings, code), settings.smoothing_px)
+
+
+def _structured_light_cloud(
     images: Images, geometry: StereoGeometry | StructuredLightGeometry, settings: DecoderSettings, code: LightCode
 ) -> PointCloud:
     size, coordinates = projector_size(images.capture), images.coordinates or {}
@@ -267,7 +285,9 @@ def _device_technology(name: MapName, prepare: Callable[[Rig], DeviceMapGeometry
 
 TECHNOLOGIES: dict[str, Technology] = {
     "active_stereo": Technology((), lambda rig, settings, pattern: stereo_geometry(rig), _stereo),
-    "reference_stereo": Technology((RandomDots, DiffractionSpots), _reference_geometry, _reference),
+    "reference_stereo": Technology(
+        (RandomDots, DiffractionSpots, ProjectorImages, ImagesDescription), _reference_geometry, _reference
+    ),
     "structured_light": Technology(
         (PhaseShift, GrayCode, GrayCodePhaseShift, ImageSequence),
         _structured_light_geometry,

@@ -32,7 +32,7 @@ class DepthSettings(Document):
 
 
 class DecoderSettings(DepthSettings):
-    """Limits of a structured-light decoder. Nothing is filtered or filled: lost points stay lost.
+    """Limits of a structured-light decoder, and its filter. Nothing is filled: lost points stay lost.
 
     - ``near_mm``, ``far_mm``: range of accepted depths along the camera's axis.
     - ``minimum_modulation_dn``: least accepted amplitude of fringes, or half the step from black to white [DN of 8 bit,
@@ -45,6 +45,8 @@ class DecoderSettings(DepthSettings):
       point that the first coordinate gives (assumed).
     - ``correct_gamma``: estimate the projector's gamma from the images and remove its effect on the phase. Needs five
       or more steps, or a white and a black image.
+    - ``smoothing_px``: standard deviation of a Gaussian mean over the distances of neighbouring points, as makers apply
+      it; 0 for none.
     - ``triangulate``: between the first camera and the ``projector``, or between two ``cameras``; in the latter case
       the projector only provides the code.
     """
@@ -57,6 +59,7 @@ class DecoderSettings(DepthSettings):
     bit_share: float = Field(default=0.1, ge=0, lt=1)
     epipolar_px: float = Field(default=2.0, gt=0)
     correct_gamma: bool = False
+    smoothing_px: float = Field(default=0.0, ge=0, le=10, repr=False)
     triangulate: Literal["projector", "cameras"] = "projector"
 
 

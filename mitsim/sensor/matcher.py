@@ -10,19 +10,29 @@ from mitsim.sensor.decoder_settings import DepthSettings
 
 
 class MatcherSettings(DepthSettings):
-    """Search range and limits of a stereo matcher. No filling, no speckle filter: lost points stay lost.
+    """Search range, limits and filters of a stereo matcher. Nothing is filled: lost points stay lost.
 
     - ``near_mm``, ``far_mm``: range of accepted depths along the axis of the rectified left camera.
-    - ``method``: ``sgbm`` of one frame, or ``correlation`` of all frames at once. ``contrast_window_px``, ``p1``,
-      ``p2``, ``mode`` and ``prefilter_cap`` apply to ``sgbm`` only.
+    - ``method``: ``sgbm`` of one frame; ``census`` (semi-global matching of codes) or ``correlation`` of all frames at
+      once. ``contrast_window_px`` and ``prefilter_cap`` apply to ``sgbm`` only; ``p1``, ``p2`` and ``mode`` not to
+      ``correlation``.
+    - ``mode``: paths of semi-global matching. ``hh``: all eight. ``sgbm``: one pass, five; ``3way``: one pass, three.
     - ``contrast_window_px``: odd window over which local brightness and contrast are equalised before matching; 0 for
       none.
-    - ``block_size`` [px], odd; ``p1``, ``p2``: smoothness penalties, multiplied by block_size^2.
+    - ``census_window_px``, odd: side of the window of a census code.
+    - ``block_size`` [px], odd, over which costs are summed, from 3; ``census`` also takes 1, for none.
+    - ``p1``, ``p2``: smoothness penalties, multiplied by block_size^2. For ``census`` they refer to a code of 62 bits.
     - ``uniqueness_percent``: margin by which the best cost must beat the next.
     - ``left_right_px``: largest difference from the match found from the right image.
     - ``prefilter_cap``: gradients are clipped to it [DN of 8 bit].
     - ``minimum_contrast_dn``: least standard deviation in the neighbourhood of an accepted match [DN of 8 bit, that is
       1/255 of full scale].
+    - ``sub_pixel``: fit between whole disparities. ``method`` is that of the method: a parabola, for ``correlation`` a
+      closed form. ``parabola`` and ``equiangular`` (two lines) of three costs. ``sgbm`` has the parabola only, with
+      corrected steps; ``opencv`` leaves its disparities as OpenCV rounds them.
+    - ``median_px``: side of a median filter of the disparities; 0 for none.
+    - ``speckle_px``: regions of up to so many pixels are removed, 0 for none; neighbours within ``speckle_range_px`` of
+      disparity belong to one region.
     - ``disparity_step`` [px]: disparities are rounded to multiples of it, as in devices with fixed-point output; 0 for
       no rounding.
     - ``reference_mm``: depth of the plane whose image is the reference of a sensor with one camera.
@@ -30,9 +40,10 @@ class MatcherSettings(DepthSettings):
 
     level_key = "minimum_contrast_dn"
 
-    method: Literal["sgbm", "correlation"] = "sgbm"
+    method: Literal["sgbm", "census", "correlation"] = "sgbm"
     contrast_window_px: int = Field(default=0, ge=0, le=101)
-    block_size: int = Field(default=5, ge=3, le=31)
+    census_window_px: Literal[3, 5, 7, 9] = Field(default=7, repr=False)
+    block_size: int = Field(default=5, ge=1, le=31)
     p1: float = Field(default=8, ge=0, le=1000)
     p2: float = Field(default=32, ge=0, le=1000)
     uniqueness_percent: int = Field(default=5, ge=0, le=100)
@@ -40,8 +51,17 @@ class MatcherSettings(DepthSettings):
     mode: Literal["hh", "sgbm", "3way"] = "hh"
     prefilter_cap: int = Field(default=63, ge=1, le=127)
     minimum_contrast_dn: float = Field(default=1.5, ge=0)
+    sub_pixel: Literal["method", "parabola", "equiangular", "opencv"] = Field(default="method", repr=False)
+    median_px: Literal[0, 3, 5, 7] = Field(default=0, repr=False)
+    speckle_px: int = Field(default=0, ge=0, le=100_000, repr=False)
+    speckle_range_px: float = Field(default=1.0, gt=0, le=100, repr=False)
     disparity_step: float = Field(default=0.0, ge=0, le=1)
     reference_mm: float | None = Field(default=None, gt=0)
+
+    @property
+    def support_px(self) -> int:
+        """Return the side of the square of pixels that the cost of one pixel depends on."""
+        return self.block_size + (self.census_window_px - 1 if self.method == "census" else 0)
 
     @field_validator("block_size")
     @classmethod
@@ -61,4 +81,13 @@ class MatcherSettings(DepthSettings):
     def _check_penalties(self) -> MatcherSettings:
         if self.p2 < self.p1:
             raise ValueError("p1 not over p2")
+        return self
+
+    @model_validator(mode="after")
+    def _check_method(self) -> MatcherSettings:
+        if self.block_size < 3 and self.method != "census":
+            raise ValueError(f"block_size from 3 for method {self.method}")
+        other = ("equiangular",) if self.method == "sgbm" else ("opencv",)
+        if self.sub_pixel in other:
+            raise ValueError(f"another sub_pixel than {self.sub_pixel} for method {self.method}")
         return self

@@ -38,6 +38,8 @@ _SPOT_REACH = 4.0
 class RandomDots(Document):
     """Random pattern of an active-stereo projector, in projector pixels.
 
+    ``seed`` selects the mask. Each device has its own, with the same statistics (:func:`another_mask`).
+
     ``shifts_px``: one frame for each, with the pattern shifted right and down by these amounts; empty is one frame.
     """
 
@@ -78,6 +80,11 @@ class DiffractionSpots(Document):
 
 
 DotPattern = RandomDots | DiffractionSpots
+
+
+def another_mask(pattern: DotPattern, seed: int) -> DotPattern:
+    """Return the pattern of another device of the same type: another realisation with the same statistics."""
+    return pattern.model_copy(update={"seed": seed})
 
 
 def dot_frames(pattern: DotPattern, width: int, height: int) -> NDArray[np.float32]:
@@ -151,6 +158,13 @@ def diffraction_spots(
     --------
     random_blobs : random dark and bright areas
     """
+    return _spots(width, height, cell_px, places, spot_px, tiles, seed).copy()
+
+
+@lru_cache(maxsize=2)  # the projector of a unit shows the mask that its decoder stores
+def _spots(
+    width: int, height: int, cell_px: float, places: int, spot_px: float, tiles: tuple[int, int], seed: int
+) -> NDArray[np.float32]:
     down, across = int(np.ceil(height / cell_px)), int(np.ceil(width / cell_px))
     tile = (int(np.ceil(down / tiles[1])), int(np.ceil(across / tiles[0])))
     order = np.random.default_rng(seed).integers(0, places, (2, *tile))
@@ -162,14 +176,20 @@ def diffraction_spots(
     field = np.zeros((height + 2 * reach + 2, width + 2 * reach + 2), np.float32)
     near_row, near_column = np.rint(rows).astype(int), np.rint(columns).astype(int)
     steps = np.arange(-reach, reach + 1)
+    inside = (near_row <= height) & (near_column <= width)
+    near_row, near_column, rows, columns = (each[inside] for each in (near_row, near_column, rows, columns))
+    places_taken = near_row * field.shape[1] + near_column
+    apart = len(np.unique(places_taken)) == len(places_taken)  # then indices do not repeat, which is faster
+    falls = [np.exp(-0.5 * ((near_column + j - columns) / spot_px) ** 2) for j in steps]
     for i in steps:
         fall = np.exp(-0.5 * ((near_row + i - rows) / spot_px) ** 2)
-        for j in steps:
-            value = fall * np.exp(-0.5 * ((near_column + j - columns) / spot_px) ** 2)
-            inside = (near_row <= height) & (near_column <= width)
-            np.add.at(
-                field, (near_row[inside] + i + reach, near_column[inside] + j + reach), value[inside].astype(np.float32)
-            )
+        for j, across in zip(steps, falls, strict=True):
+            index = (near_row + i + reach, near_column + j + reach)
+            value = (fall * across).astype(np.float32)
+            if apart:
+                field[index] += value
+            else:
+                np.add.at(field, index, value)
     return np.minimum(field[reach : reach + height, reach : reach + width], 1.0)
 
 

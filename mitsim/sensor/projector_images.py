@@ -144,10 +144,12 @@ def allowed_images(
     InputError
         If the technology has a pattern of its own, or the matcher takes one image only.
     """
-    if technology not in ("active_stereo", "structured_light"):
-        raise InputError(where, "pattern", f"images, for {technology}", "images for active_stereo or structured_light")
-    if pattern.count > 1 and matcher is not None and matcher.method != "correlation":
-        hint = 'set method = "correlation" in [matcher], which matches all images at once'
+    if technology == "time_of_flight":
+        raise InputError(where, "pattern", f"images, for {technology}", "images for sensors that project a pattern")
+    if technology == "reference_stereo" and pattern.count > 1:
+        raise InputError(where, "pattern", f"{pattern.count} images, for {technology}", "one, the mask of its dots")
+    if pattern.count > 1 and matcher is not None and matcher.method == "sgbm":
+        hint = 'set method = "correlation" in [matcher], which matches all images at once, or "census"'
         raise InputError(where, "pattern", f"{pattern.count} images, for matcher.method {matcher.method}", "one", hint)
     return pattern
 

@@ -274,16 +274,17 @@ def _check_dots(file: SensorFile) -> None:
     if len(file.cameras) != cameras or file.matcher is None or file.decoder is not None:
         number = {1: "one camera", 2: "two cameras"}[cameras]
         raise ValueError(f"{file.technology} needs {number} and [matcher], and has no [decoder]")
-    own = isinstance(file.pattern, ImageFolder) and file.technology == "active_stereo"
-    if file.pattern is not None and not isinstance(file.pattern, DotPattern) and not own:
-        kinds = "random_dots, diffraction_spots or images" if cameras == 2 else "random_dots or diffraction_spots"
+    if file.pattern is not None and not isinstance(file.pattern, DotPattern | ImageFolder):
+        kinds = "random_dots, diffraction_spots or images"
         raise ValueError(f"{file.technology} needs a pattern of kind {kinds}, not {file.pattern.kind}")
     if (
         isinstance(file.pattern, DotPattern)
         and file.pattern.frames > 1
-        and (file.matcher.method != "correlation" or file.technology != "active_stereo")
+        and (file.matcher.method == "sgbm" or file.technology != "active_stereo")
     ):
-        raise ValueError('pattern.shifts_px needs technology "active_stereo" and matcher.method "correlation"')
+        raise ValueError(
+            'pattern.shifts_px needs technology "active_stereo" and matcher.method "correlation" or "census"'
+        )
     if (file.matcher.reference_mm is None) == (file.technology == "reference_stereo"):
         raise ValueError("matcher.reference_mm is for reference_stereo, which needs it")
 

@@ -11,12 +11,46 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field, model_validator
 
 from characterisation.files.documents import Document
 from mitsim.sensor.drift import Drift
 
 NotNegative = Annotated[float, Field(ge=0)]
+Percent = Annotated[float, Field(ge=0, le=100)]
+_OverZero = Annotated[float, Field(gt=0, le=1000)]
+
+
+def _in_order(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError("the smaller number first")
+    return ends
+
+
+def _from_one(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] < 1:
+        raise ValueError("factors from 1, since p2 is not under p1")
+    return ends
+
+
+def _odd(size: int) -> int:
+    if size % 2 == 0:
+        raise ValueError("an odd number of pixels")
+    return size
+
+
+def _odd_or_none(size: int) -> int:
+    if size != 0 and (size % 2 == 0 or size < 5):
+        raise ValueError("0, or an odd number of pixels from 5")
+    return size
+
+
+#: a range of numbers over 0
+Factors = Annotated[tuple[_OverZero, _OverZero], AfterValidator(_in_order)]
+
+OddBlock = Annotated[int, Field(ge=3, le=31), AfterValidator(_odd)]
+OddSum = Annotated[int, Field(ge=1, le=31), AfterValidator(_odd)]
+ContrastWindow = Annotated[int, Field(ge=0, le=101), AfterValidator(_odd_or_none)]
 
 #: illuminance [lx] of the named rooms: EN 12464-1 requires 500 lx at workplaces
 ROOMS = {"office": 500.0, "dark cell": 0.0}
@@ -117,6 +151,67 @@ class PoseUnknowns(Document):
     told_deg: Annotated[float, Field(ge=0, le=2)] = 0.05
 
 
+class UnitUnknowns(Document):
+    """The device at hand, of all devices of its type.
+
+    ``mask`` of random dots: ``another`` for each device, since each has its own realisation of the pattern; ``own`` if
+    the sensor file has the mask of this device, by its ``seed``. Images of the user's own are always those of this
+    device. The fixed pattern of the imager is drawn in either case.
+    """
+
+    mask: Literal["another", "own"] = "another"
+
+
+class DecoderUnknowns(Document):
+    """What a maker does not say of its decoder. A virtual measurement draws a decoder for each day.
+
+    A list holds choices of equal chance; an empty one keeps the setting of the sensor file. A pair of numbers is a
+    range. ``known``: nothing is drawn, since the sensor file's settings are those that decode the captures.
+
+    - ``methods`` of two cameras: several frames are not matched by ``sgbm``. One camera keeps its method.
+    - ``blocks_px`` of ``sgbm``, ``sums_px`` of ``census``; ``block_factor`` of the sensor's own block for
+      ``correlation``.
+    - ``census_windows_px``, ``contrast_windows_px``, ``prefilter_caps``, ``modes``, ``p1``, ``p2_over_p1``,
+      ``uniqueness_percent``, ``left_right_px``, ``sub_pixel``, ``medians_px``, ``speckles_px``,
+      ``disparity_steps_px``: as in :class:`mitsim.sensor.matcher.MatcherSettings`. A method draws among the sub-pixel
+      fits that it has.
+    - ``thresholds``: factor of the sensor's least contrast or modulation, and of the uniqueness of ``correlation``.
+    - ``smoothings_px`` of structured light.
+
+    The logarithms of penalties and factors are uniform. docs/reference/unknowns.md states the source of each range.
+    """
+
+    known: bool = False
+    methods: list[Literal["sgbm", "census", "correlation"]] = Field(
+        default=["sgbm", "census", "correlation"], max_length=20
+    )
+    blocks_px: list[OddBlock] = Field(default=[5, 7, 9, 11], max_length=20)
+    sums_px: list[OddSum] = Field(default=[1, 3, 5], max_length=20)
+    block_factor: Factors = (0.6, 1.4)
+    census_windows_px: list[Literal[3, 5, 7, 9]] = Field(default=[5, 7, 9], max_length=20)
+    contrast_windows_px: list[ContrastWindow] = Field(default=[0, 11], max_length=20)
+    prefilter_caps: list[Annotated[int, Field(ge=1, le=127)]] = Field(default=[15, 31, 63], max_length=20)
+    modes: list[Literal["hh", "sgbm", "3way"]] = Field(default=["hh", "sgbm", "3way"], max_length=20)
+    p1: Factors = (4.0, 16.0)
+    p2_over_p1: Annotated[Factors, AfterValidator(_from_one)] = (2.0, 8.0)
+    uniqueness_percent: Annotated[tuple[Percent, Percent], AfterValidator(_in_order)] = (5.0, 15.0)
+    left_right_px: Annotated[tuple[NotNegative, NotNegative], AfterValidator(_in_order)] = (0.5, 2.0)
+    sub_pixel: list[Literal["method", "parabola", "equiangular", "opencv"]] = Field(
+        default=["method", "parabola", "equiangular", "opencv"], max_length=20
+    )
+    medians_px: list[Literal[0, 3, 5, 7]] = Field(default=[0, 3, 5], max_length=20)
+    speckles_px: list[Annotated[int, Field(ge=0, le=100_000)]] = Field(default=[0, 100], max_length=20)
+    disparity_steps_px: list[Annotated[float, Field(ge=0, le=1)]] = Field(default=[], max_length=20)
+    thresholds: Factors = (0.5, 2.0)
+    smoothings_px: list[Annotated[float, Field(ge=0, le=10)]] = Field(default=[], max_length=20)
+
+    @model_validator(mode="after")
+    def _check_penalties(self) -> DecoderUnknowns:
+        if self.p1[1] * self.p2_over_p1[1] > 1000:
+            raise ValueError("p1 times p2_over_p1 up to 1000, the largest p2")
+        return self
+
+
 class UnknownsTable(Document):
     """All groups of unknowns."""
 
@@ -126,6 +221,8 @@ class UnknownsTable(Document):
     light: LightUnknowns = LightUnknowns()
     temperature: TemperatureUnknowns = TemperatureUnknowns()
     pose: PoseUnknowns = PoseUnknowns()
+    unit: UnitUnknowns = UnitUnknowns()
+    decoder: DecoderUnknowns = DecoderUnknowns()
 
 
 def unknowns_of(*tables: UnknownsTable) -> UnknownsTable:

@@ -14,7 +14,7 @@ from mitsim.decoding.image_context import ImageContext
 from mitsim.decoding.matching.reference_matching import decode_reference, reference_geometry
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.matcher import MatcherSettings
-from mitsim.sensor.pattern import DiffractionSpots, dot_frames
+from mitsim.sensor.pattern import DiffractionSpots, another_mask, dot_frames
 from mitsim.sensor.transforms import Transform
 
 WIDTH, HEIGHT, FOCAL, BASELINE, REFERENCE = 200, 120, 300.0, 75.0, 700.0
@@ -32,11 +32,11 @@ def make_rig(distortion=(), turn=(0.0, 0.0, 0.0)) -> Rig:
     return Rig({"infrared": camera}, Camera(wide, np.zeros(5), 800, 520, place))
 
 
-def drawn(rig: Rig, normal, distance: float) -> np.ndarray:
+def drawn(rig: Rig, normal, distance: float, pattern=PATTERN) -> np.ndarray:
     """What the camera sees of a plane n . x = n_z distance that the projector lights, 16 rays a pixel, 10 bit."""
     camera, projector = rig.reference, rig.projector
     n = np.array(normal) / np.linalg.norm(normal)
-    field = dot_frames(PATTERN, projector.width, projector.height)[0]
+    field = dot_frames(pattern, projector.width, projector.height)[0]
     total = np.zeros((HEIGHT, WIDTH))
     for right in (np.arange(4) - 1.5) / 4:
         for down in (np.arange(4) - 1.5) / 4:
@@ -67,6 +67,22 @@ def test_planes_come_back_where_they_are(rig, normal, distance):
     # at one distance all pixels stand at one fraction of a pixel; half a step of the devices is 0.0625 px
     assert abs(off[kept].mean()) < 0.0625
     assert off[kept].std() < 0.12  # spots of less than a pixel, and a block that sees the plane squarely
+
+
+def test_the_mask_of_another_device_is_decoded_by_its_own_reference():
+    rig, own = make_rig(), another_mask(PATTERN, 8)
+    nominal = reference_geometry(rig, PATTERN, REFERENCE)
+    image, context = drawn(rig, (0, 0, 1), 930.0, own), ImageContext("drawn", "simulated", 1023)
+    known = decode_reference(image, nominal.showing(own), SETTINGS, context)
+    depth = known.points[known.valid][:, 2]
+    assert known.valid.mean() > 0.6
+    assert np.median(depth) == pytest.approx(930, abs=930**2 / (FOCAL * BASELINE) * 0.0625)
+    other = decode_reference(image, nominal, SETTINGS, context)
+    right = np.abs(other.points[other.valid][:, 2] - 930) < 20
+    assert right.sum() < 0.1 * known.valid.sum()  # unrelated masks match by chance
+    again = reference_geometry(rig, own, REFERENCE)
+    np.testing.assert_array_equal(nominal.showing(own).reference, again.reference)
+    assert nominal.showing(PATTERN) is nominal
 
 
 def test_the_reference_plane_is_the_disparity_nought():

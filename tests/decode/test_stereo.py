@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -124,6 +125,23 @@ def test_no_part_of_a_pixel_is_lost(mode):
         bias.append(disparity_error(decode(rig, pair(rig, surface), settings), rig, surface).mean())
     assert abs(np.mean(bias)) < 0.01
     assert np.abs(bias).max() < 0.15
+
+
+def test_settings_of_opencvs_sample_give_the_disparities_that_opencv_writes():
+    rig, surface = ideal_rig(), plane([0.1, 0.5, 1], 470)
+    images = pair(rig, surface)
+    as_sample = {"mode": "sgbm", "prefilter_cap": 15, "uniqueness_percent": 10, "sub_pixel": "opencv"}
+    settings = SETTINGS.model_copy(update=as_sample)
+    cloud, geometry = decode(rig, images, settings), stereo_geometry(rig)
+    first, count = search_range(geometry.rectification, settings)
+    matcher = cv2.StereoSGBM.create(first, count, 5, 200, 800, uniquenessRatio=10)
+    wide = [np.pad(image, ((0, 0), (count, count)), mode="edge") for image in images]
+    written = matcher.compute(*wide)[:, count:-count] / 16
+    found = geometry.rectification.disparity(cloud.points[..., 2].astype(float))
+    both = cloud.valid & (written >= first)
+    both[:, :20] = both[:, -20:] = False  # beyond the edges the two repeat other columns
+    assert both.mean() > 0.5
+    assert np.mean(np.abs(found - written)[both] < 1e-3) > 0.999
 
 
 def test_points_lie_on_the_view_rays_of_their_pixels():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from mitsim.sensor.pattern import DiffractionSpots, RandomDots, diffraction_spots, dot_frames
+from mitsim.sensor.pattern import DiffractionSpots, RandomDots, another_mask, diffraction_spots, dot_frames
 
 
 @pytest.mark.parametrize(("cell", "places"), [(9.0, 3), (20.0, 7), (12.5, 5)])
@@ -52,3 +52,25 @@ def test_no_shifts_is_one_frame_as_ever():
 def test_spots_smaller_than_a_pixel_are_refused():
     with pytest.raises(ValidationError, match="spot_px"):
         DiffractionSpots(kind="diffraction_spots", cell_px=9, spot_px=0.1)
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        RandomDots(kind="random_dots", run_length_px=6, bright_share=0.4, blur_px=0.9, seed=2),
+        DiffractionSpots(kind="diffraction_spots", cell_px=9, places=3, spot_px=1.6, tiles=(2, 2), seed=2),
+    ],
+    ids=["random dots", "spots"],
+)
+def test_masks_of_two_devices_differ_and_have_the_same_statistics(pattern):
+    masks = [dot_frames(another_mask(pattern, seed), 480, 360)[0] for seed in (11, 12, 13)]
+    cells = masks[0].size / (6 if pattern.kind == "random_dots" else 9) ** 2
+    for one, other in ((masks[0], masks[1]), (masks[1], masks[2])):
+        # independent fields: a correlation of four standard deviations is one in 16,000
+        assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 4 / np.sqrt(cells / 4)
+        assert one.mean() == pytest.approx(other.mean(), abs=4 * one.std() / np.sqrt(cells / 4))
+        assert one.std() == pytest.approx(other.std(), rel=4 / np.sqrt(cells / 4))
+        for lag in (2, 5):
+            there = [(each - each.mean())[:, lag:] * (each - each.mean())[:, :-lag] for each in (one, other)]
+            assert there[0].mean() == pytest.approx(there[1].mean(), abs=4 * there[0].std() / np.sqrt(cells / 4))
+    assert another_mask(pattern, pattern.seed) == pattern

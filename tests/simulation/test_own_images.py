@@ -13,8 +13,10 @@ import mitsim as ms
 from characterisation.point_cloud import Status
 from mitsim.capture.folder import read_capture, write_capture
 from mitsim.capture.recordings.image_folder import read_image_folder
+from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import capture_cloud, decoder_settings, sensor_geometry
 from mitsim.decoding.structured_light.decoder import decode_coordinates
+from mitsim.sensor.pattern import another_mask
 from mitsim.sensor.png import encode_png
 from mitsim.sensor.projector_images import ProjectorImages, checked_images
 from mitsim.sensor.transforms import look_at
@@ -87,6 +89,59 @@ def test_an_own_mask_replaces_the_dots_of_two_cameras_and_decodes_as_they_do(tmp
     other = sensor.with_patterns(np.roll(sensor.patterns()[0], 50, axis=1))
     assert other.pattern != own.pattern
     assert not equal_images(shot(other), known)
+
+
+def reference_stereo() -> str:
+    """The small camera's left eye and its projector, matched to a stored image."""
+    text = re.sub(r"(?ms)^\[cameras\.right\].*?(?=^\[)|^\[matcher\].*", "", STEREO)
+    matcher = '[matcher]\nmethod = "correlation"\nnear_mm = 330\nfar_mm = 950\nblock_size = 9\nreference_mm = 600\n'
+    return text.replace("active_stereo", "reference_stereo") + matcher
+
+
+def test_an_own_mask_of_one_camera_is_decoded_with_the_sensor_that_has_it(tmp_path):
+    path = written(tmp_path, reference_stereo())
+    sensor = ms.load_sensor(path)
+    mask = (255 * sensor.patterns()[0]).astype(np.uint8)
+    (tmp_path / "code").mkdir()
+    (tmp_path / "code" / "mask.png").write_bytes(encode_png(mask))
+    own_path = tmp_path / "own.toml"
+    own_path.write_text(re.sub(r"(?ms)^\[pattern\].*?(?=^\[)", OWN + "\n", reference_stereo()), encoding="utf-8")
+    own = ms.load_sensor(own_path)
+    known, capture = shot(sensor), shot(own)
+    expected = capture_cloud(known, sensor.settings)
+    assert expected.valid.sum() > 3000
+    found = capture_cloud(capture, own.settings, sensor_geometry(own))
+    both = found.valid & expected.valid
+    assert both.sum() > 0.95 * expected.valid.sum()  # the mask was rounded to 8 bit
+    depth = np.abs(found.points - expected.points)[both][:, 2]
+    assert np.median(depth) < 0.3
+    np.testing.assert_array_equal(ms.decode(capture, sensor=own_path).points, found.points)
+    with pytest.raises(ms.InputError, match="--sensor"):
+        ms.decode(capture)
+    with pytest.raises(ms.InputError, match="one, the mask"):
+        own.with_patterns(np.stack([mask, mask]))
+
+
+def test_units_of_one_camera_know_their_own_masks(tmp_path):
+    """One geometry, prepared for the mask of the file, decodes the captures of every unit."""
+    sensor = ms.load_sensor(written(tmp_path, reference_stereo()))
+    simulated, geometry = SimulatedSensor(sensor), sensor_geometry(sensor)
+    scene = ms.load_scene(ROOT / "scenes/two_pillars/matt_white.xml", sensor)
+    clouds = []
+    for seed in (0, 21, 22):
+        mask = another_mask(sensor.pattern, seed) if seed else None
+        unit = simulated.recalibrated(sensor.rig, mask=mask)
+        capture = unit.capture(scene, POSE, seed=1)
+        assert capture.decoding.pattern.seed == (seed or sensor.pattern.seed)
+        clouds.append(capture_cloud(capture, sensor.settings, geometry))
+    first = clouds[0]
+    for other in clouds[1:]:
+        both = first.valid & other.valid
+        assert both.sum() > 0.8 * first.valid.sum()
+        off = (other.points - first.points)[both][:, 2]
+        assert np.median(np.abs(off)) > 0 and abs(np.median(off)) < 0.2
+        assert np.median(np.abs(off)) < 2  # 0.4 px at 500 mm
+    assert (clouds[1].points[both] != clouds[2].points[both]).any()
 
 
 def test_several_masks_are_matched_by_correlation_alone(tmp_path):
@@ -250,9 +305,8 @@ def test_a_folder_that_cannot_be_read_is_refused(images, told, tmp_path):
         ms.load_sensor(sensor)
 
 
-@pytest.mark.parametrize("name", ["kinect-v2", "primesense-carmine-1.09"])
-def test_technologies_with_a_pattern_of_their_own_take_no_other(name):
-    sensor = ms.load_sensor(name)
+def test_light_that_is_modulated_in_time_takes_no_images():
+    sensor = ms.load_sensor("kinect-v2")
     optics = sensor.projector.optics
     with pytest.raises(ms.InputError, match=f"found images, for {sensor.technology}"):
         sensor.with_patterns(np.zeros((optics.height, optics.width)))

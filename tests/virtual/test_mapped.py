@@ -161,7 +161,8 @@ def test_rendered_trials_do_not_depend_on_what_is_beyond_the_map():
     less = replace(some, varied=tuple(group for group in some.varied if group != BEYOND))
     assert trial_digest(study, some, "render") == trial_digest(study, less, "render")
     assert trial_digest(study, some, "map") != trial_digest(study, less, "map")
-    assert BEYOND in budget_groups(some, "map") and BEYOND not in budget_groups(some, "render")
+    assert BEYOND in budget_groups(some, "map", study.sensor)
+    assert BEYOND not in budget_groups(some, "render", study.sensor)
 
 
 def test_trials_repeat_and_differ(drawn):
@@ -187,5 +188,5 @@ def test_what_measures_follows_the_source_of_the_map():
     assert isinstance(measurements_of(simulated, study_unknowns(simulated)), RenderedMeasurements)
     with pytest.raises(InputError, match=r"measure\.by"):
         measured_by(replace(study_of("ensenso-n10"), performance_map=None))
-    groups = budget_groups(study_unknowns(device), "map")
-    assert "light" not in groups and "unit" not in groups and "calibration" in groups
+    groups = budget_groups(study_unknowns(device), "map", device.sensor)
+    assert not {"light", "unit", "decoder"} & set(groups) and "calibration" in groups

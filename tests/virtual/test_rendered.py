@@ -12,11 +12,13 @@ from mitsim.capture.simulated.indirect_light import IndirectLight
 from mitsim.capture.simulated.rendering import IndirectImages, Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene import load
+from mitsim.scene.backend import dr
 from mitsim.scene.light_transport.room_light import directional_albedos
 from mitsim.scene.load import load_scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.self_view import sees_itself
 from mitsim.sensor.imager import electrons_per_radiance
+from mitsim.sensor.pattern import another_mask
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform, look_at
@@ -27,7 +29,7 @@ from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import displaced
 from mitsim.study.virtual.stated import budget_groups, statement_document
 from mitsim.study.virtual.study_unknowns import study_unknowns
-from mitsim.study.virtual.world import Trial, finish_deviation
+from mitsim.study.virtual.world import GROUPS, Trial, finish_deviation
 from tests.smaller_sensors import binned, coarse_sensor, middle_part
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
@@ -199,6 +201,47 @@ def test_another_unit_has_another_fixed_pattern_of_the_same_size(coarse_n10):
     assert sensor.recalibrated(sensor.sensor.rig).units is sensor.units
 
 
+def test_another_unit_has_another_mask_unless_the_file_has_its_own(coarse_n10):
+    study = study_of(coarse_n10)
+    maker = measurements_of(study, study_unknowns(study, ("unit",)))
+    view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
+    world = maker.unknowns.draw(Trial(0))
+    nominal = study.sensor.patterns()
+    one, again, other = (maker.lit(view, replace(world, unit=unit)) for unit in (5, 5, 6))
+    patterns = [lit.sensor.sensor.patterns() for lit in (one, again, other)]
+    np.testing.assert_array_equal(patterns[0], patterns[1])
+    assert abs(np.corrcoef(patterns[0].ravel(), patterns[2].ravel())[0, 1]) < 0.05
+    assert patterns[0].mean() == pytest.approx(nominal.mean(), abs=0.01)
+    for name, image in one.light.radiance.items():
+        np.testing.assert_array_equal(again.light.radiance[name], image)
+        lit = image[image > 0.2 * image.max()]
+        assert np.abs(other.light.radiance[name] - image).mean() > 0.1 * lit.mean() * len(lit) / image.size
+    seed = maker.exposed(other, None, 1).decoding.pattern.seed
+    assert seed == 6
+    assert maker.lit(view, replace(world, unit=0)).sensor.sensor.pattern == study.sensor.pattern
+    own = study_of(coarse_n10, unknowns={"unit": {"mask": "own"}})
+    kept = measurements_of(own, study_unknowns(own, ("unit",))).lit(view, world)
+    assert kept.sensor.sensor.pattern == own.sensor.pattern
+
+
+def test_masks_of_other_units_share_the_kernels(coarse_n10):
+    sensor = SimulatedSensor(load_sensor(coarse_n10))
+    scene, pose = (
+        load_scene(SCENES / "matt_white.xml", 850.0),
+        look_at((0.0, -300.0, 450.0), (0.0, 0.0, 20.0), (0, 0, 1)),
+    )
+
+    def kernels_of(one):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            one.radiance(scene, pose, "left", Rendering(samples=1, depth=1), seed=1)
+            return {each["hash"] for each in dr.kernel_history() if "hash" in each}
+
+    masks = [another_mask(sensor.sensor.pattern, seed) for seed in (3, 4)]
+    first, second = (kernels_of(sensor.recalibrated(sensor.sensor.rig, mask=mask)) for mask in masks)
+    assert first and second <= first
+
+
 def test_a_path_that_is_read_too_long_moves_points_along_their_rays(fringes):
     _, maker, _, world = fringes
     grid = maker.geometry.grid
@@ -251,7 +294,7 @@ def test_a_statement_from_a_few_trials(coarse_n10, tmp_path):
     view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
     stated = session.state(view)
     assert [one.measurement for one in stated.statements] == list(study.task.measurements)
-    groups = budget_groups(session.unknowns, "render")
+    groups = budget_groups(session.unknowns, "render", study.sensor)
     assert "form" not in groups and {line.group for line in stated.statements[0].budget} <= set(groups)
     # a second start has nothing left to do, and says the same to the last bit
 
@@ -272,6 +315,27 @@ def test_a_statement_from_a_few_trials(coarse_n10, tmp_path):
     assert "form of the part" in missing and "interreflections" in missing
     other = study_of(coarse_n10, unknowns={"pose": {"told_mm": 0.2}})
     assert trial_digest(other, study_unknowns(other), "render") != session.digest
+
+
+def test_unit_and_decoder_that_are_off_contribute_nothing(coarse_n10):
+    study = study_of(coarse_n10)
+    view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
+    groups = ("unit", "decoder")
+    trials = [Trial(4), Trial(4), *(Trial(4, 0, group) for group in groups)]
+    off = measurements_of(study, study_unknowns(study, tuple(one for one in GROUPS if one not in groups)))
+    outcomes = [outcome.errors for _, outcome in off.run([Job(view, trial) for trial in trials])]
+    assert outcomes[0][DISTANCE] == outcomes[0][DISTANCE]
+    assert all(outcome == outcomes[0] for outcome in outcomes[1:])  # to the last bit
+    on = measurements_of(study, study_unknowns(study))
+    first, again, *swapped = [outcome.errors for _, outcome in on.run([Job(view, trial) for trial in trials])]
+    assert first == again != outcomes[0]
+    assert all(outcome[DISTANCE] != first[DISTANCE] for outcome in swapped)
+    known = study_of(coarse_n10, unknowns={"decoder": {"known": True}, "unit": {"mask": "own"}})
+    maker = measurements_of(known, study_unknowns(known, ("decoder",)))
+    errors = [outcome.errors for _, outcome in maker.run([Job(view, Trial(day)) for day in (4, 5)])]
+    assert errors[0] == errors[1]
+    assert "decoder" not in budget_groups(maker.unknowns, "render", known.sensor)
+    assert "decoder" in budget_groups(on.unknowns, "render", study.sensor)
 
 
 def test_unknowns_of_a_study_are_checked(tmp_path):

@@ -45,6 +45,7 @@ from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.image_formation import converter
 from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.noise_sources import Noise
+from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.projector_images import described
 from mitsim.sensor.roi import roi_around
@@ -91,11 +92,11 @@ class SimulatedSensor:
         """Return the rays of a camera's pixel centres, with the calibration that this sensor was made with."""
         return PixelRays.of_camera(self._cameras[camera])
 
-    def recalibrated(self, rig: Rig, unit: int | None = None) -> SimulatedSensor:
+    def recalibrated(self, rig: Rig, unit: int | None = None, mask: DotPattern | None = None) -> SimulatedSensor:
         """Return a sensor of the same type with a calibration close to this one's.
 
-        The patterns of the projector, which need most memory on the device, are shared. Speckle is still drawn for the
-        pixels of this sensor's rig, because a small change does not affect its statistics.
+        Without another mask, the patterns of the projector are shared: they need most memory on the device. Speckle is
+        still drawn for the pixels of this sensor's rig, because a small change does not affect its statistics.
 
         Parameters
         ----------
@@ -104,14 +105,20 @@ class SimulatedSensor:
         unit
             Seed of another unit's fixed pattern; None keeps the pattern. It is this unit's pattern, shifted by random
             rows and columns: pixels are independent, so it is as good as a new draw and faster.
+        mask
+            Dots of another unit (:func:`mitsim.sensor.pattern.another_mask`), which its captures state; None keeps
+            this unit's.
         """
         other = copy.copy(self)
         optics = rig.projector or self.sensor.projector.optics
         projector = replace(self.sensor.projector, optics=optics)
-        other.sensor = replace(self.sensor, rig=rig, projector=projector)
+        other.sensor = replace(self.sensor, rig=rig, projector=projector, pattern=mask or self.sensor.pattern)
         cameras = self.sensor.misaligned(rig).cameras
         other.rays = {name: self.rays[name].recalibrated(camera) for name, camera in cameras.items()}
-        other.patterns = copy.copy(self.patterns)
+        if mask is not None and isinstance(self.patterns, ProjectedPatterns):
+            other.patterns = self.patterns.showing(other.sensor.patterns())
+        else:
+            other.patterns = copy.copy(self.patterns)
         other.patterns.projector = projector
         if unit is not None:
             shifts = np.random.default_rng(unit).integers(1, 10_000, (len(rig.cameras), 2))

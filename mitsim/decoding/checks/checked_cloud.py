@@ -19,7 +19,7 @@ from mitsim.decoding.checks.sanity import (
     row_error_in_words,
     uncalibrated_in_words,
 )
-from mitsim.decoding.cloud import capture_geometry
+from mitsim.decoding.cloud import capture_geometry, stored_geometry
 from mitsim.decoding.coded_images import decoded_once
 from mitsim.decoding.depth_range import range_warning, surface_beyond
 from mitsim.decoding.matching.stereo import StereoGeometry
@@ -69,7 +69,8 @@ def checked_cloud(
         If the settings belong to another technology, or the capture is inconsistent.
     """
     pair = _pair_geometry(capture, settings)
-    cloud, images, noise = decoded_once(capture, settings, imager, pair)
+    geometry = pair or stored_geometry(capture, settings, sensor)
+    cloud, images, noise = decoded_once(capture, settings, imager, geometry)
     found = Findings() if images is None else code_findings(images, capture.rig, capture.source == "device", pair)
     matched = pair_row_error(capture, cloud, pair)
     warnings = [*capture.settings.get("warnings", []), *found.warnings, *row_error_warnings(matched)]

@@ -48,6 +48,7 @@ from mitsim.decoding.matching.correlation_products import (
     right_correlations,
 )
 from mitsim.decoding.matching.sgbm import Matches, both_ways_disagreement, pixels_matched_back
+from mitsim.decoding.matching.sub_pixel import offset_of_minimum
 from mitsim.sensor.matcher import MatcherSettings
 
 #: bytes of the correlations that each thread holds at once, if they are computed disparity by disparity
@@ -87,7 +88,7 @@ def correlate_both_ways(
     noisy_right
         False if the right image is a reference without noise.
     """
-    height, uniqueness = left.shape[1], settings.uniqueness_percent
+    height = left.shape[1]
     width = columns[1] - columns[0]
     if len(left) >= _PRODUCT_FRAMES:
         pair, rows = prepare_pair(left, right, columns, first, count, settings.block_size), _PRODUCT_ROWS
@@ -97,7 +98,7 @@ def correlate_both_ways(
     def match_rows(start: int) -> tuple[Floats, Floats]:
         chunk = slice(start, min(start + rows, height))
         if pair is not None:
-            return _match_products(pair, chunk, uniqueness, noisy_right)
+            return _match_products(pair, chunk, settings, noisy_right)
         reach = settings.block_size // 2
         around = slice(max(chunk.start - reach, 0), min(chunk.stop + reach, height))
         inner = slice(chunk.start - around.start, chunk.stop - around.start)
@@ -111,7 +112,7 @@ def correlate_both_ways(
 
 
 def _match_products(
-    pair: PreparedPair, rows: slice, uniqueness_percent: int, noisy_right: bool
+    pair: PreparedPair, rows: slice, settings: MatcherSettings, noisy_right: bool
 ) -> tuple[Floats, Floats]:
     """Match rows of a prepared pair.
 
@@ -131,7 +132,7 @@ def _match_products(
     back = np.full((len(score), end - begin + 2 * count), np.nan, np.float32)
     back[:, 1 : end - begin + count] = np.where(matched, best, np.float32(np.nan))[:, ::-1]
     from_left = score[:, begin - pair.start : end - pair.start]
-    return _best_disparities(from_left, 2, pair.variance[rows], pair.lag[rows], uniqueness_percent, noisy_right), back
+    return _best_disparities(from_left, 2, pair.variance[rows], pair.lag[rows], settings, noisy_right), back
 
 
 @dataclass(frozen=True)
@@ -191,12 +192,12 @@ def _match_disparities(
     known = min(back_requested.shape[1], back.shape[1] - shift)
     back_requested[:, :known] = back[:, shift : shift + known]
     right_statistics = (variance_right[inner, shift:], lag[inner, shift:])
-    found = _best_disparities(score[:, :, requested], 0, *right_statistics, settings.uniqueness_percent, noisy_right)
+    found = _best_disparities(score[:, :, requested], 0, *right_statistics, settings, noisy_right)
     return found, back_requested
 
 
 def _best_disparities(
-    score: Floats, axis: int, variance: Floats, lag: Floats, uniqueness_percent: int, noisy_right: bool
+    score: Floats, axis: int, variance: Floats, lag: Floats, settings: MatcherSettings, noisy_right: bool
 ) -> Floats:
     """Return the best disparities (h, w) less ``first``, NaN if not unique.
 
@@ -207,10 +208,15 @@ def _best_disparities(
     best = score.argmax(axis=axis)
     beside = [np.expand_dims(np.clip(best + step, 0, count - 1), axis) for step in (-1, 0, 1)]
     lower, peak, upper = (np.take_along_axis(score, k, axis=axis).squeeze(axis) for k in beside)
-    step = _sub_pixel((lower, peak, upper), best, variance, lag, count, noisy_right)
+    fit = settings.sub_pixel
+    if fit == "method" or fit == "opencv":
+        step = _sub_pixel((lower, peak, upper), best, variance, lag, count, noisy_right)
+    else:
+        inside = (best > 0) & (best < count - 1)
+        step = np.where(inside, offset_of_minimum(-lower, -peak, -upper, fit), np.float32(0))
     for k in beside:
         np.put_along_axis(score, k, -1.0, axis=axis)
-    unique = (1 - peak) * 100 <= (1 - score.max(axis=axis)) * (100 - uniqueness_percent)
+    unique = (1 - peak) * 100 <= (1 - score.max(axis=axis)) * (100 - settings.uniqueness_percent)
     return np.where(unique & (peak > 0), best + step, np.nan).astype(np.float32)
 
 

@@ -11,6 +11,9 @@ camera to projector, and Z0 the depth of the reference plane (Khoshelham and Elb
 The reference is therefore the image of a camera at the projector, whose principal point is shifted by f B / Z0. A point
 follows exactly as in stereo.
 
+Each device stores the image of its own mask. Where the pattern is sampled follows from the rig alone, so that the
+reference of another device's mask costs one interpolation (:meth:`ReferenceGeometry.showing`).
+
 Depths follow from geometry alone. A device's own stored reference, its registration to a colour camera and its table of
 depths are not modelled. The reference has no noise and no shadow. Its sharpness is that of the pattern and ``blur_px``.
 """
@@ -33,7 +36,11 @@ from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.pattern import DotPattern, dot_frames
 from mitsim.sensor.point_spread import point_spread
+from mitsim.sensor.projector_images import ImagesDescription, ProjectorImages, described
 from mitsim.sensor.transforms import Transform
+
+#: a pattern of dots, or the image of one unit's mask
+Mask = DotPattern | ProjectorImages
 
 #: number of samples of the reference along each side of a pixel
 _SAMPLES_PER_SIDE = 3
@@ -52,10 +59,22 @@ class ReferenceGeometry:
         The rectified camera, and the reference in place of the right camera.
     reference
         (H, W) 0..1 on the rectified grid.
+    pattern
+        The mask of dots in the reference.
+    samples
+        (n, 2, H * W) projector rows and columns [px] that are averaged in each pixel of the reference.
+    projector_size
+        Width and height of the projector [px].
+    blur_px
+        Standard deviation of the blur of the reference by the camera's lens [px].
     """
 
     pair: StereoGeometry
     reference: NDArray[np.float32]
+    pattern: Mask
+    samples: NDArray[np.float32]
+    projector_size: tuple[int, int]
+    blur_px: float
 
     @property
     def grid(self) -> ViewGrid:
@@ -72,14 +91,29 @@ class ReferenceGeometry:
         """(3,) unit vector from camera to projector in the sensor frame."""
         return self.pair.baseline
 
+    def showing(self, pattern: DotPattern | ImagesDescription) -> ReferenceGeometry:
+        """Return the geometry for another mask of dots: that of another device of the same type.
 
-def reference_geometry(rig: Rig, pattern: DotPattern, reference_mm: float, blur_px: float = 0.5) -> ReferenceGeometry:
+        Raises
+        ------
+        InputError
+            If the mask is an image of which only the description is known.
+        """
+        if pattern == described(self.pattern):
+            return self
+        if isinstance(pattern, ImagesDescription):
+            raise unknown_mask()
+        image = _reference_image(pattern, self.projector_size, self.samples, self.reference.shape, self.blur_px)
+        return replace(self, reference=image, pattern=pattern)
+
+
+def reference_geometry(rig: Rig, pattern: Mask, reference_mm: float, blur_px: float = 0.5) -> ReferenceGeometry:
     """Rectify the camera of a rig toward its projector, and compute its reference image.
 
     Parameters
     ----------
     rig, pattern
-        The rig with its projector, and the pattern of dots.
+        The rig with its projector, and the mask of dots: a pattern, or an image of the user's own.
     reference_mm
         Depth Z0 of the reference plane along the axis of the rectified camera [mm].
     blur_px
@@ -126,24 +160,51 @@ def reference_geometry(rig: Rig, pattern: DotPattern, reference_mm: float, blur_
         )
         return np.asarray(projector.project(camera.centre + reference_mm * rays @ rotation.T).T)
 
-    pattern_image = dot_frames(pattern, projector.width, projector.height)[0]
     offsets = (np.arange(_SAMPLES_PER_SIDE) - (_SAMPLES_PER_SIDE - 1) / 2) / _SAMPLES_PER_SIDE
-    image = np.zeros(camera.height * camera.width)
-    for right, down in itertools.product(offsets, offsets):
-        u, v = np.nan_to_num(projector_position(right, down), nan=-9.0)  # outside the field: dark
-        image += map_coordinates(pattern_image, [v, u], order=1, mode="constant") / _SAMPLES_PER_SIDE**2
-    kernel = point_spread(blur_px)
-    reference = cv2.sepFilter2D(
-        image.reshape(camera.height, camera.width), -1, kernel, kernel, borderType=cv2.BORDER_REFLECT
-    )
+    samples = np.stack(
+        [
+            np.nan_to_num(projector_position(right, down), nan=-9.0)[::-1]  # outside the field: dark
+            for right, down in itertools.product(offsets, offsets)
+        ]
+    ).astype(np.float32)
+    size, shape = (projector.width, projector.height), (camera.height, camera.width)
     u, v = projector_position(0.0, 0.0)
     lit = (u >= 0) & (u <= projector.width - 1) & (v >= 0) & (v <= projector.height - 1)
-    seen = pair.seen_right & lit.reshape(reference.shape)
+    seen = pair.seen_right & lit.reshape(shape)
     if not seen.any():
         raise InputError(
             "rig", "projector", f"nothing lit at {reference_mm:g} mm", "a projector that lights what the camera sees"
         )
-    return ReferenceGeometry(replace(pair, seen_right=seen), reference.astype(np.float32))
+    reference = _reference_image(pattern, size, samples, shape, blur_px)
+    return ReferenceGeometry(replace(pair, seen_right=seen), reference, pattern, samples, size, blur_px)
+
+
+def unknown_mask() -> InputError:
+    """Return the error that the image of a mask is in the sensor file, not in the capture."""
+    return InputError(
+        "capture",
+        "pattern",
+        "an image of the user's own",
+        "the mask itself",
+        "name the sensor file that has it: --sensor",
+    )
+
+
+def _reference_image(
+    pattern: Mask,
+    size: tuple[int, int],
+    samples: NDArray[np.float32],
+    shape: tuple[int, ...],
+    blur_px: float,
+) -> NDArray[np.float32]:
+    """Return the image (H, W) of a pattern at the samples (n, 2, H * W) of each pixel, blurred by the lens."""
+    field = pattern.patterns()[0] if isinstance(pattern, ProjectorImages) else dot_frames(pattern, *size)[0]
+    image = np.mean([map_coordinates(field, each, order=1, mode="constant") for each in samples], axis=0)
+    kernel = point_spread(blur_px)
+    blurred = cv2.sepFilter2D(
+        image.reshape(shape).astype(np.float64), -1, kernel, kernel, borderType=cv2.BORDER_REFLECT
+    )
+    return np.asarray(blurred, np.float32)
 
 
 def decode_reference(
@@ -156,7 +217,7 @@ def decode_reference(
     images
         (H, W) or (1, H, W) raw image [DN] of the camera, uint8 or uint16.
     geometry
-        From :func:`reference_geometry`, for the same rig and pattern.
+        From :func:`reference_geometry`, for the same rig and the mask of the device that took the image.
     settings, context
         As for :func:`mitsim.decoding.matching.stereo.decode_stereo`, for the one camera.
 

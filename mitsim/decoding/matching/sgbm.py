@@ -9,7 +9,7 @@ pixel and P2 for larger ones. Both are scaled by the block's area, as OpenCV doc
 by default).
 
 Disparities have steps of 1/16 px. They are biased toward whole pixels (pixel locking) by up to 0.14 px at quarters of a
-pixel.
+pixel. Modes of one pass have no paths from below: where the disparity changes from row to row, they follow it late.
 """
 
 from __future__ import annotations
@@ -221,7 +221,7 @@ def _disparities(
 
     OpenCV adds the offset of its parabola [1/16 px] to the whole disparity, with a division that rounds toward zero.
     Negative offsets are therefore one step too large, and zero represents -1.5 to 0.5. The mean bias would be 0.03 px.
-    Here each step becomes the middle of the interval that it represents.
+    Here each step becomes the middle of the interval that it represents, unless ``settings.sub_pixel`` is ``opencv``.
     """
     reference, other = np.ascontiguousarray(reference), np.ascontiguousarray(other)
     height, width = reference.shape[0], reference.shape[1] - count
@@ -231,6 +231,8 @@ def _disparities(
     else:
         found = match_in_bands(reference, other, count, penalties, rows_in_budget(budget, height, width, count))
     sixteenths = found.astype(np.float32)
+    if settings.sub_pixel == "opencv":
+        return np.where(sixteenths < 0, np.float32(np.nan), sixteenths / 16)
     offset = np.mod(sixteenths, 16)  # 0 to 8 are not negative; 9 to 15 are -7 to -1
     too_large = np.where(offset > 8, np.float32(1), np.where(offset == 0, np.float32(0.5), np.float32(0)))
     return np.where(sixteenths < 0, np.float32(np.nan), (sixteenths - too_large) / 16)

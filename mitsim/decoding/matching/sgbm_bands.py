@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any, Literal, Protocol
 
 import cv2
 import numpy as np
@@ -25,6 +26,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 Costs = NDArray[np.int16]
+Mode = Literal["hh", "sgbm", "3way"]
 
 #: largest cost of a pixel: 2 x 127 from the gradient, and a quarter of 255 grey levels
 _LARGEST_PIXEL_COST = 2 * 127 + 63
@@ -123,8 +125,34 @@ def match_in_bands(
     --------
     bytes_of_band : its memory
     """
-    height = len(reference)
-    images = _MatchingCosts(reference, other, count, penalties)
+    cap, p1, p2 = max(penalties.cap, 15) | 1, penalties.p1 or 2, penalties.p2 or 5
+    used = Penalties(penalties.block, p1, max(p2, p1 + 1), cap, penalties.uniqueness)
+    out = np.full(reference.shape, -16, np.int16)
+    for row, total in summed_paths(BlockCosts(_GradientCosts(reference, other, count, cap), used), band_rows):
+        out[row, count:] = _best_disparities(total, count, used.uniqueness)
+        del total  # a view of a whole band, which would live on beside the next
+    return np.asarray(cv2.medianBlur(out, 3))
+
+
+class PixelCosts(Protocol):
+    """Matching costs of single pixels: of ``width`` columns in ``height`` rows, at ``count`` disparities."""
+
+    height: int
+    width: int
+    count: int
+
+    def row(self, row: int) -> Costs:
+        """Return the costs (w, count) of a row."""
+
+
+def summed_paths(images: BlockCosts, band_rows: int, mode: Mode = "hh") -> Iterator[tuple[int, Costs]]:
+    """Yield each row, in any order, with the sum (w, count) of its paths, in bands of rows.
+
+    ``mode``: all eight paths for ``hh``. One pass over the image, as in hardware, has none from below: both along the
+    row and the three from above for ``sgbm``, or the one straight from above for ``3way``.
+    """
+    height = images.pixels.height
+    from_above, from_below = (1,) if mode == "3way" else (0, 1, 2), mode == "hh"
     begins = list(range(0, height, band_rows))
     saved = []
     above = images.zero_paths()
@@ -134,8 +162,7 @@ def match_in_bands(
         if begin == begins[-1]:
             break
         for cost in images.costs(begin, begin + band_rows):
-            above.advance(cost, images.penalties, scratch)
-    out = np.full(reference.shape, -16, np.int16)
+            above.advance(cost, images.penalties, scratch, from_above)
     below = images.zero_paths()
     for begin in reversed(begins):
         end = min(begin + band_rows, height)
@@ -143,13 +170,13 @@ def match_in_bands(
         total = _horizontal_paths(cost, images.penalties)
         above = saved.pop()
         for row in range(end - begin):
-            above.advance(cost[row], images.penalties, scratch, total[row])
+            above.advance(cost[row], images.penalties, scratch, from_above, total[row])
         del above
         for row in reversed(range(end - begin)):
-            below.advance(cost[row], images.penalties, scratch, total[row])
-            out[begin + row, count:] = _best_disparities(total[row], count, images.penalties.uniqueness)
+            if from_below:
+                below.advance(cost[row], images.penalties, scratch, from_above, total[row])
+            yield begin + row, total[row]
         del cost, total
-    return np.asarray(cv2.medianBlur(out, 3))
 
 
 class _Paths:
@@ -165,10 +192,17 @@ class _Paths:
     def copy(self) -> _Paths:
         return _Paths(self.paths.copy(), self.least.copy())
 
-    def advance(self, cost: Costs, penalties: Penalties, scratch: Costs, total: Costs | None = None) -> None:
+    def advance(
+        self,
+        cost: Costs,
+        penalties: Penalties,
+        scratch: Costs,
+        directions: tuple[int, ...],
+        total: Costs | None = None,
+    ) -> None:
         """Advance to the next row with the given cost (w, count), and add the paths to a total (w, count)."""
         width = len(cost)
-        for direction in range(3):
+        for direction in directions:
             before = slice(direction, direction + width)
             path = _next_path_costs(
                 self.paths[direction, before], self.least[direction, before], cost, penalties, scratch
@@ -213,27 +247,12 @@ def _horizontal_paths(cost: Costs, penalties: Penalties) -> Costs:
     return total
 
 
-class _MatchingCosts:
-    """Both images as OpenCV compares them, and the matching costs of their rows."""
+class BlockCosts:
+    """Matching costs of rows: those of ``pixels``, summed over blocks."""
 
-    def __init__(
-        self, reference: NDArray[np.uint8], other: NDArray[np.uint8], count: int, penalties: Penalties
-    ) -> None:
-        cap = max(penalties.cap, 15) | 1
-        p1 = penalties.p1 if penalties.p1 > 0 else 2
-        p2 = max(penalties.p2 if penalties.p2 > 0 else 5, p1 + 1)
-        self.penalties = Penalties(penalties.block, p1, p2, cap, penalties.uniqueness)
-        self.count, self.width, self.last = count, reference.shape[1] - count, len(reference) - 1
-        self.reference = _channels(reference, cap)
-        # column x of the reference is compared with column x - d of the other image; the disparities of one column are
-        # adjacent in the mirrored image
-        self.compared = [
-            [
-                sliding_window_view(np.ascontiguousarray(each[:, ::-1]), self.count, axis=1)[:, : self.width][:, ::-1]
-                for each in channel
-            ]
-            for channel in _channels(other, cap)
-        ]
+    def __init__(self, pixels: PixelCosts, penalties: Penalties) -> None:
+        self.pixels, self.penalties = pixels, penalties
+        self.count, self.width, self.last = pixels.count, pixels.width, pixels.height - 1
 
     def zero_paths(self) -> _Paths:
         """Return the paths before the first row and after the last."""
@@ -256,7 +275,7 @@ class _MatchingCosts:
 
     def _row_sums(self, row: int) -> Costs:
         """Return sums (w, count) of a row's pixel costs over the width of a block, with repeated edges."""
-        cost = self._pixel_costs(row)
+        cost = self.pixels.row(row)
         reach = self.penalties.block // 2
         padded = np.pad(cost, ((reach, reach), (0, 0)), mode="edge")
         total = padded[: self.width].copy()
@@ -264,7 +283,16 @@ class _MatchingCosts:
             total += padded[shift : shift + self.width]
         return total
 
-    def _pixel_costs(self, row: int) -> Costs:
+
+class _GradientCosts:
+    """Both images as OpenCV compares them, with gradients that are clipped to ``cap``."""
+
+    def __init__(self, reference: NDArray[np.uint8], other: NDArray[np.uint8], count: int, cap: int) -> None:
+        self.height, self.width, self.count = len(reference), reference.shape[1] - count, count
+        self.reference = _channels(reference, cap)
+        self.compared = [[beside_each_other(each, count) for each in channel] for channel in _channels(other, cap)]
+
+    def row(self, row: int) -> Costs:
         """Return the Birchfield-Tomasi costs (w, count) of a row: gradients, and a quarter of the grey levels."""
         total = np.zeros((self.width, self.count), np.int16)
         for channel, shift in ((0, 0), (1, 2)):
@@ -274,6 +302,15 @@ class _MatchingCosts:
             backward = np.maximum(np.maximum(v, u1) - u1, np.maximum(u0, v) - v)
             total += np.minimum(forward, backward) >> shift
         return total
+
+
+def beside_each_other(image: NDArray[Any], count: int) -> NDArray[Any]:
+    """Return the pixels (h, w, count) with which each column of a reference is compared: x - d for column x.
+
+    The disparities of one column are adjacent in the mirrored image.
+    """
+    width = image.shape[1] - count
+    return sliding_window_view(np.ascontiguousarray(image[:, ::-1]), count, axis=1)[:, :width][:, ::-1]
 
 
 def _channels(image: NDArray[np.uint8], cap: int) -> list[list[NDArray[np.uint8]]]:

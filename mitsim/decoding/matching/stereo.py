@@ -36,7 +36,9 @@ from characterisation.region_of_interest import Roi, checked_roi
 from mitsim.decoding.grid_cloud import cloud_on_grid
 from mitsim.decoding.image_context import ImageContext
 from mitsim.decoding.interpolated import needed_region, was_read_out
+from mitsim.decoding.matching.census import match_census_both_ways
 from mitsim.decoding.matching.correlation import correlate_both_ways
+from mitsim.decoding.matching.disparity_filters import median_of_neighbours, without_speckles
 from mitsim.decoding.matching.evidence import (
     block_deviation,
     block_saturated,
@@ -44,7 +46,7 @@ from mitsim.decoding.matching.evidence import (
     nearest_value,
     right_property,
 )
-from mitsim.decoding.matching.sgbm import local_contrast, match_both_ways, search_range
+from mitsim.decoding.matching.sgbm import Matches, local_contrast, match_both_ways, search_range
 from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
 from mitsim.sensor.distortion_fold import before_fold, inverse_fold_radii
 from mitsim.sensor.matcher import MatcherSettings
@@ -191,7 +193,7 @@ def decode_stereo(
             "images",
             f"{len(left)} left and {len(right)} right for {settings.method}",
             allowed,
-            'several frames are matched by method = "correlation"',
+            'several frames are matched by method = "correlation" or "census"',
         )
     if roi is None and read_out[0] is not None:
         roi = rectified_roi(geometry, read_out[0])
@@ -203,7 +205,12 @@ def decode_stereo(
     left_strips, left_full = _rectified(left, geometry.map_left[:, rows], full_scale, settings.method)
     right_strips, right_full = _rectified(right, geometry.map_right[:, rows], full_scale, settings.method)
     first, count = search_range(rectification, settings)
-    if settings.method == "correlation":
+    matches: Matches
+    if settings.method == "census":
+        matches = match_census_both_ways(
+            np.stack(left_strips), np.stack(right_strips), (begin, end), first, count, settings
+        )
+    elif settings.method == "correlation":
         matches = correlate_both_ways(
             _centred(left_strips, left, read_out[0], full_scale),
             _centred(right_strips, right, read_out[1], full_scale),
@@ -224,7 +231,7 @@ def decode_stereo(
     depth = rectification.depth(disparity)
 
     columns = np.arange(begin, end)
-    block = settings.block_size
+    block = settings.support_px
     seen_left, seen_right = geometry.seen_left[rows, begin:end], geometry.seen_right[rows]
     if read_out[0] is not None:
         seen_left = seen_left & _read_out_pixels(
@@ -239,6 +246,11 @@ def decode_stereo(
     disparity_or_zero = np.where(matched, disparity, 0)
     right_exists = right_property(seen_right, columns, disparity_or_zero, outside=False)
     valid = matched & in_range & confirmed & seen_left & right_exists & ~blank_left
+    if settings.speckle_px or settings.median_px:
+        kept = np.where(valid, disparity, np.float32(np.nan))
+        kept = without_speckles(kept, settings.speckle_px, settings.speckle_range_px)
+        depth = rectification.depth(median_of_neighbours(kept, settings.median_px))
+        valid = np.isfinite(kept)
 
     # disparity at which the right camera would see the pixel, if the pixel belonged to the nearest decoded surface
     expected = nearest_value(disparity, valid, first + count / 2)
@@ -310,7 +322,7 @@ def _centred(strips: Strips, raw: Raw, read_out: Roi | None, full_scale: float) 
 
 def _lacks_contrast(strips: Strips, settings: MatcherSettings) -> NDArray[np.bool_]:
     """Return where a block has too little contrast in every frame (h, W)."""
-    deviation = np.max([block_deviation(strip, settings.block_size) for strip in strips], axis=0)
+    deviation = np.max([block_deviation(strip, settings.support_px) for strip in strips], axis=0)
     return np.asarray(deviation < settings.minimum_contrast_dn)
 
 

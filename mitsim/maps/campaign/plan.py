@@ -358,10 +358,16 @@ _NUMPY_PRINTS: dict[str, Any] = {
 def _written(sensor: Sensor) -> str:
     # values of a single unit; a file without them keeps its former checksum, which existing maps have
     own = [sensor.room, sensor.misalignment, sensor.imager.smoothing_px]
-    lens = sensor.imager.corner_blur_px
+    lens, settings = sensor.imager.corner_blur_px, sensor.settings
+    # keys of a decoder that came later, which its text does not have
+    later = {
+        key: getattr(settings, key)
+        for key, field in type(settings).model_fields.items()
+        if not field.repr and getattr(settings, key) != field.default
+    }
     with np.printoptions(**_NUMPY_PRINTS):
         said = repr(sensor) + (repr(own) if own != [None, MisalignmentTable(), 0.0] else "")
-        return said + ("" if lens is None else f"corner_blur_px={lens!r}")
+        return said + ("" if lens is None else f"corner_blur_px={lens!r}") + (repr(later) if later else "")
 
 
 def _digest(file: CampaignFile, sensor: Sensor, sample: Sample, distance: float, place: str) -> str:

@@ -11,6 +11,7 @@ loop evaluates both on the same paths. The radiometry is that of :mod:`mitsim.se
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Sequence
 from functools import reduce
 from operator import add
@@ -82,14 +83,35 @@ class ProjectedPatterns:
         emitted = projector.emit(patterns[:, :1] if self.along_row else patterns)
         chosen, self.weights = independent(emitted)
         self.codes = len(chosen)
-        stack = np.ascontiguousarray(np.moveaxis(emitted[chosen], 0, -1))
-        kind, stack = (mi.Texture1f, stack[0]) if self.along_row else (mi.Texture2f, stack)
         gap = float(projector.pixel_gap)
         self.has_gap = gap > 0
         self.size = [opaque(n) for n in (optics.width, optics.height)]
         self.half_lit, self.lit_factor = (opaque(n) for n in (0.5 - 0.5 * gap, 1.0 / (1.0 - gap) ** 2))
+        self.texture = self._stored(emitted[chosen])
+
+    def _stored(self, codes: NDArray[np.float32]) -> Any:
+        """Return codes (C, H, W) as a texture on the device."""
+        stack = np.ascontiguousarray(np.moveaxis(codes, 0, -1))
+        kind, stack = (mi.Texture1f, stack[0]) if self.along_row else (mi.Texture2f, stack)
         filter_mode = dr.FilterMode.Nearest if self.has_gap else dr.FilterMode.Linear
-        self.texture = kind(mi.TensorXf(stack), wrap_mode=dr.WrapMode.Clamp, filter_mode=filter_mode)
+        return kind(mi.TensorXf(stack), wrap_mode=dr.WrapMode.Clamp, filter_mode=filter_mode)
+
+    def showing(self, patterns: NDArray[np.floating]) -> ProjectedPatterns:
+        """Return the same projector with other patterns of the same kind, such as the mask of another device.
+
+        Textures have the same shape, so that the kernels of these patterns serve the others.
+
+        Raises
+        ------
+        InputError
+            If the patterns do not have the size of the projector.
+        """
+        plain = self.codes == self.count and not self.along_row
+        if not plain or patterns.shape != (self.count, self.projector.optics.height, self.projector.optics.width):
+            return ProjectedPatterns(patterns, self.projector)
+        other = copy.copy(self)
+        other.texture = self._stored(self.projector.emit(patterns))
+        return other
 
     def values(self, uv: Any, length: Any, active: Any) -> list[Any]:
         """Return the relative light of each independent pattern at texture coordinate ``uv``."""

@@ -165,7 +165,7 @@ def coordinate_noise(sensor: Sensor, distance_mm: float, square_px: float, seed:
     white = window**2 / 2
     pattern, imager = sensor.pattern, sensor.imager
     level = board_level(sensor, distance_mm)
-    if isinstance(pattern, DotPattern):
+    if sensor.technology == "reference_stereo":
         return float(_matching_noise(sensor, level) / np.sqrt(max(white / _block(sensor) ** 2, 1.0)))
     if isinstance(pattern, ProjectorImages):
         raise unknown_code(f"sensor {sensor.name}", pattern.count)
@@ -223,7 +223,7 @@ def _block(sensor: Sensor) -> int:
 def _matching_noise(sensor: Sensor, level: float) -> float:
     """Return the noise of a block matched to a noiseless reference [projector px]: sigma_I / |gradient|, and steps."""
     assert sensor.matcher is not None and sensor.matcher.reference_mm is not None
-    assert isinstance(sensor.pattern, DotPattern)
+    assert isinstance(sensor.pattern, DotPattern | ProjectorImages)
     imager = sensor.imager
     reference = reference_geometry(sensor.rig, sensor.pattern, sensor.matcher.reference_mm, imager.blur_px).reference
     electrons = level * imager.full_well * reference.astype(np.float64)

@@ -65,9 +65,11 @@ def influences(table: UnknownsTable, source: str, depth: int) -> list[Influence]
         Influence("error of the assumed pose", pose.told_mm > 0 or pose.told_deg > 0, "drawn anew in every trial"),
         Influence("noise of the imager, speckle", True, "drawn anew in every trial"),
         Influence(
-            "fixed pattern of another unit",
+            "fixed pattern and mask of dots of another unit",
             rendered,
-            "drawn" if rendered else "that of the unit that the map was made with",
+            ("drawn" if table.unit.mask == "another" else "drawn; the mask is that of the sensor file")
+            if rendered
+            else "that of the unit that the map was made with",
         ),
         Influence(
             "interreflections",
@@ -76,7 +78,11 @@ def influences(table: UnknownsTable, source: str, depth: int) -> list[Influence]
         ),
         Influence("edges and curved faces", True, "rendered and decoded" if rendered else _OTHER_PARTS),
         Influence(
-            "the maker's own software", False, "mitsim decodes with OpenCV instead; compare with captures of your unit"
+            "the maker's own software",
+            rendered and not table.decoder.known,
+            "drawn from decoders within published ranges; compare with captures of your unit"
+            if rendered and not table.decoder.known
+            else "mitsim decodes with the settings of the sensor file; compare with captures of your unit",
         ),
         Influence("vibration, motion during a capture", False, "hold the sensor and the part still"),
         Influence("dirt, oil, coatings, marks on the part", False, "clean the part as for the characterisation"),

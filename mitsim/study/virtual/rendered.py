@@ -44,9 +44,11 @@ from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.scene.ray_casting.triangles import hull_corners
 from mitsim.scene.surface.scatter import Deviation
 from mitsim.sensor.exposure import PlannedExposure
+from mitsim.sensor.pattern import DotPattern, another_mask
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, Study
+from mitsim.study.virtual.drawn_decoder import drawn_decoder
 from mitsim.study.virtual.form import form_deviation
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.trials import Outcome
@@ -172,19 +174,25 @@ class RenderedMeasurements:
     def lit(self, view: View, drawn: DrawnValues) -> TracedLight:
         """Trace the light of one draw in a view, which all of its exposures share."""
         true, assumed = (motion.inverse() @ view.world_from_sensor for motion in (drawn.placed, drawn.assumed))
-        sensor = self.simulated.recalibrated(drawn.rig, drawn.unit)
+        sensor = self.simulated.recalibrated(drawn.rig, drawn.unit or None, self._mask(drawn.unit))
         if self.separate_light:
-            source, pose, shared = sensor, true, self._shared(sensor, true, view, False)
+            pose, shared = true, self._shared(sensor, true, view, False)
         else:
-            source, pose, shared = self.simulated, view.world_from_sensor, self._view_light(view)
+            pose, shared = view.world_from_sensor, self._view_light(view)
         scene, albedos = self._scene(drawn.finish)
-        indirect = self._indirect(source, scene, pose, view, drawn, shared)
+        indirect = self._indirect(sensor, scene, pose, view, drawn, shared)
         room = {
-            name: source.apply_lens(one.room_radiance(albedos), name, shared.rois[name])
+            name: sensor.apply_lens(one.room_radiance(albedos), name, shared.rois[name])
             for name, one in shared.seen.items()
         }
         light = sensor.light(scene, true, seed=drawn.seed, rendering=replace(self.rendering, indirect=indirect))
         return TracedLight(sensor, light, room, drawn, assumed)
+
+    def _mask(self, unit: int) -> DotPattern | None:
+        """Return the mask of dots of a unit; None for that of the sensor file."""
+        pattern = self.study.sensor.pattern
+        redrawn = unit > 0 and self.unknowns.table.unit.mask == "another"
+        return another_mask(pattern, unit) if redrawn and isinstance(pattern, DotPattern) else None
 
     def exposed(self, lit: TracedLight, planned: PlannedExposure | None, seed: int, keep: bool = False) -> Capture:
         """Expose light as planned, or by the sensor's own rule.
@@ -217,13 +225,17 @@ class RenderedMeasurements:
         )
         return replace(lit.sensor.expose(light, seed), rig=self.study.sensor.rig)
 
-    def unlabelled_cloud(self, capture: Capture) -> PointCloud:
-        """Decode a capture of this sensor with its nominal calibration, without path, temperature and form errors."""
+    def unlabelled_cloud(self, capture: Capture, decoder: int = 0) -> PointCloud:
+        """Decode a capture of this sensor with its nominal calibration, without path, temperature and form errors.
+
+        ``decoder`` is the seed of a drawn decoder, 0 for that of the sensor file.
+        """
         sensor = self.study.sensor
-        return capture_cloud(capture, sensor.settings, self.geometry, imager=sensor.imager)
+        settings = drawn_decoder(sensor, self.unknowns.table.decoder, decoder)
+        return capture_cloud(capture, settings, self.geometry, imager=sensor.imager)
 
     def _cloud(self, captured: _Captured) -> PointCloud:
-        scene, cloud = self.study.scene, self.unlabelled_cloud(captured.capture)
+        scene, cloud = self.study.scene, self.unlabelled_cloud(captured.capture, captured.drawn.decoder)
         points = displaced(cloud, captured.drawn, captured.assumed, scene.centre)
         if captured.surfaces is not None:
             form = self.unknowns.table.form.features

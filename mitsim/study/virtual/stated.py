@@ -23,8 +23,10 @@ from characterisation.statements.verdict_words import Judged
 from mitsim.running.text_table import aligned
 from mitsim.running.version import __version__
 from mitsim.sensor.exposure import PlannedExposure
+from mitsim.sensor.preset import Sensor
 from mitsim.study import StatementTable
 from mitsim.study.exposures.planned import with_exposure
+from mitsim.study.virtual.drawn_decoder import decoder_is_drawn
 from mitsim.study.virtual.influences import influences
 from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.race import Job, complete
@@ -65,7 +67,7 @@ def state_view(session: Session, view: View, table: StatementTable | None = None
     table = table or study.file.statement
     base = [Trial(STATEMENT_DAYS + k) for k in range(table.trials)]
     pairs = base[: min(table.pairs, table.trials)]
-    groups = budget_groups(session.unknowns, session.source)
+    groups = budget_groups(session.unknowns, session.source, study.sensor)
     swapped = {group: [Trial(one.day, one.capture, group) for one in pairs] for group in groups}
     repeats = [Trial(one.day, one.capture + 1) for one in pairs]
     wanted = [*base, *repeats, *(trial for some in swapped.values() for trial in some)]
@@ -86,10 +88,12 @@ def state_view(session: Session, view: View, table: StatementTable | None = None
     return StatedView(view, out, planned)
 
 
-def budget_groups(unknowns: Unknowns, source: str) -> list[str]:
+def budget_groups(unknowns: Unknowns, source: str, sensor: Sensor) -> list[str]:
     """Return the groups of unknowns with a line in the budget: those that are drawn and can have an effect."""
     table = unknowns.table
-    idle = {"light", "unit"} if source == "map" else {BEYOND}
+    idle = {"light", "unit", "decoder"} if source == "map" else {BEYOND}
+    if not decoder_is_drawn(sensor, table.decoder):
+        idle.add("decoder")
     if not any(size > 0 for size in table.form.features.values()):
         idle.add("form")
     if source != "map" and not any(table.finish.model_dump().values()):

@@ -29,16 +29,18 @@ from mitsim.sensor.room_light import room_irradiance
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import FinishUnknowns, UnknownsTable
 
-#: groups of unknowns that all captures of a day share, and groups that are drawn for every capture
-COMMON = ("calibration", "finish", "form", "light", "temperature", "unit")
-FRESH = ("pose", "noise")
-
 #: effects outside the performance map, for measurements drawn from a map (:mod:`mitsim.study.virtual.beyond_map`); they
 #: are the same in all captures of a day
 BEYOND = "beyond_map"
 
-#: all groups; the index of a group in this tuple seeds its stream
-GROUPS = (*COMMON, *FRESH, BEYOND)
+#: groups of unknowns that are drawn for every capture
+FRESH = ("pose", "noise")
+
+#: all groups; the index of a group in this tuple seeds its stream, so that a new one comes last
+GROUPS = ("calibration", "finish", "form", "light", "temperature", "unit", *FRESH, BEYOND, "decoder")
+
+#: groups that all captures of a day share
+COMMON = tuple(group for group in GROUPS if group not in (*FRESH, BEYOND))
 
 #: seed of the stream of finishes, different from those of the groups
 _FINISH_STREAM = 8
@@ -70,11 +72,12 @@ class DrawnValues:
     """All values that were drawn for one trial.
 
     ``rig`` is the sensor's true geometry. ``path`` is offset [mm] and scale [1] of a time-of-flight distance.
-    ``finish`` numbers the deviation of the finishes (:func:`finish_deviation`), -1 for the best estimate. ``form`` and
-    ``unit`` are seeds, 0 for none. ``room`` is irradiance [W/mm^2]. ``power`` and ``exposure`` are relative to nominal
-    [1]. ``expansion`` of the part is relative [1]. ``placed`` and ``assumed`` (world to world) are the true and the
-    assumed motion of the part from its nominal pose. ``seed`` is that of the capture, ``beyond`` that of effects
-    outside the map, 0 for none.
+    ``finish`` numbers the deviation of the finishes (:func:`finish_deviation`), -1 for the best estimate. ``form``,
+    ``unit`` and ``decoder`` are seeds, 0 for none: the unit's patterns, and
+    :func:`mitsim.study.virtual.drawn_decoder.drawn_decoder`. ``room`` is irradiance [W/mm^2]. ``power`` and
+    ``exposure`` are relative to nominal [1]. ``expansion`` of the part is relative [1]. ``placed`` and ``assumed``
+    (world to world) are the true and the assumed motion of the part from its nominal pose. ``seed`` is that of the
+    capture, ``beyond`` that of effects outside the map, 0 for none.
     """
 
     rig: Rig
@@ -90,6 +93,7 @@ class DrawnValues:
     unit: int
     seed: int
     beyond: int = 0
+    decoder: int = 0
 
 
 @dataclass(frozen=True)
@@ -135,6 +139,7 @@ class Unknowns:
             unit=_seed(streams["unit"]) if "unit" in self.varied else 0,
             seed=_seed(streams["noise"]),
             beyond=_seed(streams[BEYOND]) if BEYOND in self.varied else 0,
+            decoder=_seed(streams["decoder"]) if "decoder" in self.varied else 0,
         )
 
     def _stream(self, group: str, trial: Trial) -> np.random.Generator:

@@ -40,6 +40,7 @@ from mitsim.sensor.modulation import AmplitudeModulation
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.pattern import RandomDots
 from mitsim.sensor.preset import Sensor
+from mitsim.sensor.projector_images import ImagesDescription
 from mitsim.twin.compare.plain_image import plain_image
 from mitsim.twin.compare.plate import REFLECTANCE, plate, printed, texture_of
 from mitsim.twin.finish.electrons import chip_of, linearised
@@ -142,7 +143,8 @@ def like(real: Capture, sensor: Sensor, where: str) -> Sensor:
     count = len(next(iter(real.images.values())))
     projector, pattern = sensor.projector, sensor.pattern
     if real.technology == "structured_light":
-        pattern = capture_pattern(real) or pattern  # the order of the recorded images
+        recorded = capture_pattern(real)  # the order of the recorded images
+        pattern = pattern if recorded is None or isinstance(recorded, ImagesDescription) else recorded
     if real.rig.projector is not None:
         projector = replace(projector, optics=real.rig.projector)
     if isinstance(pattern, RandomDots) and pattern.frames != count:

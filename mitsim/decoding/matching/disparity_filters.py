@@ -1,0 +1,47 @@
+"""Filter disparities as makers do: remove small regions that stand apart, and take the median of neighbours.
+
+No filter fills a pixel: one without a match stays lost.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from mitsim.decoding.matching.evidence import nearest_value
+
+Disparities = NDArray[np.float32]
+
+#: steps of a disparity in which regions are compared, and the integer of a pixel without one
+_STEPS_PER_PX, _NONE = 16, np.iinfo(np.int16).min
+
+
+def without_speckles(disparity: Disparities, most_px: int, range_px: float) -> Disparities:
+    """Return disparities (h, w) without regions of up to ``most_px`` pixels; NaN is none.
+
+    Neighbours within ``range_px`` of one another belong to one region.
+    """
+    known = np.isfinite(disparity)
+    if most_px == 0 or not known.any():
+        return disparity
+    middle = np.float32(np.median(disparity[known]))
+    limit = np.float32(np.iinfo(np.int16).max)
+    steps = np.clip(np.rint((disparity - middle) * _STEPS_PER_PX), -limit, limit)
+    image = np.where(known, steps, _NONE).astype(np.int16)
+    cv2.filterSpeckles(image, _NONE, most_px, round(range_px * _STEPS_PER_PX))
+    return np.where(image == _NONE, np.float32(np.nan), disparity)
+
+
+def median_of_neighbours(disparity: Disparities, side: int) -> Disparities:
+    """Return disparities (h, w) of which each is the median of a square of ``side`` pixels; 0 for no filter.
+
+    A neighbour without a disparity counts as the nearest one that has one.
+    """
+    known = np.isfinite(disparity)
+    if side == 0 or not known.any():
+        return disparity
+    filled = nearest_value(np.where(known, disparity, 0).astype(np.float32), known, 0.0)
+    smooth = cv2.medianBlur(filled, side) if side <= 5 else median_filter(filled, side, mode="nearest")
+    return np.where(known, smooth, np.float32(np.nan)).astype(np.float32)
