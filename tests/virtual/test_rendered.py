@@ -27,7 +27,8 @@ from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import displaced
 from mitsim.study.virtual.stated import budget_groups, statement_document
 from mitsim.study.virtual.study_unknowns import study_unknowns
-from mitsim.study.virtual.world import Trial, finish_deviation
+from mitsim.study.virtual.drawn_finish import finish_deviation
+from mitsim.study.virtual.world import Trial
 from tests.smaller_sensors import binned, coarse_sensor, middle_part
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"

@@ -11,16 +11,15 @@ from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import parameter_names
 from mitsim.sensor.room_light import room_irradiance
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
+from mitsim.study.virtual.drawn_finish import DRAWN, FINISHES, finish_deviation, finish_numbers
 from mitsim.study.virtual.world import (
     FINISH_DAYS,
-    FINISHES,
     FRESH,
     GROUPS,
     OWN_FINISH_DAYS,
     STATEMENT_DAYS,
     Trial,
     Unknowns,
-    finish_deviation,
 )
 
 

@@ -14,21 +14,19 @@ gives its share of the variance (:mod:`characterisation.statements.budget`).
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import ndtri
 
-from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import eyes, moved, parameter_names, path_error
 from mitsim.sensor.room_light import room_irradiance
 from mitsim.sensor.transforms import Transform
-from mitsim.sensor.unknowns import FinishUnknowns, UnknownsTable
+from mitsim.sensor.unknowns import UnknownsTable
+from mitsim.study.virtual.drawn_finish import FINISHES
 
 #: groups of unknowns that all captures of a day share, and groups that are drawn for every capture
 COMMON = ("calibration", "finish", "form", "light", "temperature", "unit")
@@ -41,13 +39,7 @@ BEYOND = "beyond_map"
 #: all groups; the index of a group in this tuple seeds its stream
 GROUPS = (*COMMON, *FRESH, BEYOND)
 
-#: seed of the stream of finishes, different from those of the groups
-_FINISH_STREAM = 8
-
-#: size of the pool of finishes that trials share, since interreflections must be rendered for each finish
-FINISHES = 8
-
-#: number of successive days that share a finish, for the same reason
+#: number of successive days that share a finish, since interreflections must be rendered for each finish
 FINISH_DAYS = 2
 
 #: Days of a race start at 0. First day of draws that judge the choice of a view; their finishes are not of the pool.
@@ -77,8 +69,8 @@ class DrawnValues:
     """All values that were drawn for one trial.
 
     ``rig`` is the sensor's true geometry. ``path`` is offset [mm] and scale [1] of a time-of-flight distance.
-    ``finish`` numbers the deviation of the finishes (:func:`finish_deviation`), -1 for the best estimate. ``form`` and
-    ``unit`` are seeds, 0 for none. ``room`` is irradiance [W/mm^2]. ``power`` and ``exposure`` are relative to nominal
+    ``finish`` numbers the deviation of the finishes (:mod:`mitsim.study.virtual.drawn_finish`), -1 for the best
+    estimate. ``form`` and ``unit`` are seeds, 0 for none. ``room`` is irradiance [W/mm^2]. ``power`` and ``exposure`` are relative to nominal
     [1]. ``expansion`` of the part is relative [1]. ``placed`` and ``assumed`` (world to world) are the true and the
     assumed motion of the part from its nominal pose. ``seed`` is that of the capture, ``beyond`` that of effects
     outside the map, 0 for none.
@@ -197,30 +189,6 @@ class Unknowns:
         """Return a small rotation about the part's middle, with a shift."""
         turn = Rotation.from_rotvec(rng.normal(0.0, np.radians(turn_deg), 3)).as_matrix()
         return Transform(turn, self.centre + rng.normal(0.0, shift_mm, 3) - turn @ self.centre)
-
-
-def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
-    """Return the deviation of a finish, given by its BSDF's id, from its best estimate in the finishes of a number.
-
-    Deviations are quantiles of the normal distribution, scaled to variance 1. Their order is random for each finish,
-    and for alpha, wide-angle share and reflectance (Latin hypercube sampling: McKay et al. 1979). The number -1 is the
-    best estimate. A number beyond the pool of :data:`FINISHES` seeds a normal draw.
-    """
-    ranges = unknowns.table.finish
-    if number < 0:
-        return Deviation()
-    if number >= FINISHES:
-        seeded = np.random.default_rng(np.random.SeedSequence([number, _FINISH_STREAM, zlib.crc32(finish.encode())]))
-        drawn = np.clip(seeded.standard_normal(3), -LARGEST_DEVIATION, LARGEST_DEVIATION).tolist()
-        return _deviation(ranges, *drawn)
-    quantiles = ndtri((np.arange(FINISHES) + 0.5) / FINISHES)
-    quantiles = np.clip(quantiles / quantiles.std(), -LARGEST_DEVIATION, LARGEST_DEVIATION)
-    rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, _FINISH_STREAM, zlib.crc32(finish.encode())]))
-    return _deviation(ranges, *(float(quantiles[rng.permutation(FINISHES)[number]]) for _ in range(3)))
-
-
-def _deviation(ranges: FinishUnknowns, alpha: float, wide_angle: float, reflectance: float) -> Deviation:
-    return Deviation(alpha * ranges.alpha, wide_angle * ranges.wide_angle, reflectance * ranges.reflectance)
 
 
 Scaled = tuple[tuple[str, ...], NDArray[np.float64]]

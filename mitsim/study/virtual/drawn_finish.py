@@ -1,0 +1,82 @@
+"""Draw the finishes of a trial: the size and the shape of the light that each finish reflects.
+
+Signal chain: number of the finishes of a trial, id of a finish -> independent standard normals, one for each unknown
+property -> sizes and centres of ``[unknowns.finish]`` -> a :class:`~mitsim.scene.surface.scatter.Deviation`.
+
+One finish is one draw: faces of the same BSDF have the same alpha, shares and direction of the lay, each in its own
+frame. All directions of a lay are equally likely.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation
+from mitsim.sensor.unknowns import UnknownsTable
+
+#: seed of the stream of finishes, different from those of the groups
+_FINISH_STREAM = 8
+
+#: size of the pool of finishes that trials share, since interreflections must be rendered for each finish
+FINISHES = 8
+
+#: drawn properties, in the order of their random numbers
+DRAWN = ("alpha", "wide_angle", "reflectance", "tail", "lay", "lay_direction")
+
+
+class FinishSource(Protocol):
+    """What the draws of finishes depend on: the seed of a study and its table of unknowns."""
+
+    @property
+    def seed(self) -> int: ...
+
+    @property
+    def table(self) -> UnknownsTable: ...
+
+
+def finish_numbers(unknowns: FinishSource, number: int, finish: str) -> dict[str, float]:
+    """Return the standard normals behind a finish, given by its BSDF's id, by the names of :data:`DRAWN`.
+
+    The number -1 is the best estimate, with zeros. A number beyond the pool of :data:`FINISHES` seeds a normal draw. In
+    the pool they are quantiles of the normal distribution, scaled to variance 1, in a random order for each finish and
+    property (Latin hypercube sampling: McKay et al. 1979).
+    """
+    if number < 0:
+        return dict.fromkeys(DRAWN, 0.0)
+    own, name = number >= FINISHES, zlib.crc32(finish.encode())
+    rng = np.random.default_rng(np.random.SeedSequence([number if own else unknowns.seed, _FINISH_STREAM, name]))
+    if own:
+        values = rng.standard_normal(len(DRAWN))
+    else:
+        quantiles = ndtri((np.arange(FINISHES) + 0.5) / FINISHES)
+        quantiles = quantiles / quantiles.std()
+        values = np.array([quantiles[rng.permutation(FINISHES)[number]] for _ in DRAWN])
+    return dict(zip(DRAWN, np.clip(values, -LARGEST_DEVIATION, LARGEST_DEVIATION).tolist(), strict=True))
+
+
+def finish_deviation(unknowns: FinishSource, number: int, finish: str) -> Deviation:
+    """Return the deviation of a finish, given by its BSDF's id, from its best estimate in the finishes of a number.
+
+    The lay of a finish is drawn unless ``lay`` of its table is 0. The number -1 is the best estimate, whose lay is not
+    drawn.
+    """
+    if number < 0:
+        return Deviation()
+    table = unknowns.table.finish
+    return deviation_of(table.centres_and_sizes(finish), finish_numbers(unknowns, number, finish))
+
+
+def deviation_of(prior: Mapping[str, tuple[float, float]], numbers: Mapping[str, float]) -> Deviation:
+    """Return the deviation of standard normals under a prior, which is a centre and a size for each property."""
+
+    def drawn(name: str) -> float:
+        centre, size = prior[name]
+        return float(np.clip(centre + size * numbers[name], -LARGEST_DEVIATION, LARGEST_DEVIATION))
+
+    lay_deg = 180.0 * float(ndtr(numbers["lay_direction"])) if prior["lay"][1] > 0 else None
+    return Deviation(*(drawn(name) for name in ("alpha", "wide_angle", "reflectance", "tail", "lay")), lay_deg)
