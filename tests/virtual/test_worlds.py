@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.preset import load_sensor
@@ -135,10 +136,34 @@ def test_finishes_have_the_spread_of_a_normal_distribution(unknowns):
     others = np.array([finish_deviation(unknowns, number, "pillar").alpha for number in range(FINISHES)])
     assert sorted(alphas) == pytest.approx(sorted(others)) and not np.array_equal(alphas, others)
     assert finish_deviation(unknowns, -1, "plate").alpha == 0
-    known = replace(unknowns, table=UnknownsTable.model_validate({"finish": {"alpha": 0.0, "wide_angle": 0.5}}))
-    assert finish_deviation(known, 3, "plate").alpha == 0
+    known = replace(unknowns, table=UnknownsTable.model_validate({"finish": {"alpha": 0.0, "lay": 0.0}}))
+    assert finish_deviation(known, 3, "plate").alpha == 0 and finish_deviation(known, 3, "plate").lay_deg is None
     days = [unknowns.draw(Trial(day)).finish for day in range(40 * FINISH_DAYS)]
     assert set(days) <= set(range(FINISHES)) and len(set(days)) == FINISHES
+
+
+def test_the_lay_has_any_direction_and_properties_are_independent(unknowns):
+    numbers = range(FINISHES, FINISHES + 2000)
+    directions = np.array([finish_deviation(unknowns, number, "plate").lay_deg for number in numbers])
+    assert kstest(directions / 180.0, "uniform").pvalue > 1e-3
+    drawn = np.array([list(finish_numbers(unknowns, number, "plate").values()) for number in numbers])
+    assert drawn.shape == (2000, len(DRAWN))
+    np.testing.assert_allclose(np.corrcoef(drawn.T), np.eye(len(DRAWN)), atol=4 / np.sqrt(2000))
+    assert finish_numbers(unknowns, -1, "plate") == dict.fromkeys(DRAWN, 0.0)
+
+
+def test_a_measured_finish_replaces_its_prior_alone(unknowns):
+    measured = {"plate": {"alpha": [-0.5, 0.1], "tail": [0.3, 0.0]}}
+    known = replace(unknowns, table=UnknownsTable.model_validate({"finish": {"measured": measured}}))
+    numbers = range(FINISHES, FINISHES + 800)
+    drawn = [finish_deviation(known, number, "plate") for number in numbers]
+    alphas = np.array([one.alpha for one in drawn])
+    assert alphas.mean() == pytest.approx(-0.5, abs=4 * 0.1 / np.sqrt(800))
+    assert alphas.std() == pytest.approx(0.1, rel=0.1) and {one.tail for one in drawn} == {0.3}
+    for number in numbers[:5]:
+        assert finish_deviation(known, number, "pillar") == finish_deviation(unknowns, number, "pillar")
+        was, now = finish_deviation(unknowns, number, "plate"), finish_deviation(known, number, "plate")
+        assert (was.wide_angle, was.reflectance, was.lay_deg) == (now.wide_angle, now.reflectance, now.lay_deg)
 
 
 def test_a_choice_is_judged_with_other_finishes_than_those_that_made_it(unknowns):

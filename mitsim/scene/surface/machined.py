@@ -160,6 +160,7 @@ def machined(
     )
     share = process.wide_angle.share(face.roughness) if face.wide_angle is None else face.wide_angle
     ends = process.wide_angle.range(face.roughness) if face.wide_angle is None else (share, share)
+    words = _in_words(face, lobe.provenance, turn_deg)
     return Scatter(
         phase_variance=phase_variance(sigma, wavelength_nm),
         alpha_u=alpha_u,
@@ -169,13 +170,14 @@ def machined(
         wide_angle=deviation.share(share, ends),
         wide_angle_range=ends,
         alpha_factor=lobe.factor,
-        provenance=deviation.provenance_of(_in_words(face, process, lobe.provenance), lobe.factor, ends),
+        provenance=deviation.provenance_of(words, lobe.factor, ends),
         lay=face.lay or "none",
         energy_factor=energy_factors(alpha_u, alpha_v, normal_reflectance(face.metal, wavelength_nm)),
         coherent_alpha=_mirror_directions(lay, mirror),
         correlation_um=lobe.correlation,
         beckmann_range=tails,
         turn_deg=turn_deg,
+        lay_open=lay_is_open(face),
     )
 
 
@@ -382,8 +384,10 @@ def _prior_in_words(face: MachinedFace, process: Process) -> tuple[str, float]:
     return f"prior of {name.replace('_', '-')} metal for Ra {face.roughness:g} um{marks}", FACTORS["process"]
 
 
-def _in_words(face: MachinedFace, process: Process, provenance: str) -> str:
+def _in_words(face: MachinedFace, provenance: str, turn_deg: float | None) -> str:
     words = provenance
-    if face.alpha is None and face.alpha_u is None and process.lay_ratio < 1 and face.lay in (None, "none"):
+    if turn_deg is not None:
+        words = f"{provenance}; lay drawn at {turn_deg:.0f} deg from u"
+    elif lay_is_open(face):
         words = f"{provenance}; lay not given: round, as wide as across the lay"
     return words if face.alpha_factor == 1 else f"{words}; times {face.alpha_factor:g}"

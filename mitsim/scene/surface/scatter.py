@@ -43,6 +43,7 @@ class Scatter:
       slope. NaN if there is no such lobe.
     - ``beckmann``: share of Beckmann in the incoherent lobe; ``beckmann_range``: its one-sigma range.
     - ``turn_deg``: angle from u of the shape to u of the lobe [deg]; None where the lobe is not turned.
+    - ``lay_open``: whether there are marks whose direction is not given.
     - ``height_um``: Rq that determines coherence and speckle [um]; NaN if light is scattered in the volume.
     - ``wide_angle``: share of all reflected light at wide angles; ``wide_angle_range``: its one-sigma range.
     - ``alpha_factor``: one-sigma factor of alpha, which lies between alpha / factor and alpha x factor;
@@ -70,6 +71,7 @@ class Scatter:
     depolarising: bool = False
     beckmann_range: tuple[float, float] | None = None
     turn_deg: float | None = None
+    lay_open: bool = False
 
     @property
     def coherent(self) -> float:
@@ -181,8 +183,7 @@ class Deviation:
         moved += [f"wide angle {self.wide_angle:+g}"] if self.wide_angle and ends[0] != ends[1] else []
         moved += [f"reflectance {self.reflectance:+g}"] if self.reflectance else []
         moved += [f"tail {self.tail:+g}"] if self.tail else []
-        words = f"{provenance}; {' and '.join(moved)} sigma" if moved else provenance
-        return words if self.lay_deg is None else f"{words}; lay at {self.lay_deg:g} deg, strength {self.lay:+g} sigma"
+        return f"{provenance}; {' and '.join(moved)} sigma" if moved else provenance
 
 
 #: largest deviation; the prior is not meaningful beyond

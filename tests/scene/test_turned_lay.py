@@ -1,0 +1,80 @@
+"""The turned BSDF against the stock lobe in a frame that is turned by hand."""
+
+import numpy as np
+import pytest
+
+from mitsim.scene import backend
+from mitsim.scene.bsdf_descriptions import conductor_bsdf
+from mitsim.scene.turned_lay import turned_description
+
+
+def directions(rng, count):
+    vectors = rng.normal(size=(3, count))
+    vectors[2] = np.abs(vectors[2]) + 0.1
+    return vectors / np.linalg.norm(vectors, axis=0)
+
+
+def turned(vectors, degrees):
+    """Coordinates of vectors in a frame that is turned about z."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ vectors
+
+
+def surface_of(vectors):
+    from mitsim.scene.backend import dr, mi
+
+    surface = dr.zeros(mi.SurfaceInteraction3f, vectors.shape[1])
+    surface.wi = mi.Vector3f(vectors.astype(np.float32))
+    return surface
+
+
+@pytest.fixture(scope="module")
+def lobe():
+    backend.activate()
+    return conductor_bsdf("ggx", (0.05, 0.3), (2.6, 8.2))
+
+
+@pytest.mark.parametrize("degrees", [0.0, 35.0, 90.0, 160.0])
+def test_a_turned_lobe_is_the_lobe_in_a_turned_frame(lobe, degrees):
+    from mitsim.scene.backend import mi
+
+    rng = np.random.default_rng(3)
+    view, light = directions(rng, 4000), directions(rng, 4000)
+    one = mi.load_dict(turned_description(lobe, degrees))
+    stock, context = mi.load_dict(lobe), mi.BSDFContext()
+    found = one.eval_pdf(context, surface_of(view), mi.Vector3f(light.astype(np.float32)), True)
+    in_frame = mi.Vector3f(turned(light, degrees).astype(np.float32))
+    wanted = stock.eval_pdf(context, surface_of(turned(view, degrees)), in_frame, True)
+    for a, b in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(np.array(a).ravel(), np.array(b).ravel(), rtol=2e-3, atol=1e-5)
+    value = one.eval(context, surface_of(view), mi.Vector3f(light.astype(np.float32)), True)
+    np.testing.assert_allclose(np.array(value), np.array(found[0]), rtol=1e-5)
+
+
+def test_samples_have_the_density_that_is_stated(lobe):
+    from mitsim.scene.backend import mi
+
+    rng = np.random.default_rng(4)
+    count = 20000
+    view = np.repeat(directions(rng, 1), count, axis=1)
+    one, context = mi.load_dict(turned_description(lobe, 50.0)), mi.BSDFContext()
+    random = rng.random((3, count)).astype(np.float32)
+    sampled, weight = one.sample(context, surface_of(view), mi.Float(random[0]), mi.Point2f(random[1:]), True)
+    value, density = one.eval_pdf(context, surface_of(view), sampled.wo, True)
+    density, weight = np.array(density), np.array(weight)[0]
+    used = density > 1e-3
+    assert used.mean() > 0.9
+    np.testing.assert_allclose(np.array(sampled.pdf)[used], density[used], rtol=1e-2)
+    np.testing.assert_allclose(weight[used], np.array(value)[0][used] / density[used], rtol=1e-2)
+
+
+def test_the_streak_of_a_turned_lay_lies_across_the_marks(lobe):
+    """Light along the normal: the lobe of marks at 30 deg is widest at 120 deg."""
+    from mitsim.scene.backend import mi
+
+    azimuths, polar = np.radians(np.arange(0.0, 180.0, 2.0)), np.radians(25.0)
+    light = np.array([np.sin(polar) * np.cos(azimuths), np.sin(polar) * np.sin(azimuths), 0 * azimuths + np.cos(polar)])
+    view = np.repeat([[0.0], [0.0], [1.0]], len(azimuths), axis=1)
+    one = mi.load_dict(turned_description(lobe, 30.0))
+    value = np.array(one.eval(mi.BSDFContext(), surface_of(view), mi.Vector3f(light.astype(np.float32)), True))[0]
+    assert np.degrees(azimuths[np.argmax(value)]) == pytest.approx(120.0, abs=2.1)
