@@ -22,9 +22,11 @@ from scipy.optimize import least_squares
 from scipy.special import expit, logit
 from scipy.stats import chi2
 
+from mitsim.scene.surface.machined import FACTORS, MachinedFace, machined
 from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, Distribution, shadowing, slope_density
 from mitsim.scene.surface.processes import LARGEST_WIDE_ANGLE, PROCESSES
-from mitsim.scene.surface.roughness import ALPHA_LARGEST
+from mitsim.scene.surface.roughness import ALPHA_LARGEST, stylus_slope
+from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation
 from tests.proofs.finishes.measured_surfaces import EXIT_DEG, LARGEST_INCIDENCE_DEG, MeasuredSurface
 
 Floats = NDArray[np.float64]
@@ -49,6 +51,7 @@ class FittedShape:
 
     ``least``, ``most``: wide-angle share of the fits to small and to large exit angles alone. ``bound``: largest
     wide-angle share, as no direction is darker than the matt part. ``misfit``: rms of the logarithm of the BRDF.
+    ``kept``: share of the other light that is in the lobe, not in the mirror-like part.
     """
 
     surface: MeasuredSurface
@@ -60,6 +63,7 @@ class FittedShape:
     alpha: float
     lay: float
     misfit: float
+    kept: float
 
     @property
     def determined(self) -> bool:
@@ -92,9 +96,13 @@ def model(numbers: Floats, incidence: Floats, leaving: Floats) -> Floats:
     """Return f / R [1/sr] for (logit w, logit of the light in the lobe, logit b, log alpha, log s)."""
     wide, kept, tail = expit(numbers[:3])
     alpha, concentrated = np.exp(numbers[3:])
-    shape = tail * lobe(incidence, leaving, alpha, "beckmann")
-    shape += (1 - tail) * lobe(incidence, leaving, GGX_PER_BECKMANN * alpha, "ggx")
+    shape = _mixed(tail, alpha, incidence, leaving)
     return np.asarray((1 - wide) * kept * concentrated * shape + wide / np.pi)
+
+
+def _mixed(tail: float, alpha: float, incidence: Floats, leaving: Floats) -> Floats:
+    beckmann = lobe(incidence, leaving, alpha, "beckmann")
+    return np.asarray(tail * beckmann + (1 - tail) * lobe(incidence, leaving, GGX_PER_BECKMANN * alpha, "ggx"))
 
 
 def fit_shape(surface: MeasuredSurface) -> FittedShape:
@@ -117,6 +125,7 @@ def fit_shape(surface: MeasuredSurface) -> FittedShape:
         float(np.exp(numbers[3])),
         float(np.exp(-numbers[4])),
         float(np.sqrt(np.mean(np.log(predicted / surface.brdf[used]) ** 2))),
+        float(expit(numbers[1])),
     )
 
 
@@ -190,8 +199,18 @@ def factor_of(logs: Sequence[float]) -> Factor:
     return Factor(*(float(np.exp(one)) for one in rms), count)
 
 
-def roughness_factor(large: Floats, small: Floats) -> tuple[float, Factor]:
-    """Return the exponent of small-scale roughness in Ra, and the one-sigma factor of the rest.
+def process_factor(roughness_um: float, wavelength_nm: float = 850.0) -> float:
+    """Return the one-sigma factor of alpha at one Ra over the processes that usually give it."""
+    logs = [
+        np.log(machined(MachinedFace(process=name, Ra=roughness_um), wavelength_nm).alpha_u)
+        for name, process in PROCESSES.items()
+        if process.usual[0] <= roughness_um <= process.usual[1]
+    ]
+    return float(np.exp(np.std(logs, ddof=1)))
+
+
+def roughness_factor(large: Floats, small: Floats) -> tuple[float, Factor, float]:
+    """Return the exponent of small-scale roughness in Ra, the one-sigma factor of the rest, and half its central 68 %.
 
     Parameters
     ----------
@@ -200,4 +219,67 @@ def roughness_factor(large: Floats, small: Floats) -> tuple[float, Factor]:
     """
     x, y = np.log(large), np.log(small)
     slope, offset = np.polyfit(x, y, 1)
-    return float(slope), factor_of((y - slope * x - offset).tolist())
+    rest = y - slope * x - offset
+    low, high = np.quantile(rest, [0.16, 0.84])
+    return float(slope), factor_of(rest.tolist()), float(np.exp((high - low) / 2))
+
+
+def energy_found(shape: FittedShape) -> float:
+    """Return the light of a round surface as a share of the reflected light [1]: measured spike and fitted rest.
+
+    The spike is the measured light within 3 deg of the mirror direction at an exit angle of 30 deg, less the fitted
+    lobe and matt part, as if it were the same in all planes. A closed balance gives 1.
+    """
+    surface = shape.surface
+    row = np.isclose(surface.exit, np.radians(30.0)) & (np.abs(surface.incidence - surface.exit) <= _MIRROR + 1e-6)
+    away = np.abs(surface.incidence[row] - surface.exit[row])
+    rest = shape.kept * (1 - shape.wide_angle) * _mixed(shape.tail, shape.alpha, surface.incidence[row], surface.exit[row])
+    rest += shape.wide_angle / np.pi
+    spike = surface.brdf[row] / surface.reflected[row] - rest
+    order = np.argsort(away)
+    ring = np.pi * np.cos(surface.incidence[row]) * np.abs(spike)[order] * np.sin(away)[order]
+    inner = float(np.trapezoid(2 * ring, away[order]))
+    return inner + shape.kept * (1 - shape.wide_angle) + shape.wide_angle
+
+
+def peak_deg(shape: FittedShape, exit_deg: float) -> tuple[float, float]:
+    """Return the incidence [deg], up to 80, at which the BRDF is largest: measured, and of the fitted model."""
+    surface = shape.surface
+    row = np.isclose(surface.exit, np.radians(exit_deg)) & (surface.incidence <= np.radians(80.0))
+    incidence = surface.incidence[row]
+    fitted = shape.kept * (1 - shape.wide_angle) * _mixed(shape.tail, shape.alpha, incidence, surface.exit[row])
+    measured, modelled = (float(np.degrees(incidence[np.argmax(one)])) for one in (surface.brdf[row], fitted))
+    return measured, modelled
+
+
+#: angles off the mirror direction at which the prior is compared with a surface [deg], at an exit angle of 45 deg
+OFF_MIRROR_DEG = (10.0, 20.0, 40.0)
+
+
+def places_in_prior(surface: MeasuredSurface, draws: int = 2000, seed: int = 1) -> list[float]:
+    """Return the share of drawn shapes that are darker than a surface, at each of :data:`OFF_MIRROR_DEG` [1].
+
+    Ra is drawn evenly in its logarithm over the usual range of the process, as the surface's is unknown. Alpha is that
+    of the slopes, without diffraction; no light is in a mirror-like part.
+    """
+    assert surface.process is not None
+    process, rng = PROCESSES[surface.process], np.random.default_rng(seed)
+    at_45 = np.isclose(surface.exit, np.radians(45.0))
+    incidences = np.radians(45.0 - np.array(OFF_MIRROR_DEG))
+    measured = [
+        float((surface.brdf / surface.reflected)[at_45][np.argmin(np.abs(surface.incidence[at_45] - one))])
+        for one in incidences
+    ]
+    numbers = np.clip(rng.standard_normal((draws, 4)), -LARGEST_DEVIATION, LARGEST_DEVIATION)
+    heights = np.exp(rng.uniform(*np.log(process.usual), draws))
+    darker = np.zeros(len(measured))
+    for (alpha, wide, tail, lay), ra in zip(numbers.tolist(), heights.tolist(), strict=True):
+        deviation = Deviation(alpha=alpha, wide_angle=wide, tail=tail, lay=lay)
+        share = process.wide_angle.share(ra)
+        width = min(stylus_slope(ra, surface.process) * FACTORS["process"] ** alpha, ALPHA_LARGEST)
+        ratio = deviation.along(process.lay_ratio, 1.0) if surface.across_lay else 1.0
+        share = deviation.share(share, process.wide_angle.range(ra))
+        beckmann = np.clip(deviation.beckmann(process.beckmann, process.tail_range), 1e-9, 1 - 1e-9)
+        drawn = np.array([logit(share), 30.0, logit(beckmann), np.log(width), -np.log(ratio)])
+        darker += model(drawn, incidences, np.full(len(measured), np.radians(45.0))) < measured
+    return (darker / draws).tolist()
