@@ -291,7 +291,11 @@ def test_a_lay_that_is_not_given_is_drawn_and_no_other(tmp_path):
     assert weaker.alpha_u / found.alpha_u == pytest.approx(LAY_FACTOR)
     none = load(tmp_path, metal(RA, ground), deviation=Deviation(lay=3.0, lay_deg=30.0)).scatter
     assert none.alpha_u == none.alpha_v
-    for given in ('<string name="lay" value="u"/>', '<string name="lay" value="none"/>', '<float name="alpha" value=".1"/>'):
+    for given in (
+        '<string name="lay" value="u"/>',
+        '<string name="lay" value="none"/>',
+        '<float name="alpha" value=".1"/>',
+    ):
         face = metal(RA, ground, given)
         assert load(tmp_path, face, deviation=Deviation(lay_deg=30.0)).scatter == load(tmp_path, face).scatter
     polished = metal('<float name="Ra" value="0.05"/>', '<string name="process" value="polished"/>')

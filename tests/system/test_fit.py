@@ -38,8 +38,8 @@ from mitsim.twin.finish.electrons import PixelNoise, linearised, pixel_noise
 from mitsim.twin.finish.estimate import fit_views
 from mitsim.twin.finish.finish import ALPHA_RANGE, metal_finish
 from mitsim.twin.finish.observation import CouponCapture, CouponView, observe
-from mitsim.twin.finish.posterior import finish_posterior
 from mitsim.twin.finish.place import found_place, known_place
+from mitsim.twin.finish.posterior import finish_posterior
 from mitsim.twin.finish.run import KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX, fit_captures
 from mitsim.twin.finish.specimen import place_of
 from mitsim.twin.finish.white_coupon import WhiteCouponRenderer

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-
 #: largest wide-angle share of a machined metal [1]. The largest of 18 that the data determine is 0.49
 LARGEST_WIDE_ANGLE = 0.6
 

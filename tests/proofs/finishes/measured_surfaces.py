@@ -124,9 +124,7 @@ def merl_surfaces(folder: Path) -> list[MeasuredSurface]:
         scale = max(reflectance - diffuse, 0.0) / _returned(b, c)
         shape = scale * lobe / (np.cos(incidence) * np.cos(leaving))
         brdf = shape + diffuse / np.pi
-        out.append(
-            MeasuredSurface(name, "polished", incidence, leaving, brdf, np.full(brdf.shape, reflectance))
-        )
+        out.append(MeasuredSurface(name, "polished", incidence, leaving, brdf, np.full(brdf.shape, reflectance)))
     return out
 
 
@@ -139,9 +137,8 @@ def _returned(b: float, c: float, incidence: float = np.radians(30.0)) -> float:
     light = np.array([-np.sin(incidence), 0.0, np.cos(incidence)])
     mirror, side = np.array([np.sin(incidence), 0.0, np.cos(incidence)]), np.array([0.0, 1.0, 0.0])
     up = np.cross(mirror, side)
-    out = (
-        np.cos(mid)[:, None, None] * mirror
-        + np.sin(mid)[:, None, None] * (np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * up)
+    out = np.cos(mid)[:, None, None] * mirror + np.sin(mid)[:, None, None] * (
+        np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * up
     )
     half = out + light
     cosine = half[..., 2] / np.linalg.norm(half, axis=-1)

@@ -86,7 +86,9 @@ def _comparison_table(shapes: Sequence[FittedShape]) -> str:
     head = ["surface", "light found", *(f"peak at exit {one:g} deg: measured, model" for one in _PEAKS_DEG)]
     body = []
     for one in shapes:
-        energy = "-" if one.surface.across_lay else f"{energy_found(one):.2f}"
+        # a blasted face has no mirror-like share: its fit is scaled to the light that is there
+        balanced = not one.surface.across_lay and one.surface.process != "grit_blasted"
+        energy = f"{energy_found(one):.2f}" if balanced else "-"
         peaks = [", ".join(f"{angle:.0f}" for angle in peak_deg(one, angle)) for angle in _PEAKS_DEG]
         places = "-"
         if one.surface.process is not None:

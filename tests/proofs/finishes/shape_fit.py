@@ -233,7 +233,9 @@ def energy_found(shape: FittedShape) -> float:
     surface = shape.surface
     row = np.isclose(surface.exit, np.radians(30.0)) & (np.abs(surface.incidence - surface.exit) <= _MIRROR + 1e-6)
     away = np.abs(surface.incidence[row] - surface.exit[row])
-    rest = shape.kept * (1 - shape.wide_angle) * _mixed(shape.tail, shape.alpha, surface.incidence[row], surface.exit[row])
+    rest = (
+        shape.kept * (1 - shape.wide_angle) * _mixed(shape.tail, shape.alpha, surface.incidence[row], surface.exit[row])
+    )
     rest += shape.wide_angle / np.pi
     spike = surface.brdf[row] / surface.reflected[row] - rest
     order = np.argsort(away)
