@@ -3,9 +3,9 @@
 Signal chain: directions in the local frame of a shape -> the same in a frame turned about the normal -> a BSDF whose
 lobe is wider along v than along u.
 
-Mitsuba's ``roughconductor`` has its widths along u and v of the shape. Here u of the lobe lies at the angle ``turn_deg``
-from u of the shape, toward v. On a mesh without UVs, Mitsuba derives u from the normal alone: the direction is then one
-on each flat face, and unrelated between faces that are inclined to one another.
+Mitsuba's ``roughconductor`` has its widths along u and v of the shape. Here u of the lobe lies at the angle
+``turn_deg`` from u of the shape, toward v. On a mesh without UVs, Mitsuba derives u from the normal alone: each flat face
+then has one direction, and faces that are inclined to one another have unrelated ones.
 """
 
 from __future__ import annotations

@@ -326,8 +326,9 @@ def test_drawn_finishes_have_the_same_parts():
         '<bsdf type="gloss_paint" id="f"><float name="alpha" value="0.02"/></bsdf>',
     ],
 )
-def test_a_deviation_leaves_alone_what_is_known(tmp_path, bsdf):
-    moved = load(tmp_path, bsdf, deviation=Deviation(1, 1)).scatter
+@pytest.mark.parametrize("deviation", [Deviation(1, 1), Deviation(lay=1.0, lay_deg=30.0)])
+def test_a_deviation_leaves_alone_what_is_known(tmp_path, bsdf, deviation):
+    moved = load(tmp_path, bsdf, deviation=deviation).scatter
     assert repr(moved) == repr(load(tmp_path, bsdf).scatter)
 
 

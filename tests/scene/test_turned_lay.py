@@ -78,3 +78,22 @@ def test_the_streak_of_a_turned_lay_lies_across_the_marks(lobe):
     one = mi.load_dict(turned_description(lobe, 30.0))
     value = np.array(one.eval(mi.BSDFContext(), surface_of(view), mi.Vector3f(light.astype(np.float32)), True))[0]
     assert np.degrees(azimuths[np.argmax(value)]) == pytest.approx(120.0, abs=2.1)
+
+
+def test_a_flat_face_without_uvs_has_one_direction(tmp_path):
+    """Two triangles of one tilted face: the tangent frame, and so the streak, is the same all over it."""
+    from mitsim.scene.backend import dr, mi
+
+    corners = np.array([[-10, -10, 0], [10, -10, 4], [10, 10, 7], [-10, 10, 3]], np.float32)
+    mesh = mi.Mesh("face", 4, 2)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = corners.ravel()
+    parameters["faces"] = np.array([0, 1, 2, 0, 2, 3], np.uint32)
+    parameters.update()
+    rng = np.random.default_rng(5)
+    origins = np.vstack([rng.uniform(-8, 8, (2, 200)), np.full((1, 200), 50.0)]).astype(np.float32)
+    scene = mi.load_dict({"type": "scene", "face": mesh})
+    surface = scene.ray_intersect(mi.Ray3f(mi.Point3f(origins), mi.Vector3f(0, 0, -1)))
+    tangents = np.array(surface.sh_frame.s)
+    assert dr.all(surface.is_valid()) and len(np.unique(np.array(surface.prim_index))) == 2
+    np.testing.assert_allclose(tangents, np.repeat(tangents[:, :1], 200, axis=1), atol=1e-5)

@@ -170,7 +170,7 @@ def machined(
         wide_angle=deviation.share(share, ends),
         wide_angle_range=ends,
         alpha_factor=lobe.factor,
-        provenance=deviation.provenance_of(words, lobe.factor, ends),
+        provenance=deviation.provenance_of(words, lobe.factor, ends, tails),
         lay=face.lay or "none",
         energy_factor=energy_factors(alpha_u, alpha_v, normal_reflectance(face.metal, wavelength_nm)),
         coherent_alpha=_mirror_directions(lay, mirror),

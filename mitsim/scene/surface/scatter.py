@@ -177,12 +177,22 @@ class Deviation:
         """Return alpha along the marks [1] after the deviation; it is ``across`` at most."""
         return float(min(along * factor**self.lay, across))
 
-    def provenance_of(self, provenance: str, factor: float, ends: tuple[float, float]) -> str:
-        """Return the source of alpha and the deviations applied; exactly known properties do not deviate."""
+    def provenance_of(
+        self, provenance: str, factor: float, ends: tuple[float, float], tails: tuple[float, float] = (0.0, 0.0)
+    ) -> str:
+        """Return the source of alpha and the deviations applied; exactly known properties do not deviate.
+
+        Parameters
+        ----------
+        provenance, factor
+            Source of alpha and its one-sigma factor.
+        ends, tails
+            One-sigma ranges of the wide-angle share and of the Beckmann share; without width if they are known.
+        """
         moved = [f"alpha {self.alpha:+g}"] if self.alpha and factor != 1 else []
         moved += [f"wide angle {self.wide_angle:+g}"] if self.wide_angle and ends[0] != ends[1] else []
         moved += [f"reflectance {self.reflectance:+g}"] if self.reflectance else []
-        moved += [f"tail {self.tail:+g}"] if self.tail else []
+        moved += [f"tail {self.tail:+g}"] if self.tail and tails[0] != tails[1] else []
         return f"{provenance}; {' and '.join(moved)} sigma" if moved else provenance
 
 

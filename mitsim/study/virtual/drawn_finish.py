@@ -11,13 +11,15 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import ndtr, ndtri
 
 from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation
-from mitsim.sensor.unknowns import UnknownsTable
+
+if TYPE_CHECKING:
+    from mitsim.study.virtual.world import Unknowns
 
 #: seed of the stream of finishes, different from those of the groups
 _FINISH_STREAM = 8
@@ -29,17 +31,7 @@ FINISHES = 8
 DRAWN = ("alpha", "wide_angle", "reflectance", "tail", "lay", "lay_direction")
 
 
-class FinishSource(Protocol):
-    """What the draws of finishes depend on: the seed of a study and its table of unknowns."""
-
-    @property
-    def seed(self) -> int: ...
-
-    @property
-    def table(self) -> UnknownsTable: ...
-
-
-def finish_numbers(unknowns: FinishSource, number: int, finish: str) -> dict[str, float]:
+def finish_numbers(unknowns: Unknowns, number: int, finish: str) -> dict[str, float]:
     """Return the standard normals behind a finish, given by its BSDF's id, by the names of :data:`DRAWN`.
 
     The number -1 is the best estimate, with zeros. A number beyond the pool of :data:`FINISHES` seeds a normal draw. In
@@ -59,7 +51,7 @@ def finish_numbers(unknowns: FinishSource, number: int, finish: str) -> dict[str
     return dict(zip(DRAWN, np.clip(values, -LARGEST_DEVIATION, LARGEST_DEVIATION).tolist(), strict=True))
 
 
-def finish_deviation(unknowns: FinishSource, number: int, finish: str) -> Deviation:
+def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
     """Return the deviation of a finish, given by its BSDF's id, from its best estimate in the finishes of a number.
 
     The lay of a finish is drawn unless ``lay`` of its table is 0. The number -1 is the best estimate, whose lay is not
@@ -79,4 +71,5 @@ def deviation_of(prior: Mapping[str, tuple[float, float]], numbers: Mapping[str,
         return float(np.clip(centre + size * numbers[name], -LARGEST_DEVIATION, LARGEST_DEVIATION))
 
     lay_deg = 180.0 * float(ndtr(numbers["lay_direction"])) if prior["lay"][1] > 0 else None
-    return Deviation(*(drawn(name) for name in ("alpha", "wide_angle", "reflectance", "tail", "lay")), lay_deg)
+    alpha, wide_angle, reflectance, tail, lay = (drawn(name) for name in DRAWN[:5])
+    return Deviation(alpha, wide_angle, reflectance, tail, lay, lay_deg)

@@ -70,10 +70,10 @@ class DrawnValues:
 
     ``rig`` is the sensor's true geometry. ``path`` is offset [mm] and scale [1] of a time-of-flight distance.
     ``finish`` numbers the deviation of the finishes (:mod:`mitsim.study.virtual.drawn_finish`), -1 for the best
-    estimate. ``form`` and ``unit`` are seeds, 0 for none. ``room`` is irradiance [W/mm^2]. ``power`` and ``exposure`` are relative to nominal
-    [1]. ``expansion`` of the part is relative [1]. ``placed`` and ``assumed`` (world to world) are the true and the
-    assumed motion of the part from its nominal pose. ``seed`` is that of the capture, ``beyond`` that of effects
-    outside the map, 0 for none.
+    estimate. ``form`` and ``unit`` are seeds, 0 for none. ``room`` is irradiance [W/mm^2]. ``power`` and ``exposure``
+    are relative to nominal [1]. ``expansion`` of the part is relative [1]. ``placed`` and ``assumed`` (world to world)
+    are the true and the assumed motion of the part from its nominal pose. ``seed`` is that of the capture, ``beyond``
+    that of effects outside the map, 0 for none.
     """
 
     rig: Rig

@@ -166,7 +166,19 @@ def _amplitudes(columns: Floats, measured: Floats, weight: Floats) -> tuple[Floa
 
 
 def refine(problem: Problem, start: Floats, variance: Floats, use: NDArray[np.bool_]) -> Floats:
-    """Return the parameters of weighted least squares over the blocks of ``use``, by SciPy's ``trf`` method."""
+    """Return the parameters of weighted least squares, by SciPy's ``trf`` method.
+
+    Parameters
+    ----------
+    problem
+        Blocks of all views.
+    start
+        Parameters to start from.
+    variance
+        Of the block means [e-^2], (blocks,).
+    use
+        Which blocks count, (blocks,).
+    """
     low, high, inner = np.zeros(len(start)), np.full(len(start), np.inf), start.copy()
     first = 0
     if problem.finish is not None:

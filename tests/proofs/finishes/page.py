@@ -69,7 +69,8 @@ def _priors_table(shapes: Sequence[FittedShape], folder: Path) -> str:
     over = ", ".join(f"{process_factor(ra):.2f}" for ra in (0.4, 0.8, 1.6))
     tails = [one.tail for one in shapes if one.surface.process != "grit_blasted"]
     beyond = 1 - 0.05 ** (1 / len(tails))
-    held = f"{sum(tail > TAIL_RANGE[1] for tail in tails)} of {len(tails)} above {TAIL_RANGE[1]:g}, largest {max(tails):.2f}"
+    above = sum(tail > TAIL_RANGE[1] for tail in tails)
+    held = f"{above} of {len(tails)} above {TAIL_RANGE[1]:g}, largest {max(tails):.2f}"
     rows = [
         ["odds of the wide-angle share", str(shares), f"{WIDE_ANGLE_FACTOR:g}"],
         ["ratio of alphas of a lay", str(lays), f"{LAY_FACTOR:g}"],
