@@ -1,11 +1,12 @@
-"""A Mitsuba BSDF that turns another about the normal, for machining marks in any direction.
+"""A Mitsuba BSDF that turns another about the normal, for machining marks whose direction is drawn.
 
-Signal chain: directions in the local frame of a shape -> the same in a frame turned about the normal -> a BSDF whose
-lobe is wider along v than along u.
+Signal chain: directions in the local frame of a surface -> the same in the frame of the marks -> a BSDF whose lobe is
+wider along v than along u.
 
-Mitsuba's ``roughconductor`` has its widths along u and v of the shape. Here u of the lobe lies at the angle
-``turn_deg`` from u of the shape, toward v. On a mesh without UVs, Mitsuba derives u from the normal alone: each flat face
-then has one direction, and faces that are inclined to one another have unrelated ones.
+Mitsuba's ``roughconductor`` has its widths along u and v of the shape. On a mesh without UVs these follow the edges of
+each triangle, so that a flat face has several directions. Here the marks have the angle ``turn_deg`` to the z axis of
+the part, projected onto the surface, and to its x axis where the surface is normal to z. Every flat face then has one
+direction. On a cylinder along z or across it, the marks have one angle to the axis; on others the angle varies.
 """
 
 from __future__ import annotations
@@ -16,9 +17,12 @@ from typing import Any
 #: Mitsuba's name of the BSDF
 NAME = "turned_lay"
 
+#: angle between normal and z axis below which the marks are counted from x [rad]
+_NORMAL_TO_Z = 1e-3
+
 
 def turned_description(description: dict[str, Any], turn_deg: float) -> dict[str, Any]:
-    """Return the description of a BSDF that is turned by an angle [deg] from u toward v."""
+    """Return the description of a BSDF whose u is turned to an angle [deg] from the projected z axis of the part."""
     register_turned_lay()
     return {"type": NAME, "turn_deg": turn_deg, "lobe": description}
 
@@ -31,6 +35,15 @@ def register_turned_lay() -> None:
     nested BSDF, ``lobe``.
     """
     from mitsim.scene.backend import dr, mi
+
+    def _reference(frame: Any) -> tuple[Any, Any]:
+        """Return sine and cosine of the angle from u to the projected z axis; 0 and 1 for a surface without place."""
+        flat = dr.square(frame.s.z) + dr.square(frame.t.z) < _NORMAL_TO_Z**2
+        along_u, along_v = dr.select(flat, frame.s.x, frame.s.z), dr.select(flat, frame.t.x, frame.t.z)
+        square = dr.square(along_u) + dr.square(along_v)
+        placed = square > 0
+        scale = dr.rsqrt(dr.select(placed, square, 1.0))
+        return along_v * scale, dr.select(placed, along_u * scale, 1.0)
 
     class TurnedLay(mi.BSDF):  # type: ignore[misc]
         def __init__(self, props: Any) -> None:
@@ -67,7 +80,10 @@ def register_turned_lay() -> None:
 
         def _turned(self, surface: Any) -> tuple[Any, Any, Any]:
             """Return the surface seen in the lobe's frame, and the maps of directions into that frame and back."""
-            sine, cosine = dr.sincos(self.turn_deg * (dr.pi / 180))
+            zero_sine, zero_cosine = _reference(surface.sh_frame)
+            turn_sine, turn_cosine = dr.sincos(self.turn_deg * (dr.pi / 180))
+            cosine = dr.fma(zero_cosine, turn_cosine, -zero_sine * turn_sine)
+            sine = dr.fma(zero_sine, turn_cosine, zero_cosine * turn_sine)
 
             def to_lobe(one: Any) -> Any:
                 return mi.Vector3f(dr.fma(cosine, one.x, sine * one.y), dr.fma(cosine, one.y, -sine * one.x), one.z)

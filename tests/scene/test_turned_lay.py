@@ -80,20 +80,53 @@ def test_the_streak_of_a_turned_lay_lies_across_the_marks(lobe):
     assert np.degrees(azimuths[np.argmax(value)]) == pytest.approx(120.0, abs=2.1)
 
 
-def test_a_flat_face_without_uvs_has_one_direction(tmp_path):
-    """Two triangles of one tilted face: the tangent frame, and so the streak, is the same all over it."""
+def test_a_flat_face_without_uvs_has_one_direction():
+    """Two triangles of one tilted face, whose tangents differ: all over it, light returns as from marks in one plane.
+
+    The marks at 90 deg to the projected z axis are horizontal, so the streak lies in the plane of normal and z.
+    """
     from mitsim.scene.backend import dr, mi
 
-    corners = np.array([[-10, -10, 0], [10, -10, 4], [10, 10, 7], [-10, 10, 3]], np.float32)
-    mesh = mi.Mesh("face", 4, 2)
+    slope = np.array([0.4, 0.15])
+    corners = np.array([[-10, -10], [10, -10], [10, 10], [-10, 10]], float)
+    mesh_props = mi.Properties()
+    mesh_props["bsdf"] = mi.load_dict(turned_description(conductor_bsdf("ggx", (0.02, 0.3), (2.6, 8.2)), 90.0))
+    mesh = mi.Mesh("face", 4, 2, props=mesh_props)
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = corners.ravel()
+    parameters["vertex_positions"] = np.column_stack([corners, corners @ slope]).astype(np.float32).ravel()
     parameters["faces"] = np.array([0, 1, 2, 0, 2, 3], np.uint32)
     parameters.update()
     rng = np.random.default_rng(5)
     origins = np.vstack([rng.uniform(-8, 8, (2, 200)), np.full((1, 200), 50.0)]).astype(np.float32)
     scene = mi.load_dict({"type": "scene", "face": mesh})
     surface = scene.ray_intersect(mi.Ray3f(mi.Point3f(origins), mi.Vector3f(0, 0, -1)))
-    tangents = np.array(surface.sh_frame.s)
     assert dr.all(surface.is_valid()) and len(np.unique(np.array(surface.prim_index))) == 2
-    np.testing.assert_allclose(tangents, np.repeat(tangents[:, :1], 200, axis=1), atol=1e-5)
+    assert len(np.unique(np.array(surface.sh_frame.s).round(3), axis=1).T) == 2  # two frames of Mitsuba
+    normal = np.array([-slope[0], -slope[1], 1.0]) / np.sqrt(1 + slope @ slope)
+    uphill = np.array([0, 0, 1.0]) - normal * normal[2]
+    uphill /= np.linalg.norm(uphill)
+    level = np.cross(normal, uphill)
+    surface.wi = surface.to_local(mi.Vector3f(normal))
+    found = []
+    for tangent in (uphill, level):
+        toward = np.cos(0.4) * normal + np.sin(0.4) * tangent
+        found.append(np.array(surface.bsdf().eval(mi.BSDFContext(), surface, surface.to_local(mi.Vector3f(toward))))[0])
+    for values in found:
+        np.testing.assert_allclose(values, values[0], rtol=1e-3)
+    assert found[0][0] > 20 * found[1][0]
+
+
+@pytest.mark.parametrize("degrees", [0.0, 40.0])
+def test_marks_on_a_horizontal_face_are_counted_from_x(degrees):
+    from mitsim.scene.backend import mi
+
+    lobe = conductor_bsdf("ggx", (0.02, 0.3), (2.6, 8.2))
+    turn = mi.ScalarTransform4f().rotate([0, 0, 1], 25).scale(10)
+    face = {"type": "rectangle", "to_world": turn, "bsdf": turned_description(lobe, degrees)}
+    scene = mi.load_dict({"type": "scene", "face": face})
+    azimuths = np.radians(np.arange(0.0, 180.0, 2.0))
+    ray = mi.Ray3f(mi.Point3f(np.repeat([[1.0], [2.0], [50.0]], 90, axis=1)), mi.Vector3f(0, 0, -1))
+    surface = scene.ray_intersect(ray)
+    light = np.array([0.4 * np.cos(azimuths), 0.4 * np.sin(azimuths), 0 * azimuths + np.sqrt(1 - 0.16)])
+    value = surface.bsdf().eval(mi.BSDFContext(), surface, surface.to_local(mi.Vector3f(light.astype(np.float32))))
+    assert np.degrees(azimuths[np.argmax(np.array(value)[0])]) == pytest.approx((degrees + 90) % 180, abs=2.1)

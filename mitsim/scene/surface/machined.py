@@ -387,7 +387,7 @@ def _prior_in_words(face: MachinedFace, process: Process) -> tuple[str, float]:
 def _in_words(face: MachinedFace, provenance: str, turn_deg: float | None) -> str:
     words = provenance
     if turn_deg is not None:
-        words = f"{provenance}; lay drawn at {turn_deg:.0f} deg from u"
+        words = f"{provenance}; lay drawn at {turn_deg:.0f} deg"
     elif lay_is_open(face):
         words = f"{provenance}; lay not given: round, as wide as across the lay"
     return words if face.alpha_factor == 1 else f"{words}; times {face.alpha_factor:g}"

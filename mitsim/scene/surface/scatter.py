@@ -42,7 +42,8 @@ class Scatter:
     - ``alpha_u``, ``alpha_v``: width of the incoherent lobe along u and v in Beckmann's sense: sqrt(2) times the rms
       slope. NaN if there is no such lobe.
     - ``beckmann``: share of Beckmann in the incoherent lobe; ``beckmann_range``: its one-sigma range.
-    - ``turn_deg``: angle from u of the shape to u of the lobe [deg]; None where the lobe is not turned.
+    - ``turn_deg``: angle of the lobe's u, along the marks, as of :mod:`mitsim.scene.turned_lay` [deg]; None where u is
+      that of the shape.
     - ``lay_open``: whether there are marks whose direction is not given.
     - ``height_um``: Rq that determines coherence and speckle [um]; NaN if light is scattered in the volume.
     - ``wide_angle``: share of all reflected light at wide angles; ``wide_angle_range``: its one-sigma range.
@@ -108,8 +109,8 @@ class Deviation:
       at -3 and 1 at +3, linear between. At -3 the tail of the lobe is the longest, that of GGX.
     - ``lay``: multiplies the ratio of alpha along the marks to alpha across them by
       :data:`~mitsim.scene.surface.processes.LAY_FACTOR` to this power, up to a ratio of 1.
-    - ``lay_deg``: direction of the marks, from u of the shape [deg]. None leaves a face round whose lay is not given.
-      ``lay`` has an effect only on a face with ``lay_deg``.
+    - ``lay_deg``: direction of the marks on faces whose lay is not given: angle to the projected z axis of the part, or
+      to its x axis on a face normal to z [deg]. None leaves such a face round, and then ``lay`` has no effect.
     """
 
     alpha: float = 0.0
