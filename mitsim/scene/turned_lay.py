@@ -27,6 +27,37 @@ def turned_description(description: dict[str, Any], turn_deg: float) -> dict[str
     return {"type": NAME, "turn_deg": turn_deg, "lobe": description}
 
 
+def from_z_axis(frame: Any, direction: Any) -> Any:
+    """Return a local direction in the frame whose first axis is the projected z axis of the part.
+
+    A turned BSDF returns the same for such directions on a surface without ``sh_frame`` as for local directions on the
+    surface itself.
+    """
+    from mitsim.scene.backend import mi
+
+    sine, cosine = _reference(frame)
+    return mi.Vector3f(*_turned(sine, cosine, direction))
+
+
+def _turned(sine: Any, cosine: Any, one: Any) -> tuple[Any, Any, Any]:
+    """Return a direction's coordinates in axes that are turned about z by an angle."""
+    from mitsim.scene.backend import dr
+
+    return dr.fma(cosine, one.x, sine * one.y), dr.fma(cosine, one.y, -sine * one.x), one.z
+
+
+def _reference(frame: Any) -> tuple[Any, Any]:
+    """Return sine and cosine of the angle from u to the projected z axis; 0 and 1 for a surface without a frame."""
+    from mitsim.scene.backend import dr
+
+    flat = dr.square(frame.s.z) + dr.square(frame.t.z) < _NORMAL_TO_Z**2
+    along_u, along_v = dr.select(flat, frame.s.x, frame.s.z), dr.select(flat, frame.t.x, frame.t.z)
+    square = dr.square(along_u) + dr.square(along_v)
+    placed = square > 0
+    scale = dr.rsqrt(dr.select(placed, square, 1.0))
+    return along_v * scale, dr.select(placed, along_u * scale, 1.0)
+
+
 @lru_cache(maxsize=1)
 def register_turned_lay() -> None:
     """Register the BSDF ``turned_lay`` with Mitsuba.
@@ -35,15 +66,6 @@ def register_turned_lay() -> None:
     nested BSDF, ``lobe``.
     """
     from mitsim.scene.backend import dr, mi
-
-    def _reference(frame: Any) -> tuple[Any, Any]:
-        """Return sine and cosine of the angle from u to the projected z axis; 0 and 1 for a surface without place."""
-        flat = dr.square(frame.s.z) + dr.square(frame.t.z) < _NORMAL_TO_Z**2
-        along_u, along_v = dr.select(flat, frame.s.x, frame.s.z), dr.select(flat, frame.t.x, frame.t.z)
-        square = dr.square(along_u) + dr.square(along_v)
-        placed = square > 0
-        scale = dr.rsqrt(dr.select(placed, square, 1.0))
-        return along_v * scale, dr.select(placed, along_u * scale, 1.0)
 
     class TurnedLay(mi.BSDF):  # type: ignore[misc]
         def __init__(self, props: Any) -> None:
@@ -86,10 +108,10 @@ def register_turned_lay() -> None:
             sine = dr.fma(zero_sine, turn_cosine, zero_cosine * turn_sine)
 
             def to_lobe(one: Any) -> Any:
-                return mi.Vector3f(dr.fma(cosine, one.x, sine * one.y), dr.fma(cosine, one.y, -sine * one.x), one.z)
+                return mi.Vector3f(*_turned(sine, cosine, one))
 
             def from_lobe(one: Any) -> Any:
-                return mi.Vector3f(dr.fma(cosine, one.x, -sine * one.y), dr.fma(cosine, one.y, sine * one.x), one.z)
+                return mi.Vector3f(*_turned(-sine, cosine, one))
 
             turned = mi.SurfaceInteraction3f(surface)
             turned.wi = to_lobe(surface.wi)

@@ -5,7 +5,7 @@ import pytest
 
 from mitsim.scene import backend
 from mitsim.scene.bsdf_descriptions import conductor_bsdf
-from mitsim.scene.turned_lay import turned_description
+from mitsim.scene.turned_lay import from_z_axis, turned_description
 
 
 def directions(rng, count):
@@ -114,6 +114,25 @@ def test_a_flat_face_without_uvs_has_one_direction():
     for values in found:
         np.testing.assert_allclose(values, values[0], rtol=1e-3)
     assert found[0][0] > 20 * found[1][0]
+
+
+def test_directions_from_the_z_axis_need_no_place(lobe):
+    """On a cylinder along x, whose u is around it: local directions on it, and turned ones without any frame."""
+    from mitsim.scene.backend import dr, mi
+
+    shape = {"type": "cylinder", "p0": [-9, 0, 0], "p1": [9, 0, 0], "radius": 5, "bsdf": turned_description(lobe, 30.0)}
+    rng = np.random.default_rng(6)
+    origins = np.vstack([rng.uniform(-8, 8, 300), rng.uniform(-4.5, 4.5, 300), np.full(300, 50.0)]).astype(np.float32)
+    scene = mi.load_dict({"type": "scene", "shape": shape})
+    surface = scene.ray_intersect(mi.Ray3f(mi.Point3f(origins), mi.Vector3f(0, 0, -1)))
+    light = mi.Vector3f(directions(rng, 300).astype(np.float32))
+    one, context = surface.bsdf(), mi.BSDFContext()
+    there = np.array(one.eval(context, surface, light))[0]
+    bare = dr.zeros(mi.SurfaceInteraction3f, 300)
+    bare.wi = from_z_axis(surface.sh_frame, surface.wi)
+    anywhere = mi.load_dict(turned_description(lobe, 30.0)).eval(context, bare, from_z_axis(surface.sh_frame, light))
+    assert (there > 0).mean() > 0.5
+    np.testing.assert_allclose(np.array(anywhere)[0], there, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 40.0])

@@ -150,6 +150,9 @@ def test_the_lay_has_any_direction_and_properties_are_independent(unknowns):
     assert drawn.shape == (2000, len(DRAWN))
     np.testing.assert_allclose(np.corrcoef(drawn.T), np.eye(len(DRAWN)), atol=4 / np.sqrt(2000))
     assert finish_numbers(unknowns, -1, "plate") == dict.fromkeys(DRAWN, 0.0)
+    known = replace(unknowns, table=UnknownsTable.model_validate({"finish": {"alpha": 0.0, "lay": 0.0}}))
+    left = {name: finish_numbers(unknowns, 99, "plate")[name] for name in ("wide_angle", "reflectance", "tail")}
+    assert finish_numbers(known, 99, "plate") == left
 
 
 def test_a_measured_finish_replaces_its_prior_alone(unknowns):

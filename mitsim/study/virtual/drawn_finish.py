@@ -34,9 +34,21 @@ DRAWN = ("alpha", "wide_angle", "reflectance", "tail", "lay", "lay_direction")
 def finish_numbers(unknowns: Unknowns, number: int, finish: str) -> dict[str, float]:
     """Return the standard normals behind a finish, given by its BSDF's id, by the names of :data:`DRAWN`.
 
-    The number -1 is the best estimate, with zeros. A number beyond the pool of :data:`FINISHES` seeds a normal draw. In
-    the pool they are quantiles of the normal distribution, scaled to variance 1, in a random order for each finish and
-    property (Latin hypercube sampling: McKay et al. 1979).
+    Properties that are not drawn are left out: those of size 0, and the direction of a lay that is not drawn. The
+    number -1 is the best estimate, with zeros.
+    """
+    prior = unknowns.table.finish.centres_and_sizes(finish)
+    drawn = [name for name in DRAWN if prior[name.removesuffix("_direction")][1] > 0]
+    numbers = _normals(unknowns, number, finish)
+    return {name: numbers[name] for name in drawn}
+
+
+def _normals(unknowns: Unknowns, number: int, finish: str) -> dict[str, float]:
+    """Return a standard normal for each of :data:`DRAWN`.
+
+    A number beyond the pool of :data:`FINISHES` seeds a normal draw. In the pool they are quantiles of the normal
+    distribution, scaled to variance 1, in a random order for each finish and property (Latin hypercube sampling: McKay
+    et al. 1979).
     """
     if number < 0:
         return dict.fromkeys(DRAWN, 0.0)
@@ -60,7 +72,7 @@ def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
     if number < 0:
         return Deviation()
     table = unknowns.table.finish
-    return deviation_of(table.centres_and_sizes(finish), finish_numbers(unknowns, number, finish))
+    return deviation_of(table.centres_and_sizes(finish), _normals(unknowns, number, finish))
 
 
 def deviation_of(prior: Mapping[str, tuple[float, float]], numbers: Mapping[str, float]) -> Deviation:
