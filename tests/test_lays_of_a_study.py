@@ -13,8 +13,7 @@ def test_a_study_names_the_features_whose_marks_have_no_direction(scenes, capsys
     }
     report_lays(study)
     told = capsys.readouterr().err
-    ground = ", ".join(f"{name} (aluminium/ground)" for name in ("plane", "pillar1", "pillar2"))
-    assert told.startswith(f"{ground}: no direction of the marks is given") and told.count("\n") == 1
+    assert told.startswith("plane and 2 more: lay not given") and told.count("\n") == 1 and len(told) < 120
 
 
 def test_a_study_of_matt_faces_says_nothing(scenes, capsys):

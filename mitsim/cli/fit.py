@@ -50,6 +50,8 @@ def finish(
 ) -> None:
     """Estimate the width alpha of a coupon's specular lobe, its equivalent Ra, and the projector's power.
 
+    Prints them, and a table for a study that narrows the prior of the finish.
+
     Example: mitsim fit finish captures/coupon_* --scene scenes/coupon/coupon.xml -o fit.json --figure fit.png
     """
     start(variant)
@@ -65,6 +67,8 @@ def finish(
             check_file(file)
     found = fit_captures(captures, sensor, scene, definitions(define), block, Roi(*window) if window else None)
     print(fit_table(found), end="")
+    if found.posterior is not None:
+        print(f"\n# for a study whose part has this finish and the Ra of this scene\n{found.posterior.toml()}", end="")
     for remark in remarks(found):
         say(remark)
     if output is not None:

@@ -15,6 +15,7 @@ from mitsim.scene.surface.coherence import LARGEST_INCIDENCE
 from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, Distribution, fresnel
 from mitsim.scene.surface.paint import INDEX, surface_share
 from mitsim.scene.surface.scatter import Scatter
+from mitsim.scene.turned_lay import turned_description
 
 #: a coherent share below this at every angle where its law holds is not rendered
 _LEAST_COHERENT = 0.005
@@ -42,7 +43,8 @@ def metal_bsdf(index: tuple[float, float], scatter: Scatter, reflected: float = 
     """Return the Mitsuba description of a machined metal.
 
     It blends up to two incoherent lobes, a coherent lobe and a diffuse wide-angle share. All lobes have the same
-    refractive index, and none is a delta function, so blending conserves energy.
+    refractive index, and none is a delta function, so blending conserves energy. The parts depend on the finish, but
+    not on its deviation: a part is left out only if its share is known to be nothing.
 
     Parameters
     ----------
@@ -62,6 +64,7 @@ def metal_bsdf(index: tuple[float, float], scatter: Scatter, reflected: float = 
         lobe("ggx", scatter.ggx_alpha, ggx),
         lobe("beckmann", (scatter.alpha_u, scatter.alpha_v), beckmann),
         scatter.beckmann,
+        scatter.beckmann_range,
     )
     mirror = lobe("beckmann", scatter.coherent_alpha, 1.0)
     specular = incoherent
@@ -74,7 +77,10 @@ def metal_bsdf(index: tuple[float, float], scatter: Scatter, reflected: float = 
             "lobe": incoherent,
             **dict(zip(NUMBERS, scatter.lobe_numbers, strict=True)),
         }
-    return _blend(specular, diffuse_bsdf(reflected * float(fresnel(1.0, *index))), scatter.wide_angle)
+    if scatter.turn_deg is not None:
+        specular = turned_description(specular, scatter.turn_deg)
+    matt = diffuse_bsdf(reflected * float(fresnel(1.0, *index)))
+    return _blend(specular, matt, scatter.wide_angle, scatter.wide_angle_range)
 
 
 def gloss_paint_bsdf(reflectance: float, scatter: Scatter) -> dict[str, Any]:
@@ -104,15 +110,18 @@ def powder_coat_bsdf(reflectance: float, scatter: Scatter) -> dict[str, Any]:
     return _blend(diffuse_bsdf(body / (1 - _COAT_WEIGHT)), coat, _COAT_WEIGHT)
 
 
-def _blend(first: dict[str, Any], second: dict[str, Any], weight: float) -> dict[str, Any]:
+def _blend(
+    first: dict[str, Any], second: dict[str, Any], weight: float, ends: tuple[float, float] | None = None
+) -> dict[str, Any]:
     """Blend two descriptions; ``weight`` is the share of the second [1], as in ``blendbsdf``.
 
-    A share below 1e-3 is dropped.
+    A share below 1e-3 is dropped, except if ``ends``, its one-sigma range, say that it is not known.
     """
-    if weight < 1e-3:
-        return first
-    if weight > 1 - 1e-3:
-        return second
+    if ends is None or ends[0] == ends[1]:
+        if weight < 1e-3:
+            return first
+        if weight > 1 - 1e-3:
+            return second
     return {"type": "blendbsdf", "weight": weight, "first": first, "second": second}
 
 

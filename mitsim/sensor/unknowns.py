@@ -83,16 +83,47 @@ class CalibrationUnknowns(Document):
         )
 
 
+Scale = Annotated[float, Field(ge=0, le=1)]
+
+#: centre and standard deviation of a measured property, in one-sigma ranges of its prior
+Posterior = tuple[Annotated[float, Field(ge=-3, le=3)], Annotated[float, Field(ge=0, le=3)]]
+
+
+class MeasuredFinish(Document):
+    """What a measurement of one finish says of each property; a property without an entry keeps its prior."""
+
+    alpha: Posterior | None = None
+    wide_angle: Posterior | None = None
+    reflectance: Posterior | None = None
+    tail: Posterior | None = None
+    lay: Posterior | None = None
+
+
 class FinishUnknowns(Document):
     """Uncertainty of the surface finish.
 
-    ``alpha``, ``wide_angle`` and ``reflectance`` scale the one-sigma ranges of every finish
-    (:class:`mitsim.scene.surface.scatter.Deviation`): 1 is the whole range, 0 is a known finish.
+    ``alpha``, ``wide_angle``, ``reflectance``, ``tail`` and ``lay`` scale the one-sigma ranges of every finish
+    (:class:`mitsim.scene.surface.scatter.Deviation`): 1 is the whole range, 0 is a known finish. With ``lay`` 0, a face
+    whose lay is not given is round. ``measured`` replaces the priors of single finishes, by the id of the BSDF.
     """
 
-    alpha: Annotated[float, Field(ge=0, le=1)] = 1.0
-    wide_angle: Annotated[float, Field(ge=0, le=1)] = 1.0
-    reflectance: Annotated[float, Field(ge=0, le=1)] = 1.0
+    alpha: Scale = 1.0
+    wide_angle: Scale = 1.0
+    reflectance: Scale = 1.0
+    tail: Scale = 1.0
+    lay: Scale = 1.0
+    measured: dict[str, MeasuredFinish] = Field(default_factory=dict)
+
+    def centres_and_sizes(self, finish: str) -> dict[str, tuple[float, float]]:
+        """Return centre and standard deviation of each property of a finish, in one-sigma ranges of its prior."""
+        given = self.measured.get(finish, MeasuredFinish())
+        names = MeasuredFinish.model_fields
+        return {name: getattr(given, name) or (0.0, float(getattr(self, name))) for name in names}
+
+    @property
+    def varies(self) -> bool:
+        """Return whether any finish is drawn; a measured value is drawn even if it is exact."""
+        return bool(self.measured) or any(getattr(self, name) > 0 for name in MeasuredFinish.model_fields)
 
 
 class FormUnknowns(Document):

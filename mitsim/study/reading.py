@@ -181,9 +181,9 @@ def finishes_of_features(study: Study) -> dict[str, Finish | None]:
 
 
 def report_lays(study: Study) -> None:
-    """Report how the prediction simplifies the direction of machining marks on the features of the study."""
+    """Report the features of the study whose machining marks have no given direction."""
     finishes = finishes_of_features(study)
-    for sentence in lays_in_words({name: (one.name, one.scatter) for name, one in finishes.items() if one is not None}):
+    for sentence in lays_in_words({name: one.scatter for name, one in finishes.items() if one is not None}):
         say(sentence)
 
 

@@ -81,7 +81,7 @@ def run_record(
         Largest render noise; None if nothing was rendered for it.
     """
     finishes = finishes_of_features(study)
-    lays = {name: lay_left_out(one.name, one.scatter) for name, one in finishes.items() if one is not None}
+    lays = {name: lay_left_out(one.scatter) for name, one in finishes.items() if one is not None}
     return {
         "schema_version": 1,
         "mitsim": __version__,

@@ -183,7 +183,7 @@ def test_a_lay_keeps_its_directions_their_mean_and_what_they_differ_by(shipped, 
         along = tangent_at(AHEAD, turn, mirror_direction(np.array([504.0]), one_finish.mirror_mm(n10)))
         in_direction = joined.query(lay.name, lay.roughness, [504.0], AHEAD, lay.light, along)
         assert in_direction.fraction[0] == pytest.approx(level, abs=0.03)
-    assert lay_left_out(lay.name, lay.scatter) is None
+    assert lay_left_out(lay.scatter) is None
     with pytest.raises(InputError):  # the round lobe of the same name is another finish
         joined.query(lay.name, lay.roughness, [504.0], AHEAD, finish_of(**MILLED).light)
 

@@ -268,7 +268,21 @@ def seeds(
     print(seeds_table(stated), end="")
 
 
-for command in (maps, scores, statements, losses, laboratory, seeds):
+def finishes(
+    folder: Annotated[Path, typer.Argument(help="Folder of real data, with brdf_metals and merl_fits.")],
+) -> None:
+    """Fit the priors of finishes to measured surfaces, and compare the model of a BSDF with a goniometer.
+
+    Prints tables of the fits, of the priors with their 95 % intervals, and of model against data; takes a minute.
+
+    Example: python -m tests.proofs finishes ../shared/real
+    """
+    from tests.proofs.finishes.page import finishes_page
+
+    print(finishes_page(folder), end="")
+
+
+for command in (maps, scores, statements, losses, laboratory, seeds, finishes):
     app.command(name=command.__name__)(command)
 
 if __name__ == "__main__":

@@ -17,13 +17,13 @@ from mitsim.scene.surface.energy import directional_albedo, energy_factors
 from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.scene.surface.metals import normal_reflectance, refractive_index
 from mitsim.scene.surface.paint import ALPHA_RANGE, paint
-from mitsim.scene.surface.processes import PROCESSES
+from mitsim.scene.surface.processes import LAY_FACTOR, PROCESSES
 from mitsim.scene.surface.scatter import NOMINAL, Deviation
 
 FURNACE_DEG = np.array([0, 15, 30, 45, 60])
 
 #: where the white furnace misses its 5 % up to 60 deg: Ra of the worst, and what it returns at 60 deg
-EXCEPTIONS = {"bead_blasted": (2.0, 0.944), "grit_blasted": (1.45, 0.930), "edm": (1.43, 0.944)}
+EXCEPTIONS = {"bead_blasted": (2.0, 0.944), "grit_blasted": (1.45, 0.946), "edm": (1.43, 0.944)}
 
 
 def furnace(description, degrees=FURNACE_DEG, azimuths=(0.0,), side=128):
@@ -252,7 +252,7 @@ def test_a_paint_cannot_be_given_twice(tmp_path):
 
 
 def test_a_deviation_moves_what_is_not_known_and_says_so(tmp_path):
-    """Ground, Ra 0.4: factor 1.6 of alpha with the process given; share 0.1, a factor 2.5 either way."""
+    """Ground, Ra 0.4: factor 1.6 of alpha with the process given; share 0.1, whose odds are 0.2."""
     face = metal(RA, '<string name="process" value="ground"/>')
     best = load(tmp_path, face).scatter
     up = load(tmp_path, face, deviation=Deviation(alpha=1, wide_angle=-1)).scatter
@@ -261,10 +261,61 @@ def test_a_deviation_moves_what_is_not_known_and_says_so(tmp_path):
     assert (up.alpha_factor, up.wide_angle_range) == (best.alpha_factor, best.wide_angle_range)
     assert up.energy_factor != best.energy_factor
     half = load(tmp_path, face, deviation=Deviation(wide_angle=0.5)).scatter
-    assert np.isclose(half.wide_angle, math.sqrt(best.wide_angle * best.wide_angle_range[1]))
+    odds = [share / (0.6 - share) for share in (best.wide_angle, half.wide_angle, best.wide_angle_range[1])]
+    assert np.isclose(odds[1], math.sqrt(odds[0] * odds[2]))
     assert half.alpha_u == best.alpha_u
     far = load(tmp_path, face, deviation=Deviation(3, 3)).scatter
-    assert (far.alpha_u, far.wide_angle) == (0.5, 1.0)
+    assert far.alpha_u == 0.5 and best.wide_angle_range[1] < far.wide_angle < 0.6
+
+
+def test_the_tail_moves_between_ggx_and_beckmann(tmp_path):
+    face = metal(RA, '<string name="process" value="ground"/>')
+
+    def tail(sigma):
+        return load(tmp_path, face, deviation=Deviation(tail=sigma)).scatter.beckmann
+
+    best = load(tmp_path, face).scatter
+    assert best.beckmann_range == (tail(-1), tail(1)) and tail(0) == best.beckmann
+    assert (tail(-3), tail(3)) == (0.0, 1.0)
+    assert best.beckmann < tail(0.5) < tail(1) < tail(2) < 1
+
+
+def test_a_lay_that_is_not_given_is_drawn_and_no_other(tmp_path):
+    """The marks keep alpha across them; along them it is that of the process times the factor of the strength."""
+    ground = '<string name="process" value="ground"/>'
+    best = load(tmp_path, metal(RA, ground)).scatter
+    found = load(tmp_path, metal(RA, ground), deviation=Deviation(lay_deg=30.0)).scatter
+    assert (found.alpha_v, found.turn_deg) == (best.alpha_u, 30.0)
+    assert found.alpha_u == pytest.approx(PROCESSES["ground"].lay_ratio * best.alpha_u)
+    weaker = load(tmp_path, metal(RA, ground), deviation=Deviation(lay=1.0, lay_deg=30.0)).scatter
+    assert weaker.alpha_u / found.alpha_u == pytest.approx(LAY_FACTOR)
+    none = load(tmp_path, metal(RA, ground), deviation=Deviation(lay=3.0, lay_deg=30.0)).scatter
+    assert none.alpha_u == none.alpha_v
+    for given in (
+        '<string name="lay" value="u"/>',
+        '<string name="lay" value="none"/>',
+        '<float name="alpha" value=".1"/>',
+    ):
+        face = metal(RA, ground, given)
+        assert load(tmp_path, face, deviation=Deviation(lay_deg=30.0)).scatter == load(tmp_path, face).scatter
+    polished = metal('<float name="Ra" value="0.05"/>', '<string name="process" value="polished"/>')
+    assert load(tmp_path, polished, deviation=Deviation(lay_deg=30.0)).scatter.turn_deg is None
+
+
+def test_drawn_finishes_have_the_same_parts():
+    """A BSDF whose numbers are drawn keeps its structure, down to shares of nothing."""
+
+    def parts(description):
+        return {key: parts(value) if isinstance(value, dict) else None for key, value in description.items()}
+
+    rng, seen = np.random.default_rng(1), []
+    for process in ("ground", "polished", "grit_blasted"):
+        face = MachinedFace("aluminium", process, 0.05)
+        for numbers in (*rng.uniform(-3, 3, (6, 5)), np.full(5, -3.0), np.full(5, 3.0)):
+            scatter = machined(face, 850.0, deviation=Deviation(*numbers.tolist(), lay_deg=20.0))
+            seen.append(str(parts(metal_bsdf(refractive_index("aluminium", 850.0), scatter))))
+        assert len(set(seen)) == 1
+        seen.clear()
 
 
 @pytest.mark.parametrize(
@@ -275,8 +326,9 @@ def test_a_deviation_moves_what_is_not_known_and_says_so(tmp_path):
         '<bsdf type="gloss_paint" id="f"><float name="alpha" value="0.02"/></bsdf>',
     ],
 )
-def test_a_deviation_leaves_alone_what_is_known(tmp_path, bsdf):
-    moved = load(tmp_path, bsdf, deviation=Deviation(1, 1)).scatter
+@pytest.mark.parametrize("deviation", [Deviation(1, 1), Deviation(lay=1.0, lay_deg=30.0)])
+def test_a_deviation_leaves_alone_what_is_known(tmp_path, bsdf, deviation):
+    moved = load(tmp_path, bsdf, deviation=deviation).scatter
     assert repr(moved) == repr(load(tmp_path, bsdf).scatter)
 
 
@@ -321,6 +373,7 @@ def test_reflectance_scales_all_light_alike_and_stays_below_one(tmp_path, bsdf, 
 def test_a_deviation_is_written_as_on_a_command_line():
     assert Deviation.parse(" alpha=1, wide_angle = -1.5 ") == Deviation(1.0, -1.5)
     assert Deviation.parse("") == NOMINAL
+    assert Deviation.parse("tail=-1, lay=0.5, lay_deg=120") == Deviation(tail=-1.0, lay=0.5, lay_deg=120.0)
 
 
 @pytest.mark.parametrize(
@@ -332,6 +385,7 @@ def test_a_deviation_is_written_as_on_a_command_line():
         ("alpha=4", "-3 to 3"),
         ("alpha=nan", "-3 to 3"),
         ("alpha=1,alpha=2", "two values"),
+        ("lay_deg=181", "0 to 180"),
     ],
 )
 def test_a_deviation_that_is_none_is_told(text, says):

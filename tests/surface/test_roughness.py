@@ -93,4 +93,3 @@ def test_wide_angle_share_grows_with_roughness_and_lies_in_its_range():
 def test_wide_angle_share_of_ground_metal_is_the_one_that_the_maps_were_made_with():
     share = PROCESSES["ground"].wide_angle.share
     assert [round(share(ra), 3) for ra in (0.09, 0.37, 3.0)] == [0.022, 0.092, 0.3]
-    assert PROCESSES["polished"].wide_angle.share(0.05) < share(0.05)

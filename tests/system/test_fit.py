@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,17 +26,20 @@ from mitsim.cli.program import app
 from mitsim.scene.differentiable import Directions, SpecularLobe
 from mitsim.scene.load import load_scene
 from mitsim.scene.surface.machined import MachinedFace, machined
+from mitsim.scene.surface.scatter import Deviation
 from mitsim.sensor.image_formation import expose
 from mitsim.sensor.imager import Imager
 from mitsim.sensor.noise_sources import Noise
 from mitsim.sensor.speckle import speckle_field
 from mitsim.sensor.transforms import look_at
+from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.twin.finish.dots import compare_dots
 from mitsim.twin.finish.electrons import PixelNoise, linearised, pixel_noise
 from mitsim.twin.finish.estimate import fit_views
 from mitsim.twin.finish.finish import ALPHA_RANGE, metal_finish
 from mitsim.twin.finish.observation import CouponCapture, CouponView, observe
 from mitsim.twin.finish.place import found_place, known_place
+from mitsim.twin.finish.posterior import finish_posterior
 from mitsim.twin.finish.run import KNOWN_BLOCK_PX, UNKNOWN_BLOCK_PX, fit_captures
 from mitsim.twin.finish.specimen import place_of
 from mitsim.twin.finish.white_coupon import WhiteCouponRenderer
@@ -265,6 +269,33 @@ def test_the_uncertainty_covers_the_truth(plain_views, ground, size_px):
         assert np.mean([fit.grain for fit in results]) == pytest.approx(GRAIN, rel=0.03)
 
 
+def test_a_posterior_covers_the_truth_and_is_narrower_than_its_prior(plain_views, ground):
+    """The views were made of the lobe at tail 0. A prior of another Ra moves centres, not what they stand for."""
+    views = noisy(plain_views, 0.0, 1)
+    fit = fit_views(views, ground)
+    alphas = []
+    for roughness in (0.37, 0.74):
+        prior = machined(MachinedFace("aluminium", "ground", roughness), 850.0)
+        found = finish_posterior(views, ground, prior, fit, "plate")
+        centre, size = found.alpha
+        assert abs(math.log(TRUE_ALPHA / prior.alpha_u) / math.log(1.6) - centre) < 3 * size and size < 0.5
+        alphas.append(prior.alpha_u * 1.6**centre)
+        moved = Deviation(wide_angle=found.wide_angle[0]).share(prior.wide_angle, prior.wide_angle_range)
+        assert moved == pytest.approx(TRUE_SHARE, rel=0.25) and found.wide_angle[1] < 1
+        assert abs(found.tail[0]) < 3 * found.tail[1] and found.tail[1] < 1
+    assert alphas[0] == pytest.approx(alphas[1], rel=0.01)
+    told = UnknownsTable.model_validate(tomllib.loads(found.toml())["unknowns"])
+    assert told.finish.centres_and_sizes("plate")["alpha"] == pytest.approx(found.alpha, abs=1e-3)
+
+
+def test_views_without_information_leave_the_prior_of_the_tail(plain_views, ground):
+    """Views whose noise is that of a night: mean 0 and standard deviation 1, inside +-3."""
+    dark = [replace(view, noise=PixelNoise(1e14, 0.0, 0.0, 0.0, 0.0, 0.01)) for view in plain_views]
+    prior = machined(MachinedFace("aluminium", "ground", 0.37), 850.0)
+    found = finish_posterior(dark, ground, prior, fit_views(plain_views, ground), "plate")
+    assert found.tail[0] == pytest.approx(0.0, abs=0.05) and found.tail[1] == pytest.approx(0.987, abs=0.03)
+
+
 def test_poses_that_do_not_show_the_lobe_leave_its_width_open(plain_views, ground):
     """At 40 deg off the mirror direction only the wide-angle light is left to see."""
     fit = fit_views(noisy(plain_views[-1:], 0.0, 1), ground)
@@ -315,6 +346,9 @@ def test_alpha_and_power_are_recovered_from_noisy_captures(captures, tmp_path):
     assert numbers["reduced_chi_square"] == pytest.approx(1.0, abs=0.18)
     assert numbers["source"] == "simulated"
     assert len(numbers["views"]) == 6
+    ((name, entries),) = numbers["unknowns_finish"].items()
+    assert set(entries) == {"alpha", "wide_angle", "tail"} and all(size < 1 for _, size in entries.values())
+    assert f'[unknowns.finish.measured."{name}"]' in result.stdout
     assert result.stdout.startswith("alpha\t0.1")
     assert (tmp_path / "fit.png").stat().st_size > 10_000
 

@@ -24,12 +24,13 @@ from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.transforms import Transform, look_at
 from mitsim.study import StudyFile, open_study
 from mitsim.study.session import Session
+from mitsim.study.virtual.drawn_finish import finish_deviation
 from mitsim.study.virtual.plan import measurements_of, trial_digest
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import displaced
 from mitsim.study.virtual.stated import budget_groups, statement_document
 from mitsim.study.virtual.study_unknowns import study_unknowns
-from mitsim.study.virtual.world import GROUPS, Trial, finish_deviation
+from mitsim.study.virtual.world import GROUPS, Trial
 from tests.smaller_sensors import binned, coarse_sensor, middle_part
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
@@ -145,7 +146,9 @@ def test_finishes_are_loaded_with_the_alpha_that_was_drawn():
     for name, finish in (("plane", "plane_finish"), ("pillar1", "pillar_finish")):
         one, other = (scene.finishes[scene.names.index(name)].scatter for scene in (nominal, drawn))
         deviation = finish_deviation(unknowns, 2, finish)
-        assert other.alpha_u / one.alpha_u == pytest.approx(one.alpha_factor**deviation.alpha, rel=1e-6)
+        # across the drawn lay; along it the lobe is narrower
+        assert other.alpha_v / one.alpha_v == pytest.approx(one.alpha_factor**deviation.alpha, rel=1e-6)
+        assert other.alpha_u <= other.alpha_v and other.turn_deg == deviation.lay_deg
 
 
 def test_sharing_kernels_changes_no_image(monkeypatch):

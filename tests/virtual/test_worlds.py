@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
 from characterisation.files.errors import InputError
 from mitsim.sensor.preset import load_sensor
@@ -11,6 +12,7 @@ from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import parameter_names
 from mitsim.sensor.room_light import room_irradiance
 from mitsim.sensor.unknowns import UnknownsTable, unknowns_of
+from mitsim.study.virtual.drawn_finish import DRAWN, finish_deviation, finish_numbers
 from mitsim.study.virtual.world import (
     FRESH,
     GROUPS,
@@ -19,7 +21,6 @@ from mitsim.study.virtual.world import (
     STATEMENT_DAYS,
     Trial,
     Unknowns,
-    finish_deviation,
 )
 
 
@@ -140,8 +141,8 @@ def test_finishes_have_the_spread_of_a_normal_distribution(unknowns):
     assert abs(alphas.mean()) < 4.5 / np.sqrt(2000) and alphas.std() == pytest.approx(1, abs=4.5 / np.sqrt(4000))
     assert abs(np.corrcoef(alphas, others)[0, 1]) < 4.5 / np.sqrt(2000)
     assert finish_deviation(unknowns, -1, "plate").alpha == 0
-    known = replace(unknowns, table=UnknownsTable.model_validate({"finish": {"alpha": 0.0, "wide_angle": 0.5}}))
-    assert finish_deviation(known, 3, "plate").alpha == 0
+    known = replace(unknowns, table=UnknownsTable.model_validate({"finish": {"alpha": 0.0, "lay": 0.0}}))
+    assert finish_deviation(known, 3, "plate").alpha == 0 and finish_deviation(known, 3, "plate").lay_deg is None
 
 
 @pytest.mark.parametrize("first", [0, JUDGING_DAYS, STATEMENT_DAYS, SET_DAYS])
@@ -159,6 +160,33 @@ def test_every_day_has_a_finish_of_its_own_and_its_captures_share_it(unknowns, f
     assert not set(days) & {
         replace(unknowns, seed=unknowns.seed + 1).draw(Trial(first + day)).finish for day in range(200)
     }
+
+
+def test_the_lay_has_any_direction_and_properties_are_independent(unknowns):
+    numbers = range(2000)
+    directions = np.array([finish_deviation(unknowns, number, "plate").lay_deg for number in numbers])
+    assert kstest(directions / 180.0, "uniform").pvalue > 1e-3
+    drawn = np.array([list(finish_numbers(unknowns, number, "plate").values()) for number in numbers])
+    assert drawn.shape == (2000, len(DRAWN))
+    np.testing.assert_allclose(np.corrcoef(drawn.T), np.eye(len(DRAWN)), atol=4 / np.sqrt(2000))
+    assert finish_numbers(unknowns, -1, "plate") == dict.fromkeys(DRAWN, 0.0)
+    known = replace(unknowns, table=UnknownsTable.model_validate({"finish": {"alpha": 0.0, "lay": 0.0}}))
+    left = {name: finish_numbers(unknowns, 99, "plate")[name] for name in ("wide_angle", "reflectance", "tail")}
+    assert finish_numbers(known, 99, "plate") == left
+
+
+def test_a_measured_finish_replaces_its_prior_alone(unknowns):
+    measured = {"plate": {"alpha": [-0.5, 0.1], "tail": [0.3, 0.0]}}
+    known = replace(unknowns, table=UnknownsTable.model_validate({"finish": {"measured": measured}}))
+    numbers = range(800)
+    drawn = [finish_deviation(known, number, "plate") for number in numbers]
+    alphas = np.array([one.alpha for one in drawn])
+    assert alphas.mean() == pytest.approx(-0.5, abs=4 * 0.1 / np.sqrt(800))
+    assert alphas.std() == pytest.approx(0.1, rel=0.1) and {one.tail for one in drawn} == {0.3}
+    for number in numbers[:5]:
+        assert finish_deviation(known, number, "pillar") == finish_deviation(unknowns, number, "pillar")
+        was, now = finish_deviation(unknowns, number, "plate"), finish_deviation(known, number, "plate")
+        assert (was.wide_angle, was.reflectance, was.lay_deg) == (now.wide_angle, now.reflectance, now.lay_deg)
 
 
 def test_a_study_overrules_the_sensor_key_by_key():

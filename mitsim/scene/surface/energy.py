@@ -22,8 +22,9 @@ from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, Distribution, fres
 #: incidence at which the compensation is exact [rad]
 NOMINAL_INCIDENCE = float(np.radians(30))
 
-#: facets of the quadrature: radii and azimuths of their slopes, and azimuths of the light for an elongated lobe
-_COUNTS = (300, 96, 12)
+#: facets of the quadrature: radii and azimuths of their slopes, and azimuths of the light for an elongated lobe. The
+#: error of the coarser one is 1e-4
+_COUNTS, _ELONGATED_COUNTS = (300, 96, 1), (150, 48, 4)
 
 
 @lru_cache(maxsize=4096)
@@ -51,7 +52,8 @@ def directional_albedo(
     --------
     compensation : the factor that restores the lost light
     """
-    weights, _ = facets(incidence, alpha_u, alpha_v, distribution, _COUNTS, index)
+    counts = _COUNTS if alpha_u == alpha_v else _ELONGATED_COUNTS
+    weights, _ = facets(incidence, alpha_u, alpha_v, distribution, counts, index)
     return float(weights.sum())
 
 

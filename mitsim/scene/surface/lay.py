@@ -1,41 +1,32 @@
-"""Report how a prediction simplifies the direction of machining marks, the lay.
+"""Report how maps and virtual measurements treat the direction of machining marks, the lay.
 
 Signal chain: scattering of a face, and its process -> whether the marks have a direction, and whether it is known.
 
 Marks in one direction reflect a line of light across them. Where the author of a scene gives their direction, maps and
-renderings have it (:mod:`characterisation.maps.lay`). Where it is not given, both are round.
+renderings have it (:mod:`characterisation.maps.lay`). Where it is not given, maps are round, and rendered virtual
+measurements draw direction and strength (:mod:`mitsim.study.virtual.drawn_finish`).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Literal
 
-from mitsim.scene.surface.processes import PROCESSES
 from mitsim.scene.surface.scatter import Scatter
 
-#: the process leaves marks, their direction is not given, and prediction and virtual measurements treat the face as
-#: round
+#: the process leaves marks, their direction is not given, and maps treat the face as round
 LayLeftOut = Literal["round"]
 
 
-def lay_left_out(finish: str, scatter: Scatter | None) -> LayLeftOut | None:
-    """Return what is left out of the lay of a face with a finish such as ``aluminium/turned``; None if nothing is."""
-    if scatter is None or math.isnan(scatter.alpha_u) or scatter.alpha_u != scatter.alpha_v:
-        return None
-    process = PROCESSES.get(finish.partition("/")[2])
-    return None if process is None or process.lay_ratio == 1 else "round"
+def lay_left_out(scatter: Scatter | None) -> LayLeftOut | None:
+    """Return what a map leaves out of the lay of a face; None if it leaves out nothing."""
+    return "round" if scatter is not None and scatter.lay_open and scatter.turn_deg is None else None
 
 
-def lays_in_words(finishes: Mapping[str, tuple[str, Scatter | None]]) -> list[str]:
-    """Return a sentence about the omission, of the finishes of several faces by their names; empty without one."""
-    left_out = [
-        f"{face} ({finish})" for face, (finish, scatter) in finishes.items() if lay_left_out(finish, scatter) == "round"
-    ]
+def lays_in_words(scatters: Mapping[str, Scatter | None]) -> list[str]:
+    """Return one line about lays that are not given, of several faces by their names; or no line."""
+    left_out = [face for face, scatter in scatters.items() if lay_left_out(scatter) == "round"]
     if not left_out:
         return []
-    return [
-        f"{', '.join(left_out)}: no direction of the marks is given, so prediction and virtual measurements leave out "
-        'the line of light that marks reflect; lay = "u" or "v" in the scene renders it'
-    ]
+    faces = left_out[0] if len(left_out) == 1 else f"{left_out[0]} and {len(left_out) - 1} more"
+    return [f"{faces}: lay not given (lay = u, v or none): virtual measurements draw it, maps are round"]

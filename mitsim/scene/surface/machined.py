@@ -23,7 +23,7 @@ from mitsim.scene.surface.gloss import GLOSS_WAVELENGTH_NM, alpha_of_gloss, base
 from mitsim.scene.surface.measured import HeightMap, Profile
 from mitsim.scene.surface.metals import normal_reflectance, refractive_index
 from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN
-from mitsim.scene.surface.processes import PROCESSES, Process, feed, feed_slope, micro_roughness
+from mitsim.scene.surface.processes import LAY_FACTOR, PROCESSES, Process, feed, feed_slope, micro_roughness
 from mitsim.scene.surface.roughness import (
     ALPHA_LARGEST,
     correlation_length,
@@ -139,33 +139,52 @@ def machined(
         feed_variance = 2 * _feed_slope(face) ** 2
     lobe = _lobe(face, process, sigma, wavelength_nm, where)
     across = np.hypot(lobe.across, np.sqrt(feed_variance))
-    beckmann = process.beckmann
-    if feed_variance:
+
+    def with_marks(share: float) -> float:
         # a uniform slope has no tail: it counts as Beckmann, weighted by variance
-        beckmann = (beckmann * lobe.across**2 + feed_variance) / (lobe.across**2 + feed_variance)
+        return float((share * lobe.across**2 + feed_variance) / (lobe.across**2 + feed_variance))
+
+    low, high = process.tail_range
+    tails = with_marks(low), with_marks(high)
+    beckmann = deviation.beckmann(with_marks(process.beckmann), tails)
     lay: Lay = face.lay or "none"
+    along, turn_deg = lobe.along, None
+    if deviation.lay_deg is not None and lay_is_open(face):
+        # a drawn lay runs along u of a lobe that is turned
+        strength = 1.0 if face.height_map is not None else LAY_FACTOR
+        lay, turn_deg, along = "u", deviation.lay_deg, deviation.along(along, float(across), strength)
     mirror = float(np.hypot(ALPHA_FORM, np.sqrt(feed_variance)))
     alpha_u, alpha_v = (
         min(deviation.width(a * face.alpha_factor, lobe.factor), ALPHA_LARGEST)
-        for a in _directions(lay, float(across), lobe.along, face)
+        for a in _directions(lay, float(across), along, face)
     )
     share = process.wide_angle.share(face.roughness) if face.wide_angle is None else face.wide_angle
     ends = process.wide_angle.range(face.roughness) if face.wide_angle is None else (share, share)
+    words = _in_words(face, lobe.provenance, turn_deg)
     return Scatter(
         phase_variance=phase_variance(sigma, wavelength_nm),
         alpha_u=alpha_u,
         alpha_v=alpha_v,
-        beckmann=float(beckmann),
+        beckmann=beckmann,
         height_um=sigma,
         wide_angle=deviation.share(share, ends),
         wide_angle_range=ends,
         alpha_factor=lobe.factor,
-        provenance=deviation.provenance_of(_in_words(face, process, lobe.provenance), lobe.factor, ends),
-        lay=lay,
+        provenance=deviation.provenance_of(words, lobe.factor, ends, tails),
+        lay=face.lay or "none",
         energy_factor=energy_factors(alpha_u, alpha_v, normal_reflectance(face.metal, wavelength_nm)),
         coherent_alpha=_mirror_directions(lay, mirror),
         correlation_um=lobe.correlation,
+        beckmann_range=tails,
+        turn_deg=turn_deg,
+        lay_open=lay_is_open(face),
     )
+
+
+def lay_is_open(face: MachinedFace) -> bool:
+    """Return whether the process leaves marks whose direction is not given; ``lay = "none"`` says there are none."""
+    given = face.lay is not None or face.alpha is not None or face.alpha_u is not None
+    return not given and PROCESSES[face.process_or_default].lay_ratio < 1
 
 
 def check(face: MachinedFace, where: str) -> None:
@@ -365,8 +384,10 @@ def _prior_in_words(face: MachinedFace, process: Process) -> tuple[str, float]:
     return f"prior of {name.replace('_', '-')} metal for Ra {face.roughness:g} um{marks}", FACTORS["process"]
 
 
-def _in_words(face: MachinedFace, process: Process, provenance: str) -> str:
+def _in_words(face: MachinedFace, provenance: str, turn_deg: float | None) -> str:
     words = provenance
-    if face.alpha is None and face.alpha_u is None and process.lay_ratio < 1 and face.lay in (None, "none"):
+    if turn_deg is not None:
+        words = f"{provenance}; lay drawn at {turn_deg:.0f} deg"
+    elif lay_is_open(face):
         words = f"{provenance}; lay not given: round, as wide as across the lay"
     return words if face.alpha_factor == 1 else f"{words}; times {face.alpha_factor:g}"

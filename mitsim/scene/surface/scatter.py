@@ -6,9 +6,12 @@ import math
 from dataclasses import dataclass, fields
 from typing import Literal
 
+import numpy as np
+
 from characterisation.files.errors import InputError, nearest
 from mitsim.scene.surface.coherence import lobe_numbers
 from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN
+from mitsim.scene.surface.processes import LARGEST_WIDE_ANGLE, LAY_FACTOR, moved_odds
 
 #: direction of the marks on a face: along its u, along its v, or none
 Lay = Literal["u", "v", "none"]
@@ -38,7 +41,10 @@ class Scatter:
       every angle.
     - ``alpha_u``, ``alpha_v``: width of the incoherent lobe along u and v in Beckmann's sense: sqrt(2) times the rms
       slope. NaN if there is no such lobe.
-    - ``beckmann``: share of Beckmann in the incoherent lobe.
+    - ``beckmann``: share of Beckmann in the incoherent lobe; ``beckmann_range``: its one-sigma range.
+    - ``turn_deg``: angle of the lobe's u, along the marks, as of :mod:`mitsim.scene.turned_lay` [deg]; None where u is
+      that of the shape.
+    - ``lay_open``: whether there are marks whose direction is not given.
     - ``height_um``: Rq that determines coherence and speckle [um]; NaN if light is scattered in the volume.
     - ``wide_angle``: share of all reflected light at wide angles; ``wide_angle_range``: its one-sigma range.
     - ``alpha_factor``: one-sigma factor of alpha, which lies between alpha / factor and alpha x factor;
@@ -64,6 +70,9 @@ class Scatter:
     coherent_alpha: tuple[float, float] = (ALPHA_FORM, ALPHA_FORM)
     correlation_um: float = float("nan")
     depolarising: bool = False
+    beckmann_range: tuple[float, float] | None = None
+    turn_deg: float | None = None
+    lay_open: bool = False
 
     @property
     def coherent(self) -> float:
@@ -93,14 +102,23 @@ class Deviation:
     """Deviation of the unknown properties of a finish from their best estimates, in standard deviations.
 
     - ``alpha``: multiplies the width of the lobe by its one-sigma factor to this power.
-    - ``wide_angle``: the wide-angle share at the low end of its range at -1, at the high end at +1, interpolated and
-      extrapolated geometrically.
+    - ``wide_angle``: the wide-angle share w is at the low end of its range at -1, at the high end at +1. The logarithm
+      of its odds w / (0.6 - w) is interpolated and extrapolated.
     - ``reflectance``: multiplies all reflected light by :data:`REFLECTANCE_FACTOR` to this power.
+    - ``tail``: the Beckmann share of the lobe is at the low end of its range at -1 and at the high end at +1; it is 0
+      at -3 and 1 at +3, linear between. At -3 the tail of the lobe is the longest, that of GGX.
+    - ``lay``: multiplies the ratio of alpha along the marks to alpha across them by
+      :data:`~mitsim.scene.surface.processes.LAY_FACTOR` to this power, up to a ratio of 1.
+    - ``lay_deg``: direction of the marks on faces whose lay is not given: angle to the projected z axis of the part, or
+      to its x axis on a face normal to z [deg]. None leaves such a face round, and then ``lay`` has no effect.
     """
 
     alpha: float = 0.0
     wide_angle: float = 0.0
     reflectance: float = 0.0
+    tail: float = 0.0
+    lay: float = 0.0
+    lay_deg: float | None = None
 
     @classmethod
     def parse(cls, text: str, where: str = "--deviation") -> Deviation:
@@ -118,13 +136,16 @@ class Deviation:
                 raise InputError(where, "", repr(name), ", ".join(known), nearest(name, known))
             if name in given:
                 raise InputError(where, name, "two values", "one")
-            allowed = f"a number of standard deviations from {-LARGEST_DEVIATION:g} to {LARGEST_DEVIATION:g}"
+            low, high, unit = -LARGEST_DEVIATION, LARGEST_DEVIATION, "standard deviations"
+            if name == "lay_deg":
+                low, high, unit = 0.0, 180.0, "degrees"
+            allowed = f"a number of {unit} from {low:g} to {high:g}"
             try:
                 given[name] = float(value)
             except ValueError:
                 found = repr(value) if mark else "nothing"
                 raise InputError(where, name, found, allowed, f"write {name}=1") from None
-            if not abs(given[name]) <= LARGEST_DEVIATION:
+            if not low <= given[name] <= high:
                 raise InputError(where, name, value, allowed)
         return cls(**given)
 
@@ -139,16 +160,40 @@ class Deviation:
 
     def share(self, share: float, ends: tuple[float, float]) -> float:
         """Return a wide-angle share [1] after the deviation; ``ends`` are its one-sigma range, low and high."""
-        if share <= 0:
+        if not self.wide_angle or ends[0] == ends[1] or not 0 < share < LARGEST_WIDE_ANGLE:
             return share
-        ratio = ends[1] / share if self.wide_angle > 0 else share / ends[0]
-        return float(min(share * ratio**self.wide_angle, 1.0))
 
-    def provenance_of(self, provenance: str, factor: float, ends: tuple[float, float]) -> str:
-        """Return the source of alpha and the deviations applied; exactly known properties do not deviate."""
+        def odds(one: float) -> float:
+            return one / (LARGEST_WIDE_ANGLE - one)
+
+        ratio = odds(ends[1]) / odds(share) if self.wide_angle > 0 else odds(share) / odds(ends[0])
+        return moved_odds(share, ratio**self.wide_angle)
+
+    def beckmann(self, share: float, ends: tuple[float, float]) -> float:
+        """Return the Beckmann share of a lobe [1] after the deviation; ``ends`` are its one-sigma range."""
+        places = (-LARGEST_DEVIATION, -1.0, 0.0, 1.0, LARGEST_DEVIATION)
+        return float(np.interp(self.tail, places, (0.0, ends[0], share, ends[1], 1.0)))
+
+    def along(self, along: float, across: float, factor: float = LAY_FACTOR) -> float:
+        """Return alpha along the marks [1] after the deviation; it is ``across`` at most."""
+        return float(min(along * factor**self.lay, across))
+
+    def provenance_of(
+        self, provenance: str, factor: float, ends: tuple[float, float], tails: tuple[float, float] = (0.0, 0.0)
+    ) -> str:
+        """Return the source of alpha and the deviations applied; exactly known properties do not deviate.
+
+        Parameters
+        ----------
+        provenance, factor
+            Source of alpha and its one-sigma factor.
+        ends, tails
+            One-sigma ranges of the wide-angle share and of the Beckmann share; without width if they are known.
+        """
         moved = [f"alpha {self.alpha:+g}"] if self.alpha and factor != 1 else []
         moved += [f"wide angle {self.wide_angle:+g}"] if self.wide_angle and ends[0] != ends[1] else []
         moved += [f"reflectance {self.reflectance:+g}"] if self.reflectance else []
+        moved += [f"tail {self.tail:+g}"] if self.tail and tails[0] != tails[1] else []
         return f"{provenance}; {' and '.join(moved)} sigma" if moved else provenance
 
 

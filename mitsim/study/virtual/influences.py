@@ -43,8 +43,8 @@ def influences(table: UnknownsTable, source: str, depth: int) -> list[Influence]
         Influence("temperature gradients and warming up", False, "let the sensor warm up, and measure its drift"),
         Influence(
             "finish of the part",
-            rendered and table.finish.alpha > 0,
-            "drawn: width of the lobe and wide-angle share"
+            rendered and table.finish.varies,
+            "drawn: width and tail of the lobe, wide-angle share, reflectance, and a lay that is not given"
             if rendered
             else "drawn from errors and spread of the map; the finish is that of the map",
         ),

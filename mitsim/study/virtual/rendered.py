@@ -49,10 +49,11 @@ from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.virtual.drawn_decoder import drawn_decoder
+from mitsim.study.virtual.drawn_finish import finish_deviation
 from mitsim.study.virtual.form import form_deviation
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.trials import Outcome
-from mitsim.study.virtual.world import DrawnValues, Trial, Unknowns, finish_deviation
+from mitsim.study.virtual.world import DrawnValues, Trial, Unknowns
 from mitsim.views import View
 
 Floats = NDArray[np.float64]

@@ -96,7 +96,7 @@ def budget_groups(unknowns: Unknowns, source: str, sensor: Sensor) -> list[str]:
         idle.add("decoder")
     if not any(size > 0 for size in table.form.features.values()):
         idle.add("form")
-    if source != "map" and not any(table.finish.model_dump().values()):
+    if source != "map" and not table.finish.varies:
         idle.add("finish")
     return [group for group in GROUPS if group in unknowns.varied and group not in idle]
 

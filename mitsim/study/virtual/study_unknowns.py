@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from characterisation.files.errors import InputError
+from characterisation.files.errors import InputError, nearest
 from mitsim.running.progress import say
 from mitsim.sensor.drift import Drift, with_drift
 from mitsim.sensor.preset import Sensor, presets
@@ -46,13 +46,19 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
     Raises
     ------
     InputError
-        If a file is missing or belongs to another sensor, or if a feature with a form deviation is not in the task.
+        If a file is missing or belongs to another sensor, if a feature with a form deviation is not in the task, or
+        if a measured finish is not in the scene.
     """
     table, sensor = study.unknowns, study.sensor
     for name in table.form.features:
         if name not in study.task.shapes:
             allowed = ", ".join(study.task.shapes)
             raise InputError(study.path, f"unknowns.form.features.{name}", "no shape of the task", allowed)
+    finishes = sorted({shape.bsdf().id() for shape in study.scene.shapes})
+    for name in table.finish.measured:
+        if name not in finishes:
+            field = f"unknowns.finish.measured.{name}"
+            raise InputError(study.path, field, "no bsdf of the scene", ", ".join(finishes), nearest(name, finishes))
     folder = study.path.parent
     return Unknowns(
         table,

@@ -14,20 +14,18 @@ gives its share of the variance (:mod:`characterisation.statements.budget`).
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.rig_covariance import RigCovariance
 from mitsim.sensor.rig_parameters import eyes, moved, parameter_names, path_error
 from mitsim.sensor.room_light import room_irradiance
 from mitsim.sensor.transforms import Transform
-from mitsim.sensor.unknowns import FinishUnknowns, UnknownsTable
+from mitsim.sensor.unknowns import UnknownsTable
 
 #: effects outside the performance map, for measurements drawn from a map (:mod:`mitsim.study.virtual.beyond_map`); they
 #: are the same in all captures of a day
@@ -41,9 +39,6 @@ GROUPS = ("calibration", "finish", "form", "light", "temperature", "unit", *FRES
 
 #: groups that all captures of a day share
 COMMON = tuple(group for group in GROUPS if group not in (*FRESH, BEYOND))
-
-#: seed of the stream of finishes, different from those of the groups
-_FINISH_STREAM = 8
 
 #: days of a race start at 0; first day of draws that judge the choice of a view
 JUDGING_DAYS = 1 << 19
@@ -72,7 +67,7 @@ class DrawnValues:
     """All values that were drawn for one trial.
 
     ``rig`` is the sensor's true geometry. ``path`` is offset [mm] and scale [1] of a time-of-flight distance.
-    ``finish`` numbers the deviation of the finishes (:func:`finish_deviation`), -1 for the best estimate. ``form``,
+    ``finish`` numbers the deviation of the finishes (:mod:`mitsim.study.virtual.drawn_finish`), -1 for the best estimate. ``form``,
     ``unit`` and ``decoder`` are seeds, 0 for none: the unit's patterns, and
     :func:`mitsim.study.virtual.drawn_decoder.drawn_decoder`. ``room`` is irradiance [W/mm^2]. ``power`` and
     ``exposure`` are relative to nominal [1]. ``expansion`` of the part is relative [1]. ``placed`` and ``assumed``
@@ -186,22 +181,6 @@ class Unknowns:
         """Return a small rotation about the part's middle, with a shift."""
         turn = Rotation.from_rotvec(rng.normal(0.0, np.radians(turn_deg), 3)).as_matrix()
         return Transform(turn, self.centre + rng.normal(0.0, shift_mm, 3) - turn @ self.centre)
-
-
-def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
-    """Return the deviation of a finish, given by its BSDF's id, from its best estimate in the finishes of a number.
-
-    The number seeds a normal draw for each finish; -1 is the best estimate.
-    """
-    if number < 0:
-        return Deviation()
-    seeded = np.random.default_rng(np.random.SeedSequence([number, _FINISH_STREAM, zlib.crc32(finish.encode())]))
-    drawn = np.clip(seeded.standard_normal(3), -LARGEST_DEVIATION, LARGEST_DEVIATION).tolist()
-    return _deviation(unknowns.table.finish, *drawn)
-
-
-def _deviation(ranges: FinishUnknowns, alpha: float, wide_angle: float, reflectance: float) -> Deviation:
-    return Deviation(alpha * ranges.alpha, wide_angle * ranges.wide_angle, reflectance * ranges.reflectance)
 
 
 Scaled = tuple[tuple[str, ...], NDArray[np.float64]]

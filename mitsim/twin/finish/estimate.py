@@ -97,12 +97,7 @@ def fit_views(views: Sequence[CouponView], finish: MetalFinish | None, where: st
         free = f"{problem.count} of {whole} blocks on the coupon free of saturation"
         hint = "shorter exposures, other poses, or smaller blocks"
         raise InputError(where, "images", free, f"{FEWEST_BLOCKS} or more", hint)
-    every = np.ones(problem.count, bool)
-    values = _first(problem, every)
-    grain = 0.0
-    for _ in range(_ROUNDS):
-        variance, grain = problem.variance(values)
-        values = _refine(problem, values, variance, every)
+    values, variance, grain = best_values(problem)
     residual, jacobian = problem.residual(values, variance), problem.jacobian(values, variance)
     degrees = max(problem.count - len(values), 1)
     chi_square = float(residual @ residual) / degrees
@@ -127,6 +122,16 @@ def fit_views(views: Sequence[CouponView], finish: MetalFinish | None, where: st
     )
 
 
+def best_values(problem: Problem) -> tuple[Floats, Floats, float]:
+    """Return the best parameters, the variance of the block means [e-^2] that weighs them, and the grain [1]."""
+    every = np.ones(problem.count, bool)
+    values, grain = _first(problem, every), 0.0
+    for _ in range(_ROUNDS):
+        variance, grain = problem.variance(values)
+        values = refine(problem, values, variance, every)
+    return values, variance, grain
+
+
 def _first(problem: Problem, use: NDArray[np.bool_]) -> Floats:
     """Return initial estimates of the parameters: the best local minimum along alpha, after Gauss-Newton from each."""
     measured = np.maximum(problem.measured, 0.0)
@@ -147,7 +152,7 @@ def _first(problem: Problem, use: NDArray[np.bool_]) -> Floats:
         starts.append(np.array([float(x), *amplitudes]))
         costs.append(misfit)
     lowest = [i for i in range(_SCAN) if costs[i] <= min(costs[max(i - 1, 0)], costs[min(i + 1, _SCAN - 1)])]
-    refined = [_refine(problem, starts[i], variance, use) for i in lowest]
+    refined = [refine(problem, starts[i], variance, use) for i in lowest]
     return min(refined, key=lambda v: float(np.sum(problem.residual(v, variance)[use] ** 2)))
 
 
@@ -160,8 +165,20 @@ def _amplitudes(columns: Floats, measured: Floats, weight: Floats) -> tuple[Floa
     return np.asarray(amplitudes / scale), float(misfit)
 
 
-def _refine(problem: Problem, start: Floats, variance: Floats, use: NDArray[np.bool_]) -> Floats:
-    """Return the parameters of weighted least squares over the blocks of ``use``, by SciPy's ``trf`` method."""
+def refine(problem: Problem, start: Floats, variance: Floats, use: NDArray[np.bool_]) -> Floats:
+    """Return the parameters of weighted least squares, by SciPy's ``trf`` method.
+
+    Parameters
+    ----------
+    problem
+        Blocks of all views.
+    start
+        Parameters to start from.
+    variance
+        Of the block means [e-^2], (blocks,).
+    use
+        Which blocks count, (blocks,).
+    """
     low, high, inner = np.zeros(len(start)), np.full(len(start), np.inf), start.copy()
     first = 0
     if problem.finish is not None:
@@ -189,7 +206,7 @@ def _jackknife(problem: Problem, values: Floats, variance: Floats) -> Floats:
     """Return the jackknife's standard uncertainties of the results: one capture, or quarter of a view, is left out."""
     group = problem.capture if len(np.unique(problem.capture)) >= _FEWEST_CAPTURES else problem.quarters()
     without = np.array(
-        [problem.results(_refine(problem, values, variance, group != left_out))[0] for left_out in np.unique(group)]
+        [problem.results(refine(problem, values, variance, group != left_out))[0] for left_out in np.unique(group)]
     )
     count = len(without)
     return np.asarray(np.sqrt((count - 1) / count * ((without - without.mean(axis=0)) ** 2).sum(axis=0)))

@@ -78,6 +78,10 @@ class MetalFinish:
             energy_factor=(float(self._energy[0](x)), float(self._energy[1](x))),
         )
 
+    def with_beckmann(self, share: float) -> MetalFinish:
+        """Return the same metal and process with this Beckmann share of the lobe [1] at every alpha."""
+        return replace(self, _along=self._along | {"beckmann": np.full(len(self.log_alpha), share)})
+
     @property
     def alpha_range(self) -> tuple[float, float]:
         """Least and largest alpha [1] with a Ra-equivalent."""

@@ -33,6 +33,7 @@ from mitsim.twin.finish.estimate import Fit, FittedQuantity, fit_views
 from mitsim.twin.finish.finish import MetalFinish, metal_finish
 from mitsim.twin.finish.observation import CouponCapture, CouponView, observe
 from mitsim.twin.finish.place import Place
+from mitsim.twin.finish.posterior import FinishPosterior, finish_posterior
 from mitsim.twin.finish.problem import Residual
 from mitsim.twin.finish.specimen import place_of
 from mitsim.twin.finish.white_coupon import WhiteCouponRenderer, pattern_is_known, with_rig
@@ -54,6 +55,7 @@ class CouponFit:
     - ``captures``: their folders; ``places`` of the coupon in them; ``source`` of the captures.
     - ``block_px``: side of a block [px].
     - ``pattern_unknown``: whether the pattern of a capture is not known to be that of the sensor file.
+    - ``posterior``: what the captures say of the finish, for ``[unknowns.finish.measured]``; None for a diffuse sheet.
     """
 
     sensor: Sensor = field(repr=False)
@@ -66,6 +68,7 @@ class CouponFit:
     block_px: int
     source: str
     pattern_unknown: bool
+    posterior: FinishPosterior | None = None
 
     @property
     def alpha(self) -> tuple[float, float]:
@@ -138,6 +141,7 @@ class CouponFit:
                 "left_out_share": self.censored,
                 "residual_rms_dn": self.rms_dn,
                 "residual_rms_in_noise": self.rms_in_noise,
+                "unknowns_finish": None if self.posterior is None else {self.posterior.name: self.posterior.entries()},
                 "dots": [asdict(one) for one in self.dots],
                 "views": [_view_numbers(residual) for residual in fit.residuals],
             }
@@ -221,17 +225,22 @@ def fit_captures(
         hint = "give the region of the image that shows it: --window"
         raise InputError("captures", "images", none, "a coupon in the images", hint)
     say(f"fitting {sum(len(view.block) for view in views)} pixels in {sum(view.size for view in views)} blocks")
+    fit, posterior = fit_views(views, metal), None
+    if metal is not None and finish.scatter is not None:
+        name = sample.scene.shapes[0].bsdf().id()
+        posterior = finish_posterior(views, metal, finish.scatter, fit, name)
     return CouponFit(
         chosen,
         finish.name,
         metal,
-        fit_views(views, metal),
+        fit,
         tuple(dots),
         tuple(str(c) for c in captures),
         tuple(places),
         block,
         first.source,
         unknown,
+        posterior,
     )
 
 

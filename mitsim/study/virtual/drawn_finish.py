@@ -1,0 +1,73 @@
+"""Draw the finishes of a trial: the size and the shape of the light that each finish reflects.
+
+Signal chain: number of the finishes of a trial, id of a finish -> independent standard normals, one for each unknown
+property -> sizes and centres of ``[unknowns.finish]`` -> a :class:`~mitsim.scene.surface.scatter.Deviation`.
+
+One finish is one draw: faces of the same BSDF have the same alpha, shares and direction of the lay, each in its own
+frame. All directions of a lay are equally likely.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.special import ndtr
+
+from mitsim.scene.surface.scatter import LARGEST_DEVIATION, Deviation
+
+if TYPE_CHECKING:
+    from mitsim.study.virtual.world import Unknowns
+
+#: seed of the stream of finishes, different from those of the groups
+_FINISH_STREAM = 8
+
+#: drawn properties, in the order of their random numbers
+DRAWN = ("alpha", "wide_angle", "reflectance", "tail", "lay", "lay_direction")
+
+
+def finish_numbers(unknowns: Unknowns, number: int, finish: str) -> dict[str, float]:
+    """Return the standard normals behind a finish, given by its BSDF's id, by the names of :data:`DRAWN`.
+
+    Properties that are not drawn are left out: those of size 0, and the direction of a lay that is not drawn. The
+    number -1 is the best estimate, with zeros.
+    """
+    prior = unknowns.table.finish.centres_and_sizes(finish)
+    drawn = [name for name in DRAWN if prior[name.removesuffix("_direction")][1] > 0]
+    numbers = _normals(number, finish)
+    return {name: numbers[name] for name in drawn}
+
+
+def _normals(number: int, finish: str) -> dict[str, float]:
+    """Return a standard normal for each of :data:`DRAWN`, from a stream that the number seeds."""
+    if number < 0:
+        return dict.fromkeys(DRAWN, 0.0)
+    rng = np.random.default_rng(np.random.SeedSequence([number, _FINISH_STREAM, zlib.crc32(finish.encode())]))
+    values = np.clip(rng.standard_normal(len(DRAWN)), -LARGEST_DEVIATION, LARGEST_DEVIATION)
+    return dict(zip(DRAWN, values.tolist(), strict=True))
+
+
+def finish_deviation(unknowns: Unknowns, number: int, finish: str) -> Deviation:
+    """Return the deviation of a finish, given by its BSDF's id, from its best estimate in the finishes of a number.
+
+    The lay of a finish is drawn unless ``lay`` of its table is 0. The number -1 is the best estimate, whose lay is not
+    drawn.
+    """
+    if number < 0:
+        return Deviation()
+    table = unknowns.table.finish
+    return deviation_of(table.centres_and_sizes(finish), _normals(number, finish))
+
+
+def deviation_of(prior: Mapping[str, tuple[float, float]], numbers: Mapping[str, float]) -> Deviation:
+    """Return the deviation of standard normals under a prior, which is a centre and a size for each property."""
+
+    def drawn(name: str) -> float:
+        centre, size = prior[name]
+        return float(np.clip(centre + size * numbers[name], -LARGEST_DEVIATION, LARGEST_DEVIATION))
+
+    lay_deg = 180.0 * float(ndtr(numbers["lay_direction"])) if prior["lay"][1] > 0 else None
+    alpha, wide_angle, reflectance, tail, lay = (drawn(name) for name in DRAWN[:5])
+    return Deviation(alpha, wide_angle, reflectance, tail, lay, lay_deg)
