@@ -25,7 +25,8 @@ class BudgetEntry(PartialDocument):
     low: float
     high: float
     share: float
-    pairs: int
+    settled: bool = True
+    source: str = ""
     fresh: bool
 
 
