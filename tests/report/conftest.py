@@ -225,7 +225,7 @@ def statement_of(view):
         "low": 0.02,
         "high": 0.09,
         "share": 0.64,
-        "pairs": 16,
+        "settled": True,
         "fresh": False,
     }
     known = {
