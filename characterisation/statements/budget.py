@@ -54,8 +54,10 @@ class BudgetLine:
         Its high end.
     share
         ``variance`` over the variance of the error by all groups.
+    share_interval
+        95 % interval of ``share``.
     settled
-        Whether the interval is narrower than half the variance of the error. Else the trials are too few to tell.
+        Whether this interval is narrower than 0.5. Else the trials are too few to tell.
     source
         Where a variance that was not drawn comes from; empty for groups that the trials drew.
     """
@@ -65,6 +67,7 @@ class BudgetLine:
     low: float
     high: float
     share: float
+    share_interval: tuple[float, float]
     settled: bool = True
     source: str = ""
 
@@ -124,12 +127,21 @@ def budget(
             drawn * float(low[i]),
             drawn * float(high[i]),
             drawn / whole * float(found.shares[i]),
+            (drawn / whole * float(low[i]), drawn / whole * float(high[i])),
             bool(high[i] - low[i] < _TOO_WIDE),
         )
         for i, name in enumerate(found.names)
     ]
     lines += [
-        BudgetLine(one.group, one.variance, one.variance, one.variance, one.variance / whole, True, one.source)
+        BudgetLine(
+            one.group,
+            one.variance,
+            one.variance,
+            one.variance,
+            one.variance / whole,
+            (one.variance / whole, one.variance / whole),
+            source=one.source,
+        )
         for one in undrawn
     ]
     return tuple(sorted(lines, key=lambda line: -line.variance))

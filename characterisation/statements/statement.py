@@ -201,7 +201,10 @@ class Statements(list[Statement]):
         rows: dict[str, list[ErrorRow]] = {}
         for one in self:
             shares = {line.group: line.share for line in one.budget}
-            row = ErrorRow(one.measurement, one.bias, one.standard_uncertainty, one.interval, shares, one.verdict)
+            unsettled = frozenset(line.group for line in one.budget if not line.settled)
+            row = ErrorRow(
+                one.measurement, one.bias, one.standard_uncertainty, one.interval, shares, one.verdict, unsettled
+            )
             rows.setdefault(one.unit, []).append(row)
         columns = 2 if ax is None and any(one.budget for one in self) else 1
         heights = [ROW_IN * len(of_unit) + MARGIN_IN for of_unit in rows.values()]

@@ -210,9 +210,7 @@ def score(study: Study) -> xr.Dataset:
     return Session(study).screen()[0]
 
 
-def statement(
-    study: Study, view: int, *, trials: int | None = None, folder: str | Path | None = None
-) -> Statements:
+def statement(study: Study, view: int, *, trials: int | None = None, folder: str | Path | None = None) -> Statements:
     """State the uncertainty of every measurement from one view, by virtual measurements of it.
 
     Each trial draws calibration, finish, room light, temperature, pose and noise anew, renders, decodes and measures

@@ -25,8 +25,9 @@ class BudgetEntry(PartialDocument):
     low: float
     high: float
     share: float
-    settled: bool = True
-    source: str = ""
+    share_interval: tuple[float, float]
+    settled: bool
+    source: str
     fresh: bool
 
 

@@ -124,7 +124,9 @@ def test_errors_of_a_position_are_divided_by_their_vectors():
     numbers = rng.standard_normal((day.max() + 1, 3))[day]
     vectors = 0.8 * numbers + 0.6 * rng.standard_normal((count, 3))
     directions = rng.standard_normal((day.max() + 1, 3))[day]
-    errors = OneSidedErrors(vectors[:, None], directions[:, None], lambda rows: np.linalg.norm(rows, axis=(-2, -1)), 50.0)
+    errors = OneSidedErrors(
+        vectors[:, None], directions[:, None], lambda rows: np.linalg.norm(rows, axis=(-2, -1)), 50.0
+    )
     lines = {line.group: line for line in budget(errors, {"calibration": numbers}, {INTERACTION: day})}
     assert lines["calibration"].share == pytest.approx(0.64, abs=0.1)
     plain = {line.group: line for line in budget(errors.stated, {"calibration": numbers}, {INTERACTION: day})}

@@ -26,7 +26,7 @@ from mitsim.study.virtual.stated import StatedView, statement_document
 @pytest.fixture(scope="module")
 def stated():
     errors = np.random.default_rng(1).normal(0.02, 0.01, 40)
-    line = BudgetLine("pose", 1e-4, 5e-5, 2e-4, 1.0)
+    line = BudgetLine("pose", 1e-4, 5e-5, 2e-4, 1.0, (0.5, 1.0))
     return statement("radius", "mm", errors, plus_minus(20.0, 0.2), (line,), np.arange(40) // 2)
 
 

@@ -68,7 +68,9 @@ def test_some_days_of_a_statement_keep_a_seed_of_the_day_before_and_nothing_else
     kept = []
     for day in range(8):
         one, other = (told(unknowns.draw(Trial(STATEMENT_DAYS + k))) for k in (day, day + 1))
-        kept.append({group for group in ("calibration", "form", "unit", "beyond_map") if same(one[group], other[group])})
+        kept.append(
+            {group for group in ("calibration", "form", "unit", "beyond_map") if same(one[group], other[group])}
+        )
     assert kept == 2 * [{"unit", "beyond_map"}, set(), {"form"}, set()]
     race = [unknowns.draw(Trial(day)).unit for day in range(8)]
     assert len(set(race)) == 8

@@ -183,7 +183,9 @@ def drawn_spread(study: Study, unknowns: Unknowns, finish: int) -> Floats:
     return np.array([draw[sorted(used)] for draw in draws] or np.zeros((2, len(used)))).ravel()
 
 
-def _map_draws(performance_map: PerformanceMap, unknowns: Unknowns, finish: int) -> Iterator[tuple[str, Floats, Floats]]:
+def _map_draws(
+    performance_map: PerformanceMap, unknowns: Unknowns, finish: int
+) -> Iterator[tuple[str, Floats, Floats]]:
     """Yield F and sigma with the draws of their spread, by sample (s,), and of their errors, by node."""
     rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, 101, finish]))
     shape = tuple(performance_map.data.sizes[name] for name in _NODES)
