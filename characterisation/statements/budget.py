@@ -4,10 +4,10 @@ Signal chain: errors of trials, and what every group drew for them -> shares of 
 (:mod:`characterisation.statements.variance_components`) -> a line for each group, with its 95 % interval. The lines add
 up to the variance.
 
-The line of a group is the variance that its draw alone explains: for drawn numbers, the variance of a sum of their
-functions that the caller states, such as the numbers and their squares; for a seed, the variance between draws. What the
-captures of a day have in common and no group explains is *interaction and unexplained*. What differs between captures
-of a day and no group explains is *noise*; interactions with the noise and the pose count there.
+The line of a group is the variance that its draw alone explains. For drawn numbers, this is the variance of a linear
+function of them, and of other functions of them that the caller states, such as squares; for a seed, the variance
+between draws. *Interaction and unexplained* is what the captures of a day have in common and no group explains. *Noise*
+is what differs between captures of a day and no group explains; interactions with noise and pose count there.
 """
 
 from __future__ import annotations

@@ -3,16 +3,17 @@
 Signal chain: errors of trials, and the numbers that each group drew for them -> covariance of the errors of two trials
 by each group -> restricted maximum likelihood -> variance by each group, and the covariance of these estimates.
 
-The error of trial i is e_i = m + sum over g of x_gi . b_g + r_i. x_gi are the numbers drawn for group g, independent and
-of variance 1, and b_g are unknown. A group causes the variance v_g = |b_g|^2. A regression on many numbers fits noise
+The error of trial i is e_i = m + sum over g of x_gi . b_g + r_i. The numbers x_gi of group g are independent and of
+variance 1, and b_g are unknown. A group causes the variance v_g = |b_g|^2. A regression on many numbers fits noise
 and makes v_g too large. Instead, the covariance of the errors is modelled as V = sum over g of v_g K_g, with K_g = x_g
 x_g^T / p_g, and v_g is found by restricted maximum likelihood (Patterson and Thompson 1971). This is consistent for
 fixed b_g and errors of any distribution, even with more numbers than trials (Dicker and Erdogdu 2016). A group that
 drew only a seed has K_g = 1 for trials with the same seed, 0 for others: nested analysis of variance, as in ISO 5725-3.
 
 One step of the iteration, v = T^-1 q with T_gh = tr(P K_g P K_h) and q_g = e^T P K_g P e, is a quadratic form e^T M_g e
-that is unbiased for every distribution (MINQUE, Rao 1971). Its covariance for fixed b and normal r is 2 tr(M_g V M_h V) -
-2 tr(M_g D M_h D), with D the part of V by drawn numbers. Rare large errors add to it (:func:`_beyond_normal`).
+that is unbiased for every distribution (MINQUE, Rao 1971). Its covariance for fixed b and normal r is
+2 tr(M_g V M_h V) - 2 tr(M_g D M_h D), with D the part of V by drawn numbers. Rare large errors add to it
+(:func:`_beyond_normal`).
 """
 
 from __future__ import annotations

@@ -7,54 +7,34 @@ from scipy.stats import binom
 from characterisation.statements.budget import INTERACTION, NOISE, Undrawn, budget
 from characterisation.statements.one_sided import OneSidedErrors
 from characterisation.statements.variance_components import AT_ONCE
+from tests.proofs.budgets import NUMBERS, KnownStudy, design
 
-#: how many numbers each group draws; the design of a statement: every fifth trial repeats a day, every fourth day keeps
-#: the seed of the unit of the day before
-NUMBERS = {"calibration": 39, "finish": 6, "temperature": 2, "pose": 12}
-
-#: variances by group
+#: variances by group; temperature and light cause none
 TRUTH = {
-    "calibration": 0.30, "finish": 0.20, "temperature": 0.0, "pose": 0.15, "unit": 0.15, INTERACTION: 0.05, NOISE: 0.15,
+    "calibration": 0.30, "finish": 0.20, "light": 0.0, "temperature": 0.0, "pose": 0.15, "unit": 0.15,
+    INTERACTION: 0.05, NOISE: 0.15,
 }  # fmt: skip
 
 
-def design(count):
-    """Day and unit of each trial."""
-    row, place = np.divmod(np.arange(count), 5)
-    day = 4 * row + np.where(place == 4, 0, place)
-    return day, np.where(day % 4 == 1, day - 1, day)
-
-
-def drawn(rng, count, truth=TRUTH, noise=None):
-    """Errors of trials whose variances by group are ``truth``, their numbers and seeds."""
-    day, unit = design(count)
-    numbers = {name: rng.standard_normal((day.max() + 1, width))[day] for name, width in NUMBERS.items()}
-    numbers["pose"] = rng.standard_normal((count, NUMBERS["pose"]))
-    errors = np.zeros(count)
-    for name, values in numbers.items():
-        weights = np.zeros(values.shape[1])
-        weights[:3] = rng.standard_normal(len(weights[:3]))
-        errors += np.sqrt(truth[name]) * values @ weights / np.linalg.norm(weights)
-    errors += np.sqrt(truth["unit"]) * rng.standard_normal(day.max() + 1)[unit]
-    errors += np.sqrt(truth[INTERACTION]) * numbers["calibration"][:, 0] * numbers["finish"][:, 0]
-    errors += np.sqrt(truth[NOISE]) * (rng.standard_normal(count) if noise is None else noise(rng, count))
-    return errors, numbers, {"unit": unit, INTERACTION: day}
+def drawn(seed, count, truth=TRUTH, rare=False):
+    """Errors, numbers and seeds of the trials of a statement whose variances are known."""
+    return KnownStudy(truth, np.random.default_rng(seed), rare).statement(count)
 
 
 def test_shares_are_right_on_average_and_as_often_inside_their_intervals_as_is_said():
-    rng, rounds = np.random.default_rng(1), 24
+    rounds = 24
     found = {name: [] for name in TRUTH}
     inside = 0
-    for _ in range(rounds):
-        errors, numbers, seeds = drawn(rng, 200)
+    for number in range(rounds):
+        errors, numbers, seeds = drawn(number, 200)
         lines = budget(errors, numbers, seeds)
         assert sum(line.share for line in lines) == pytest.approx(1)
         assert sum(line.variance for line in lines) == pytest.approx(errors.var(ddof=1))
         assert [line.variance for line in lines] == sorted((line.variance for line in lines), reverse=True)
         for line in lines:
             found[line.group].append(line.share)
-            ends = line.low / errors.var(ddof=1) - 1e-9, line.high / errors.var(ddof=1) + 1e-9
-            inside += ends[0] <= TRUTH[line.group] <= ends[1]
+            low, high = line.share_interval
+            inside += low - 1e-9 <= TRUTH[line.group] <= high + 1e-9
     for name, shares in found.items():
         error = max(np.std(shares, ddof=1), 0.01) / np.sqrt(rounds)
         assert abs(np.mean(shares) - TRUTH[name]) < 4 * error + 0.01, name
@@ -63,18 +43,15 @@ def test_shares_are_right_on_average_and_as_often_inside_their_intervals_as_is_s
 
 
 def test_many_trials_find_the_truth():
-    errors, numbers, seeds = drawn(np.random.default_rng(2), 8 * AT_ONCE)
+    errors, numbers, seeds = drawn(2, 4 * AT_ONCE)
     for line in budget(errors, numbers, seeds):
         assert line.share == pytest.approx(TRUTH[line.group], abs=0.03), line.group
         assert line.settled
 
 
 def test_rare_large_errors_of_the_noise_are_charged_to_no_group_that_drew_numbers():
-    def rare(rng, count):
-        return np.where(rng.random(count) < 0.03, np.sqrt(1 / 0.03), 0.0) * rng.standard_normal(count)
-
-    rng, truth = np.random.default_rng(3), dict.fromkeys(TRUTH, 0.0) | {"calibration": 0.3, NOISE: 0.7}
-    several = [budget(*drawn(rng, 200, truth, rare)) for _ in range(12)]
+    truth = dict.fromkeys(TRUTH, 0.0) | {"calibration": 0.3, NOISE: 0.7}
+    several = [budget(*drawn(number, 200, truth, rare=True)) for number in range(12)]
     shares = {name: [one.share for lines in several for one in lines if one.group == name] for name in TRUTH}
     assert np.mean(shares["calibration"]) == pytest.approx(0.3, abs=0.12)
     for name in ("finish", "temperature", "pose"):
@@ -82,7 +59,7 @@ def test_rare_large_errors_of_the_noise_are_charged_to_no_group_that_drew_number
 
 
 def test_lines_are_open_where_trials_are_too_few():
-    errors, numbers, seeds = drawn(np.random.default_rng(4), 40)
+    errors, numbers, seeds = drawn(4, 40)
     lines = {line.group: line for line in budget(errors, numbers, seeds)}
     assert not lines["calibration"].settled  # 39 numbers, 40 trials
     assert budget(errors[:29], {}, {}) == ()
@@ -90,7 +67,7 @@ def test_lines_are_open_where_trials_are_too_few():
 
 
 def test_trials_without_a_value_are_left_out():
-    errors, numbers, seeds = drawn(np.random.default_rng(5), 200)
+    errors, numbers, seeds = drawn(5, 200)
     errors[::7] = np.nan
     known = np.isfinite(errors)
     less = budget(errors[known], *({k: v[known] for k, v in one.items()} for one in (numbers, seeds)))
@@ -98,8 +75,8 @@ def test_trials_without_a_value_are_left_out():
 
 
 def test_numbers_that_do_not_vary_and_seeds_that_all_differ_have_no_line():
-    errors, numbers, seeds = drawn(np.random.default_rng(6), 60)
-    constant = numbers | {"light": np.full((60, 3), 0.7), "none": np.empty((60, 0))}
+    errors, numbers, seeds = drawn(6, 60)
+    constant = numbers | {"constant": np.full((60, 3), 0.7), "none": np.empty((60, 0))}
     groups = {line.group for line in budget(errors, constant, seeds | {"form": np.arange(60)})}
     assert groups == set(TRUTH)
     single = {line.group for line in budget(errors, numbers, {INTERACTION: np.arange(60)})}
@@ -107,7 +84,7 @@ def test_numbers_that_do_not_vary_and_seeds_that_all_differ_have_no_line():
 
 
 def test_an_undrawn_variance_is_a_line_of_its_own():
-    errors, numbers, seeds = drawn(np.random.default_rng(7), 100)
+    errors, numbers, seeds = drawn(7, 100)
     plain = {line.group: line for line in budget(errors, numbers, seeds)}
     whole = errors.var(ddof=1)
     lines = {line.group: line for line in budget(errors, numbers, seeds, [Undrawn("model", whole, "a laboratory")])}

@@ -129,5 +129,6 @@ def _numbers(study: Study, unknowns: Unknowns, source: str, group: str, trial: T
     number = unknowns.draw(trial).finish
     if source == "map":
         return drawn_spread(study, unknowns, number)
-    ids = sorted({shape.bsdf().id() for shape, known in zip(study.scene.shapes, study.scene.finishes) if known})
+    scene = study.scene
+    ids = sorted({shape.bsdf().id() for shape, known in zip(scene.shapes, scene.finishes, strict=True) if known})
     return np.array([value for one in ids for value in finish_numbers(unknowns, number, one).values()])
