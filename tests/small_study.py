@@ -32,7 +32,6 @@ shortlist = 1
 trials = 4
 [statement]
 trials = 2
-pairs = 0
 [check]
 views = 0
 """

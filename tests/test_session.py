@@ -34,7 +34,7 @@ def test_to_screen_needs_neither_a_folder_nor_the_measurements(study, monkeypatc
 
 
 def test_measurements_that_were_released_are_made_again_the_same_and_unknowns_stay(study, tmp_path):
-    here, table = Session(study, tmp_path / "a"), StatementTable(trials=2, pairs=0)
+    here, table = Session(study, tmp_path / "a"), StatementTable(trials=2)
     view, unknowns, first = study.views[0], here.unknowns, here.measurements
     here.release()
     stated = here.state(view, table)

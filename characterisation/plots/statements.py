@@ -29,6 +29,8 @@ GROUPS = {
     "pose": ("#009e73", "place and pose of the part"),
     "noise": ("#56b4e9", "noise and speckle"),
     "beyond_map": ("#000000", "effects outside the map"),
+    "interaction": ("#7f5539", "interaction and unexplained"),
+    "model": ("#b5179e", "error of the model"),
 }
 
 #: colour of a group that is not in :data:`GROUPS`
@@ -42,7 +44,8 @@ ROW_IN, MARGIN_IN = 0.34, 1.25
 class ErrorRow:
     """Numbers of one measurement, all in its unit.
 
-    ``budget``: the share of each group of unknowns in the variance, by name; empty if it is not known.
+    ``budget``: the share of each group of unknowns in the variance, by name; empty if it is not known. ``open_groups``:
+    those whose share the trials are too few to tell.
     """
 
     name: str
@@ -51,6 +54,7 @@ class ErrorRow:
     interval: tuple[float, float]
     budget: dict[str, float]
     verdict: str = ""
+    open_groups: frozenset[str] = frozenset()
 
 
 def draw_errors(axes: Axes, rows: Sequence[ErrorRow], unit: str) -> None:
@@ -79,19 +83,23 @@ def draw_errors(axes: Axes, rows: Sequence[ErrorRow], unit: str) -> None:
 
 
 def draw_budget(axes: Axes, rows: Sequence[ErrorRow]) -> None:
-    """Draw a bar for each measurement, divided into the shares of the groups of unknowns in its variance."""
+    """Draw a bar for each measurement, divided into the shares of the groups of unknowns in its variance.
+
+    Shares that the trials are too few to tell are hatched.
+    """
     order = _groups(rows)
     for y, row in enumerate(rows):
         left = 0.0
         for group in order:
             share = row.budget.get(group, 0.0)
-            axes.barh(y, 100 * share, 0.6, left=100 * left, color=GROUPS.get(group, (_OTHER_GROUP, ""))[0])
+            colour, hatch = GROUPS.get(group, (_OTHER_GROUP, ""))[0], "////" if group in row.open_groups else None
+            axes.barh(y, 100 * share, 0.6, left=100 * left, color=colour, hatch=hatch, edgecolor="white", lw=0)
             left += share
-    axes.axvline(100, color=MUTED, lw=0.8, ls=":")
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_yticks([])
-    axes.set_xlim(0, None)
-    axes.set_xlabel("share of the variance [%]; over 100: unknowns interact")
+    axes.set_xlim(0, 100)
+    hatched = "; hatched: too few trials to tell" if any(row.open_groups & set(row.budget) for row in rows) else ""
+    axes.set_xlabel(f"share of the variance [%]{hatched}")
 
 
 def budget_legend(axes: Axes, rows: Sequence[ErrorRow]) -> None:

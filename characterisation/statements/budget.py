@@ -1,45 +1,65 @@
-"""Compute the uncertainty budget: the contribution of each group of unknowns to the variance.
+"""Divide the variance of a measurement's error among the groups of unknowns, from the trials of its statement.
 
-Signal chain: error of a trial, and of the same trial with one group of unknowns drawn again -> half the mean square of
-their difference, the total effect of the group -> its share, with an interval.
+Signal chain: errors of trials, and what every group drew for them -> shares of the groups in the variance
+(:mod:`characterisation.statements.variance_components`) -> a line for each group, with its 95 % interval. The lines add
+up to the variance.
 
-The estimator is Jansen's (1999; Saltelli et al. 2010, table 2): V_g = E[(e - e_g)^2] / 2. It is the variance from the
-group alone and in interaction with others. The shares add up to 1 where groups do not interact, and to more where they
-do. Noise outside the group is the same in both trials and cancels.
+The line of a group is the variance that its draw alone explains. For drawn numbers, this is the variance of a linear
+function of them, and of other functions of them that the caller states, such as squares; for a seed, the variance
+between draws. *Interaction and unexplained* is what the captures of a day have in common and no group explains. *Noise*
+is what differs between captures of a day and no group explains; interactions with noise and pose count there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
+from characterisation.statements.one_sided import OneSidedErrors, stated_errors
+from characterisation.statements.variance_components import RESIDUAL, Components, components
+
 Floats = NDArray[np.float64]
+
+#: lines that no group of unknowns explains: common to the captures of a day, and new in each capture
+INTERACTION, NOISE = "interaction", "noise"
+
+#: least number of trials with a value for a budget
+LEAST_TRIALS = 30
+
+#: width of the interval of a share above which the trials are too few to tell it
+_TOO_WIDE = 0.5
+
+#: half width of an interval, in standard errors
+_HALF = 2.0
 
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """Contribution of one group of unknowns to the variance of an error.
-
-    Interactions of groups count in each group that takes part, so the shares may add up to more than 1.
+    """Contribution of one group of unknowns to the variance of an error. The lines of a budget add up to all of it.
 
     Parameters
     ----------
     group
-        Name of the group, such as ``calibration``, ``finish``, ``light``, ``unit``, ``pose`` or ``noise``.
+        Name of the group, such as ``calibration``, ``finish``, ``light``, ``unit``, ``pose`` or ``noise``;
+        ``interaction`` for what no group explains alone.
     variance
         Variance of the error by this group [unit^2].
     low
-        Low end of the 95 % interval of ``variance``, for normal errors. Heavy tails make it wider.
+        Low end of the 95 % interval of ``variance``, for the stated variance of the error.
     high
         Its high end.
     share
         ``variance`` over the variance of the error by all groups.
-    pairs
-        Number of pairs of trials with a value that it rests on.
+    share_interval
+        95 % interval of ``share``.
+    settled
+        Whether this interval is narrower than 0.5. Else the trials are too few to tell.
+    source
+        Where a variance that was not drawn comes from; empty for groups that the trials drew.
     """
 
     group: str
@@ -47,37 +67,93 @@ class BudgetLine:
     low: float
     high: float
     share: float
-    pairs: int
+    share_interval: tuple[float, float]
+    settled: bool = True
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class Undrawn:
+    """A variance [unit^2] that no trial draws, such as the error of a model, with its ``source``."""
+
+    group: str
+    variance: float
+    source: str
 
 
 def budget(
-    errors: ArrayLike, swapped: Mapping[str, ArrayLike], variance: float | None = None
+    errors: ArrayLike | OneSidedErrors,
+    numbers: Mapping[str, ArrayLike],
+    seeds: Mapping[str, ArrayLike],
+    undrawn: Sequence[Undrawn] = (),
 ) -> tuple[BudgetLine, ...]:
-    """Return the budget of one measurement, largest contribution first.
+    """Return the budget of one measurement, largest contribution first; empty for under 30 trials with a value.
 
     Parameters
     ----------
     errors
-        (n,) of trials, NaN for trials without a value.
-    swapped
-        By group, errors (n,) of the same trials with that group drawn again.
-    variance
-        Of the error over all trials, which may be more; by default that of ``errors``.
+        (n,) of trials, NaN for trials without a value. Errors of a value that folds are those at the limit of its
+        tolerance.
+    numbers
+        By group, (n, p) independent numbers that it drew, and functions of them that are uncorrelated with these.
+    seeds
+        By group, (n,) whole numbers: trials with the same number have the same draw of the group. ``interaction`` has
+        the day of each trial.
+    undrawn
+        Variances that are added to that of the trials.
 
     Notes
     -----
-    The interval assumes normal differences: V times the pairs over a chi-square quantile.
+    Intervals are those of twice the standard error. That of the noise is at least as wide as by chi-square with the
+    degrees of freedom of Satterthwaite (1946).
     """
-    base = np.asarray(errors, float)
-    whole = float(np.nanvar(base, ddof=1)) if variance is None else variance
-    lines = []
-    for group, values in swapped.items():
-        square = (base - np.asarray(values, float)) ** 2 / 2
-        square = square[np.isfinite(square)]
-        pairs = len(square)
-        if not pairs:
-            continue
-        part = float(square.mean())
-        low, high = (part * pairs / float(chi2.ppf(tail, pairs)) for tail in (0.975, 0.025))
-        lines.append(BudgetLine(group, part, low, high, part / whole if whole > 0 else 0.0, pairs))
+    every = stated_errors(errors) if isinstance(errors, OneSidedErrors) else np.asarray(errors, float)
+    known = np.isfinite(every)
+    if known.sum() < LEAST_TRIALS or not np.ptp(every[known]) > 0:
+        return ()
+    drawn = float(every[known].var(ddof=1))
+    found = components(
+        every[known],
+        {name: np.asarray(one, float)[known] for name, one in numbers.items()},
+        {name: np.asarray(one)[known] for name, one in seeds.items()},
+        errors.part(known).gradients if isinstance(errors, OneSidedErrors) else None,
+    )
+    low, high = _intervals(found)
+    whole = drawn + sum(one.variance for one in undrawn)
+    lines = [
+        BudgetLine(
+            NOISE if name == RESIDUAL else name,
+            drawn * float(found.shares[i]),
+            drawn * float(low[i]),
+            drawn * float(high[i]),
+            drawn / whole * float(found.shares[i]),
+            (drawn / whole * float(low[i]), drawn / whole * float(high[i])),
+            bool(high[i] - low[i] < _TOO_WIDE),
+        )
+        for i, name in enumerate(found.names)
+    ]
+    lines += [
+        BudgetLine(
+            one.group,
+            one.variance,
+            one.variance,
+            one.variance,
+            one.variance / whole,
+            (one.variance / whole, one.variance / whole),
+            source=one.source,
+        )
+        for one in undrawn
+    ]
     return tuple(sorted(lines, key=lambda line: -line.variance))
+
+
+def _intervals(found: Components) -> tuple[Floats, Floats]:
+    """Return the ends (m,) of the 95 % intervals of shares."""
+    low = np.clip(found.shares - _HALF * found.errors, 0.0, 1.0)
+    high = np.clip(found.shares + _HALF * found.errors, 0.0, 1.0)
+    share, error = float(found.shares[-1]), float(found.errors[-1])
+    if error > 0:
+        degrees = max(2 * (share / error) ** 2, 1.0)
+        ends = degrees * share / np.array([chi2.ppf(tail, degrees) for tail in (0.975, 0.025)])
+        low[-1], high[-1] = min(low[-1], ends[0]), max(high[-1], min(ends[1], 1.0))
+    return low, high

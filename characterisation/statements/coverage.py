@@ -64,15 +64,19 @@ def coverage_interval(errors: Floats, coverage: float = COVERAGE) -> tuple[float
     return float(low), float(high)
 
 
-def standard_errors(errors: Floats, numbers: Callable[[Floats], Floats]) -> Floats:
+def standard_errors(
+    errors: Floats, numbers: Callable[[Floats], Floats], related: NDArray[np.int64] | None = None
+) -> Floats:
     """Return standard errors of ``numbers`` of the errors (n,), by a jackknife that leaves out a tenth at a time.
 
     Every tenth trial belongs to one block, so the order of the trials has no effect (Efron & Tibshirani 1993, 11.5,
-    grouped).
+    grouped). Trials with the same number in ``related`` (n,) are not independent, and are left out together.
     """
-    blocks = min(BLOCKS, len(errors))
-    index = np.arange(len(errors)) % blocks
-    if len(errors) < 3:
+    place = np.arange(len(errors)) if related is None else np.unique(related, return_inverse=True)[1]
+    several = int(place.max(initial=-1)) + 1
+    blocks = min(BLOCKS, several)
+    index = place % max(blocks, 1)
+    if several < 3:
         return np.full(len(numbers(errors)), np.inf)
     left = np.array([numbers(errors[index != block]) for block in range(blocks)])
     return np.asarray(np.sqrt((blocks - 1) / blocks * ((left - left.mean(axis=0)) ** 2).sum(axis=0)))

@@ -101,6 +101,21 @@ class OneSidedErrors:
         return self.at(self.deviation)
 
     @cached_property
+    def gradients(self) -> Floats:
+        """Return by how much the stated error of each trial changes with each error of the deviations, (n, k m).
+
+        Errors of the deviations are assumed to be small against the deviation; places without a value have 0.
+        """
+        step = 1e-4 * self.deviation
+        part = self.deviation * self._units
+        out = np.zeros((len(part), part[0].size if len(part) else 0))
+        for place in range(out.shape[1]):
+            move = np.zeros(part.shape[1:])
+            move.flat[place] = step
+            out[:, place] = (self.size(part + move) - self.size(part - move)) / (2 * step)
+        return np.nan_to_num(out if self.fold == 0 else -out)
+
+    @cached_property
     def table(self) -> tuple[Floats, Floats]:
         """Return deviations (n, steps) of parts, and those (n, steps) that the trials measure of them.
 

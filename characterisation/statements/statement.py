@@ -78,7 +78,7 @@ class Statement:
     settled
         Whether twice every one of ``moved`` is below ``numerical_tolerance``.
     repeatability
-        Standard deviation between captures of one day, from ``repeats``; NaN without any.
+        Standard deviation between captures of one day, from days with several; NaN without any.
     budget
         Variance by group of unknowns, largest first; empty if it was not computed.
     tolerance
@@ -201,7 +201,10 @@ class Statements(list[Statement]):
         rows: dict[str, list[ErrorRow]] = {}
         for one in self:
             shares = {line.group: line.share for line in one.budget}
-            row = ErrorRow(one.measurement, one.bias, one.standard_uncertainty, one.interval, shares, one.verdict)
+            unsettled = frozenset(line.group for line in one.budget if not line.settled)
+            row = ErrorRow(
+                one.measurement, one.bias, one.standard_uncertainty, one.interval, shares, one.verdict, unsettled
+            )
             rows.setdefault(one.unit, []).append(row)
         columns = 2 if ax is None and any(one.budget for one in self) else 1
         heights = [ROW_IN * len(of_unit) + MARGIN_IN for of_unit in rows.values()]
@@ -222,22 +225,26 @@ def statement(
     errors: ArrayLike | OneSidedErrors,
     tolerance: Tolerance | None = None,
     budget: tuple[BudgetLine, ...] = (),
-    repeats: ArrayLike = (),
+    days: ArrayLike | None = None,
+    related: ArrayLike | None = None,
 ) -> Statement:
-    """State a measurement from the errors (n,) of independent trials, NaN for trials without a value.
+    """State a measurement from the errors (n,) of trials, NaN for trials without a value.
 
     Parameters
     ----------
     measurement, unit
         Name of the measurement; mm or deg.
     errors
-        (n,) of independent trials, NaN for trials without a value.
+        (n,) of trials, NaN for trials without a value.
     tolerance
         None for a measurement without one.
     budget
         Variance by group of unknowns.
-    repeats
-        (m,) errors of a second capture on the day of the first m trials, for the same part.
+    days
+        (n,) day of each trial. Trials of one day are repeated captures of the same part. By default every trial has a
+        day of its own.
+    related
+        (n,) whole numbers: trials with the same number have draws in common. By default those of one day.
     """
     part: Part = ANY_PART
     if isinstance(errors, OneSidedErrors):
@@ -245,12 +252,12 @@ def statement(
         every = errors.stated
     else:
         every = np.asarray(errors, float)
-    second = np.asarray(repeats, float)
-    square = (every[: len(second)] - second) ** 2 / 2
-    square = square[np.isfinite(square)]
-    repeatability = math.sqrt(float(square.mean())) if len(square) else math.nan
-    known = every[np.isfinite(every)]
+    finite = np.isfinite(every)
+    known = every[finite]
     count = len(known)
+    day = np.arange(count) if days is None else np.asarray(days)[finite]
+    common = day if related is None else np.asarray(related)[finite]
+    repeatability = _within(known, day)
     decided = None
     if tolerance is not None:
         decided = decide(errors.part(errors.known) if isinstance(errors, OneSidedErrors) else known, tolerance)
@@ -259,9 +266,11 @@ def statement(
     moved, share, shares = np.full(4, nan), None, None
     if count >= 2:
         bias, spread = float(known.mean()), float(known.std(ddof=1))
-        bias_uncertainty, delta = spread / math.sqrt(count), numerical_tolerance(spread)
+        bias_uncertainty, delta = _error_of_mean(known, common), numerical_tolerance(spread)
         low, high = coverage_interval(known)
-        moved = standard_errors(known, lambda part: np.array([part.mean(), part.std(ddof=1), *coverage_interval(part)]))
+        moved = standard_errors(
+            known, lambda part: np.array([part.mean(), part.std(ddof=1), *coverage_interval(part)]), common
+        )
         if tolerance is not None:
             half = max(abs(low), abs(high))
             share = half / tolerance.size
@@ -290,6 +299,28 @@ def statement(
         verdict="no tolerance" if decided is None else decided.verdict,
         errors_of=part,
     )
+
+
+def _within(errors: Floats, day: NDArray[np.int64]) -> float:
+    """Return the standard deviation of errors (n,) within days (n,); NaN if no day has two."""
+    _, place, several = np.unique(day, return_inverse=True, return_counts=True)
+    degrees = len(errors) - len(several)
+    if not degrees:
+        return math.nan
+    mean = np.bincount(place, errors) / several
+    return math.sqrt(float(((errors - mean[place]) ** 2).sum()) / degrees)
+
+
+def _error_of_mean(errors: Floats, related: NDArray[np.int64]) -> float:
+    """Return the standard error of the mean of errors (n,), of which those with the same number are not independent.
+
+    It follows from the sums of related errors (Liang and Zeger 1986), which need no model of their dependence.
+    """
+    sums = np.bincount(np.unique(related, return_inverse=True)[1], errors - errors.mean())
+    clusters = len(sums)
+    if clusters < 2:
+        return float(errors.std(ddof=1)) / math.sqrt(len(errors))
+    return math.sqrt(clusters / (clusters - 1) * float(sums @ sums)) / len(errors)
 
 
 def numerical_tolerance(uncertainty: float) -> float:

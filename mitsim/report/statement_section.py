@@ -1,7 +1,7 @@
 """Make the section of the page with the statement of a run: uncertainties, budget as table and bars, influences.
 
 Signal chain: ``statement.json`` -> checked document -> texts and one bar for each measurement, divided into the groups
-of unknowns. All bars share a scale from 0 to the largest sum of parts. An interaction of two groups counts in both.
+of unknowns. All bars are as long: the lines of a budget add up to the variance.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 from characterisation.plots.statements import GROUPS
 from characterisation.statements.losses import Loss, common_losses
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
-from mitsim.running.numbers import NONE, listed, percent, quantity, rounded, two_digits
-from mitsim.study.statement_file import ExposureEntry, StatedMeasurement, StatementDocument
+from mitsim.running.numbers import NONE, listed, percent, quantity, rounded
+from mitsim.study.statement_file import BudgetEntry, ExposureEntry, StatedMeasurement, StatementDocument
 
 
 def statement_section(document: StatementDocument) -> dict[str, Any]:
@@ -24,7 +24,6 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
         for group in GROUPS
         if any(line.group == group for one in document.measurements.values() for line in one.budget)
     ]
-    widest = max((sum(line.share for line in one.budget) for one in document.measurements.values()), default=1.0) or 1.0
     return {
         "view": document.view,
         "rendered": document.measured_by == "render",
@@ -34,10 +33,17 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
         "rows": rows,
         "tolerances": any(one.tolerance is not None for one in document.measurements.values()),
         "legend": [{"colour": GROUPS[group][0], "name": GROUPS[group][1]} for group in shown],
-        "bars": [_bar(name, one, widest) for name, one in document.measurements.items() if one.budget],
+        "bars": [_bar(name, one) for name, one in document.measurements.items() if one.budget],
         "budget_groups": [GROUPS[group][1] for group in shown],
         "budget_rows": [_budget_row(name, one, shown) for name, one in document.measurements.items() if one.budget],
         "included": [one.model_dump() for one in document.influences if one.included],
+        "open_lines": any(not line.settled for one in document.measurements.values() for line in one.budget),
+        "undrawn": [
+            {"name": GROUPS.get(group, ("", group))[1], "source": source}
+            for group, source in {
+                line.group: line.source for one in document.measurements.values() for line in one.budget if line.source
+            }.items()
+        ],
         "missing": [one.model_dump() for one in document.influences if not one.included],
         "losses": [
             {"names": names, "count": count, "trials": trials, "reason": reason}
@@ -80,15 +86,17 @@ def _row(name: str, one: StatedMeasurement) -> dict[str, str]:
     }
 
 
-def _bar(name: str, one: StatedMeasurement, widest: float) -> dict[str, Any]:
+def _bar(name: str, one: StatedMeasurement) -> dict[str, Any]:
     """Return the parts of a bar in per cent of its width, in the order of :data:`GROUPS`, so that colours line up."""
     left, parts = 0.0, []
     by_group = {line.group: line for line in one.budget}
     for group, (colour, words) in GROUPS.items():
         if group in by_group:
-            width = 100 * by_group[group].share / widest
-            label = f"{words}: {percent(by_group[group].share)} of the variance"
-            parts.append({"left": f"{left:.2f}", "width": f"{width:.2f}", "colour": colour, "title": label})
+            line = by_group[group]
+            width = 100 * line.share
+            label = f"{words}: {percent(line.share)} of the variance ({_share_interval(line)})"
+            part = {"left": f"{left:.2f}", "width": f"{width:.2f}", "colour": colour, "title": label}
+            parts.append(part | {"open": not line.settled})
             left += width
     return {"name": name, "parts": parts}
 
@@ -101,9 +109,18 @@ def _budget_row(name: str, one: StatedMeasurement, groups: list[str]) -> dict[st
         if line is None:
             cells.append({"u": NONE, "share": ""})
             continue
-        ends = f"{two_digits(math.sqrt(line.low))} to {two_digits(math.sqrt(line.high))}"
-        cells.append({"u": quantity(math.sqrt(line.variance), one.unit), "share": f"{percent(line.share)}; {ends}"})
+        if line.settled:
+            u, share = quantity(math.sqrt(line.variance), one.unit), f"{percent(line.share)}; {_share_interval(line)}"
+        else:
+            u, share = "too few trials", _share_interval(line)
+        cells.append({"u": u, "share": share})
     return {"name": name, "cells": cells, "whole": quantity(one.standard_uncertainty, one.unit)}
+
+
+def _share_interval(line: BudgetEntry) -> str:
+    """Return the 95 % interval of a line's share in words."""
+    low, high = line.share_interval
+    return f"{100 * low:.0f} to {100 * high:.0f} %"
 
 
 def _interval(ends: tuple[float | None, float | None], unit: str) -> str:

@@ -27,6 +27,13 @@ def turned_description(description: dict[str, Any], turn_deg: float) -> dict[str
     return {"type": NAME, "turn_deg": turn_deg, "lobe": description}
 
 
+def is_turned(bsdf: Any) -> bool:
+    """Return whether a BSDF is or contains a turned one."""
+    from mitsim.scene.backend import mi
+
+    return any(key.rpartition(".")[2] == "turn_deg" for key in mi.traverse(bsdf).keys())  # noqa: SIM118 - not a dict
+
+
 def from_z_axis(frame: Any, direction: Any) -> Any:
     """Return a local direction in the frame whose first axis is the projected z axis of the part.
 

@@ -59,7 +59,8 @@ class RigCovariance:
     def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Draw one deviation of all parameters from nominal, (n,), normally distributed.
 
-        The draw uses the eigenvectors of the correlation matrix, so a singular covariance is allowed.
+        The draw uses the eigenvectors of the correlation matrix, so a singular covariance is allowed. It takes one
+        standard normal number for each, in the order of ascending eigenvalues.
         """
         values, vectors = np.linalg.eigh(self.correlation)
         standard = rng.standard_normal(len(self.names))

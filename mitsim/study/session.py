@@ -152,7 +152,7 @@ class Session:
         return planned_for(self, view)
 
     def state(self, view: View, table: StatementTable | None = None) -> StatedView:
-        """State every measurement from one view at its exposures; ``table`` replaces the study's numbers of trials."""
+        """State every measurement from one view at its exposures; ``table`` replaces the study's number of trials."""
         return state_view(self, view, table)
 
     def release(self) -> None:
@@ -209,9 +209,7 @@ def score(study: Study) -> xr.Dataset:
     return Session(study).screen()[0]
 
 
-def statement(
-    study: Study, view: int, *, trials: int | None = None, pairs: int | None = None, folder: str | Path | None = None
-) -> Statements:
+def statement(study: Study, view: int, *, trials: int | None = None, folder: str | Path | None = None) -> Statements:
     """State the uncertainty of every measurement from one view, by virtual measurements of it.
 
     Each trial draws calibration, finish, room light, temperature, pose and noise anew, renders, decodes and measures
@@ -226,10 +224,7 @@ def statement(
     trials
         Number of virtual measurements, at least 2; by default that of the study (200). A trial takes 0.2 to 1 s. With
         fewer than 39, the 95 % interval assumes normal errors. Rare large errors then make u, interval and budget
-        wrong by a factor of two or more: see ``settled``.
-    pairs
-        Trials of which each line of the budget needs another one; by default those of the study (16). The budget has
-        eight lines at most, so the total is ``trials`` + 8 ``pairs``. 0: no budget.
+        wrong by a factor of two or more: see ``settled``. With fewer than 30 there is no budget.
     folder
         Where finished trials are kept for reuse by the next call; by default they are not kept.
 
@@ -253,17 +248,15 @@ def statement(
     --------
     >>> import mitsim as ms
     >>> study = ms.open_study("study.toml")
-    >>> stated = {one.measurement: one for one in ms.statement(study, 4, trials=4, pairs=0)}
+    >>> stated = {one.measurement: one for one in ms.statement(study, 4, trials=4)}
     >>> stated["pillar1_radius"].trials, stated["pillar1_radius"].unit
     (4, 'mm')
     """
-    table = study.file.statement
-    numbers = {"trials": table.trials if trials is None else trials, "pairs": table.pairs if pairs is None else pairs}
-    for (name, value), least in zip(numbers.items(), (2, 0), strict=True):
-        if not least <= value <= 1_000_000:
-            raise InputError("statement", name, value, f"{least} to 1000000")
+    count = study.file.statement.trials if trials is None else trials
+    if not 2 <= count <= 1_000_000:
+        raise InputError("statement", "trials", count, "2 to 1000000")
     chosen = study.view(view, "statement: view")
     with nullcontext(folder) if folder is not None else TemporaryDirectory() as kept:
         session = Session(study, kept)
         session.claim(f"budget of view {view}")
-        return Statements(session.state(chosen, StatementTable(**numbers)).statements)
+        return Statements(session.state(chosen, StatementTable(trials=count)).statements)

@@ -25,7 +25,9 @@ class BudgetEntry(PartialDocument):
     low: float
     high: float
     share: float
-    pairs: int
+    share_interval: tuple[float, float]
+    settled: bool
+    source: str
     fresh: bool
 
 

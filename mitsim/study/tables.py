@@ -76,12 +76,10 @@ class RaceTable(Document):
 class StatementTable(Document):
     """How the uncertainty of the chosen view is stated.
 
-    ``trials`` are made with draws that no race uses. ``pairs`` of them serve each line of the budget, with one more
-    trial each.
+    ``trials`` are made with draws that no race uses.
     """
 
     trials: int = Field(default=200, ge=2, le=1_000_000)
-    pairs: int = Field(default=16, ge=0, le=100_000)
 
 
 class ExposureTable(Document):

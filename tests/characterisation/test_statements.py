@@ -1,10 +1,9 @@
-"""Statements from trials: intervals that hold, tolerances of JCGM 101, budgets and selections of known truth."""
+"""Statements from trials: intervals that hold, tolerances of JCGM 101 and selections of known truth."""
 
 import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
-from characterisation.statements.budget import budget
 from characterisation.statements.coverage import coverage_interval
 from characterisation.statements.decision import plus_minus
 from characterisation.statements.selection import Standing, judge, posterior, sampled
@@ -80,33 +79,23 @@ def test_verdicts_follow_the_share_of_the_tolerance():
     assert statement("m", "mm", errors, tolerance=plus_minus(5.0, 4 * share)).verdict == "not decided"
 
 
-def test_the_budget_of_a_linear_model_is_its_variances():
-    # e = 2 a + b, a, b standard normal: parts 4 and 1 of 5
-    rng = np.random.default_rng(9)
-    inside = {"a": 0, "b": 0}
-    for _ in range(400):
-        a, b, other_a, other_b = rng.standard_normal((4, 24))
-        lines = budget(2 * a + b, {"a": 2 * other_a + b, "b": 2 * a + other_b}, variance=5.0)
-        by = {line.group: line for line in lines}
-        assert lines[0].variance >= lines[1].variance
-        for group, truth in (("a", 4.0), ("b", 1.0)):
-            inside[group] += by[group].low <= truth <= by[group].high
-    for count in inside.values():
-        assert binom.ppf(0.0005, 400, 0.95) <= count <= binom.ppf(0.9995, 400, 0.95)
-
-
 def test_what_is_fresh_averages_out_and_the_rest_does_not():
     rng = np.random.default_rng(10)
-    common, fresh, other_fresh = rng.standard_normal((3, 20000))
-    found = statement("m", "mm", common + 2 * fresh, repeats=common + 2 * other_fresh)
+    common, fresh = np.tile(rng.standard_normal(20000), 2), rng.standard_normal(40000)
+    found = statement("m", "mm", common + 2 * fresh, days=np.tile(np.arange(20000), 2))
+    assert np.isnan(statement("m", "mm", common + 2 * fresh).repeatability)
     assert found.repeatability == pytest.approx(2, rel=0.03)
     for captures in (1, 4, 100):
         assert found.after_repeats(captures) == pytest.approx(np.sqrt(1 + 4 / captures), rel=0.03)
 
 
-def test_pairs_without_a_value_leave_the_budget():
-    lines = budget([1.0, np.nan, 3.0], {"noise": [2.0, 5.0, np.nan]})
-    assert lines[0].pairs == 1 and lines[0].variance == pytest.approx(0.5)
+def test_the_uncertainty_of_the_bias_knows_that_captures_of_a_day_are_alike():
+    rng = np.random.default_rng(13)
+    day = np.repeat(np.arange(60), 3)
+    found = [statement("m", "mm", np.repeat(rng.standard_normal(60), 3), days=day) for _ in range(300)]
+    spread = np.std([one.bias for one in found])
+    for stated in ([one.bias_uncertainty for one in found], [one.moved[0] for one in found]):
+        assert np.mean(stated) == pytest.approx(spread, rel=0.15)  # 0.13; as if independent it were 0.075
 
 
 def test_a_leader_is_as_often_the_best_as_is_said():

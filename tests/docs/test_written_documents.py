@@ -26,8 +26,8 @@ from mitsim.study.virtual.stated import StatedView, statement_document
 @pytest.fixture(scope="module")
 def stated():
     errors = np.random.default_rng(1).normal(0.02, 0.01, 40)
-    line = BudgetLine("pose", 1e-4, 5e-5, 2e-4, 1.0, 16)
-    return statement("radius", "mm", errors, plus_minus(20.0, 0.2), (line,), errors[:16] + 0.001)
+    line = BudgetLine("pose", 1e-4, 5e-5, 2e-4, 1.0, (0.5, 1.0))
+    return statement("radius", "mm", errors, plus_minus(20.0, 0.2), (line,), np.arange(40) // 2)
 
 
 def test_keys_of_a_statement(stated):

@@ -87,11 +87,11 @@ def test_score_has_the_figures_of_the_command(workplace):
 
 
 def test_statement_has_the_figures_of_the_command(workplace):
-    text = (workplace / "study.toml").read_text() + "\n[statement]\ntrials = 3\npairs = 0\n"
+    text = (workplace / "study.toml").read_text() + "\n[statement]\ntrials = 3\n"
     (workplace / "short.toml").write_text(text)
     CliRunner().invoke(app, ["study", "state", "short.toml", "--view", "4", "-o", "budget"], catch_exceptions=False)
     theirs = json.loads((workplace / "budget/statement.json").read_text())["measurements"]
-    for one in ms.statement(ms.open_study("study.toml"), 4, trials=3, pairs=0, folder="mine"):
+    for one in ms.statement(ms.open_study("study.toml"), 4, trials=3, folder="mine"):
         assert one.trials == 3
         assert one.standard_uncertainty == pytest.approx(theirs[one.measurement]["standard_uncertainty"], nan_ok=True)
     kept, mine = (workplace / one / "trials/view_0004.jsonl" for one in ("budget", "mine"))

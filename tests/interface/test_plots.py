@@ -159,7 +159,10 @@ def test_a_map_draws_its_first_sample_at_mid_range_and_refuses_what_it_does_not_
 
 def stated() -> Statements:
     rng = np.random.default_rng(1)
-    lines = tuple(BudgetLine(group, share, 0, 1, share, 16) for group, share in (("noise", 0.7), ("pose", 0.4)))
+    lines = tuple(
+        BudgetLine(group, share, 0, 1, share, (0.0, 1.0), group != "pose")
+        for group, share in (("noise", 0.7), ("pose", 0.3))
+    )
     return Statements(
         [
             statement("distance", "mm", rng.normal(0.1, 0.05, 200), budget=lines),

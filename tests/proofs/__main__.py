@@ -89,6 +89,22 @@ def statements(
     say(f"page: {page}")
 
 
+def budgets(
+    rounds: Annotated[int, typer.Option(min=2, max=10_000, help="Statements of each study.")] = 40,
+    variant: Variant = None,
+) -> None:
+    """Compare budgets with variances that are known, and with budgets from pairs of trials.
+
+    Needs no cases: errors are drawn from known functions of drawn numbers. Prints a table.
+
+    Example: python -m tests.proofs budgets
+    """
+    start(variant)
+    from tests.proofs.budgets import budgets_table
+
+    print(budgets_table(rounds), end="")
+
+
 def losses(
     cases: Annotated[Path, typer.Argument(help="TOML file that lists parts, sensors and finishes.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="TOML file to write.")],
@@ -282,7 +298,7 @@ def finishes(
     print(finishes_page(folder), end="")
 
 
-for command in (maps, scores, statements, losses, laboratory, seeds, finishes):
+for command in (maps, scores, statements, budgets, losses, laboratory, seeds, finishes):
     app.command(name=command.__name__)(command)
 
 if __name__ == "__main__":

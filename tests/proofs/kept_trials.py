@@ -20,7 +20,7 @@ from characterisation.files.datasets import Schema, Variable, read_dataset
 from characterisation.files.errors import InputError
 from mitsim.maps.campaign.run import write_netcdf
 from mitsim.study.virtual.trials import Outcome, TrialFolder
-from mitsim.study.virtual.world import GROUPS, Trial
+from mitsim.study.virtual.world import Trial
 
 _TRIAL = ("trial",)
 _SCHEMA = Schema(
@@ -33,13 +33,9 @@ _SCHEMA = Schema(
         "view": Variable(_TRIAL, "whole", 0, 1e9),
         "day": Variable(_TRIAL, "whole", 0, 2**62),
         "capture": Variable(_TRIAL, "whole", 0, 2**15),
-        "swapped": Variable(_TRIAL, "whole", 0, len(GROUPS)),
     },
     hint="remove `measured` from the cases file to measure everything again",
 )
-
-#: groups that a trial may have redrawn, by their number in a file
-_SWAPPED_GROUPS = ("", *GROUPS)
 
 
 def write_trials(path: Path, folders: Mapping[str, TrialFolder], views: list[int]) -> None:
@@ -60,7 +56,6 @@ def write_trials(path: Path, folders: Mapping[str, TrialFolder], views: list[int
         "view": np.array([row[1] for row in rows], np.int32),
         "day": np.array([row[2].day for row in rows], np.int64),
         "capture": np.array([row[2].capture for row in rows], np.int16),
-        "swapped": np.array([_SWAPPED_GROUPS.index(row[2].swapped) for row in rows], np.int8),
     }
     data = xr.Dataset(
         {
@@ -110,9 +105,7 @@ def take_up_trials(path: Path, folders: Mapping[str, TrialFolder]) -> dict[str, 
             for view in np.unique(mine["view"].values).tolist():
                 rows = np.flatnonzero(mine["view"].values == view)
                 trials = {
-                    Trial(
-                        int(mine["day"][i]), int(mine["capture"][i]), _SWAPPED_GROUPS[int(mine["swapped"][i])]
-                    ): _outcome(folder, values[i], behind[i])
+                    Trial(int(mine["day"][i]), int(mine["capture"][i])): _outcome(folder, values[i], behind[i])
                     for i in rows
                 }
                 whole = {trial: outcome for trial, outcome in trials.items() if folder.is_whole(outcome)}
@@ -149,5 +142,5 @@ def _outcome(folder: TrialFolder, errors: NDArray[np.float64], row: NDArray[np.f
     return Outcome(dict(zip(folder.measurements, errors.tolist(), strict=True)), {}, deviations)
 
 
-def _place(trial: Trial) -> tuple[int, int, str]:
-    return trial.day, trial.capture, trial.swapped
+def _place(trial: Trial) -> tuple[int, int]:
+    return trial.day, trial.capture

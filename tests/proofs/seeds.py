@@ -33,7 +33,7 @@ def statements_of_seeds(
     for seed in seeds:
         one = replace(study, file=study.file.model_copy(update={"seed": seed}))
         session = Session(one, folder / f"seed_{seed}", workers)
-        out[seed] = session.state(view, StatementTable(trials=trials, pairs=0)).statements
+        out[seed] = session.state(view, StatementTable(trials=trials)).statements
     return out
 
 

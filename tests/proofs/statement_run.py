@@ -118,7 +118,7 @@ def _to_state(case: PartCase, study: Study, scores: xr.Dataset, chosen: int | No
 
 def _stated(case: PartCase, trials_of_kind: dict[str, Session], view: View, why: str) -> JudgedView:
     tool, apart, count = trials_of_kind["tool"], trials_of_kind["apart"], case.file.stated_worlds
-    table = StatementTable(trials=tool.study.file.statement.trials, pairs=0)
+    table = StatementTable(trials=tool.study.file.statement.trials)
     stated = tool.state(view, table)
     measure_worlds(case, "apart", apart, [view], {view.number: days(count)})
     errors = apart.trials.stated_errors(view.number, days(count))

@@ -225,7 +225,9 @@ def statement_of(view):
         "low": 0.02,
         "high": 0.09,
         "share": 0.64,
-        "pairs": 16,
+        "share_interval": [0.32, 0.9],
+        "settled": False,
+        "source": "",
         "fresh": False,
     }
     known = {
@@ -241,7 +243,7 @@ def statement_of(view):
         "settled": False,
         "repeatability": 0.1,
         "after_repeats": {"1": 0.25, "4": 0.231},
-        "budget": [line, line | {"group": "noise", "variance": 0.01, "share": 0.16, "fresh": True}],
+        "budget": [line, line | {"group": "noise", "variance": 0.01, "share": 0.36, "settled": True, "fresh": True}],
         "tolerance": None,
         "share_of_tolerance": None,
         "verdict": "no tolerance",

@@ -175,7 +175,6 @@ def test_another_mesh_of_the_same_size_is_measured_anew(tmp_path):
     )
     (tmp_path / "study.toml").write_text(
         STUDY.replace(f"{SCENES / 'matt_white.xml'}", "balls.xml").replace('"ensenso-n10"', '"ensenso-n10.toml"')
-        + "pairs = 0\n"
     )
     ball(30)
     large = radius_error("kept")

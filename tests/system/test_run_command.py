@@ -53,7 +53,6 @@ def study_folder(tmp_path_factory):
         trials = 4
         [statement]
         trials = 2
-        pairs = 1
         [check]
         views = 2
     """)

@@ -23,7 +23,6 @@ lowest_elevation_deg = 20
 light_path_depth = 1
 [statement]
 trials = 4
-pairs = 1
 """
 
 

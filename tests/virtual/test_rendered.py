@@ -292,7 +292,7 @@ def test_parts_whose_faces_face_one_another(tmp_path):
 
 
 def test_a_statement_from_a_few_trials(coarse_n10, tmp_path):
-    study = study_of(coarse_n10, statement={"trials": 6, "pairs": 2}, unknowns={"pose": {"told_mm": 0.1}})
+    study = study_of(coarse_n10, statement={"trials": 6}, unknowns={"pose": {"told_mm": 0.1}})
     session = Session(study, tmp_path)
     view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
     stated = session.state(view)

@@ -213,7 +213,7 @@ def test_a_kept_trial_without_its_deviations_is_measured_again(tmp_path, kept):
     trials.add(3, Trial(0), Outcome({"radius": 0.1, "angle": 0.2}, {}, {"angle": [1.0, 2.0, 3.0]}))
     path = tmp_path / "view_0003.jsonl"
     good = path.read_text()
-    line = {"day": 1, "capture": 0, "swapped": "", "errors": [0.1, 0.2], "deviations": kept}
+    line = {"day": 1, "capture": 0, "errors": [0.1, 0.2], "deviations": kept}
     path.write_text(good + json.dumps(line) + "\n")
     assert list(TrialFolder(tmp_path, "d", NAMES, FOLDED).known(3)) == [Trial(0)]
     assert not trials.is_whole(Outcome({"radius": 0.1, "angle": 0.2}))
@@ -273,9 +273,9 @@ def test_trials_of_another_study_are_moved_aside_and_not_used(tmp_path):
         "[]",
         "null",
         '{"day": 1}',
-        '{"day": "x", "capture": 0, "swapped": "", "errors": [1, 2]}',
-        '{"day": 1, "capture": 0, "swapped": "../x", "errors": [1, 2]}',
-        '{"day": 1, "capture": 0, "swapped": "", "errors": [1]}',
+        '{"day": "x", "capture": 0, "errors": [1, 2]}',
+        '{"day": 1, "capture": -1, "errors": [1, 2]}',
+        '{"day": 1, "capture": 0, "errors": [1]}',
         "\ufffd" * 40,
         "[" * 3000,
     ],

@@ -65,13 +65,16 @@ def test_captures_of_a_day_share_what_is_common_and_nothing_else(unknowns):
         assert same(one[group], other[group]) == (group not in FRESH), group
 
 
-@pytest.mark.parametrize("group", GROUPS)
-def test_a_swapped_group_changes_alone(unknowns, group):
-    one, other = told(unknowns.draw(Trial(5))), told(unknowns.draw(Trial(5, 0, group)))
-    for name in GROUPS:
-        if name == "finish" and group == "finish":
-            continue  # one of eight: may come out the same
-        assert same(one[name], other[name]) == (name != group), name
+def test_some_days_of_a_statement_keep_a_seed_of_the_day_before_and_nothing_else(unknowns):
+    kept = []
+    for day in range(8):
+        one, other = (told(unknowns.draw(Trial(STATEMENT_DAYS + k))) for k in (day, day + 1))
+        kept.append(
+            {group for group in ("calibration", "form", "unit", "beyond_map") if same(one[group], other[group])}
+        )
+    assert kept == 2 * [{"unit", "beyond_map"}, set(), {"form"}, set()]
+    race = [unknowns.draw(Trial(day)).unit for day in range(8)]
+    assert len(set(race)) == 8
 
 
 def test_a_group_that_is_not_varied_stays_at_its_best_estimate(unknowns):

@@ -27,6 +27,7 @@ from mitsim.scene.light_transport.kept_tracing import Tracing, camera_paths, pho
 from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
 from mitsim.scene.load import Scene, bsdf_of
 from mitsim.scene.ray_casting.raycast import shapes_met
+from mitsim.scene.turned_lay import is_turned
 from mitsim.sensor.transforms import Transform
 
 
@@ -98,6 +99,7 @@ def keep_light(
     }
     drawn = [number if one.id() in described else -1 for number, one in enumerate(bsdfs)]
     sampled = [bsdf_of(broad(described[one.id()])) if one.id() in described else one for one in bsdfs]
+    turned = [any(is_turned(finish[number]) for finish in finishes) for number in range(len(bsdfs))]
     out = {}
     for index, (camera, roi) in enumerate(rois.items()):
         shape = shapes_met(scene, simulated.pixel_rays(camera), world_from_sensor)[roi.slices]
@@ -105,7 +107,7 @@ def keep_light(
         pixels = np.flatnonzero(binary_dilation(shape >= 0, np.ones((3, 3))))
         photons = int(np.ceil(np.sqrt(settings.photons * settings.samples * len(pixels)))) ** 2
         own = int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
-        tracing = Tracing(settings.samples, photons, rendering.depth, own, drawn, sampled)
+        tracing = Tracing(settings.samples, photons, rendering.depth, own, drawn, sampled, turned)
         rays, projector = simulated.rays[camera], simulated.patterns.projector
         candidates: list[Candidates] = []
         if len(pixels):

@@ -28,6 +28,7 @@ from mitsim.scene.light_transport.projector_light import ProjectorLight
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays, bilinear, pixel_area
 from mitsim.scene.ray_casting.eye import Eye, shadow_ray
+from mitsim.scene.turned_lay import from_z_axis
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.transforms import Transform
 
@@ -46,7 +47,8 @@ class Tracing:
     """How paths are traced: ``samples`` per pixel (a square number), ``photons``, surfaces (``depth``), ``seed``.
 
     ``drawn`` is the number of the drawn finish of each BSDF of the scene, in its order, or -1. ``bsdfs`` are those to
-    sample with, in the same order.
+    sample with, in the same order. ``turned`` tells whose lay may be drawn: the directions of their paths are in the
+    frame of :func:`mitsim.scene.turned_lay.from_z_axis`.
     """
 
     samples: int
@@ -55,6 +57,7 @@ class Tracing:
     seed: int
     drawn: Sequence[int]
     bsdfs: Sequence[Any]
+    turned: Sequence[bool]
 
 
 @dataclass
@@ -108,6 +111,7 @@ class _Tracer:
         self.bsdfs = SceneBsdfs(scene, tracing.bsdfs)
         self.drawn = mi.Int32(np.asarray([*tracing.drawn, -1], np.int32))
         self.all_drawn = min(tracing.drawn) >= 0
+        self.turned = mi.Bool(np.asarray([*tracing.turned, False], bool))
         self.has_aperture = rays.aperture_mm > 0
         self.aperture, self.inverse_focus = opaque(0.5 * rays.aperture_mm), opaque(1.0 / rays.focus_mm)
         self.seed = opaque_index(tracing.seed & 0xFFFFFFFF)
@@ -125,6 +129,14 @@ class _Tracer:
     def material(self, surface: Any, valid: Any) -> Any:
         """Return the number of the drawn finish of each lane, -1 for none."""
         return dr.gather(mi.Int32, self.drawn, self.bsdfs.place(surface, valid), valid)
+
+    def kept(self, surface: Any, material: Any, toward_camera: Any, toward_projector: Any) -> list[Any]:
+        """Return material and local directions of a surface as a path keeps them."""
+        directions = [mi.Vector3f(toward_camera), mi.Vector3f(toward_projector)]
+        if any(self.tracing.turned):
+            turned = dr.gather(mi.Bool, self.turned, mi.UInt32(dr.maximum(material, 0)), material >= 0)
+            directions = [dr.select(turned, from_z_axis(surface.sh_frame, one), one) for one in directions]
+        return [material, *directions]
 
     def factor(self, material: Any, value: Any) -> Any:
         """Return the part of a BSDF that belongs into the weight: its value if its finish is not drawn, else 1."""
@@ -215,7 +227,7 @@ def _camera_step(one: _Tracer, walk: _Walk, number: int) -> tuple[_Walk | None, 
         lit = hit & (irradiance > 0) & (value > 0)
         weight = walk.weight * irradiance * one.factor(material, value) / (1.0 + ratio * density)
         weight *= opaque(1.0 / tracing.samples)
-        record = weight, uv, length + distance, material, toward_camera, toward_projector
+        record = weight, uv, length + distance, *one.kept(surface, material, toward_camera, toward_projector)
     goes_on = mi.Bool(False)
     follower = None
     if number < tracing.depth:
@@ -244,7 +256,7 @@ def _camera_step(one: _Tracer, walk: _Walk, number: int) -> tuple[_Walk | None, 
             ratio,
             length,
             walk.code,
-            [*walk.surfaces, [material, toward_camera, sampled.wo]],
+            [*walk.surfaces, one.kept(surface, material, toward_camera, sampled.wo)],
         )
     return _split(walk, lit, record, goes_on, follower)
 
@@ -328,7 +340,7 @@ def _photon_step(one: _Tracer, walk: _Walk, number: int) -> tuple[_Walk | None, 
         weight = walk.weight * one.factor(material, value) * importance / cosine_in
         weight /= 1.0 + ratio * density * importance
         walk.pixel = (row - top) * width + column - left
-        record = weight, walk.code, length + distance, material, toward_camera, toward_projector
+        record = weight, walk.code, length + distance, *one.kept(surface, material, toward_camera, toward_projector)
     goes_on = mi.Bool(False)
     follower = None
     if number < tracing.depth:
@@ -355,7 +367,7 @@ def _photon_step(one: _Tracer, walk: _Walk, number: int) -> tuple[_Walk | None, 
             ratio,
             length,
             walk.code,
-            [*walk.surfaces, [material, sampled.wo, toward_projector]],
+            [*walk.surfaces, one.kept(surface, material, sampled.wo, toward_projector)],
         )
     return _split(walk, lit, record, goes_on, follower)
 

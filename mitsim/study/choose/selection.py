@@ -274,8 +274,8 @@ def _measure_sensor(one: SensorResult, seconds: float) -> None:
 
 
 def _state(one: SensorResult, view: int, count: int) -> None:
-    """State a view from ``count`` trials, without a budget."""
-    table = StatementTable(trials=count, pairs=0)
+    """State a view from ``count`` trials."""
+    table = StatementTable(trials=count)
     one.stated[view] = one.session.state(one.session.study.view(view), table)
 
 

@@ -13,12 +13,15 @@ matches, or the light of the user's room.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
 from characterisation.tasks.evaluation import measure
@@ -48,6 +51,10 @@ _POINTS = 600
 
 #: number of drawn maps that are kept: views are compared with the same draws
 _MAPS = 32
+
+#: dimensions of a map's nodes, and limits of the fields of which errors and spread are drawn
+_NODES = ("sample", "distance", "b", "a")
+_LIMITS = {"recovered_fraction": (0.0, 1.0), "ray_noise_std": (1e-6, np.inf)}
 
 #: reason of a measurement without a value that screening rates as impossible
 _NOT_PREDICTED = "by the map, too few points are recovered in this view"
@@ -152,19 +159,43 @@ def drawn_map(performance_map: PerformanceMap, unknowns: Unknowns, finish: int) 
     """
     if finish < 0:
         return performance_map
-    rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, 101, finish]))
     data = performance_map.data.copy(deep=True)
-    samples = data.sizes["sample"]
-    for name, low, high in (("recovered_fraction", 0.0, 1.0), ("ray_noise_std", 1e-6, np.inf)):
-        values = data[name].transpose("sample", "distance", "b", "a").values
-        common = rng.standard_normal((samples, 1, 1, 1)) * unknowns.table.finish.alpha
+    for name, common, error in _map_draws(performance_map, unknowns, finish):
+        values = data[name].transpose(*_NODES).values
         moved = values.copy()
-        for suffix, draw in (("spread", common), ("error", rng.standard_normal(values.shape))):
+        for suffix, draw in (("spread", common[:, None, None, None] * unknowns.table.finish.alpha), ("error", error)):
             if f"{name}_{suffix}" in data:
-                size = data[f"{name}_{suffix}"].transpose("sample", "distance", "b", "a").values
-                moved = moved + np.nan_to_num(size) * draw
-        data[name] = (("sample", "distance", "b", "a"), np.clip(moved, low, high))
+                moved = moved + np.nan_to_num(data[f"{name}_{suffix}"].transpose(*_NODES).values) * draw
+        data[name] = (_NODES, np.clip(moved, *_LIMITS[name]))
     return PerformanceMap(data)
+
+
+def drawn_spread(study: Study, unknowns: Unknowns, finish: int) -> Floats:
+    """Return the numbers (2 s,) that the spread of finishes drew, for the s samples of the map that represent a part.
+
+    Those of the best estimate are 0.
+    """
+    performance_map = study.performance_map
+    assert performance_map is not None
+    used = set[int]()
+    for one in study.scene.finishes:
+        if one is not None:
+            with suppress(InputError):  # a surface that no view shows
+                members, rough = performance_map.known.representing(one.name, one.roughness, one.light)
+                place = int(np.searchsorted(performance_map.known.roughness[members], rough))
+                used |= set(members if math.isnan(rough) else members[max(place - 1, 0) : place + 1])
+    draws = [common for _, common, _ in _map_draws(performance_map, unknowns, finish)] if finish >= 0 else []
+    return np.array([draw[sorted(used)] for draw in draws] or np.zeros((2, len(used)))).ravel()
+
+
+def _map_draws(
+    performance_map: PerformanceMap, unknowns: Unknowns, finish: int
+) -> Iterator[tuple[str, Floats, Floats]]:
+    """Yield F and sigma with the draws of their spread, by sample (s,), and of their errors, by node."""
+    rng = np.random.default_rng(np.random.SeedSequence([unknowns.seed, 101, finish]))
+    shape = tuple(performance_map.data.sizes[name] for name in _NODES)
+    for name in _LIMITS:
+        yield name, rng.standard_normal(shape[0]), rng.standard_normal(shape)
 
 
 def moved_by_calibration(cloud: PointCloud, sensor: Sensor, drawn: DrawnValues) -> NDArray[np.float32]:

@@ -1,7 +1,8 @@
 """State the uncertainty of every measurement from one view, with its budget.
 
-Signal chain: trials with draws that were not used to choose the view -> the same trials with one group of unknowns
-redrawn -> :class:`characterisation.statements.statement.Statement` of every measurement -> ``statement.json``.
+Signal chain: trials with draws that were not used to choose the view, some of them repeated captures of a day -> their
+errors, and what each group of unknowns drew -> :class:`characterisation.statements.statement.Statement` of every
+measurement -> ``statement.json``.
 """
 
 from __future__ import annotations
@@ -11,13 +12,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from characterisation.files.atomic_io import json_values
-from characterisation.statements.budget import BudgetLine, budget
+from characterisation.statements.budget import INTERACTION, budget
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import common_losses, losses
-from characterisation.statements.one_sided import stated_errors
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
 from mitsim.running.text_table import aligned
@@ -27,11 +25,12 @@ from mitsim.sensor.preset import Sensor
 from mitsim.study import StatementTable
 from mitsim.study.exposures.planned import with_exposure
 from mitsim.study.virtual.drawn_decoder import decoder_is_drawn
+from mitsim.study.virtual.drawn_numbers import drawn_numbers, related, seeds, statement_trials
 from mitsim.study.virtual.influences import influences
 from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.race import Job, complete
 from mitsim.study.virtual.trials import TrialFolder
-from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, STATEMENT_DAYS, Trial, Unknowns
+from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, Unknowns
 from mitsim.views import View
 
 if TYPE_CHECKING:
@@ -54,7 +53,7 @@ def state_view(session: Session, view: View, table: StatementTable | None = None
     """State every measurement from one view at its exposures, and reuse trials in the folder of the session.
 
     Draws of the race are not used: they selected the view, and are biased in its favour. ``table`` replaces the
-    study's numbers of trials.
+    study's number of trials.
     """
     study, runner, trials, planned = session.study, session.runner, session.trials, session.exposures(view)
     if planned is not None:
@@ -65,26 +64,18 @@ def state_view(session: Session, view: View, table: StatementTable | None = None
             TrialFolder.of(session.folder / "planned_trials", digest, study.task),
         )
     table = table or study.file.statement
-    base = [Trial(STATEMENT_DAYS + k) for k in range(table.trials)]
-    pairs = base[: min(table.pairs, table.trials)]
+    made = statement_trials(table.trials)
+    complete(trials, runner, [Job(view, trial) for trial in made], f"state view {view.number}")
     groups = budget_groups(session.unknowns, session.source, study.sensor)
-    swapped = {group: [Trial(one.day, one.capture, group) for one in pairs] for group in groups}
-    repeats = [Trial(one.day, one.capture + 1) for one in pairs]
-    wanted = [*base, *repeats, *(trial for some in swapped.values() for trial in some)]
-    complete(trials, runner, [Job(view, trial) for trial in wanted], f"state view {view.number}")
-    by_trial = trials.errors_of_parts(view.number, base)
-    second = trials.stated_errors(view.number, repeats)
-    again = {group: trials.stated_errors(view.number, some) for group, some in swapped.items()}
+    numbers = drawn_numbers(study, session.unknowns, session.source, made, groups)
+    shared = seeds(made, groups)
+    errors = trials.errors_of_parts(view.number, made)
     out = []
     for m, (name, asked) in enumerate(study.task.measurements.items()):
-        errors = stated_errors(by_trial[m])
-        lines: tuple[BudgetLine, ...] = ()
-        known = errors[np.isfinite(errors)]
-        if pairs and len(known) > 1:
-            redrawn = {group: of_group[m] for group, of_group in again.items()}
-            lines = budget(errors[: len(pairs)], redrawn, float(known.var(ddof=1)))
-        stated = statement(name, asked.unit, by_trial[m], tolerance_of(study.task, name), lines, second[m])
-        out.append(replace(stated, losses=losses(trials.reasons(view.number, base, name))))
+        lines = budget(errors[m], numbers, shared)
+        limit = tolerance_of(study.task, name)
+        stated = statement(name, asked.unit, errors[m], limit, lines, shared[INTERACTION], related(made))
+        out.append(replace(stated, losses=losses(trials.reasons(view.number, made, name))))
     return StatedView(view, out, planned)
 
 
@@ -129,7 +120,6 @@ def statement_table(stated: Sequence[Statement]) -> str:
     about_error = ("bias", "u", "95 % interval of the error", "after correction", "no value", "most of it from")
     rows = [("measurement", "unit", *about_error, "accepted readings", "verdict")]
     for one in stated:
-        largest = one.budget[0] if one.budget else None
         rows.append(
             (
                 one.measurement,
@@ -139,7 +129,7 @@ def statement_table(stated: Sequence[Statement]) -> str:
                 _interval(one.interval),
                 _interval(one.interval_corrected),
                 f"{100 * one.without_value:.0f} %",
-                f"{largest.group} ({100 * largest.share:.0f} %)" if largest else "",
+                _largest(one),
                 _accepted(one),
                 one.verdict,
             )
@@ -173,6 +163,17 @@ def _accepted(one: Statement) -> str:
     low, high = one.decided.accepted
     digits = max(0, 2 - math.floor(math.log10(one.tolerance or 1.0)))
     return f"up to {high:.{digits}f}" if math.isinf(low) else f"{low:.{digits}f} to {high:.{digits}f}"
+
+
+def _largest(one: Statement) -> str:
+    """Return the largest line of the budget; none where the trials are too few to tell which."""
+    if not one.budget:
+        return ""
+    largest = one.budget[0]
+    others = max((line.high for line in one.budget[1:]), default=0.0)
+    if not largest.settled or (largest.low < others and largest.share < 0.5):
+        return "too few trials"
+    return f"{largest.group} ({100 * largest.share:.0f} %)"
 
 
 def _measurement(one: Statement) -> dict[str, Any]:

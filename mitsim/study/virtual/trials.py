@@ -6,8 +6,8 @@ is incomplete, because of a kill or a full disk, it is dropped and its trial is 
 
 Of a value that folds, such as a zone, a trial keeps the deviations from nominal that it measured. A statement adds them
 to the deviation of a part at the limit of its tolerance, in a random direction
-(:mod:`characterisation.statements.one_sided`). The direction follows from the measurement and the day. So a repeat of a
-capture, and a trial with one group of unknowns drawn again, are about the same part.
+(:mod:`characterisation.statements.one_sided`). The direction follows from the measurement and the day. So the captures
+of one day are about the same part.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from characterisation.tasks.folded import FoldedValue, folded_values
 from characterisation.tasks.result import Result
 from characterisation.tasks.task_file import Task
 from mitsim.running.numbers import or_nan
-from mitsim.study.virtual.world import GROUPS, Trial
+from mitsim.study.virtual.world import Trial
 
 Floats = NDArray[np.float64]
 
@@ -62,9 +62,8 @@ class Outcome:
 class _KeptTrial(Document):
     """A line of a file; ``errors`` are in the order of the measurements, None without a value."""
 
-    day: int = Field(ge=0, lt=2**62)  # of 64 bits, even where groups of unknowns are swapped
+    day: int = Field(ge=0, lt=2**62)
     capture: int = Field(ge=0, lt=2**62)
-    swapped: Literal["", *GROUPS]  # type: ignore[valid-type]
     errors: list[float | None]
     reasons: dict[str, str] = Field(default_factory=dict)
     deviations: dict[str, list[float | None]] = Field(default_factory=dict)
@@ -110,7 +109,6 @@ class TrialFolder:
         line: dict[str, Any] = {
             "day": trial.day,
             "capture": trial.capture,
-            "swapped": trial.swapped,
             "errors": json_values(list(values.values())),
         }
         if outcome.reasons:
@@ -211,7 +209,7 @@ class TrialFolder:
         errors = dict(zip(self.measurements, _numbers(kept.errors), strict=True))
         deviations = {name: _numbers(values) for name, values in kept.deviations.items()}
         outcome = Outcome(errors, kept.reasons, deviations)
-        return (Trial(kept.day, kept.capture, kept.swapped), outcome) if self.is_whole(outcome) else None
+        return (Trial(kept.day, kept.capture), outcome) if self.is_whole(outcome) else None
 
     def is_whole(self, outcome: Outcome) -> bool:
         """Return whether every value that folds has its deviations, and no infinite number is among them."""

@@ -8,8 +8,8 @@ over repeated captures. Those in :data:`FRESH` are drawn for every capture. A tr
 these alone determine its draw, on every machine and in any order. Views are compared with the same draws (common random
 numbers).
 
-A trial may take one group from another stream (``swapped``). The two errors then differ by that group alone, which
-gives its share of the variance (:mod:`characterisation.statements.budget`).
+Some groups draw only a seed. Certain days of a statement keep the seed of the day before, so that the covariance of the
+two days tells the variance that the group causes (:mod:`characterisation.statements.budget`).
 """
 
 from __future__ import annotations
@@ -49,17 +49,16 @@ STATEMENT_DAYS = 1 << 20
 #: first day of the draws of a set of views
 SET_DAYS = 1 << 21
 
-#: offset of the day of the streams from which ``swapped`` takes a group
-_ELSEWHERE = 1 << 32
+#: Groups that draw only a seed, and the day among every four of a statement that keeps the seed of the day before.
+KEEPS_SEED = {"unit": 1, "form": 3, BEYOND: 1}
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Identifies a draw: day, capture within the day, and the group that is redrawn ("" for none)."""
+    """Identifies a draw: day, and capture within the day."""
 
     day: int
     capture: int = 0
-    swapped: str = ""
 
 
 @dataclass(frozen=True)
@@ -67,8 +66,8 @@ class DrawnValues:
     """All values that were drawn for one trial.
 
     ``rig`` is the sensor's true geometry. ``path`` is offset [mm] and scale [1] of a time-of-flight distance.
-    ``finish`` numbers the deviation of the finishes (:mod:`mitsim.study.virtual.drawn_finish`), -1 for the best estimate. ``form``,
-    ``unit`` and ``decoder`` are seeds, 0 for none: the unit's patterns, and
+    ``finish`` numbers the deviation of the finishes (:mod:`mitsim.study.virtual.drawn_finish`), -1 for the best
+    estimate. ``form``, ``unit`` and ``decoder`` are seeds, 0 for none: the unit's patterns, and
     :func:`mitsim.study.virtual.drawn_decoder.drawn_decoder`. ``room`` is irradiance [W/mm^2]. ``power`` and
     ``exposure`` are relative to nominal [1]. ``expansion`` of the part is relative [1]. ``placed`` and ``assumed``
     (world to world) are the true and the assumed motion of the part from its nominal pose. ``seed`` is that of the
@@ -111,7 +110,7 @@ class Unknowns:
 
     def draw(self, trial: Trial) -> DrawnValues:
         """Draw the values of a trial."""
-        table, streams = self.table, {group: self._stream(group, trial) for group in GROUPS}
+        table, streams = self.table, {group: self.stream(group, trial) for group in GROUPS}
         sensor_kelvin, part_kelvin = (
             streams["temperature"].standard_normal(2) * [table.temperature.sensor_kelvin, table.temperature.part_kelvin]
             if "temperature" in self.varied
@@ -137,8 +136,9 @@ class Unknowns:
             decoder=_seed(streams["decoder"]) if "decoder" in self.varied else 0,
         )
 
-    def _stream(self, group: str, trial: Trial) -> np.random.Generator:
-        day = trial.day + (_ELSEWHERE if trial.swapped == group else 0)
+    def stream(self, group: str, trial: Trial) -> np.random.Generator:
+        """Return the stream of random numbers from which a group is drawn in a trial."""
+        day = seed_day(group, trial.day)
         place = [day, trial.capture] if group in FRESH else [day]
         if group not in self.varied:
             place = [0]
@@ -181,6 +181,12 @@ class Unknowns:
         """Return a small rotation about the part's middle, with a shift."""
         turn = Rotation.from_rotvec(rng.normal(0.0, np.radians(turn_deg), 3)).as_matrix()
         return Transform(turn, self.centre + rng.normal(0.0, shift_mm, 3) - turn @ self.centre)
+
+
+def seed_day(group: str, day: int) -> int:
+    """Return the day whose seed of a group a day has: some days of a statement keep that of the day before."""
+    keeps = STATEMENT_DAYS <= day < SET_DAYS and day % 4 == KEEPS_SEED.get(group)
+    return day - 1 if keeps else day
 
 
 Scaled = tuple[tuple[str, ...], NDArray[np.float64]]

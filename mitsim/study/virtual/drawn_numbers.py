@@ -1,0 +1,147 @@
+"""Return what the trials of a statement drew, as numbers on which their errors can be regressed.
+
+Signal chain: number of trials -> trials, of which some repeat a day -> numbers that each group of unknowns drew, and
+the seeds of groups that drew only a seed -> :func:`characterisation.statements.budget.budget`.
+
+Every draw is known: it follows from the trial alone (:mod:`mitsim.study.virtual.world`). The numbers are those behind
+the draw, of mean 0 and variance 1; of a decoder, its settings. Effects of calibration and pose are small, and linear in
+them. The errors may also depend on the squares of the numbers of finish, light and temperature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from characterisation.statements.budget import INTERACTION
+from mitsim.study import Study
+from mitsim.study.virtual.drawn_decoder import decoder_numbers, drawn_decoder
+from mitsim.study.virtual.drawn_finish import finish_numbers
+from mitsim.study.virtual.mapped import drawn_spread
+from mitsim.study.virtual.world import (
+    FRESH,
+    KEEPS_SEED,
+    STATEMENT_DAYS,
+    Trial,
+    Unknowns,
+    seed_day,
+)
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+#: days of a statement, then the trial that captures the first of them again
+_DAYS = 4
+
+#: groups whose numbers act through their squares, too
+_CURVED = ("finish", "light", "temperature")
+
+#: least eigenvalue of a correlation matrix, over the mean, whose direction counts as drawn
+_LEAST_EIGENVALUE = 1e-9
+
+
+def statement_trials(count: int) -> list[Trial]:
+    """Return the trials of a statement; fewer are the first of more.
+
+    After every four days, the first of them is captured again. This tells what differs between captures of a day.
+    """
+    places = (divmod(k, _DAYS + 1) for k in range(count))
+    return [
+        Trial(STATEMENT_DAYS + _DAYS * row + (place if place < _DAYS else 0), place // _DAYS) for row, place in places
+    ]
+
+
+def related(trials: Sequence[Trial]) -> Ints:
+    """Return numbers (n,) that are equal for trials that have draws in common."""
+    return np.array([trial.day // 2 for trial in trials], np.int64)
+
+
+def seeds(trials: Sequence[Trial], groups: Sequence[str]) -> dict[str, Ints]:
+    """Return, for each of the groups that draw only a seed, the day (n,) whose seed each trial has.
+
+    The last is ``interaction``, with the day itself: what the captures of a day have in common.
+    """
+    of_groups = {
+        group: np.array([seed_day(group, trial.day) for trial in trials]) for group in groups if group in KEEPS_SEED
+    }
+    return of_groups | {INTERACTION: np.array([trial.day for trial in trials])}
+
+
+def drawn_numbers(
+    study: Study, unknowns: Unknowns, source: str, trials: Sequence[Trial], groups: Sequence[str]
+) -> dict[str, Floats]:
+    """Return the numbers (n, p) that each of the groups drew in trials, and squares of some.
+
+    Parameters
+    ----------
+    study, unknowns
+        The study, and its unknowns prepared for drawing.
+    source
+        How trials are made: ``render`` or ``map``.
+    trials
+        The n trials.
+    groups
+        Groups of unknowns. Those that draw only a seed are not in the result.
+    """
+    out = {}
+    for group in groups:
+        if group in KEEPS_SEED or group == "noise":
+            continue
+        known: dict[Trial, Floats] = {}
+        for trial in trials:
+            one = trial if group in FRESH else Trial(trial.day)
+            if one not in known:
+                known[one] = _numbers(study, unknowns, source, group, one)
+        rows = np.array([known[trial if group in FRESH else Trial(trial.day)] for trial in trials])
+        if group == "decoder":
+            rows = _standardised(rows)
+        out[group] = np.hstack([rows, (rows**2 - 1) / np.sqrt(2)]) if group in _CURVED else rows
+    return out
+
+
+def _numbers(study: Study, unknowns: Unknowns, source: str, group: str, trial: Trial) -> Floats:
+    """Return the numbers (p,) that a group drew in a trial."""
+    stream, table = unknowns.stream(group, trial), unknowns.table
+    if group == "calibration":
+        values = np.linalg.eigvalsh(unknowns.calibration.correlation)
+        return stream.standard_normal(len(values))[values > _LEAST_EIGENVALUE]
+    if group == "temperature":
+        sizes = np.array([table.temperature.sensor_kelvin, table.temperature.part_kelvin])
+        return stream.standard_normal(2)[sizes > 0]
+    if group == "light":
+        light = table.light
+        sizes = np.array([light.illuminance * (light.room_factor - 1), light.power_relative, light.exposure_relative])
+        normal = stream.standard_normal(2)
+        return np.array([*normal, np.sqrt(3) * stream.uniform(-1, 1)])[sizes > 0]
+    if group == "pose":
+        pose = table.pose
+        sizes = np.repeat([pose.placement_deg, pose.placement_mm, pose.told_deg, pose.told_mm], 3)
+        return stream.standard_normal(12)[sizes > 0]
+    drawn = unknowns.draw(trial)
+    if group == "decoder":
+        return np.array(list(decoder_numbers(drawn_decoder(study.sensor, table.decoder, drawn.decoder)).values()))
+    if source == "map":
+        return drawn_spread(study, unknowns, drawn.finish)
+    scene = study.scene
+    ids = sorted({shape.bsdf().id() for shape, known in zip(scene.shapes, scene.finishes, strict=True) if known})
+    return np.array([value for one in ids for value in _finish(finish_numbers(unknowns, drawn.finish, one))])
+
+
+def _finish(numbers: Mapping[str, float]) -> list[float]:
+    """Return the numbers of a finish; a direction of the lay, which has no sign, is cosine and sine of its double."""
+    out = [value for name, value in numbers.items() if name != "lay_direction"]
+    if "lay_direction" in numbers:
+        double = 2 * np.pi * float(ndtr(numbers["lay_direction"]))
+        out += [np.sqrt(2) * np.cos(double), np.sqrt(2) * np.sin(double)]
+    return out
+
+
+def _standardised(rows: Floats) -> Floats:
+    """Return columns (n, p) with mean 0 and variance 1, without those that do not vary."""
+    rows = rows - rows.mean(axis=0)
+    size = rows.std(axis=0)
+    varying = size > 1e-9
+    return np.asarray(rows[:, varying] / size[varying])
