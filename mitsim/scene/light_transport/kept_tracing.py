@@ -80,22 +80,16 @@ class _Walk:
         def some(value: Any) -> Any:
             return dr.gather(type(value), value, index)
 
-        surfaces = [[some(one) for one in surface] for surface in self.surfaces]
         return _Walk(
-            *(
-                some(one)
-                for one in (
-                    self.lane,
-                    self.pixel,
-                    self.origin,
-                    self.direction,
-                    self.weight,
-                    self.ratio,
-                    self.length,
-                    self.code,
-                )
-            ),
-            surfaces,
+            lane=some(self.lane),
+            pixel=some(self.pixel),
+            origin=some(self.origin),
+            direction=some(self.direction),
+            weight=some(self.weight),
+            ratio=some(self.ratio),
+            length=some(self.length),
+            code=some(self.code),
+            surfaces=[[some(one) for one in surface] for surface in self.surfaces],
         )
 
 
@@ -158,13 +152,13 @@ def camera_paths(
     at_once = max(1, _AT_ONCE // max(1, len(pixels)))
     for first in range(0, tracing.samples, at_once):
         count = min(at_once, tracing.samples - first)
-        walk = _camera_start(one, index, first, count)
+        walk: _Walk | None = _camera_start(one, index, first, count)
         for number in range(1, tracing.depth + 1):
+            if walk is None:
+                break
             walk, record = _camera_step(one, walk, number)
             if record is not None:
                 yield record
-            if walk is None:
-                break
 
 
 def _camera_start(one: _Tracer, pixels: Any, first: int, count: int) -> _Walk:
@@ -267,13 +261,13 @@ def photon_paths(
     """Yield the records of photons that reach the region ``roi`` of a camera."""
     one = _Tracer(scene, rays, projector, pose, roi, tracing)
     for first in range(0, tracing.photons, _AT_ONCE):
-        walk = _photon_start(one, first, min(_AT_ONCE, tracing.photons - first))
+        walk: _Walk | None = _photon_start(one, first, min(_AT_ONCE, tracing.photons - first))
         for number in range(1, tracing.depth + 1):
+            if walk is None:
+                break
             walk, record = _photon_step(one, walk, number)
             if record is not None:
                 yield record
-            if walk is None:
-                break
 
 
 def _photon_start(one: _Tracer, first: int, count: int) -> _Walk:

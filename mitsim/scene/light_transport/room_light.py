@@ -104,7 +104,7 @@ def directional_albedo(bsdf: Any) -> NDArray[np.float64]:
 @cache
 def _points() -> NDArray[np.float64]:
     """Return points (n, 4) that fill the unit cube evenly, below 1 in single precision."""
-    return np.minimum(qmc.Sobol(4, seed=7).random(_SAMPLES), 1 - 2.0**-24)
+    return np.asarray(np.minimum(qmc.Sobol(4, seed=7).random(_SAMPLES), 1 - 2.0**-24))
 
 
 def _cosines() -> NDArray[np.float64]:
