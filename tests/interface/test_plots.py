@@ -194,7 +194,7 @@ def test_budgets_add_up_from_left_to_right():
     budget = stated().plot()[0, 1]
     bars = [(round(bar.get_y() + bar.get_height() / 2), bar.get_x(), bar.get_width()) for bar in budget.patches]
     of_distance = sorted((x, width) for y, x, width in bars if y == 0 and width > 0)
-    np.testing.assert_allclose(of_distance, [(0, 40), (40, 70)])  # the order of the groups, not of the shares
+    np.testing.assert_allclose(of_distance, [(0, 30), (30, 70)])  # the order of the groups, not of the shares
     np.testing.assert_allclose([(x, w) for y, x, w in bars if y == 1 and w > 0], [(0, 70)])
     (legend,) = budget.figure.legends
     assert texts(legend) == ["place and pose of the part", "noise and speckle"]

@@ -243,7 +243,18 @@ def statement_of(view):
         "settled": False,
         "repeatability": 0.1,
         "after_repeats": {"1": 0.25, "4": 0.231},
-        "budget": [line, line | {"group": "noise", "variance": 0.01, "share": 0.36, "settled": True, "fresh": True}],
+        "budget": [
+            line,
+            line
+            | {
+                "group": "noise",
+                "variance": 0.01,
+                "share": 0.36,
+                "share_interval": [0.25, 0.48],
+                "settled": True,
+                "fresh": True,
+            },
+        ],
         "tolerance": None,
         "share_of_tolerance": None,
         "verdict": "no tolerance",

@@ -121,8 +121,9 @@ def test_the_statement_is_told_first_with_its_budget_and_what_it_leaves_out(text
     assert "undecidable" in said and "More virtual measurements would still change" in said
     assert "200 of 200" in said and "3 to 12 points, at least 100 are required" in said
     widths = [float(width) for width in re.findall(r"width:([\d.]+)%", section)]
-    assert widths == pytest.approx([80.0, 20.0])  # shares 0.64 and 0.16 of a bar that holds 0.8
-    assert "0.20 mm" in cells and "64 %; 0.14 to 0.30" in cells
+    assert widths == pytest.approx([64.0, 36.0])
+    assert "too few trials 32 to 90 %" in " ".join(cells.split()) and section.count('class="open"') == 1
+    assert "0.10 mm" in cells and "36 %; 25 to 48 %" in cells
     assert re.search(r">dirt</th><td[^>]*>no</td>", section) and re.search(r">noise</th><td[^>]*>yes</td>", section)
 
 

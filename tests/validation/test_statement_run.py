@@ -95,13 +95,13 @@ def test_only_picks_cases_and_says_which_there_are(cases):
 
 def test_a_file_of_other_trials_is_not_taken_up(tmp_path):
     mine = TrialFolder(tmp_path / "mine", "a" * 16, ["one"])
-    mine.add(3, Trial(5, 1, "pose"), Outcome({"one": 0.25}))
+    mine.add(3, Trial(5, 1), Outcome({"one": 0.25}))
     mine.add(3, Trial(1 << 20), Outcome({"one": float("nan")}))
     write_trials(tmp_path / "case.nc", {"tool": mine}, [3])
     same, other = (TrialFolder(tmp_path / digest, digest * 16, ["one"]) for digest in ("a", "b"))
     assert take_up_trials(tmp_path / "case.nc", {"tool": same, "apart": other}) == {"tool": 2, "apart": 0}
     assert take_up_trials(tmp_path / "case.nc", {"tool": other}) == {"tool": 0}
-    assert same.known(3)[Trial(5, 1, "pose")].errors == {"one": 0.25}
+    assert same.known(3)[Trial(5, 1)].errors == {"one": 0.25}
     assert np.isnan(same.known(3)[Trial(1 << 20)].errors["one"])
 
 
