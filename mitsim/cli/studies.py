@@ -305,7 +305,7 @@ def score(
 def report(
     folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim study choose.")],
     pdf: Annotated[
-        bool, typer.Option("--pdf", help="Write one A4 sheet for a quotation or an inspection plan.")
+        bool, typer.Option("--pdf", help="Write a statement of uncertainty on one A4 sheet, to sign.")
     ] = False,
 ) -> None:
     """Rewrite the HTML page of a finished run or of a comparison of sensors.

@@ -148,7 +148,7 @@ def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[ResultRow]:
     return [
         RowValues(
             name=name,
-            about=measured_words("", asked.features),
+            about=measured_words(asked.kind, asked.features),
             unit=asked.unit,
             nominal=asked.nominal,
             tolerance=asked.tolerance,

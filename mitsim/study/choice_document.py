@@ -23,13 +23,14 @@ CHOICE = "choice.json"
 
 
 class ComparedMeasurement(PartialDocument):
-    """One measurement: its tolerance as in the task, and its decision rule in words."""
+    """One measurement: its kind and tolerance as in the task, and its decision rule in words."""
 
     unit: str
     nominal: float
     tolerance: float | tuple[float, float] | None
     rule: str
     features: list[str]
+    kind: str = ""
 
     @property
     def tolerance_size(self) -> float | None:

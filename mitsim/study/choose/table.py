@@ -62,6 +62,7 @@ def document(
             nominal=one.nominal,
             tolerance=one.tolerance,
             features=list(one.features),
+            kind=one.kind,
             rule="" if one.tolerance is None else WORDS[task.decision_of(name).rule],
         )
         for name, one in task.measurements.items()
