@@ -137,8 +137,9 @@ def results(
     customer: Annotated[str, typer.Option(help="For .xml: for whom.")] = "",
     serial: Annotated[str, typer.Option(help="For .xml: serial number of the sensor.")] = "",
 ) -> None:
-    """Write the expected uncertainty of every measurement as QIF 3.0 or CSV or JSON, which also have the plan of views, or
-    as a digital calibration certificate (.xml).
+    """Write the expected uncertainty of every measurement as QIF 3.0, CSV or JSON, or as DCC (.xml).
+
+    QIF and JSON also have the plan of views. DCC is the digital calibration certificate of PTB.
 
     Example: mitsim export results runs/two_pillars -o two_pillars.qif
     """

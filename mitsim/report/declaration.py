@@ -1,7 +1,7 @@
 """Collect what an auditor reads beside the results of a statement: the declaration of ISO/TS 15530-4.
 
-Signal chain: folder of a run, or of a comparison of sensors -> part, sensor, pose, calibration, exposures, decision rule,
-influences that are varied, fixed or left out, versions and digests -> texts for the sheet (:mod:`mitsim.report.sheet`).
+Signal chain: folder of a run, or of a comparison of sensors -> part, sensor, pose, calibration, exposures, decision
+rule, influences that are varied, fixed or left out, versions and digests -> texts for :mod:`mitsim.report.sheet`.
 The numbers of a measurement are those that JCGM 101:2008, 5.5 asks to report: estimate of the error, standard
 uncertainty u, 95 % interval, number of trials; and U and k = U / u of JCGM 100:2008, 7.2.
 """
@@ -9,7 +9,6 @@ uncertainty u, 95 % interval, number of trials; and U and k = U / u of JCGM 100:
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -163,8 +162,8 @@ def _notes(document: StatementDocument | None) -> list[str]:
         return []
     notes = [
         "Error = measured − true; bias = mean error over the virtual measurements, not subtracted; u = standard "
-        "uncertainty, standard deviation about the bias; U = half the 95 % interval of the error; k = U / u; N = number "
-        "of virtual measurements. If y is read, the true value lies between y − (upper end) and y − (lower end)."
+        "uncertainty, standard deviation about the bias; U = half the 95 % interval of the error; k = U / u; N = "
+        "number of virtual measurements. If y is read, the true value lies between y − (upper end) and y − (lower end)."
     ]
     by_part = {
         AT_THE_LIMIT: "for a part at the limit of its tolerance",
@@ -219,7 +218,7 @@ def _influences(document: StatementDocument, lay_left_out: bool) -> list[tuple[s
     }
     out = [("Varied", ", ".join(_names(varied))), ("with sizes of", unknowns_in_words(drawn))]
     out += [("Fixed", ", ".join(_names(fixed)))] if fixed else []
-    return out + [("Left out", ", ".join(missing))]
+    return [*out, ("Left out", ", ".join(missing))]
 
 
 def _names(influences: Sequence[InfluenceEntry]) -> list[str]:
@@ -274,4 +273,4 @@ def _digest(path: Path) -> str:
 
 def _day(path: Path) -> str:
     """Return the day on which a file was written, for folders of older versions, whose files do not say it."""
-    return datetime.fromtimestamp(os.stat(path).st_mtime, UTC).date().isoformat()
+    return datetime.fromtimestamp(path.stat().st_mtime, UTC).date().isoformat()

@@ -1,8 +1,8 @@
 """Write ``sheet.pdf``, a statement of measurement uncertainty on one A4 sheet, ready to sign.
 
-Signal chain: folder of a run or of a comparison of sensors -> declaration (:mod:`mitsim.report.declaration`) and picture
-of the part in the colours of its verdicts -> pages of PDF by matplotlib, which needs no browser. A task whose rows do not
-fit on one page continues on the next.
+Signal chain: folder of a run or of a comparison of sensors -> declaration (:mod:`mitsim.report.declaration`) and
+picture of the part in the colours of its verdicts -> pages of PDF by matplotlib, which needs no browser. A task whose
+rows do not fit on one page continues on the next.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from characterisation.files.atomic_io import atomic_write
 from characterisation.plots.style import INK, MUTED, drawing
-from mitsim.report.declaration import DeclaredRow, Declaration, read_declaration
+from mitsim.report.declaration import Declaration, DeclaredRow, read_declaration
 from mitsim.report.first_screen import Tone
 from mitsim.report.placement_figure import draw_placement
 from mitsim.report.sheet_layout import ACROSS, HEIGHT, LINE, MARGIN, Columns, Page, text_width, wrapped
@@ -72,10 +72,9 @@ def write_sheet(folder: str | Path) -> Path:
     geometry = read_scene_geometry(folder)
     declaration = read_declaration(folder, geometry)
     out = BytesIO()
-    with drawing():
-        with PdfPages(out, metadata={"Title": declaration.title, "CreationDate": None}) as pages:
-            for figure in sheet_figures(declaration, geometry):
-                pages.savefig(figure, facecolor="white")
+    with drawing(), PdfPages(out, metadata={"Title": declaration.title, "CreationDate": None}) as pages:
+        for figure in sheet_figures(declaration, geometry):
+            pages.savefig(figure, facecolor="white")
     path = folder / "sheet.pdf"
     with atomic_write(path) as file:
         file.write_bytes(out.getvalue())
@@ -240,9 +239,7 @@ def _sign(page: Page) -> None:
 
 def _foot(page: Page, declaration: Declaration, number: int, of: int) -> None:
     page.place = MARGIN
-    words = (
-        "Simulated: no real sensor has measured this part. The verdicts are about the measurement, not about a part."
-    )
+    words = "Simulated: no real sensor has measured this part. Verdicts are about the measurement, not about a part."
     page.put(0, words, _SMALL, MUTED)
     right = f"Page {number} of {of}"
     page.put(ACROSS - text_width(right, _SMALL), right, _SMALL, MUTED)

@@ -1,7 +1,7 @@
 """Set text on an A4 page by its measured width: wrapped lines, and a table whose columns never overlap.
 
-Signal chain: text, size, weight -> width [in] by the renderer's own font metrics -> lines that fit, or columns as wide as
-their widest cell, set smaller until the table fits -> texts on a figure.
+Signal chain: text, size, weight -> width [in] by the renderer's own font metrics -> lines that fit, or columns as
+wide as their widest cell, set smaller until the table fits -> texts on a figure.
 """
 
 from __future__ import annotations
@@ -114,8 +114,8 @@ class Page:
 class Columns:
     """Columns of a table as wide as their widest cell, at the largest size of text at which they fit a page.
 
-    ``lefts`` [in] from the margin, ``widths`` [in], ``size`` [pt]. Cells of the first column wrap if they are wider than
-    ``first`` [in] and the others leave no more.
+    ``lefts`` [in] from the margin, ``widths`` [in], ``size`` [pt]. Cells of the first column wrap if they are wider
+    than ``first`` [in] and the others leave no more.
     """
 
     def __init__(self, rows: Sequence[Sequence[str]], heads: Sequence[Sequence[str]], first: float = 1.3) -> None:

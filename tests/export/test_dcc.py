@@ -1,11 +1,11 @@
-"""The digital calibration certificate: its elements in PTB's order, numbers in D-SI's form, the statement's own numbers."""
+"""The digital calibration certificate: elements in PTB's order, numbers in D-SI's form and those of the statement."""
 
 import re
 
 import pytest
-from export.test_results import FOLDER, every_kind  # noqa: F401
 
 from characterisation.files.errors import InputError
+from export.test_results import FOLDER, every_kind  # noqa: F401
 from mitsim.report.declaration import Declaration
 from mitsim.report.export.dcc import DCC, SI, Issuer, write_dcc
 from mitsim.report.first_screen import FirstScreen
@@ -19,12 +19,12 @@ SCHEMA = FOLDER / "dcc" / "dcc.xsd"
 
 ISSUER = Issuer("Laboratory & co", "GB", "A. Person", "Customer", "SN 12")
 
-#: children that DCC 3.2.0 and D-SI 2.1.0 allow in elements that mitsim writes, in their order; ``?`` may be absent, ``+``
-#: may repeat, ``#`` holds text
+#: children that DCC 3.2.0 and D-SI 2.1.0 allow in elements that mitsim writes, in their order: ``?`` may be absent,
+#: ``+`` and ``*`` repeat
 GRAMMAR = {
     "digitalCalibrationCertificate": "administrativeData measurementResults",
-    "coreData": "countryCodeISO3166_1 usedLangCodeISO639_1+ mandatoryLangCodeISO639_1+ uniqueIdentifier identifications? "
-    "beginPerformanceDate endPerformanceDate performanceLocation",
+    "coreData": "countryCodeISO3166_1 usedLangCodeISO639_1+ mandatoryLangCodeISO639_1+ uniqueIdentifier "
+    "identifications? beginPerformanceDate endPerformanceDate performanceLocation",
     "dccSoftware": "software+",
     "usedSoftware": "software+",
     "software": "name release",

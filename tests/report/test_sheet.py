@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import zlib
 
 import numpy as np
 import pytest

@@ -1,7 +1,7 @@
-"""Write the statement of a run as a digital calibration certificate (DCC 3.2.0 of PTB, units and numbers after D-SI 2.1.0).
+"""Write the statement of a run as a digital calibration certificate: DCC 3.2.0 of PTB, numbers after D-SI 2.1.0.
 
-Signal chain: results of a run, who issues them -> administrative data, then for each measurement its nominal value, error
-with u and 95 % interval, expected reading with U and k, number of virtual measurements, verdict -> one XML document.
+Signal chain: results of a run, who issues them -> administrative data, then for each measurement its nominal value,
+error with u and 95 % interval, expected reading with U and k, number of virtual measurements, verdict -> one XML document.
 
 The elements are those of PTB's schema (https://ptb.de/dcc/v3.2.0/dcc.xsd), which is LGPL-3.0 and no part of mitsim. The
 document calls itself simulated and not traceable: it is the statement of a virtual experiment in the form that programs
@@ -30,15 +30,15 @@ _XSI = "http://www.w3.org/2001/XMLSchema-instance"
 _UNITS = {"mm": r"\milli\metre", "deg": r"\degree"}
 
 _NOT_TRACEABLE = (
-    "Simulated: no real sensor has measured a part. The results are those of virtual measurements, and valid for the sensor, "
-    "pose, part and influences stated here. They are no calibration."
+    "Simulated: no real sensor has measured a part. The results are those of virtual measurements, and valid for the "
+    "sensor, pose, part and influences stated here. They are no calibration."
 )
 
 
 @dataclass(frozen=True)
 class Issuer:
-    """Who issues a certificate: ``laboratory``, its ``country`` (ISO 3166-1, two capital letters), ``responsible`` person,
-    ``customer``, and the ``serial`` number of the sensor.
+    """Who issues a certificate: ``laboratory``, its ``country`` (ISO 3166-1, two capital letters), ``responsible``
+    person, ``customer``, and the ``serial`` number of the sensor.
     """
 
     laboratory: str

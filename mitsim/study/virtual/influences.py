@@ -15,8 +15,8 @@ from mitsim.sensor.unknowns import UnknownsTable
 class Influence:
     """One influence: its ``name``, whether it is ``included``, and ``how``, or how to include or reduce it.
 
-    An influence that is not included is fixed at its nominal value if mitsim could vary it (``simulated``), and left out
-    otherwise.
+    An influence that is not included is fixed at its nominal value if mitsim could vary it (``simulated``), and left
+    out otherwise.
     """
 
     name: str
