@@ -298,7 +298,7 @@ def score(
     session.claim("score")
     scores, *_ = score_study(session)
     for name in measurement or chosen.task.measurements:
-        print(best_views(scores, name, top))
+        print(best_views(scores, name, top, chosen.task.shapes_for(name)))
     say(f"scores: {output / 'scores.csv'}\nposes: {output / 'poses'}")
 
 

@@ -255,9 +255,13 @@ def _others(choice: ChoiceDocument, best: SensorEntry) -> list[tuple[str, str]]:
     for one in choice.sensors:
         if one is best or one.status == "excluded":
             continue
-        how = "" if one.status == "stated" else ", screened only"
-        fits = f"fits {one.fits} of {asked}" if asked and one.status == "stated" else one.possible_in_words
-        words.append(f"{one.name} ({fits or 'possible'}{how})")
+        by = "" if one.status == "stated" else ", by screening alone"
+        fits = (
+            f"fits {one.fits} of {asked}"
+            if one.status == "stated"
+            else f"{one.expected_fits} of {asked} expected to fit"
+        )
+        words.append(f"{one.name} ({fits if asked else one.possible_in_words or 'all possible'}{by})")
     return [("Also compared", ", ".join(words))] if words else []
 
 

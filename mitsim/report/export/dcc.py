@@ -1,7 +1,7 @@
 """Write the statement of a run as a digital calibration certificate: DCC 3.2.0 of PTB, numbers after D-SI 2.1.0.
 
 Signal chain: results of a run, who issues them -> administrative data, then for each measurement its nominal value,
-error with u and 95 % interval, expected reading with U and k, number of virtual measurements, verdict -> one XML document.
+error with u and 95 % interval, expected reading with U and k, number of virtual measurements, verdict -> one document.
 
 The elements are those of PTB's schema (https://ptb.de/dcc/v3.2.0/dcc.xsd), which is LGPL-3.0 and no part of mitsim. The
 document calls itself simulated and not traceable: it is the statement of a virtual experiment in the form that programs
