@@ -349,7 +349,7 @@ def _size(sizes: list[float], sensor: Sensor) -> Iterator[SceneFinding]:
 def _task(facts: SceneFacts, task: TaskFeatures) -> Iterator[SceneFinding]:
     names = [shape.name for shape in facts.shapes]
     if not task.measurements:
-        yield SceneFinding("note", "task", "it has no measurements yet", "Add a [measurements.NAME] before a study")
+        yield SceneFinding("note", "task", "it has no measurements yet", "Add a measurement before a study")
     for name, feature in task.features.items():
         if not feature.shaped:
             continue  # it is derived from others
@@ -369,7 +369,7 @@ def _nominal(shape: ShapeFacts, feature: Feature) -> Iterator[SceneFinding]:
     if worst > NOMINAL_MM:
         severity: Severity = "error" if worst > MISTAKE_MM else "warning"
         what = f"the shape is up to {worst:.3g} mm off the nominal {feature.kind} of the task"
-        advice = "All errors would be measured from there: correct point_mm, direction or radius_mm"
+        advice = "All errors would be measured from there: correct its position, direction or radius"
         yield SceneFinding(severity, shape.name, what, advice)
     elif shape.mesh is not None:
         middles = shape.mesh.vertices[shape.mesh.triangles].mean(axis=1)
