@@ -76,7 +76,8 @@ def check(
 
         check_file(output)
         first = list(checked.task.features) if checked.task else []
-        write_png(preview_figure(checked.scene, facts, chosen, pose, visible, first), output)
+        measured = checked.task.measured_shapes() if checked.task else ()
+        write_png(preview_figure(checked.scene, facts, chosen, pose, visible, first, measured), output)
         say(f"picture: {output}")
     if html:
         from mitsim.report.author_page import author_page

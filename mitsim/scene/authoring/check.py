@@ -85,6 +85,13 @@ class TaskFeatures(Document):
     measurements: dict[str, Measurement] = Field(default_factory=dict)
     decision: Decision = Decision()
 
+    def measured_shapes(self) -> tuple[str, ...]:
+        """Return the names of the shapes of the scene that measurements depend on, each once."""
+        named = [self.features[name] for one in self.measurements.values() for name in one.features]
+        of = (parent for feature in named for parent in feature.of or ())
+        all_names = [*(name for one in self.measurements.values() for name in one.features), *of]
+        return tuple(dict.fromkeys(name for name in all_names if self.features[name].shaped))
+
 
 def read_features(path: str | Path) -> TaskFeatures:
     """Read a task, with or without measurements.
