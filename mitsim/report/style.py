@@ -82,7 +82,9 @@ def write_png(figure: Figure, path: Path, dpi: int = _DPI, colours: int | None =
     if colours is not None:
         full = Image.open(picture).convert("RGB")
         picture = io.BytesIO()
-        full.quantize(colours, dither=Image.Dither.NONE).save(picture, format="png", optimize=True)
+        full.quantize(colours, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+            picture, format="png", optimize=True
+        )
     with atomic_write(path) as file:  # Pillow, given the file itself, would report "encoder error" on a full disk
         file.write_bytes(picture.getvalue())
     return path

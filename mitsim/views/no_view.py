@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from mitsim.running.numbers import listed
 from mitsim.views.view_scores import OCCLUDED
 
 #: share of the points in matt white below which the finish is a cause of their loss
@@ -33,8 +34,9 @@ def why_no_view(scores: xr.Dataset, measurement: str, shapes: Sequence[str]) -> 
     here = scores.sel(measurement=measurement)
     if here["uncertainty_possible"].values.any():
         return ""
+    shapes = list(shapes)
     needed = float(scores.attrs["minimum_points"])
-    points = scores["n"].sel(feature=list(shapes)).transpose("view", "feature").values
+    points = scores["n"].sel(feature=shapes).transpose("view", "feature").values
     most = points.max(axis=0)
     if (most < needed).any():
         short = [
@@ -49,13 +51,17 @@ def why_no_view(scores: xr.Dataset, measurement: str, shapes: Sequence[str]) -> 
         least = int(points[best].argmin())
         number = int(scores["view"].values[best])
         return (
-            f"no view shows {' and '.join(shapes)} together: from view {number}, the best, {shapes[least]} has "
+            f"no view shows {listed(shapes)} together: from view {number}, the best, {shapes[least]} has "
             f"{points[best].min():.0f} points of {needed:.0f}"
         )
     if np.isfinite(here["predicted_uncertainty"].values).any():
         chance = float(np.nanmax(here["chance"].values))
-        return f"enough points of {' and '.join(shapes)} are too rare: at most in {100 * chance:.0f} % of the captures"
-    return f"the points of {' and '.join(shapes)} that a view shows do not determine it"
+        rarest = int(points[best].argmin())
+        return (
+            f"enough points are too rare, at most in {100 * chance:.0f} % of the captures: from the best view "
+            f"{shapes[rarest]} has {points[best].min():.0f} on average, {needed:.0f} are needed"
+        )
+    return f"the points of {listed(shapes)} that a view shows do not determine it"
 
 
 def _cause(scores: xr.Dataset, name: str, points: NDArray[np.float64], needed: float) -> str:

@@ -109,7 +109,10 @@ def test_the_ends_of_a_slot_are_no_fillets(tmp_path):
         slot = BRepAlgoAPI_Fuse(slot, solid("Cylinder", 4.0, 12.0, at=(x, 0, -1))).Shape()
     plate = BRepAlgoAPI_Cut(BRepPrimAPI_MakeBox(gp_Pnt(-30, -12, 0), gp_Pnt(30, 12, 10)).Shape(), slot).Shape()
     faces = with_names(read_step(write_step([("plate", plate, None)], tmp_path / "plate.step")).faces)
-    assert sorted(face.name for face in faces if face.kind == "cylinder") == ["slot_end_r4mm_left", "slot_end_r4mm_right"]
+    assert sorted(face.name for face in faces if face.kind == "cylinder") == [
+        "slot_end_r4mm_left",
+        "slot_end_r4mm_right",
+    ]
 
 
 def test_a_bore_in_two_halves_is_one_face(tmp_path):

@@ -43,7 +43,7 @@ def scores_of(n, white=1000.0, alone=1000.0, u=np.nan, chance=0.0):
         (scores_of([[40, 900], [59, 900]], white=70.0), "pin has at most 59 points of 100 from any view: other faces"),
         (scores_of([[40, 900], [59, 900]]), "pin has at most 59 points of 100 from any view: its finish returns"),
         (scores_of([[10, 900], [900, 20]]), "no view shows pin and plate together: from view 8, the best, plate has"),
-        (scores_of([[200, 900], [200, 200]], u=0.1, chance=0.3), "enough points of pin and plate are too rare: at most in"),
+        (scores_of([[200, 900], [200, 200]], u=0.1, chance=0.3), "enough points are too rare, at most in 30 % of"),
         (scores_of([[200, 900], [200, 200]]), "the points of pin and plate that a view shows do not determine it"),
     ],
 )  # fmt: skip
