@@ -29,8 +29,18 @@ _HEAD = (
 def best_views(scores: xr.Dataset, measurement: str, count: int, shapes: Sequence[str]) -> str:
     """Return the ``count`` best views by predicted risk as text; angles in deg, lengths in mm.
 
-    ``shapes`` are those that the measurement depends on. If no view can make it, the text says why. It ends with an
-    empty line.
+    If no view can make the measurement, the text says why. It ends with an empty line.
+
+    Parameters
+    ----------
+    scores
+        Scores of all views.
+    measurement
+        Name of the measurement.
+    count
+        Largest number of views.
+    shapes
+        Names of the shapes that the measurement depends on.
     """
     measured = scores.sel(measurement=measurement)
     unit, tolerance = str(measured["unit"].values), float(measured["tolerance"].values)

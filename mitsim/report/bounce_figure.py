@@ -43,7 +43,16 @@ def bounced_light(
 ) -> LightFromFaces:
     """Estimate the light of a view by face, in the part of the image that shows the part.
 
-    ``visible`` are the surfaces that the reference camera sees from ``pose``, world_from_sensor.
+    Parameters
+    ----------
+    scene, sensor
+        The scene, and the sensor.
+    pose
+        world_from_sensor.
+    visible
+        Surfaces that the reference camera sees from there.
+    seed
+        Of the light paths.
     """
     rows, columns = np.nonzero(visible.shape >= 0)
     camera = sensor.rig.reference

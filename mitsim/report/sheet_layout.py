@@ -49,6 +49,15 @@ def wrapped(text: str, size: float, across: float, weight: str = "normal") -> li
     """Return the lines of a text that are at most ``across`` [in] wide.
 
     A line breaks at a space, or after an underscore or a slash; a longer word breaks where it must.
+
+    Parameters
+    ----------
+    text
+        The text.
+    size, weight
+        Size [pt] and weight of the font.
+    across
+        Largest width of a line [in].
     """
     lines, line = list[str](), ""
     for word in text.split(" "):
@@ -86,7 +95,17 @@ class Page:
         self.place = HEIGHT - MARGIN
 
     def put(self, left: float, text: str, size: float = 8.0, colour: str = INK, weight: str = "normal") -> None:
-        """Write one line, its top at ``place`` and ``left`` [in] from the margin."""
+        """Write one line, its top at ``place``.
+
+        Parameters
+        ----------
+        left
+            Distance from the margin [in].
+        text
+            The line.
+        size, colour, weight
+            Of the font; the size in pt.
+        """
         x, y = (MARGIN + left) / WIDTH, self.place / HEIGHT
         self.figure.text(x, y, text, fontsize=size, color=colour, fontweight=weight, va="top")
 
@@ -99,7 +118,17 @@ class Page:
         left: float = 0.0,
         across: float = ACROSS,
     ) -> None:
-        """Write wrapped lines, and move down by each."""
+        """Write wrapped lines, and move down by each.
+
+        Parameters
+        ----------
+        text
+            The text.
+        size, colour, weight
+            Of the font; the size in pt.
+        left, across
+            Distance from the margin, and largest width of a line [in].
+        """
         for line in wrapped(text, size, across, weight):
             self.put(left, line, size, colour, weight)
             self.place -= size * LINE

@@ -74,7 +74,17 @@ def _lay_out(figure: Figure) -> None:
 
 
 def write_png(figure: Figure, path: Path, dpi: int = _DPI, colours: int | None = None) -> Path:
-    """Write a figure atomically as PNG on white; ``colours`` of a palette halve the size of a noisy image."""
+    """Write a figure atomically as PNG on white.
+
+    Parameters
+    ----------
+    figure, path
+        The figure, and the file to write.
+    dpi
+        Pixels per inch of the figure.
+    colours
+        Number of colours of a palette, which halves the size of a noisy image; None for all colours.
+    """
     picture = io.BytesIO()
     with drawing():
         FigureCanvasAgg(figure)

@@ -58,7 +58,17 @@ class Issuer:
 
 
 def write_dcc(found: RunResults, declared: Declaration, issuer: Issuer, path: str | Path) -> None:
-    """Write results as one DCC document."""
+    """Write results as one DCC document.
+
+    Parameters
+    ----------
+    found, declared
+        Results of a run, and their declaration.
+    issuer
+        Who issues the certificate.
+    path
+        File to write.
+    """
     register_namespace("dcc", DCC)
     register_namespace("si", SI)
     register_namespace("xsi", _XSI)
