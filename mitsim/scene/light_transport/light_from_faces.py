@@ -48,7 +48,7 @@ class LightFromFaces:
         """Return the share of interreflected light (H, W), 0 to 1; NaN where no light arrives."""
         other = self.by_face.sum(axis=0)
         whole = self.direct + other
-        return np.divide(other, whole, out=np.full(whole.shape, np.nan), where=whole > 0)
+        return np.asarray(np.divide(other, whole, out=np.full(whole.shape, np.nan), where=whole > 0))
 
     def shares_of(self, shape: int) -> Floats:
         """Return the shares (shapes,) of the light of one shape that met each shape before; NaN if it has no light."""
