@@ -233,12 +233,13 @@ def _window_around(cloud: PointCloud) -> tuple[slice, slice]:
 
 
 def _brightest(capture: Capture) -> NDArray[np.float64]:
-    """Return the reference camera's image of the largest mean; for time of flight, the mean size of its differences.
+    """Return the reference camera's image of the largest mean; for time of flight, the spread of its images.
 
-    A single difference of time of flight is 0 at the distances where its correlation changes sign.
+    An image of time of flight is a correlation about a zero level, and vanishes at some distances. Its spread over the
+    phase steps is in proportion to the light.
     """
     stack = next(iter(capture.images.values()))
     if capture.technology == "time_of_flight":
-        return np.asarray(np.abs(stack.astype(float)).mean(axis=0))
+        return np.asarray(stack.astype(float).std(axis=0))
     step = max(1, len(stack) // 12)
     return np.asarray(max(stack[::step], key=lambda image: float(image.mean())), float)
