@@ -14,6 +14,9 @@ from mitsim.cli.options import definitions
 #: settings of an imported capture that the user should check
 SETTINGS_TO_CHECK = (
     "image_set",
+    "topic",
+    "stamp_s",
+    "frame_id",
     "unit_of_file",
     "axes_of_file",
     "fitted_camera_rms_px",
@@ -48,13 +51,19 @@ def import_(
         str | None,
         typer.Option(
             "--as",
-            help="Kind of recording: ensenso, depthai, robi, stereo-pair, images, depth, ply or pcd; "
+            help="Kind of recording: ensenso, depthai, ros, robi, stereo-pair, images, depth, ply or pcd; "
             "default: detected.",
         ),
     ] = None,
     camera: Annotated[str | None, typer.Option(help="For a depth image or cloud: the name of its camera.")] = None,
     frame: Annotated[
         str | None, typer.Option(help="Image set, pair or frame to import: its number, from 0, or its name.")
+    ] = None,
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="For a bag of ROS: the topic of depth images or of clouds; twice for the left and the right images."
+        ),
     ] = None,
     images: Annotated[
         list[str] | None,
@@ -124,6 +133,7 @@ def import_(
         axes=axes,
         link=None if link is None else str(link),
         subpixel_bits=subpixel_bits,
+        topic=tuple(topic) if topic else None,
         images=_patterns(images),
         channel=channel,
         exposure_s=exposure,

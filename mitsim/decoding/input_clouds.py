@@ -17,7 +17,7 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.capture.recordings.organised_cloud import read_organised_cloud, read_stored_cloud
-from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+from mitsim.capture.recordings.recognise import ReadOptions, read_recording, unorganised_cloud
 from mitsim.decoding.cloud import Settings, decoder_settings
 from mitsim.decoding.coded_images import decoded_once
 from mitsim.decoding.plain_clouds import is_array_or_text, plain_cloud, read_plain_cloud
@@ -67,11 +67,19 @@ def cloud_paths(paths: Iterable[Path]) -> list[Path]:
     return out
 
 
-def read_cloud(path: Path, sensor: str | None = None, reference: bool = False) -> InputCloud:
+def read_cloud(
+    path: Path,
+    sensor: str | None = None,
+    reference: bool = False,
+    *,
+    topic: tuple[str, ...] | None = None,
+    frame: str | None = None,
+) -> InputCloud:
     """Read a cloud file, or decode a capture folder or recording.
 
     ``sensor`` is the preset or sensor file whose settings decode it; by default, those of the capture. The points of a
-    ``reference`` may lie anywhere; those of another cloud with a grid lie on the view rays of its camera.
+    ``reference`` may lie anywhere; those of another cloud with a grid lie on the view rays of its camera. ``topic`` and
+    ``frame`` choose a message of a recording, as ``mitsim import`` does.
 
     Raises
     ------
@@ -95,7 +103,11 @@ def read_cloud(path: Path, sensor: str | None = None, reference: bool = False) -
                 raise
             return _plain(path, *plain_cloud(stored.points, path))
     elif path.exists():
-        capture = read_recording(path, ReadOptions()).capture
+        options = ReadOptions(topic=topic, frame=frame)
+        plain = unorganised_cloud(path, options)
+        if plain is not None:
+            return _plain(path, *plain_cloud(plain, path))
+        capture = read_recording(path, options).capture
     else:
         raise InputError(
             path,

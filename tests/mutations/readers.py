@@ -513,6 +513,27 @@ def _recording(name):
     return make
 
 
+def _bag(form, compression=None):
+    def make(folder):
+        sys.path.insert(0, str(ROOT / "tests" / "recordings"))
+        from ros_bags import ROS1, ROS2, cloud, depth_messages, points_m, write_bag
+
+        store = ROS1 if form == "bag" else ROS2
+        messages = [*depth_messages(store), ("/points", cloud(store, points_m()))]
+        path = write_bag(folder / ("b.bag" if form == "bag" else "b"), messages, form, compression)
+        return path.rename(folder / f"recording.{form}")
+
+    return make
+
+
+def _read_bag(path):
+    """Both topics, of which one may be damaged alone."""
+    from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+
+    read_recording(path, ReadOptions(topic=("/points",), frame="0"))
+    read_recording(path, ReadOptions(topic=("/camera/depth/image_rect_raw",), frame="0"))
+
+
 def _read_recording(path):
     from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 
@@ -549,6 +570,10 @@ READERS: dict[str, Reader] = {
         name: Reader(_recording(name), _read_recording)
         for name in ("ascii.pcd", "compressed.pcd", "recording.zip", "calib.json")
     },
+    "recording.bag": Reader(_bag("bag"), _read_bag),
+    "packed.bag": Reader(_bag("bag", "LZ4"), _read_bag),
+    "recording.db3": Reader(_bag("db3"), _read_bag),
+    "recording.mcap": Reader(_bag("mcap"), _read_bag),
     "cloud.ply": Reader(_cloud, _read_cloud),
     "foreign.ply": Reader(_foreign, _decode_foreign),
     "image.png": Reader(_image, _read_image),

@@ -30,6 +30,7 @@ from mitsim.capture.recordings.json_fields import parsed_json
 from mitsim.capture.recordings.nxlib_calibration import nxlib_rig
 from mitsim.capture.recordings.nxlib_tree import NxLibTree
 from mitsim.sensor.calibration_qualifiers import check_camera
+from mitsim.sensor.calibration_tree import tree_of
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.opencv_calibration import CalibrationTable, has_pair, with_calibration
 from mitsim.sensor.preset import load_sensor, presets
@@ -113,6 +114,36 @@ def _read(source: str | Path, size: tuple[int, int] | None) -> Calibrated:
     if isinstance(table, dict) and "fx" in table:
         return _of_pinhole(path, table)
     return _of_opencv(path, size)
+
+
+def calibrated_by(tables: dict[str, dict[str, Any]], where: Path, size: tuple[int, int] | None) -> Calibrated:
+    """Return the cameras of ROS's ``camera_info`` messages, by topic: one camera, or the left and the right of a pair.
+
+    Parameters
+    ----------
+    tables
+        The fields of each message by name, in the order of the cameras.
+    where
+        The recording, for messages.
+    size
+        (width, height) [px] of the images.
+
+    Raises
+    ------
+    InputError
+        If values are missing, or cannot belong to the images.
+
+    See Also
+    --------
+    read_calibration : of a file
+    """
+    cameras = ["camera"] if len(tables) == 1 else ["left", "right"]
+    asked = {"file": list(tables), "projector": False, "cameras": cameras}
+    table, notes = with_calibration(where, {"calibration": asked}, size, tree_of(tables))
+    rig = Rig({name: each.camera() for name, each in validate(where, table, RigFile).cameras.items()})
+    for name, camera in rig.cameras.items():
+        check_camera(camera, where, f"cameras.{name}")
+    return Calibrated(rig, "", notes=tuple(notes))
 
 
 def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], where: str | Path) -> Camera:
