@@ -17,6 +17,7 @@ SETTINGS_TO_CHECK = (
     "topic",
     "stamp_s",
     "frame_id",
+    "grid_from",
     "unit_of_file",
     "axes_of_file",
     "fitted_camera_rms_px",
@@ -51,7 +52,7 @@ def import_(
         str | None,
         typer.Option(
             "--as",
-            help="Kind of recording: ensenso, depthai, ros, robi, stereo-pair, images, depth, ply or pcd; "
+            help="Kind of recording: ensenso, depthai, ros, robi, stereo-pair, images, depth, ply, pcd, zdf or npy; "
             "default: detected.",
         ),
     ] = None,

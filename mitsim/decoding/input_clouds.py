@@ -8,7 +8,7 @@ capture if there is one.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from characterisation import cloud_files
@@ -17,7 +17,7 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.capture.recordings.organised_cloud import read_organised_cloud, read_stored_cloud
-from mitsim.capture.recordings.recognise import ReadOptions, read_recording, unorganised_cloud
+from mitsim.capture.recordings.recognise import KINDS, ReadOptions, kind_of, read_recording, unorganised_cloud
 from mitsim.decoding.cloud import Settings, decoder_settings
 from mitsim.decoding.coded_images import decoded_once
 from mitsim.decoding.plain_clouds import is_array_or_text, plain_cloud, read_plain_cloud
@@ -25,7 +25,7 @@ from mitsim.running.progress import say
 from mitsim.sensor.matcher import MatcherSettings
 
 #: suffixes of cloud files that are found in a folder
-_SUFFIXES = (".ply", ".pcd")
+_SUFFIXES = (".ply", ".pcd", ".zdf")
 
 #: text that identifies a cloud file of ``mitsim decode``, and the length of the header in which it stands [bytes]
 _MARK, _HEAD = b"\ncomment mitsim ", 4096
@@ -103,7 +103,9 @@ def read_cloud(
                 raise
             return _plain(path, *plain_cloud(stored.points, path))
     elif path.exists():
-        options = ReadOptions(topic=topic, frame=frame)
+        options = ReadOptions(topic=topic, frame=frame, sensor=sensor)
+        if "sensor" not in KINDS[kind_of(path, options)].options:
+            options = replace(options, sensor=None)
         plain = unorganised_cloud(path, options)
         if plain is not None:
             return _plain(path, *plain_cloud(plain, path))

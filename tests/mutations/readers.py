@@ -526,6 +526,47 @@ def _bag(form, compression=None):
     return make
 
 
+def _zdf(folder):
+    sys.path.insert(0, str(ROOT / "tests" / "recordings"))
+    from test_grids_and_lenses import CAMERA, LENS, bent_cloud, zdf
+
+    return zdf(folder / "a.zdf", bent_cloud(), camera_matrix=CAMERA.matrix, distortion=LENS)
+
+
+def _gridless(folder):
+    sys.path.insert(0, str(ROOT / "tests" / "recordings"))
+    from cloud_files_of_others import ply
+    from test_grids_and_lenses import bent_cloud
+
+    path = folder / "gridless.ply"
+    path.write_bytes(ply(bent_cloud(), grid="none"))
+    return path
+
+
+def _array(channels):
+    def make(folder):
+        sys.path.insert(0, str(ROOT / "tests" / "recordings"))
+        from cloud_files_of_others import pinhole_cloud
+
+        cloud = pinhole_cloud()
+        np.save(folder / "array.npy", cloud if channels else cloud[..., 2])
+        return folder / "array.npy"
+
+    return make
+
+
+def _read_any(path):
+    from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+
+    read_recording(path, ReadOptions())
+
+
+def _read_depths(path):
+    from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+
+    read_recording(path, ReadOptions(sensor="realsense-d435"))
+
+
 def _read_bag(path):
     """Both topics, of which one may be damaged alone."""
     from mitsim.capture.recordings.recognise import ReadOptions, read_recording
@@ -574,6 +615,10 @@ READERS: dict[str, Reader] = {
     "packed.bag": Reader(_bag("bag", "LZ4"), _read_bag),
     "recording.db3": Reader(_bag("db3"), _read_bag),
     "recording.mcap": Reader(_bag("mcap"), _read_bag),
+    "cloud.zdf": Reader(_zdf, _read_any),
+    "gridless.ply": Reader(_gridless, _read_any),
+    "points.npy": Reader(_array(3), _read_any),
+    "depths.npy": Reader(_array(0), _read_depths),
     "cloud.ply": Reader(_cloud, _read_cloud),
     "foreign.ply": Reader(_foreign, _decode_foreign),
     "image.png": Reader(_image, _read_image),

@@ -14,7 +14,7 @@ others                    YAML, XML or JSON of OpenCV, ROS, Kalibr; .mat, .npz, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -41,13 +41,14 @@ from mitsim.sensor.sensor_file import OpticsTable
 class Calibrated:
     """A ``rig`` read from a file, the name of its ``sensor``, and its range if the file states one.
 
-    ``notes``: warnings for the user.
+    ``notes``: warnings for the user. ``nominal``: whether the cameras are those of a type of device, not of one unit.
     """
 
     rig: Rig
     sensor: str
     range_mm: tuple[float, float] | None = None
     notes: tuple[str, ...] = ()
+    nominal: bool = False
 
 
 class RigFile(Document):
@@ -80,7 +81,7 @@ def read_calibration(source: str | Path, size: tuple[int, int] | None = None) ->
         Name of a preset, or path of a file.
     size
         (width, height) [px] of the images: the size of an OpenCV file without one, and the size to which the cameras
-        of a DepthAI calibration are scaled.
+        of a preset or of a DepthAI calibration are scaled.
 
     Raises
     ------
@@ -88,6 +89,8 @@ def read_calibration(source: str | Path, size: tuple[int, int] | None = None) ->
         If there is no such file, it has none of the formats above, or its numbers cannot belong to its images.
     """
     read = _read(source, size)
+    if read.nominal and size is not None:
+        read = _at_size(read, size)
     for name, camera in read.rig.cameras.items():
         check_camera(camera, source, f"cameras.{name}")
     return read
@@ -196,6 +199,27 @@ def _scaled_hint(camera: Camera, size: tuple[int, int]) -> str:
     )
 
 
+def _at_size(read: Calibrated, size: tuple[int, int]) -> Calibrated:
+    """Return nominal cameras of images of another size: scaled by the longer share of the sides, and cut at the middle.
+
+    A device that shows fewer pixels in another shape cuts its images so (RealSense: 640 x 480 of 1280 x 720).
+    """
+    full = {(camera.width, camera.height) for camera in read.rig.cameras.values()}
+    if len(full) != 1 or full == {size} or read.rig.rectification is not None:
+        return read
+    (width, height), cameras = full.pop(), {}
+    scale = max(size[0] / width, size[1] / height)
+    for name, camera in read.rig.cameras.items():
+        matrix = np.diag([scale, scale, 1.0]) @ camera.matrix
+        matrix[:2, 2] += scale / 2 - 0.5 - (scale * np.array([width, height]) - size) / 2
+        cameras[name] = replace(camera, matrix=matrix, width=size[0], height=size[1])
+    note = (
+        f"{read.sensor}: its cameras of {width} x {height} px are scaled by {scale:.4g} to images of {size[0]} x "
+        f"{size[1]} px, which is wrong for depths that the device has aligned to another camera: give --calibration"
+    )
+    return replace(read, rig=replace(read.rig, cameras=cameras), notes=(*read.notes, note))
+
+
 def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
     if path.suffix.lower() == ".toml":
         written = read_toml_table(path)
@@ -205,7 +229,7 @@ def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
             rig = Rig({name: each.camera() for name, each in table.cameras.items()})
             return Calibrated(rig, table.name, notes=tuple(notes))
     sensor = load_sensor(path, "decoding", size)
-    return Calibrated(sensor.rig, sensor.name, sensor.range_mm, sensor.notes)
+    return Calibrated(sensor.rig, sensor.name, sensor.range_mm, sensor.notes, nominal=str(path) in presets())
 
 
 def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:

@@ -20,6 +20,7 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError, MissingEnvironmentError, nearest
 from mitsim.capture.capture import Capture
 from mitsim.capture.grey_image import channel_of
+from mitsim.capture.recordings.array_file import NPY_MAGIC, numbers_of_npy
 from mitsim.capture.recordings.depth_image import read_depth_image
 from mitsim.capture.recordings.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
 from mitsim.capture.recordings.ensenso import ensenso_originals, image_sets, read_ensenso
@@ -29,12 +30,27 @@ from mitsim.capture.recordings.pose_file import read_pose
 from mitsim.capture.recordings.recording_files import MCAP_MAGIC, frame_of, plain_name
 from mitsim.capture.recordings.robi import is_robi, read_robi
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
+from mitsim.capture.recordings.zdf import HDF5_MAGIC
 from mitsim.sensor.preset import load_sensor, named_sensor
 
 AXES: tuple[Axes, ...] = ("opencv", "opengl")
 
 #: suffixes of recordings that are one file
-_RECORDED_ALONE = frozenset({".zip", ".enscam", ".ply", ".pcd", ".mcap", ".bag", ".db3"})
+_RECORDED_ALONE = frozenset({".zip", ".enscam", ".ply", ".pcd", ".mcap", ".bag", ".db3", ".zdf"})
+
+#: formats that their makers have not published: what they are, what is read instead, and how to save it
+_UNPUBLISHED = {
+    ".praw": (
+        "a .praw of PhoXi Control, whose format Photoneo has not published",
+        "a cloud that PhoXi Control saves as organised PLY",
+        "open it in PhoXi Control and save it as PLY, in camera space, not unorganised",
+    ),
+    ".mkv": (
+        "a video; of Azure Kinect's recordings the depth is not read",
+        "its depth images, 16-bit PNG",
+        "extract them and import one with --calibration or --sensor: ffmpeg -i FILE -map 0:1 depth_%04d.png",
+    ),
+}
 
 #: options for recordings of every kind
 FOR_ALL = ("range_mm", "exposure_s", "pose", "sample", "projector")
@@ -146,8 +162,8 @@ def _read_depth(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, by
     capture = read_depth_image(
         path,
         source,
-        scale_mm=1.0 if options.scale_mm is None else options.scale_mm,
-        invalid=options.invalid or 0,
+        scale_mm=options.scale_mm,
+        invalid=options.invalid,
         camera=options.camera,
         sensor=options.named,
     )
@@ -158,6 +174,14 @@ def _read_cloud(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, by
     capture = _organised(path, options)
     beside = [*_file_of(options.cameras), *([] if options.link is None else [Path(options.link)])]
     return capture, _originals([path, *beside])
+
+
+def _read_array(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    """Read an array of rows x columns as depths, and one of rows x columns x 3 as points."""
+    shape = numbers_of_npy(read_bounded(path), path).shape
+    if len(shape) == 2 or (len(shape) == 3 and shape[2] == 1):
+        return _read_depth(path, options)
+    return _read_cloud(path, options)
 
 
 def _organised(cloud: Path | StoredCloud, options: ReadOptions) -> Capture:
@@ -279,6 +303,8 @@ KINDS: dict[str, Kind] = {
     "depth": Kind("a depth image", _read_depth, frozenset({"calibration", "sensor", "camera", "scale_mm", "invalid"})),
     "ply": Kind("a PLY cloud", _read_cloud, _OF_CLOUDS),
     "pcd": Kind("a PCD cloud", _read_cloud, _OF_CLOUDS),
+    "zdf": Kind("a cloud of Zivid", _read_cloud, _OF_CLOUDS),
+    "npy": Kind("a NumPy array", _read_array, _OF_CLOUDS | {"scale_mm", "invalid"}),
 }
 
 
@@ -302,6 +328,8 @@ def kind_of(path: str | Path, options: ReadOptions | None = None) -> str:
     for mark, kind in (
         (b"PK\x03\x04", "ensenso"),
         (b"PK\x05\x06", "ensenso"),
+        (HDF5_MAGIC, "zdf"),
+        (NPY_MAGIC, "npy"),
         (b"ply\n", "ply"),
         (b"ply\r\n", "ply"),
         (b"#ROSBAG V", "ros"),
@@ -315,9 +343,11 @@ def kind_of(path: str | Path, options: ReadOptions | None = None) -> str:
     if b".PCD" in begin or begin.startswith(b"VERSION") or path.suffix.lower() == ".pcd":
         return "pcd"
     known = {".zip": "ensenso", ".enscam": "ensenso", ".ply": "ply", ".mcap": "depthai", ".png": "depth"}
-    known |= {".bag": "ros", ".db3": "ros"}
+    known |= {".bag": "ros", ".db3": "ros", ".zdf": "zdf", ".npy": "npy"}
     if path.suffix.lower() in known:
         return known[path.suffix.lower()]  # damaged; its reader reports the error
+    if path.suffix.lower() in _UNPUBLISHED:
+        raise InputError(path, "", *_UNPUBLISHED[path.suffix.lower()])
     raise InputError(
         path, "", "a file of an unknown kind", "; ".join(kind.name for kind in KINDS.values()), "say which with --as"
     )
