@@ -79,7 +79,7 @@ def is_depth(message: Any) -> bool:
     return encoding_of(message) in DEPTHS
 
 
-def depth_of(message: Any, where: str) -> tuple[NDArray[np.floating], float]:
+def depth_of(message: Any, where: str) -> tuple[NDArray[Any], float]:
     """Return the numbers (H, W) of a depth image, uint16 or float32, and their unit [mm] by its encoding.
 
     Raises

@@ -16,6 +16,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,7 +118,7 @@ def read_zdf(path: Path) -> Zdf:
         )
 
 
-def _arrays(path: Path, expected: str) -> dict[str, NDArray[np.generic]]:
+def _arrays(path: Path, expected: str) -> dict[str, NDArray[Any]]:
     command = [sys.executable, "-I", "-c", _PROGRAM, str(path.resolve()), str(_MOST_POINTS)]
     try:
         done = subprocess.run(command, capture_output=True, timeout=PATIENCE_S, check=False)
