@@ -9,7 +9,7 @@ import typer
 
 from characterisation.files.errors import InputError
 from mitsim.cli.folder_lock import remove_partial_beside
-from mitsim.cli.options import definitions
+from mitsim.cli.options import Topic, definitions
 
 #: settings of an imported capture that the user should check
 SETTINGS_TO_CHECK = (
@@ -60,12 +60,7 @@ def import_(
     frame: Annotated[
         str | None, typer.Option(help="Image set, pair or frame to import: its number, from 0, or its name.")
     ] = None,
-    topic: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="For a bag of ROS: the topic of depth images or of clouds; twice for the left and the right images."
-        ),
-    ] = None,
+    topic: Topic = None,
     images: Annotated[
         list[str] | None,
         typer.Option(help="For a folder of images: files of one camera, NAME=PATTERN (left='cam0_*.png'). Repeatable."),

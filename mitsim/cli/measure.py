@@ -13,8 +13,10 @@ from mitsim.cli.options import (
     Clouds,
     DecodedAs,
     Defines,
+    Frame,
     Json,
     PoseFile,
+    Topic,
     Variant,
     ViewOfPoses,
     check_file,
@@ -35,11 +37,12 @@ def clouds(
         list[str] | None,
         typer.Option(
             metavar=_WINDOW,
-            help="Flatness, noise and distance of the plane in a window [px]; NAME alone: the whole cloud.",
+            help="Flatness, noise, distance and normal of the plane in a window [px]; NAME alone: the whole cloud.",
         ),
     ] = None,
     sphere: Annotated[
-        list[str] | None, typer.Option(metavar=_WINDOW, help="Diameter, noise and distance of the sphere in a window.")
+        list[str] | None,
+        typer.Option(metavar=_WINDOW, help="Diameter, noise, distance and centre of the sphere in a window."),
     ] = None,
     cylinder: Annotated[
         list[str] | None,
@@ -95,6 +98,17 @@ def clouds(
             help="PNG picture to write: the difference, or the distances and windows; numbered for several clouds."
         ),
     ] = None,
+    points_in: Annotated[
+        str,
+        typer.Option(
+            metavar="FRAME",
+            help="Frame of centres, axes, normals and perpendicular distances: sensor; workspace (an Ensenso's Link); "
+            "board=COLUMNS,ROWS,PITCH, the inner corners of a chequerboard in the images [mm]; or the pose.json of "
+            "the sensor in another frame.",
+        ),
+    ] = "sensor",
+    topic: Topic = None,
+    frame: Frame = None,
     as_json: Json = False,
     sensor: DecodedAs = None,
     define: Defines = None,
@@ -109,6 +123,7 @@ def clouds(
     Example: mitsim measure cloud.ply --plane top=100,50,200,150 --plane side=400,60,90,300 --angle top,side
     """
     from characterisation.tasks.result import NOT_INCLUDED, repeatability
+    from mitsim.cli.measure_frame import read_frame
     from mitsim.cli.measure_request import read_request
     from mitsim.decoding.input_clouds import cloud_paths, read_cloud
     from mitsim.decoding.measured_document import measured_document, result_tables, summary
@@ -123,7 +138,10 @@ def clouds(
         by,
         window,
     )
-    if task is None and (given := _given(scene=scene, pose=pose, view=view, correct=correct)):
+    places_in = read_frame(points_in)
+    if task is None and places_in.file is None and view is not None:
+        raise InputError("--view", "", "no --task", "a task for the scene: --task task.toml")
+    if task is None and (given := _given(scene=scene, pose=pose, correct=correct)):
         raise InputError(f"--{given}", "", "no --task", "a task for the scene: --task task.toml")
     if task is not None and scene is None:
         raise InputError("--scene", "", "none", "the scene of the task's part: --scene part.xml")
@@ -143,10 +161,13 @@ def clouds(
     for number, path in enumerate(paths):
         if len(paths) > 1:
             say(f"{path} ({number + 1}/{len(paths)})")
-        one = read_cloud(path, sensor)
+        one = read_cloud(path, sensor, topic=tuple(topic) if topic else None, frame=frame)
         if picture is not None and one.cloud.grid.height == 1:
             raise InputError("--picture", "", f"{path}, a cloud without a grid", "a cloud with rows and columns")
-        found, drawn = request.measure(one, reference)
+        to_frame, about_frame = places_in.of(one, view)
+        if about_frame:
+            say(about_frame)
+        found, drawn = request.measure(one, reference, to_frame)
         if of_task is not None:
             found += of_task(one)
         if picture is not None:

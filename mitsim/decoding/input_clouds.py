@@ -20,6 +20,7 @@ from mitsim.capture.recordings.organised_cloud import read_organised_cloud, read
 from mitsim.capture.recordings.recognise import KINDS, ReadOptions, kind_of, read_recording, unorganised_cloud
 from mitsim.decoding.cloud import Settings, decoder_settings
 from mitsim.decoding.coded_images import decoded_once
+from mitsim.decoding.kept_clouds import kept_cloud
 from mitsim.decoding.plain_clouds import is_array_or_text, plain_cloud, read_plain_cloud
 from mitsim.running.progress import say
 from mitsim.sensor.matcher import MatcherSettings
@@ -118,7 +119,9 @@ def read_cloud(
             "a cloud (.ply, .pcd, .npy, .mat, .xyz), a capture folder, or folders of these",
         )
     settings, imager = decoder_settings(capture, sensor)
-    return InputCloud(path, decoded_once(capture, settings, imager)[0], capture, margin_of(settings))
+    chosen = (settings, imager, topic, frame, sensor)
+    cloud = kept_cloud(path, chosen, lambda: decoded_once(capture, settings, imager)[0])
+    return InputCloud(path, cloud, capture, margin_of(settings))
 
 
 def _plain(path: Path, cloud: PointCloud, about: str) -> InputCloud:
