@@ -16,6 +16,8 @@ from mitsim.cli.options import (
     Frame,
     Json,
     PoseFile,
+    Seed,
+    Simulated,
     Topic,
     Variant,
     ViewOfPoses,
@@ -25,6 +27,8 @@ from mitsim.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from characterisation.point_cloud import PointCloud
+    from characterisation.region_of_interest import Roi
     from characterisation.tasks.result import Result
     from mitsim.decoding.input_clouds import InputCloud
 
@@ -107,10 +111,12 @@ def clouds(
             "the sensor in another frame.",
         ),
     ] = "sensor",
+    simulated: Simulated = None,
     topic: Topic = None,
     frame: Frame = None,
     as_json: Json = False,
     sensor: DecodedAs = None,
+    seed: Seed = 1,
     define: Defines = None,
     variant: Variant = None,
 ) -> None:
@@ -123,10 +129,12 @@ def clouds(
     Example: mitsim measure cloud.ply --plane top=100,50,200,150 --plane side=400,60,90,300 --angle top,side
     """
     from characterisation.tasks.result import NOT_INCLUDED, repeatability
+    from characterisation.tasks.windows import WindowPlan, measure_windows
     from mitsim.cli.measure_frame import read_frame
     from mitsim.cli.measure_request import read_request
+    from mitsim.cli.simulated_beside import RecordedTarget, beside_simulated, beside_table
     from mitsim.decoding.input_clouds import cloud_paths, read_cloud
-    from mitsim.decoding.measured_document import measured_document, result_tables, summary
+    from mitsim.decoding.measured_document import beside_document, measured_document, result_tables, summary
     from mitsim.running.progress import say
 
     request = read_request(
@@ -151,11 +159,24 @@ def clouds(
     if picture is not None:
         check_file(picture)
     of_task = None
-    if task is not None and scene is not None:
+    if simulated is not None or (task is not None and scene is not None):
         start(variant)
+    if task is not None and scene is not None:
         of_task = _task(task, scene, pose, view, correct, definitions(define))
     reference = None if against is None else read_cloud(against, sensor, reference=True)
     paths = cloud_paths(inputs)
+    beside: tuple[list[Result], list[Result]] | None = None
+    targets = {
+        name: RecordedTarget(shape, window)
+        for name, (shape, window) in request.plan.features.items()
+        if shape != "cylinder"
+    }
+    if simulated is not None and not targets:
+        raise InputError("--simulated", "", "no --plane and no --sphere", "a plane or a sphere to simulate")
+
+    def figures(cloud: PointCloud, name: str, window: Roi | None) -> list[Result]:
+        return measure_windows(cloud, WindowPlan({name: (request.plan.features[name][0], window)}))
+
     whose: list[tuple[Path, str, str]] = []
     results: list[list[Result]] = []
     for number, path in enumerate(paths):
@@ -168,6 +189,8 @@ def clouds(
         if about_frame:
             say(about_frame)
         found, drawn = request.measure(one, reference, to_frame)
+        if simulated is not None and beside is None:
+            beside = beside_simulated(one.cloud, targets, simulated, figures, seed)
         if of_task is not None:
             found += of_task(one)
         if picture is not None:
@@ -180,11 +203,16 @@ def clouds(
         results.append(found)
     over = repeatability(results) if len(results) > 1 else []
     if as_json:
-        print(json.dumps(measured_document(whose, results, over), indent=2, ensure_ascii=False, allow_nan=False))
+        document = measured_document(whose, results, over)
+        if beside is not None:
+            document |= {"beside": beside_document(simulated or "", *beside)}
+        print(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False))
     elif request.empty and of_task is None:
         pass
     else:
         print(result_tables(paths, results, over))
+        if beside is not None:
+            print(f"\n{paths[0]}, beside a simulation\n" + beside_table(*beside, simulated or ""))
         if any(result.origin == "fit" for found in results for result in found):
             left_out = "; ".join(NOT_INCLUDED)
             say(f"u: standard uncertainty (k = 1) from the covariance of the fit; it does not include: {left_out}")

@@ -59,6 +59,14 @@ Topic = Annotated[
 Frame = Annotated[
     str | None, typer.Option(help="For a recording with several: image set, pair or frame, its number or name.")
 ]
+Simulated = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SENSOR",
+        help="Sensor to simulate before the same planes and spheres, a preset or TOML file: its figures beside those "
+        "of the first cloud, with F and sigma of the planes.",
+    ),
+]
 MapFile = Annotated[str, typer.Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")]
 ObjectWindow = Annotated[
     tuple[int, int, int, int] | None,

@@ -111,6 +111,8 @@ def read_cloud(
         if plain is not None:
             return _plain(path, *plain_cloud(plain, path))
         capture = read_recording(path, options).capture
+        for warning in capture.settings.get("warnings", []):
+            say(f"warning: {warning}")
     else:
         raise InputError(
             path,
