@@ -114,8 +114,16 @@ def decoded_once(
 ) -> tuple[PointCloud, CodedImages | None, Imager | MeasuredNoise | None]:
     """Return the cloud of a capture; its coded images, decoded already, if it has any; and the noise of its images.
 
-    The noise is that of the imager or, without one, the noise that fringes show. ``geometry`` of the capture's rig, if
-    it is prepared already.
+    The noise is that of the imager or, without one, the noise that fringes show.
+
+    Parameters
+    ----------
+    capture
+        The capture.
+    settings, imager
+        From :func:`mitsim.decoding.cloud.decoder_settings`.
+    geometry
+        Of the capture's rig, if it is prepared already.
 
     Raises
     ------

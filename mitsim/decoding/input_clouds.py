@@ -78,9 +78,17 @@ def read_cloud(
 ) -> InputCloud:
     """Read a cloud file, or decode a capture folder or recording.
 
-    ``sensor`` is the preset or sensor file whose settings decode it; by default, those of the capture. The points of a
-    ``reference`` may lie anywhere; those of another cloud with a grid lie on the view rays of its camera. ``topic`` and
-    ``frame`` choose a message of a recording, as ``mitsim import`` does.
+    Parameters
+    ----------
+    path
+        Cloud file, capture folder or recording.
+    sensor
+        Preset or sensor file whose settings decode it; by default, those of the capture. It also supplies the camera of
+        a recording that has none.
+    reference
+        Whether its points may lie anywhere; those of another cloud with a grid lie on the view rays of its camera.
+    topic, frame
+        Message of a recording, as of ``mitsim import``.
 
     Raises
     ------
