@@ -106,6 +106,18 @@ def test_a_zdf_comes_back_with_its_colour_and_its_camera(tmp_path):
     assert read_cloud(path).cloud.valid.sum() == HEIGHT * WIDTH - 45
 
 
+def test_the_numbers_of_a_camera_may_be_attributes(tmp_path):
+    path = zdf(tmp_path / "a.zdf", bent_cloud())
+    with netCDF4.Dataset(path, "a") as file:
+        matrix = file.createGroup("intrinsics").createGroup("CameraMatrix")
+        matrix.setncatts({"FX": 88.0, "FY": 88.4, "CX": 47.2, "CY": 30.1})
+        names = ("K1", "K2", "P1", "P2", "K3")
+        file["intrinsics"].createGroup("Distortion").setncatts(dict(zip(names, LENS, strict=True)))
+    camera = read_recording(path, ReadOptions()).capture.rig.reference
+    assert camera.matrix.tolist() == CAMERA.matrix.tolist()
+    assert camera.distortion.tolist() == LENS.tolist()
+
+
 def test_a_zdf_without_a_camera_or_with_another_one_has_the_camera_of_its_points(tmp_path):
     other = CAMERA.matrix * np.array([[1.3], [1.3], [1]])
     for name, more in (("none", {}), ("other", {"camera_matrix": other})):

@@ -142,6 +142,21 @@ def test_an_organised_cloud_comes_back_in_mm(tmp_path, form, kind, big):
     assert capture_cloud(capture, decoder_settings(capture)[0]).valid.sum() == (depth_mm() > 0).sum()
 
 
+def test_a_small_cloud_has_the_camera_of_its_namespace(tmp_path):
+    """300 points are too few to fit a camera; that of another size or place is not taken."""
+    few = points_m()
+    few[:, 30:] = np.nan
+    few[12:] = np.nan
+    for name, matrix in (("right", None), ("wrong", [90.0, 0, 31.3, 0, 61, 22.8, 0, 0, 1])):
+        messages = [("/depth/camera_info", info(ROS2, k=matrix)), ("/depth/points", cloud(ROS2, few))]
+        path = write_bag(tmp_path / name, messages, "mcap")
+        if name == "right":
+            assert read_recording(path, ReadOptions()).capture.rig.reference.matrix[0, 0] == 60
+        else:
+            with pytest.raises(InputError, match="match no camera at the origin"):
+                read_recording(path, ReadOptions())
+
+
 def test_a_cloud_without_a_grid_is_measured_and_not_imported(tmp_path):
     path = bag(tmp_path, [("/points", cloud(ROS2, points_m()[depth_mm() > 0][None]))])
     with pytest.raises(InputError, match="without a grid"):

@@ -15,6 +15,7 @@ rejected.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -116,9 +117,10 @@ def _of_zdf(path: Path) -> StoredCloud:
     if read.matrix is not None:
         lens = np.zeros(5) if read.distortion is None else read.distortion
         eye = Camera(read.matrix, lens, width, height)
-        check_camera(eye, path, "camera matrix")
         # where the file keeps its matrix is not published: it is believed only if it sees the points on their pixels
-        camera = Calibrated(Rig({"camera": eye}), "", nominal=True)
+        with suppress(InputError):
+            check_camera(eye, path, "camera matrix")
+            camera = Calibrated(Rig({"camera": eye}), "", nominal=True)
     grey = None if read.colour is None else np.ascontiguousarray(read.colour[..., 1])
     return StoredCloud(path, read.points, (width, height), records, camera, grey)
 
@@ -176,7 +178,7 @@ def read_organised_cloud(
     settings: dict[str, Any] = {"imported_from": path.name, "axes_of_file": axes} | stored.records
     settings["unit_of_file"], _ = scale_to_mm(points, path, unit, "check --unit")
     count = int(np.isfinite(points[..., 0]).sum())
-    if count < LEAST_POINTS:
+    if count < LEAST_POINTS and given is None:
         raise InputError(path, "", f"{count} points", f"{LEAST_POINTS} or more")
     if axes == "opengl":
         points *= np.array([1, -1, -1], np.float32)

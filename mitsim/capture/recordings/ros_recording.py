@@ -10,7 +10,8 @@ A ``camera_info`` belongs to the images whose topic begins like its own: ``/came
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -105,14 +106,22 @@ def _listed(bag: RosBag, known: dict[str, str]) -> str:
 
 
 def read_ros_cloud(chosen: Chosen, frame: int | None) -> StoredCloud:
-    """Return the points of one message of a cloud, as they are in it."""
+    """Return the points of one message of a cloud, as they are in it.
+
+    A ``camera_info`` in the namespace of its topic is its camera if it sees the points on their pixels.
+    """
     bag, topic = chosen.bag, chosen.topics[0]
     number = chosen_frame(frame, topic.count, bag.path, f"messages of {topic.name}")
     message = read_message(bag, topic, number)
     points = points_of(message, label_of(topic, bag.path))
     height, width = points.shape[:2]
     records = {"topic": topic.name} | _stamp(message)
-    return StoredCloud(bag.path, points, (width, height) if min(height, width) > 1 else None, records)
+    if min(height, width) < 2:
+        return StoredCloud(bag.path, points, None, records)
+    camera = None
+    with suppress(InputError):  # then the camera is fitted to the points
+        camera = replace(_calibrated(chosen, (width, height), None), nominal=True)
+    return StoredCloud(bag.path, points, (width, height), records, camera)
 
 
 def read_ros_depth(
@@ -161,9 +170,7 @@ def read_ros_depth(
     size = (depth.shape[1], depth.shape[0])
     calibrated = _calibrated(chosen, size, calibration)
     settings: dict[str, Any] = {"imported_from": bag.path.name, "topic": topic.name, "depth_scale_mm": float(scale)}
-    return depth_capture(
-        depth, calibrated, Path(where), settings | _stamp(message), camera=camera, sensor=sensor or "depth-camera"
-    )
+    return depth_capture(depth, calibrated, Path(where), settings | _stamp(message), camera=camera, sensor=sensor)
 
 
 def read_ros_pair(

@@ -5,7 +5,8 @@ Signal chain: netCDF-4 file -> in a process of its own, the variables by name ->
 Zivid's samples (zivid-python-samples, ``read_zdf_without_zivid.py``) state the names in the group ``data``:
 ``pointcloud`` (H, W, 3) float32 [mm], NaN where missing; ``rgba_image`` (H, W, 4) uint8; ``snr``, before it
 ``contrast``, (H, W). They do not state where the matrix of the camera is: a matrix of 3 x 3 is taken whose name says
-*camera matrix* or *intrinsics*, with a *distortion* beside it. HDF5 may hang or crash on a damaged file; the process of
+*camera matrix* or *intrinsics*, with a *distortion* beside it, or the numbers FX, FY, CX, CY, and K1, K2, P1, P2, K3 by
+which Zivid's own calibration files state it. HDF5 may hang or crash on a damaged file; the process of
 its own ends alone.
 """
 
@@ -35,7 +36,7 @@ _MOST_POINTS = 1 << 25
 
 _PROGRAM = r"""
 import sys, netCDF4, numpy as np
-most, found, matrices, lenses = int(sys.argv[2]), {}, [], []
+most, found, matrices, lenses, numbers = int(sys.argv[2]), {}, [], [], {}
 names = "pointcloud xyz x y z snr contrast rgba_image rgb_image".split()
 
 def values(one, name):
@@ -54,12 +55,22 @@ def search(group):
             matrices.append(values(one, name))
         elif "distortion" in low and one.ndim == 1 and one.shape[0] in (4, 5, 8, 12, 14):
             lenses.append(values(one, name))
+        elif one.ndim == 0:
+            numbers.setdefault(low, float(one[...]))
+    for name in group.ncattrs():
+        value = np.asarray(group.getncattr(name))
+        if value.size == 1 and value.dtype.kind in "fiu":
+            numbers.setdefault(name.lower(), float(value.ravel()[0]))
     for inner in group.groups.values():
         search(inner)
 
 with netCDF4.Dataset(sys.argv[1]) as file:
     file.set_auto_maskandscale(False)
     search(file)
+if not matrices and {"fx", "fy", "cx", "cy"} <= set(numbers):
+    fx, fy, cx, cy = (numbers[name] for name in ("fx", "fy", "cx", "cy"))
+    matrices.append(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    lenses.append(np.array([numbers.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")]))
 if matrices:
     found["matrix"] = matrices[0]
 if lenses:
