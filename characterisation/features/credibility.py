@@ -10,13 +10,13 @@ the surface itself lies within this limit wherever it is seen. A fit is credible
 - :data:`~characterisation.features.fits.COVERAGE` standard uncertainties of its distance from nominal are within the
   limit at all these places, and those of a radius within half of it. Else the points do not determine the
   feature, and the next condition would select the fits that happen to be right;
-- it lies within the limit over all these places, or beyond it by at most as many standard uncertainties. A sphere through
-  a small cap can fit the cap, and miss the rest of the ball by many times the limit;
+- it lies within the limit over all these places, or beyond it by at most as many standard uncertainties. A sphere
+  through a small cap can fit the cap, and miss the rest of the ball by many times the limit;
 - it has no larger residuals than the nominal surface, which is one of the surfaces that it could have found.
 
 The covariance of a fit holds for independent noise. Here it is multiplied by the number of points that count as one
-(:func:`~characterisation.features.best_fit.counted_as_one`), from the residuals, and by their degrees of freedom. The rule uses no property of the
-sensor, so it holds for measured and for virtual clouds.
+(:func:`~characterisation.features.best_fit.counted_as_one`), from the residuals, and by their degrees of freedom. The
+rule uses no property of the sensor, so it holds for measured and for virtual clouds.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from characterisation.features.best_fit import counted_as_one
-from characterisation.features.fits import COVERAGE, GATE, LEAST_GATE_MM, check_radius
 from characterisation.features.figures import Circle, EdgePoint
+from characterisation.features.fits import COVERAGE, GATE, LEAST_GATE_MM, check_radius
 from characterisation.features.fitted import CircleFit, EdgePointFit, Fit
 from characterisation.features.robust_fit import CLIP, FitError, UndeterminedError, rays_from
 from characterisation.features.surfaces import GRAZING_COSINE, Surface, tangents
@@ -153,7 +153,8 @@ def _check(fit: Fit, places: Array, limit: float, factor: float, reference: str)
     allowed = limit + COVERAGE * uncertainty
     if not farthest <= allowed:
         raise FitError(
-            f"the fitted {_words(fit)} lies up to {farthest:.2g} mm from the {reference}, at most {allowed:.2g} is allowed"
+            f"the fitted {_words(fit)} lies up to {farthest:.2g} mm from the {reference}, "
+            f"at most {allowed:.2g} is allowed"
         )
 
 

@@ -90,7 +90,7 @@ def test_a_cap_of_another_curvature_is_refused_where_it_would_leave_the_ball():
     _, rays = taken(BALL, BALL, 1)
     other = Sphere(np.array([0.0, 0.0, 508.0]), 20.0)  # touches the ball, and fits the cap within the gate
     points, _ = taken(BALL, other, 1, 0.01, cap_deg=25.0)
-    with pytest.raises(FitError, match="lies up to .* mm from the nominal sphere"):
+    with pytest.raises(FitError, match=r"lies up to .* mm from the nominal sphere"):
         checked(BALL, points, rays)
     full, _ = taken(BALL, Sphere(np.array([0.0, 0.0, 500.0]), 12.6), 1, 0.05)  # a part far out of tolerance
     assert checked(BALL, full, rays).radius == pytest.approx(12.6, abs=0.02)
