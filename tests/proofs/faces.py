@@ -34,7 +34,7 @@ _LEAST_RAYS = 50
 
 @dataclass(frozen=True)
 class FeatureFraction:
-    """F of one feature in one view of a case: on the map, as scored, and found; and the share in which it sees faces."""
+    """F of one feature in a view of a case: on the map, as scored and found; the share in which it sees faces."""
 
     case: str
     view: int
