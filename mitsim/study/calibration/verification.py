@@ -27,7 +27,7 @@ from mitsim.sensor.camera import Camera, Rig, stereo_rectification
 from mitsim.sensor.preset import Sensor
 from mitsim.sensor.published_lengths import PublishedLengths
 from mitsim.sensor.rig_covariance import RigCovariance
-from mitsim.sensor.rig_parameters import moved, path_error
+from mitsim.sensor.rig_parameters import moved, parameter_names, path_error
 from mitsim.study.calibration.accuracy import measured_points
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.corner_files import found_corners, turned_alike
@@ -198,6 +198,7 @@ def verify(
     corners_of_board, dots_of_plate : the points
     """
     measuring = replace(sensor, rig=rig)
+    covariance = parameters_of(covariance, rig)
     rng = np.random.default_rng(_SEED)
     nominal = measured_points(measuring, known.points, rig)
     scales, shifts = [], []
@@ -224,6 +225,14 @@ def verify(
         by_rows,
         math.nan if published is None else published.one_sigma(distance),
     )
+
+
+def parameters_of(covariance: RigCovariance, rig: Rig) -> RigCovariance:
+    """Return the part of a covariance of which a rig has the parameters: a unit's lens may have fewer coefficients."""
+    known = parameter_names(rig, rig.projector is not None)
+    chosen = [index for index, name in enumerate(covariance.names) if name in known or name.startswith("path.")]
+    names = tuple(covariance.names[index] for index in chosen)
+    return RigCovariance(names, covariance.covariance[np.ix_(chosen, chosen)], covariance.source)
 
 
 def triangulated(first: Camera, pixels: Floats, second: Camera, others: Floats) -> tuple[Floats, Floats]:
