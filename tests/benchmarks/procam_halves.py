@@ -2,9 +2,9 @@
 
 python tests/benchmarks/procam_halves.py FOLDER_OF_RECORDINGS
 
-Twelve poses of 147 circles in 21 staggered columns, in a camera and a projector. The pitch of the circles is unknown and
-taken as 10 mm: it scales lengths, not angles. Prints the difference of every parameter between the halves of the poses,
-in standard uncertainties, and the decision.
+Twelve poses of 147 circles in 21 staggered columns, in a camera and a projector. Their unknown pitch is taken as 10 mm:
+it scales lengths, not angles. Prints the difference of every parameter between the halves of the poses, in standard
+uncertainties, and the decision.
 """
 
 from __future__ import annotations

@@ -37,12 +37,13 @@ def length_errors(sensor: Sensor, covariance: RigCovariance, distance: float) ->
     half = BAR * distance / 2 * np.array(DIRECTIONS)
     bars = np.stack([middles[:, None] - half, middles[:, None] + half], axis=2).reshape(-1, 2, 3)
     points = bars.reshape(-1, 3)
+    lengths = np.linalg.norm(bars[:, 1] - bars[:, 0], axis=1)
     nominal = measured_points(sensor, points, sensor.rig)
     out = []
     for stream in np.random.default_rng(SEED).spawn(DRAWS):
         true = moved(sensor.rig, covariance.names, covariance.draw(stream))
         found = (measured_points(sensor, points, true) - nominal + points).reshape(-1, 2, 3)
-        out.append(np.linalg.norm(found[:, 1] - found[:, 0], axis=1) / np.linalg.norm(bars[:, 1] - bars[:, 0], axis=1) - 1)
+        out.append(np.linalg.norm(found[:, 1] - found[:, 0], axis=1) / lengths - 1)
     return np.array(out)
 
 
@@ -60,7 +61,8 @@ def main(arguments: list[str]) -> None:
     for vergence in given.vergence or [own.vergence_mrad]:
         covariance = with_drift(alone, sensor.rig, replace(own, vergence_mrad=vergence))
         ratios = []
-        print(f"\nvergence {vergence:g} mrad\n| distance [mm] | maker, {100 * curve.share:.0f} % within | the same, stated |\n|---|---|---|")
+        print(f"\nvergence {vergence:g} mrad")
+        print(f"| distance [mm] | maker, {100 * curve.share:.0f} % within | the same, stated |\n|---|---|---|")
         for distance, error in zip(curve.distance_mm, curve.error, strict=True):
             stated = float(np.quantile(np.abs(length_errors(sensor, covariance, distance)), curve.share))
             ratios.append(stated / error)

@@ -103,7 +103,7 @@ def test_a_calibration_whose_halves_agree_is_not_widened():
 
 
 def test_errors_of_the_lens_at_like_poses_are_refused():
-    """Half a pixel that differs between poses, and a board that is hardly tilted: the halves differ beyond the noise."""
+    """Half a pixel that differs between poses, and a board that is hardly tilted."""
     pixels = pixels_of(3, 12, tilt=0.02)
     for values in pixels.values():
         for number in range(12):

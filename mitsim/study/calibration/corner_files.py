@@ -1,17 +1,17 @@
 """Read the corners of a calibration board from images or from the files of other programs.
 
-Signal chain: folder of images, table of corners, OpenCV's file or arrays -> pixels of every corner by pose and camera ->
-poses in which every camera sees the same corners (:class:`~mitsim.study.calibration.recorded.RecordedBoard`).
+Signal chain: folder of images, table of corners, OpenCV's file or arrays -> pixels of every corner by pose and camera
+-> poses in which every camera sees the same corners (:class:`~mitsim.study.calibration.recorded.RecordedBoard`).
 
 Four forms are read:
 
 - **A folder of images.** Camera and pose follow from the names: ``left-0001.png`` and ``right-0001.png``, as ROS's
   calibrator saves them, or folders ``left`` and ``right`` with images of equal names. Names without a camera belong to
   one camera. The corners are found by ``cv2.findChessboardCornersSB``.
-- **A table**, ``.csv``: columns ``pose, camera, column, row, x_px, y_px``. ``column`` and ``row`` count the inner corners
-  from 0. A camera named ``projector`` is a projector. The image sizes follow ``# size CAMERA WIDTH HEIGHT``.
-- **OpenCV's file**, ``.yml``, ``.yaml``, ``.xml`` or ``.json`` of its calibration sample: ``image_points`` (poses, corners)
-  of two channels, or ``image_points1`` and ``image_points2`` of a pair; ``image_width`` and ``image_height``.
+- **A table**, ``.csv``: columns ``pose, camera, column, row, x_px, y_px``. ``column`` and ``row`` count the inner
+  corners from 0. A camera named ``projector`` is a projector. Lines ``# size CAMERA WIDTH HEIGHT`` give the sizes.
+- **OpenCV's file**, ``.yml``, ``.yaml``, ``.xml`` or ``.json`` of its calibration sample: ``image_points`` (poses,
+  corners) of two channels, or ``image_points1`` and ``image_points2`` of a pair; ``image_width``, ``image_height``.
 - **Arrays**, ``.npz``: the same names or ``imgpoints``, ``imgpoints_l`` and ``imgpoints_r``; ``image_size``.
 """
 
@@ -155,8 +155,8 @@ def found_corners(image: NDArray[np.generic], board: Board) -> Floats | None:
 def turned_alike(first: Floats, second: Floats) -> Floats:
     """Return the corners (n, 2) [px] of a second camera in the order of those of a first.
 
-    A board whose numbers of rows and columns are both even or both odd looks the same after half a turn. Of the two orders, the one is chosen in
-    which the diagonals of the board have the same sense in both images.
+    A board whose numbers of rows and columns are both even or both odd looks the same after half a turn. Of the two
+    orders, the one is chosen in which the diagonals of the board have the same sense in both images.
     """
     alike = float((first[-1] - first[0]) @ (second[-1] - second[0])) > 0
     return second if alike else second[::-1]
@@ -255,7 +255,7 @@ def _opencv(path: Path) -> dict[str, Any]:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
         out: dict[str, Any] = {}
-        for name in root.keys():
+        for name in root.keys():  # noqa: SIM118 - a node of OpenCV, not a dictionary
             node = root.getNode(name)
             value = node.mat() if not (node.isInt() or node.isReal() or node.isString()) else node.real()
             if value is not None:

@@ -126,7 +126,8 @@ def calibrate_recorded(
         "coordinate_noise_px": float(noise[:, 1].max()),
     }
     covariance = RigCovariance(parameter_names(rig), matrix, source, details)
-    return RecordedCalibration(rig, places, covariance, *noise.T, effect)
+    camera_px, coordinate_px = noise.T
+    return RecordedCalibration(rig, places, covariance, camera_px, coordinate_px, effect)
 
 
 @dataclass(frozen=True)
@@ -306,7 +307,8 @@ def tilt_hint(places: Sequence[Transform]) -> str:
     tilt = largest_tilt(places)
     if tilt >= _TILTED_DEG:
         return ""
-    return f"tilts of the board differ by {tilt:.1f} deg at most; record poses tilted by 20 to 40 deg in several directions"
+    advice = "record poses tilted by 20 to 40 deg in several directions"
+    return f"tilts of the board differ by {tilt:.1f} deg at most; {advice}"
 
 
 class _Whitened(NamedTuple):

@@ -236,7 +236,7 @@ def parameters_of(covariance: RigCovariance, rig: Rig) -> RigCovariance:
 
 
 def triangulated(first: Camera, pixels: Floats, second: Camera, others: Floats) -> tuple[Floats, Floats]:
-    """Return the points (n, 3) [mm] seen by two cameras, on the rectified rows of the first, and row errors (n,) [px]."""
+    """Return points (n, 3) [mm] that two cameras see, on rectified rows of the first, and row errors (n,) [px]."""
     pair = stereo_rectification(first, second)
     left, right = _rectified(first, pixels, pair.rotation_left), _rectified(second, others, pair.rotation_right)
     f, columns = pair.matrix_left[0, 0], left[:, 0] * pair.matrix_left[0, 0] + pair.matrix_left[0, 2]
@@ -262,7 +262,7 @@ def _rectified(camera: Camera, pixels: Floats, rotation: Floats) -> Floats:
 
 
 def _on_plane(capture: Capture, pixels: Floats, cloud: PointCloud) -> Floats:
-    """Return where the rays of corners (n, 2) [px] of the reference camera meet the plane of the cloud's points there."""
+    """Return where the rays of the reference camera's corners (n, 2) [px] meet the plane of the cloud's points."""
     camera = capture.rig.reference
     rays = camera.sensor_from_camera.directions(camera.rays(pixels))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -285,7 +285,7 @@ def _spread(points: Floats) -> float:
 def _similarity(points: Floats, true: Floats) -> tuple[float, float]:
     """Return the scale from true to measured points (n, 3), and its standard uncertainty by their scatter (Umeyama)."""
     from_middle, of_true = points - points.mean(axis=0), true - true.mean(axis=0)
-    u, singular, vt = np.linalg.svd(of_true.T @ from_middle)
+    u, _, vt = np.linalg.svd(of_true.T @ from_middle)
     turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     square = float((of_true**2).sum())
     scale = float(((of_true @ turn) * from_middle).sum()) / square

@@ -1,4 +1,4 @@
-"""Write a calibration from recorded corners: OpenCV's file for a sensor file, the covariance for statements, a table."""
+"""Write a calibration from recorded corners: OpenCV's file for sensor files, covariance for statements, table."""
 
 from __future__ import annotations
 
