@@ -159,7 +159,18 @@ def corners_of_board(capture: Capture, board: Board, cloud: PointCloud | None) -
 
 
 def dots_of_plate(capture: Capture, plate: Plate, cloud: PointCloud, printed: float) -> KnownPoints:
-    """Return the dots of a plate in a cloud; ``printed`` is the relative standard uncertainty of their pitch.
+    """Return the dots of a plate in a cloud.
+
+    Parameters
+    ----------
+    capture
+        Its reference camera shows the dots.
+    plate
+        Window, pitch and colour of the dots.
+    cloud
+        Of the capture.
+    printed
+        Relative standard uncertainty of the pitch.
 
     Raises
     ------
@@ -236,7 +247,15 @@ def parameters_of(covariance: RigCovariance, rig: Rig) -> RigCovariance:
 
 
 def triangulated(first: Camera, pixels: Floats, second: Camera, others: Floats) -> tuple[Floats, Floats]:
-    """Return points (n, 3) [mm] that two cameras see, on rectified rows of the first, and row errors (n,) [px]."""
+    """Return points (n, 3) [mm] that two cameras see, on rectified rows of the first, and row errors (n,) [px].
+
+    Parameters
+    ----------
+    first, second
+        Cameras, in the sensor frame.
+    pixels, others
+        (n, 2) [px] of the points in the first and in the second camera.
+    """
     pair = stereo_rectification(first, second)
     left, right = _rectified(first, pixels, pair.rotation_left), _rectified(second, others, pair.rotation_right)
     f, columns = pair.matrix_left[0, 0], left[:, 0] * pair.matrix_left[0, 0] + pair.matrix_left[0, 2]
