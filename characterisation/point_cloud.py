@@ -228,6 +228,19 @@ class PointCloud:
         mask = self.valid & (self.feature == self.feature_names.index(name))
         return np.asarray(self.points[mask], np.float64)
 
+    def rays_of_feature(self, name: str) -> NDArray[np.float64]:
+        """Return the unit view directions (n, 3), sensor frame, of all pixels with its label, with or without a point.
+
+        Raises
+        ------
+        ValueError
+            If the cloud has no labels.
+        """
+        if self.feature is None:
+            raise ValueError("this cloud has no feature labels")
+        rows, columns = np.nonzero(self.feature == self.feature_names.index(name))
+        return self.grid.rays_at(columns, rows)
+
     def to_open3d(self) -> Any:
         """Return the points as an Open3D cloud; Open3D must be installed separately.
 

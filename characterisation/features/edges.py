@@ -32,6 +32,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from characterisation.features.credibility import check_figure
 from characterisation.features.figures import ACROSS_THE_EDGE, Circle, EdgePoint
 from characterisation.features.fitted import CircleFit, EdgePointFit, PlaneFit
 from characterisation.features.robust_fit import FitError, covariance_of, robust_fit
@@ -98,7 +99,8 @@ def fit_circle(cloud: PointCloud, plane: PlaneFit, nominal: Circle, near: float 
     Raises
     ------
     FitError
-        If too little of the edge is visible.
+        If too little of the edge is visible, or the fit is not credible
+        (:mod:`characterisation.features.credibility`).
     """
     nominal = nominal.seen_from(cloud.grid.origin).on_moved_plane(plane)
     found = _crossings(cloud, plane, nominal, near)
@@ -109,7 +111,9 @@ def fit_circle(cloud: PointCloud, plane: PlaneFit, nominal: Circle, near: float 
     residual, jacobian, _ = circle.linearised(np.zeros(3), found.places[kept])
     covariance, residual_std, count = covariance_of(residual, jacobian, circle.kind)
     covariance[2, 2] += found.shared**2
-    return CircleFit(circle.centre, circle.normal, circle.radius, circle.ray, covariance, residual_std, count)
+    fit = CircleFit(circle.centre, circle.normal, circle.radius, circle.ray, covariance, residual_std, count)
+    check_figure(fit, nominal, nominal.radius)
+    return fit
 
 
 def fit_edge_point(
@@ -144,7 +148,9 @@ def fit_edge_point(
     pitch = _pitch(cloud, edge)
     floor = pitch**2 / 12 / len(np.unique(found.lines[kept])) ** 2
     covariance[0, 0] = max(covariance[0, 0], floor) + found.shared**2
-    return EdgePointFit(edge.point, edge.direction, edge.normal, edge.slope, edge.ray, covariance, residual_std, count)
+    fit = EdgePointFit(edge.point, edge.direction, edge.normal, edge.slope, edge.ray, covariance, residual_std, count)
+    check_figure(fit, nominal, reach)
+    return fit
 
 
 Figure = TypeVar("Figure", Circle, EdgePoint)

@@ -15,8 +15,16 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.fitted import ConeFit, CylinderFit, PlaneFit, SphereFit
-from characterisation.features.robust_fit import FitError, covariance_of, rays_from, robust_fit, usable
+from characterisation.features.robust_fit import (
+    FitError,
+    UndeterminedError,
+    covariance_of,
+    rays_from,
+    robust_fit,
+    usable,
+)
 from characterisation.features.starts import plane_start
 from characterisation.features.surfaces import (
     Cone,
@@ -40,6 +48,9 @@ LEAST_GATE_MM = 1.0
 #: least share of a surface's points that belong to it. With fewer, the nearest quarter, which gives the scatter, is
 #: false, and a fit would use a few points that lie near the surface by chance
 LEAST_BELONGING = 0.25
+
+#: standard uncertainties of a fit that must lie within a limit; a normal error exceeds them in 0.3 % of cases
+COVERAGE = 3.0
 
 #: a quarter of normal residuals lie within this many standard deviations
 QUARTER_TO_STD = 0.3186
@@ -106,7 +117,8 @@ def fit_cylinder(points: ArrayLike, initial: Cylinder, viewpoint: ArrayLike | No
     ------
     FitError
         If there are fewer than 6 points, or they do not determine a cylinder, or all are at grazing incidence. Also if
-        the fit departs from the nominal geometry by more than 45 deg of axis, or a factor 3 of radius.
+        the fit departs from the nominal geometry by more than 45 deg of axis, or a factor 3 of radius, or the radius is
+        undetermined (:func:`check_radius`).
 
     Examples
     --------
@@ -128,6 +140,7 @@ def fit_cylinder(points: ArrayLike, initial: Cylinder, viewpoint: ArrayLike | No
         )
     cylinder = cylinder.at_foot_of(points[kept].mean(axis=0))
     covariance, residual_std, count = _uncertainty(cylinder, points[kept], viewpoint)
+    check_radius(cylinder, covariance)
     return CylinderFit(cylinder.point, cylinder.axis, cylinder.radius, covariance, residual_std, count)
 
 
@@ -180,8 +193,8 @@ def fit_sphere(points: ArrayLike, viewpoint: ArrayLike | None = None) -> SphereF
     Raises
     ------
     FitError
-        If there are fewer than 5 points, or they do not curve enough to determine a sphere, or all are at grazing
-        incidence.
+        If there are fewer than 5 points, or they do not curve enough to determine a sphere (:func:`check_radius`), or
+        all are at grazing incidence.
 
     Examples
     --------
@@ -204,7 +217,9 @@ def fit_sphere(points: ArrayLike, viewpoint: ArrayLike | None = None) -> SphereF
     extent = float(np.ptp(points[kept], axis=0).max())
     if not 0 < sphere.radius < 100 * extent:
         raise FitError(f"{len(points)} points that do not curve enough to determine a sphere")
-    return SphereFit(sphere.centre, sphere.radius, *_uncertainty(sphere, points[kept], viewpoint))
+    covariance, residual_std, count = _uncertainty(sphere, points[kept], viewpoint)
+    check_radius(sphere, covariance)
+    return SphereFit(sphere.centre, sphere.radius, covariance, residual_std, count)
 
 
 def fit_surface(
@@ -224,6 +239,28 @@ def fit_surface(
     if isinstance(nominal, Cone):
         return fit_cone(points, nominal, viewpoint)
     return fit_sphere(points, viewpoint)
+
+
+def check_radius(shape: Surface | Circle | EdgePoint, covariance: Array, factor: float = 1.0) -> None:
+    """Check that points determine the radius of a fitted cylinder or sphere; other shapes always pass.
+
+    Its curvature must differ from that of a plane: :data:`COVERAGE` standard uncertainties of the radius are at most
+    half of it. ``factor`` multiplies the ``covariance`` (p, p) of the fit.
+
+    Raises
+    ------
+    UndeterminedError
+        If they are more.
+    """
+    if not isinstance(shape, Cylinder | Sphere):
+        return
+    last = shape.parameter_count - 1  # the radius is the last parameter of both
+    uncertainty = float(np.sqrt(factor * max(covariance[last, last], 0.0)))
+    if not COVERAGE * uncertainty <= shape.radius / 2:
+        raise UndeterminedError(
+            f"the points do not determine the {shape.kind}: a radius of {shape.radius:.3g} mm has a standard "
+            f"uncertainty of {uncertainty:.2g} mm, at most {shape.radius / 2 / COVERAGE:.2g} is allowed"
+        )
 
 
 def belonging(points: ArrayLike, nominal: Surface, viewpoint: ArrayLike | None = None) -> NDArray[np.bool_]:

@@ -48,6 +48,10 @@ class FitError(ValueError):
     """These points do not allow the fit; the message gives the reason in a few words."""
 
 
+class UndeterminedError(FitError):
+    """These points do not determine the feature on their own; they may still determine a pose with others."""
+
+
 class Fitted(Protocol):
     """Shape of a few parameters that can be fitted and changed by them."""
 

@@ -44,9 +44,10 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from characterisation.coupon.offsets import own_area
-from characterisation.features.fits import LEAST_BELONGING
+from characterisation.features.credibility import most_uncertain
+from characterisation.features.fits import COVERAGE, GATE, LEAST_BELONGING, LEAST_GATE_MM
 from characterisation.features.robust_fit import FitError
-from characterisation.features.surfaces import GRAZING_COSINE, Plane, Sphere, Surface
+from characterisation.features.surfaces import GRAZING_COSINE, Surface
 from characterisation.maps.pooled_offsets import DISC_RADIUS
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE
 
@@ -66,10 +67,6 @@ MOST_CELLS = 500
 
 #: with a shorter correlation length [pixels of the grid], pixels count as independent
 SHORTEST_REACH = 0.45
-
-#: a robust fit converges from geometry with an error up to this share of the radius (see
-#: :mod:`characterisation.features.fits`); with a larger displacement the fit fails
-HELD = 0.5
 
 #: a measurement is called possible with at least this probability
 LEAST_CHANCE = 0.5
@@ -128,7 +125,7 @@ class ExpectedFit:
     - ``noise_covariance`` (p, p): covariance of the parameters due to noise.
     - ``shared`` (p, 1 + k): changes of the parameters by the known displacement, and by each error that features share.
     - ``count`` of expected points.
-    - ``chance``: probability that there are enough points, and that the fit stays near the nominal radius.
+    - ``chance``: probability that there are enough points, and that the fit is credible.
     - ``middle`` (3,) [mm] of the expected points.
     - ``noise`` [mm]: without persistent noise, the mean of all n points would have the standard uncertainty noise /
       sqrt(n).
@@ -176,16 +173,28 @@ def expected_fit(surface: Surface, expected: ExpectedPoints, minimum_points: flo
     used = usable(surface, expected)
     jacobian = surface.linearised(np.zeros(surface.parameter_count), used.point, used.ray)[1]
     fit = solved([expected_sums(jacobian, used, minimum_points)], surface.kind)
-    return replace(fit, chance=fit.chance * _convergence_chance(surface, fit.covariance))
+    return replace(fit, chance=fit.chance * _credible_chance(surface, expected, used, fit))
 
 
-def _convergence_chance(surface: Surface, covariance: Floats) -> float:
-    """Return the probability that a fit stays near its nominal radius, for a normal change with variance u^2."""
-    if isinstance(surface, Plane):
-        return 1.0
-    number = 3 if isinstance(surface, Sphere) else 4  # index of the radius in the parameters
-    spread = math.sqrt(float(covariance[number, number]))
-    return float(2 * ndtr(HELD * surface.radius / spread) - 1) if spread > 0 else 1.0
+def _credible_chance(surface: Surface, expected: ExpectedPoints, used: ExpectedPoints, fit: ExpectedFit) -> float:
+    """Return the probability that a fit is credible (:mod:`characterisation.features.credibility`).
+
+    It is 0 if the points do not determine the surface wherever it is seen. Else it is the probability that a normal
+    error, of the largest variance over these places, is within the limit.
+    """
+    at = surface.meet(expected.point, expected.ray)
+    places = at.foot[np.abs(at.cosine) > GRAZING_COSINE]
+    jacobian = surface.linearised(np.zeros(surface.parameter_count), places, None)[1]
+    weight = used.fraction
+    noise = float(np.sqrt(np.average(used.sigma**2 + used.persistent**2, weights=weight)))
+    limit = max(GATE * noise, LEAST_GATE_MM) + float(np.average(np.abs(used.displaced), weights=weight))
+    spread, total = (
+        math.sqrt(max(float(np.einsum("ij,jk,ik->i", jacobian, one, jacobian).max()), 0.0))
+        for one in (fit.noise_covariance, fit.covariance)
+    )
+    if spread > most_uncertain(surface, limit):
+        return 0.0
+    return float(2 * ndtr((limit + COVERAGE * spread) / total) - 1) if total > 0 else 1.0
 
 
 def usable(surface: Surface, expected: ExpectedPoints) -> ExpectedPoints:

@@ -22,13 +22,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
+from characterisation.features.credibility import check_surface, places_seen
 from characterisation.features.edges import fit_circle, fit_edge_point
 from characterisation.features.figures import Circle, EdgePoint
 from characterisation.features.fits import LEAST_BELONGING, belonging, fit_surface
 from characterisation.features.fitted import CylinderFit, Fit, PlaneFit
 from characterisation.features.form import Form, fit_form
 from characterisation.features.pose_fit import Pose, PoseFit, fit_pose
-from characterisation.features.robust_fit import FitError
+from characterisation.features.robust_fit import FitError, UndeterminedError
 from characterisation.features.surfaces import Surface
 from characterisation.files.errors import InputError, nearest
 from characterisation.point_cloud import PointCloud
@@ -110,10 +111,14 @@ class MeasurementModel:
 
 @dataclass(frozen=True)
 class _Selected:
-    """Points (n, 3) [mm] of a shape that can lie on it, of ``given`` points with its label; or why they are too few."""
+    """Points (n, 3) [mm] of a shape that can lie on it, of ``given`` points with its label; or why they are too few.
+
+    ``places`` (k, 3) [mm] on the nominal surface are those that its pixels show, with or without a point.
+    """
 
     points: Array | FitError
     given: int
+    places: Array
 
 
 def measurement_model(task: Task, measurement: str, sensor_from_part: ArrayLike | None = None) -> MeasurementModel:
@@ -198,7 +203,8 @@ def fit_features(
     points of their plane end (:mod:`characterisation.features.edges`).
 
     A feature that cannot be fitted has a :class:`FitError` in place of a fit. This holds for a shape with fewer than
-    ``minimum_points`` points or less than a quarter of the recovered points near it, and for any undetermined feature.
+    ``minimum_points`` points or less than a quarter of the recovered points near it, and for a fit that is not credible
+    (:mod:`characterisation.features.credibility`): undetermined, or farther from nominal than the surface could be.
 
     Parameters
     ----------
@@ -231,7 +237,7 @@ def _fits(
     for name, one in selected.items():
         try:
             surface = task.features[name].nominal(sensor_from_part)
-            fits[name] = fit_surface(_points(one), surface, cloud.grid.origin)
+            fits[name] = _credible_fit(_points(one), surface, one.places, cloud.grid.origin)
         except FitError as error:
             fits[name] = error
     for name, feature in task.features.items():
@@ -251,6 +257,13 @@ def _fits(
     return {name: fits[name] for name in task.features if name in fits}
 
 
+def _credible_fit(points: Array, nominal: Surface, places: Array, viewpoint: Array | None = None) -> Fit:
+    """Return the fit of a surface, or raise the error that says why there is none."""
+    fit = fit_surface(points, nominal, viewpoint)
+    check_surface(fit, nominal, points, places, viewpoint)
+    return fit
+
+
 def _selected(cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimum_points: int) -> dict[str, _Selected]:
     """Return the points of every shape [mm], sensor frame: those with its label that can lie on it."""
     selected = {}
@@ -259,16 +272,18 @@ def _selected(cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimu
             known = list(cloud.feature_names)
             labels = f"labels of the cloud: {', '.join(known) or 'there are none'}"
             raise InputError("task", f"features.{name}", repr(name), labels, nearest(name, known))
-        points = cloud.of_feature(name)
-        near = points[belonging(points, task.features[name].nominal(sensor_from_part), cloud.grid.origin)]
-        selected[name] = _Selected(near, len(points))
+        points, nominal = cloud.of_feature(name), task.features[name].nominal(sensor_from_part)
+        near = points[belonging(points, nominal, cloud.grid.origin)]
+        places = places_seen(nominal, cloud.rays_of_feature(name), cloud.grid.origin)
+        selected[name] = _Selected(near, len(points), places)
         if len(near) < minimum_points:
             few = FitError(f"{len(near)} points, at least {minimum_points} are required")
-            selected[name] = _Selected(few, len(points))
+            selected[name] = _Selected(few, len(points), places)
         elif len(near) < LEAST_BELONGING * len(points):
             share = f"{100 * len(near) / len(points):.0f} % of {len(points)} points"
             least = f"at least {100 * LEAST_BELONGING:.0f} % are required"
-            selected[name] = _Selected(FitError(f"only {share} lie near the nominal surface, {least}"), len(points))
+            few = FitError(f"only {share} lie near the nominal surface, {least}")
+            selected[name] = _Selected(few, len(points), places)
     return selected
 
 
@@ -354,7 +369,9 @@ def measure_points(
         try:
             if len(some) < minimum_points:
                 raise FitError(f"{len(some)} points, at least {minimum_points} are required")
-            fits[name] = fit_surface(some, task.features[name].nominal())
+            nominal = task.features[name].nominal()
+            finite = some[np.isfinite(some).all(axis=1)]
+            fits[name] = _credible_fit(finite, nominal, nominal.meet(finite, None).foot)
         except FitError as error:
             fits[name] = error
     known: dict[InputQuantity, Estimate | FitError] = {
@@ -382,7 +399,8 @@ def _estimate(
     origin = cloud.grid.origin
     try:
         for name in quantity.features:
-            if isinstance(fit := fits[name], FitError):
+            undetermined = quantity.kind == "pose" and isinstance(fits[name], UndeterminedError)
+            if isinstance(fit := fits[name], FitError) and not undetermined:
                 raise FitError(f"{name}: {fit}")
         points = {name: _points(selected[name]) for name in quantity.features}
         if quantity.kind == "form":

@@ -1,4 +1,4 @@
-"""Virtual calibration of sensors."""
+"""Calibration of sensors, virtual or from the corners of a board, and its verification by a capture."""
 
 from __future__ import annotations
 
@@ -11,16 +11,23 @@ from characterisation.files.errors import InputError, nearest
 from mitsim.cli.options import Seed, check_file, definitions
 
 
-def calibrate(
-    sensor: Annotated[str, typer.Argument(help="Name of a preset, or path of a sensor TOML file.")],
+def rig(
+    sensor: Annotated[
+        str,
+        typer.Argument(
+            metavar="SENSOR|CORNERS",
+            help="Virtual calibration: a preset, or a sensor TOML file. Real one: a folder of images of a board, or a "
+            "file of its corners (.csv, .npz, OpenCV's .yml, .yaml, .xml, .json).",
+        ),
+    ],
     output: Annotated[
         Path, typer.Option("--output", "-o", help="TOML file to write: the covariance of the calibration.")
     ],
     board: Annotated[
         str | None,
         typer.Option(
-            help="Calibration board: COLUMNSxROWSxSQUARE_MM:GRADE, grade glass, composite or paper; default: half as "
-            "wide as the field."
+            help="Calibration board: COLUMNSxROWSxSQUARE_MM:GRADE, in squares; grade glass, composite or paper; "
+            "default of a virtual calibration: half as wide as the field."
         ),
     ] = None,
     poses: Annotated[int, typer.Option(help="Number of poses of the board, over range and field of view.")] = 20,
@@ -42,10 +49,17 @@ def calibrate(
     ] = 0,
     seed: Seed = 1,
 ) -> None:
-    """Compute the uncertainty of a sensor's calibration from a virtual board, its poses and the noise of its corners.
+    """Calibrate virtually, or from recorded corners, and write the covariance that statements of uncertainty draw.
+
+    Recorded corners also give the calibration itself, in OpenCV's form beside the output. Two halves of the poses must
+    agree: the covariance is widened until they do, or refused.
 
     Example: mitsim calibrate ensenso-n10 -o n10-calibration.toml --board 11x8x30:glass --poses 20
+    Example: mitsim calibrate boards/ -o unit-calibration.toml --board 11x8x30:glass
     """
+    if _is_recorded(sensor):
+        _recorded(Path(sensor), output, board)
+        return
     from dataclasses import replace
 
     import numpy as np
@@ -84,3 +98,107 @@ def calibrate(
         print("\n" + coverage_table(names, scores), end="")
     write_rig_covariance(output, found.covariance, chosen.rig)
     say(f"calibration: {output}")
+
+
+def verify(
+    capture: Annotated[Path, typer.Argument(help="Capture folder that shows a board or a plate of dots.")],
+    board: Annotated[
+        str | None, typer.Option(help="Chequerboard: COLUMNSxROWSxSQUARE_MM:GRADE, grade glass, composite or paper.")
+    ] = None,
+    dots: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PITCH[,COLUMN,ROW,WIDTH,HEIGHT]", help="Plate of dots of known pitch [mm], in a window [px]."
+        ),
+    ] = None,
+    printed: Annotated[
+        float, typer.Option(min=0, max=0.1, help="Relative standard uncertainty of the pitch of the dots.")
+    ] = 2e-4,
+    sensor: Annotated[
+        str | None,
+        typer.Option(help="Preset or sensor file whose calibration is stated; default: the sensor of the capture."),
+    ] = None,
+) -> None:
+    """Verify a calibration by one capture of a board or a plate of dots: use it, or calibrate again.
+
+    Compares the error of lengths, and the difference of rows of two cameras, with what the stated covariance of the
+    calibration and the drift since then allow. Exit code 1 if one is larger.
+
+    Example: mitsim calibrate verify captures/board --board 11x8x30:glass
+    """
+    from characterisation.region_of_interest import Roi
+    from mitsim.capture.folder import read_capture
+    from mitsim.decoding.checks.checked_cloud import checked_cloud
+    from mitsim.decoding.cloud import decoder_settings
+    from mitsim.decoding.plate import Plate
+    from mitsim.running.progress import say
+    from mitsim.sensor.preset import load_sensor
+    from mitsim.study.calibration import verification
+    from mitsim.study.calibration.board import parse_board
+    from mitsim.study.virtual.study_unknowns import calibration_covariance
+
+    if (board is None) == (dots is None):
+        raise InputError("--board", "", "neither it nor --dots" if board is None else "--dots too", "one of both")
+    numbers = [] if dots is None else _plate_numbers(dots)
+    read = read_capture(capture)
+    chosen = load_sensor(sensor or read.sensor)
+    covariance = calibration_covariance(chosen, chosen.unknowns.calibration, Path(sensor or ".").parent)
+    cloud = None
+    if dots is not None or len(read.images) < 2:
+        settings, imager = decoder_settings(read, None, None)
+        cloud = checked_cloud(read, settings, imager, where=str(capture), sensor=None).cloud
+    if board is not None:
+        known = verification.corners_of_board(read, parse_board(board), cloud)
+    else:
+        assert cloud is not None
+        window = Roi(*(int(value) for value in numbers[1:])) if len(numbers) > 1 else None
+        known = verification.dots_of_plate(read, Plate(window, numbers[0]), cloud, printed)
+    say(f"comparing with the stated calibration of {chosen.name}")
+    found = verification.verify(known, chosen, read.rig, covariance, chosen.published_lengths)
+    print("\n".join([*found.rows(), found.sentence()]))
+    if not found.usable:
+        raise typer.Exit(1)
+
+
+def _plate_numbers(text: str) -> list[float]:
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    whole = all(value >= 0 and value % 1 == 0 for value in numbers[1:])
+    if len(numbers) not in (1, 5) or not 0 < numbers[0] < 1e5 or not whole:
+        raise InputError("--dots", "", repr(text), "PITCH, or PITCH,COLUMN,ROW,WIDTH,HEIGHT")
+    return numbers
+
+
+def _is_recorded(given: str) -> bool:
+    """Return whether an argument names recorded corners, rather than a sensor."""
+    path = Path(given)
+    return path.is_dir() or path.suffix.lower() in (".csv", ".npz", ".yml", ".yaml", ".xml", ".json")
+
+
+def _recorded(path: Path, output: Path, board: str | None) -> None:
+    """Calibrate from recorded corners; print the result, and write it with its covariance."""
+    from mitsim.running.progress import say
+    from mitsim.study.calibration.board import parse_board
+    from mitsim.study.calibration.corner_files import read_corners
+    from mitsim.study.calibration.halves import calibrate_checked
+    from mitsim.study.calibration.written import calibration_table, sensor_lines, write_calibration
+
+    if board is None:
+        raise InputError("--board", "", "none", "the board of the recording: COLUMNSxROWSxSQUARE_MM:GRADE")
+    if output.suffix.lower() in (".yml", ".yaml"):
+        raise InputError("--output", "", str(output), "a .toml file; the calibration is written beside it as .yml")
+    known = parse_board(board)
+    check_file(output)
+    check_file(output.with_suffix(".yml"))
+    corners = read_corners(path, known)
+    for line in corners.left_out:
+        say(f"left out: {line}")
+    say(f"calibrating {', '.join(corners.sizes)}: {len(corners.boards)} poses, and two halves of them")
+    source = f"recorded corners: {path.name}, {known}"[:400]
+    checked = calibrate_checked(corners.boards, known, corners.sizes, source, where=str(path))
+    print(calibration_table(checked), end="")
+    rig_file = write_calibration(checked, output)
+    say(f"calibration: {output}, {rig_file}; in a sensor file:")
+    say(sensor_lines(checked.calibration.rig, rig_file, output))

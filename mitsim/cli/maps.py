@@ -171,6 +171,8 @@ def predict(
     start(variant)
     from mitsim.decoding.captures import load_scene, load_sensor, write_cloud
     from mitsim.maps import use as maps
+    from mitsim.maps.prediction.faces_in_sight import in_words
+    from mitsim.running.progress import say
     from mitsim.study import read_map
 
     chosen = load_sensor(sensor)
@@ -182,6 +184,8 @@ def predict(
     check_file(output)
     write_cloud(cloud, output)
     print_reasons(cloud)
+    if lit := in_words(maps.faces_that_see_others(loaded, chosen, pose)):
+        say(f"{lit}; their F can be far lower: mitsim study score predicts it")
 
 
 def validate(

@@ -88,7 +88,6 @@ for command in (
     devices.capture,
     import_recording.import_,
     decode.decode,
-    calibrations.calibrate,
     compare.compare,
 ):
     app.command(name=command.__name__.rstrip("_"))(command)
@@ -99,6 +98,12 @@ for name, group in {
         studies.choose,
         studies.state,
         studies.exposures,
+    ),
+    "calibrate": command_group(
+        "Calibrate virtually or from the corners of a board, or verify a calibration by one capture.",
+        calibrations.rig,
+        calibrations.verify,
+        default=True,
     ),
     "measure": command_group(
         "Measure planes, spheres, cylinders, dots or a task in clouds, or compute figures of acceptance tests.",

@@ -107,6 +107,7 @@ def page_content(run: Run) -> dict[str, Any]:
         "map": map_data.attrs,
         "knows_area": bool("noise_area" in map_data and np.isfinite(map_data["noise_area"].values).any()),
         "bias_reach": f"{rounded(PERSISTENT_REACH_PX)} pixels, {rounded(math.degrees(PERSISTENT_TURN))}°",
+        "faces_in_sight": [f"{name} ({percent(share)})" for name, share in about.faces_in_sight.items()],
         "residual": _residual(run),
         "total_seconds": rounded(sum(about.seconds.values())),
         "rounded": rounded,

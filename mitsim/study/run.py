@@ -30,6 +30,7 @@ from mitsim.capture.simulated.render_residual import (
 )
 from mitsim.maps.campaign.acquire import coupon_residuals, in_turn, simulated_source
 from mitsim.maps.campaign.run import run_campaign
+from mitsim.maps.prediction.faces_in_sight import faces_in_sight
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say, track
 from mitsim.sensor.exposure import PlannedExposure
@@ -126,6 +127,13 @@ def run_study(
         residuals += [_residual(twin, number) for number in shown[:1]]
     clock.lap("pictures")
     about = run_record(study, performance_map, raced, shown, largest_residual(residuals))
+    reported = leaders[:1] or _best(scores)[:1]
+    about["faces_in_sight"] = {
+        name: share
+        for number in reported
+        for name, share in faces_in_sight(session.predictor, study.scene, study.view(number).world_from_sensor).items()
+        if name in study.task.shapes
+    }
     about["view_sets"] = [] if chosen is None else [_set_record(study, chosen, tried)]
     about["seconds"] = clock.steps
     about["files"] = digests_of(folder, own_files(study, drawn, shown, stated is not None))

@@ -169,6 +169,7 @@ class RunDocument(PartialDocument):
     render_residual: ResidualEntry | None = None
     features: dict[str, str]
     lay: dict[str, LayLeftOut] = Field(default_factory=dict)
+    faces_in_sight: dict[str, float] = Field(default_factory=dict)
     measurements: dict[str, MeasurementEntry]
     view_sets: list[ViewSetEntry] = Field(default_factory=list)
     seconds: dict[str, float] = Field(default_factory=dict)

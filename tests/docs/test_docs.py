@@ -295,7 +295,7 @@ def test_index_of_formats_links_every_page_and_names_every_command():
         f"{name} {one}".strip()
         for name, command in COMMANDS.items()
         for one in getattr(command, "commands", {"": None})
-    } - {"measure clouds"}
+    } - {"measure clouds", "calibrate rig"}  # the first of their groups, called without their names
     assert {name for name in every if f"`mitsim {name}`" not in index} == set()
 
 

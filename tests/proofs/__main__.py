@@ -298,7 +298,27 @@ def finishes(
     print(finishes_page(folder), end="")
 
 
-for command in (maps, scores, statements, budgets, losses, laboratory, seeds, finishes):
+def faces(
+    cases: Annotated[Path, typer.Argument(help="TOML file that lists parts, sensors and finishes.")],
+    views: Annotated[int, typer.Option(min=1, max=100, help="Views to render of each case.")] = 2,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="Evaluate only cases whose name PART__SENSOR__FINISH contains this text. Repeatable."),
+    ] = None,
+    variant: Variant = None,
+) -> None:
+    """Compare F of every feature on the map and of the score with F found in rendered captures; print the table.
+
+    Example: python -m tests.proofs faces scenes/parts/validation.toml
+    """
+    start(variant)
+    from tests.proofs.faces import fractions_of_cases, fractions_table
+    from tests.proofs.part_cases import read_part_cases
+
+    print(fractions_table(fractions_of_cases(read_part_cases(cases, only or ()), views)), end="")
+
+
+for command in (maps, scores, statements, budgets, losses, laboratory, seeds, finishes, faces):
     app.command(name=command.__name__)(command)
 
 if __name__ == "__main__":

@@ -49,6 +49,8 @@ _MOST_STEPS = 300
 _SMALL_STEP, _SMALL_GAIN = 1e-4, 1e-9
 #: damping with which the adjustment cannot go on
 _STUCK = 1e9
+#: least angle [deg] between board normals for which a missing tilt is not named as the cause of a failure; *assumed*
+_TILTED_DEG = 15.0
 #: least number of poses: two views of a plane leave the focal length to the prior
 LEAST_POSES = 3
 
@@ -65,6 +67,9 @@ class RecordedBoard:
 class RecordedCalibration:
     """Result of a calibration: ``rig``, ``places`` sensor_from_board of the poses, ``covariance``, observation noise.
 
+    ``board_effect`` (p, m): what one standard deviation of each imperfection of the board changes; the covariance
+    contains it.
+
     ``camera_px`` (poses,) of a corner in a camera, ``coordinate_px`` (poses,) the projector's additional part, 0
     without one; one sigma each. They differ between poses: a tilted board is out of focus, and its stripes are wider.
     """
@@ -74,6 +79,7 @@ class RecordedCalibration:
     covariance: RigCovariance
     camera_px: Floats
     coordinate_px: Floats
+    board_effect: Floats
 
 
 def calibrate_recorded(
@@ -111,7 +117,7 @@ def calibrate_recorded(
     for _ in range(_ROUNDS):
         rig, places, normal = observed.adjusted(rig, places, noise, rig_prior(rig, sizes))
         noise = observed.noise(rig, places, normal)
-    matrix = observed.covariance(rig, places, noise, normal, own_units)
+    matrix, effect = observed.covariance(rig, places, noise, normal, own_units)
     details: dict[str, str | float] = {
         "board": str(board),
         "poses": float(len(places)),
@@ -120,7 +126,8 @@ def calibrate_recorded(
         "coordinate_noise_px": float(noise[:, 1].max()),
     }
     covariance = RigCovariance(parameter_names(rig), matrix, source, details)
-    return RecordedCalibration(rig, places, covariance, *noise.T)
+    camera_px, coordinate_px = noise.T
+    return RecordedCalibration(rig, places, covariance, camera_px, coordinate_px, effect)
 
 
 @dataclass(frozen=True)
@@ -230,7 +237,7 @@ class _Observations:
             if gained < _SMALL_GAIN * cost and float(step @ normal @ step) < _SMALL_STEP:
                 return rig, places, normal
         found = f"an adjustment that does not converge in {_MOST_STEPS} steps"
-        raise InputError("boards", "", found, "poses that determine it")
+        raise InputError("boards", "", found, "poses that determine it", tilt_hint(places))
 
     def _normal(
         self, rig: Rig, places: list[Transform], noise: Floats, prior: LensPrior
@@ -269,8 +276,13 @@ class _Observations:
             out.append([np.mean(np.concatenate(camera) ** 2), np.mean(np.concatenate(own) ** 2)])
         return np.sqrt(np.array(out) * lost)
 
-    def covariance(self, rig: Rig, places: list[Transform], noise: Floats, normal: Floats, own_units: bool) -> Floats:
-        """Return the covariance of the rig's parameters (p, p) after an adjustment with a normal matrix (q, q)."""
+    def covariance(
+        self, rig: Rig, places: list[Transform], noise: Floats, normal: Floats, own_units: bool
+    ) -> tuple[Floats, Floats]:
+        """Return the covariance of the rig's parameters (p, p), and what the board's errors change of them (p, m).
+
+        ``normal`` (q, q) is the normal matrix of the adjustment.
+        """
         count, (modes, sigma) = len(parameter_names(rig)), self.board.imperfections()
         if own_units:
             sigma = np.concatenate([[0.0], sigma[1:]])  # the first is the scale
@@ -281,7 +293,22 @@ class _Observations:
             shared[pose.indices] += np.einsum("nip,nim->pm", pose.jacobian, moved)
         inverse = bundle.inverse_of(normal)
         spread = (inverse @ shared)[:count] * sigma
-        return np.asarray(inverse[:count, :count] + spread @ spread.T)
+        return np.asarray(inverse[:count, :count] + spread @ spread.T), np.asarray(spread)
+
+
+def largest_tilt(places: Sequence[Transform]) -> float:
+    """Return the largest angle [deg] between normals of the board in two poses."""
+    normals = np.array([place.rotation[:, 2] for place in places])
+    return float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))))
+
+
+def tilt_hint(places: Sequence[Transform]) -> str:
+    """Return a hint if the poses of the board are too much alike to separate focal length and distance, or ""."""
+    tilt = largest_tilt(places)
+    if tilt >= _TILTED_DEG:
+        return ""
+    advice = "record poses tilted by 20 to 40 deg in several directions"
+    return f"tilts of the board differ by {tilt:.1f} deg at most; {advice}"
 
 
 class _Whitened(NamedTuple):

@@ -1,0 +1,265 @@
+"""Read the corners of a calibration board from images or from the files of other programs.
+
+Signal chain: folder of images, table of corners, OpenCV's file or arrays -> pixels of every corner by pose and camera
+-> poses in which every camera sees the same corners (:class:`~mitsim.study.calibration.recorded.RecordedBoard`).
+
+Four forms are read:
+
+- **A folder of images.** Camera and pose follow from the names: ``left-0001.png`` and ``right-0001.png``, as ROS's
+  calibrator saves them, or folders ``left`` and ``right`` with images of equal names. Names without a camera belong to
+  one camera. The corners are found by ``cv2.findChessboardCornersSB``.
+- **A table**, ``.csv``: columns ``pose, camera, column, row, x_px, y_px``. ``column`` and ``row`` count the inner
+  corners from 0. A camera named ``projector`` is a projector. Lines ``# size CAMERA WIDTH HEIGHT`` give the sizes.
+- **OpenCV's file**, ``.yml``, ``.yaml``, ``.xml`` or ``.json`` of its calibration sample: ``image_points`` (poses,
+  corners) of two channels, or ``image_points1`` and ``image_points2`` of a pair; ``image_width``, ``image_height``.
+- **Arrays**, ``.npz``: the same names or ``imgpoints``, ``imgpoints_l`` and ``imgpoints_r``; ``image_size``.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.checked_files import read_bounded, read_text_bounded
+from characterisation.files.errors import InputError
+from mitsim.capture.grey_image import read_grey
+from mitsim.study.calibration.board import Board
+from mitsim.study.calibration.recorded import RecordedBoard
+
+Floats = NDArray[np.float64]
+
+#: pixel (2,) of every corner, by pose and camera
+Seen = dict[str, dict[str, dict[int, Floats]]]
+
+#: width and height [px] of every camera's images
+Sizes = dict[str, tuple[int, int]]
+
+#: fewest corners of a pose that all cameras see
+_LEAST_CORNERS = 12
+
+#: names of a pair's arrays, of the first and of the second camera
+_PAIRS = (("image_points1", "image_points2"), ("imgpoints_l", "imgpoints_r"), ("imgpointsL", "imgpointsR"))
+
+#: names of one camera's array
+_SINGLES = ("image_points", "imgpoints", "Image_points")
+
+_IMAGES = frozenset({".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm"})
+
+_MOST_BYTES = 256 * 2**20
+
+_COLUMNS = ("pose", "camera", "column", "row", "x_px", "y_px")
+
+
+@dataclass(frozen=True)
+class RecordedCorners:
+    """Poses of a board, and ``sizes`` (width, height) [px] of the eyes, the reference camera first.
+
+    ``left_out`` describes poses that were not used.
+    """
+
+    boards: list[RecordedBoard]
+    sizes: dict[str, tuple[int, int]]
+    left_out: list[str]
+
+
+def read_corners(path: str | Path, board: Board) -> RecordedCorners:
+    """Read the corners of a board, in any of the forms of this module.
+
+    Raises
+    ------
+    InputError
+        If there is no such file or folder, it has another form, or corners do not belong to the board.
+    """
+    path = Path(path)
+    if path.is_dir():
+        seen, sizes = _of_images(path, board)
+    elif path.suffix.lower() == ".csv":
+        seen, sizes = _of_table(path, board)
+    elif path.suffix.lower() == ".npz":
+        seen, sizes = _of_arrays(path, _npz(path), board)
+    elif path.suffix.lower() in (".yml", ".yaml", ".xml", ".json"):
+        seen, sizes = _of_arrays(path, _opencv(path), board)
+    else:
+        allowed = "a folder of images, or a file .csv, .npz, .yml, .yaml, .xml or .json"
+        raise InputError(path, "", "a file of another kind" if path.exists() else "nothing there", allowed)
+    return _together(path, seen, sizes)
+
+
+def _together(path: Path, seen: Seen, sizes: Sizes) -> RecordedCorners:
+    """Return the poses whose corners all eyes see; ``seen`` has the pixels (2,) by pose, eye and corner."""
+    boards, left_out = [], []
+    for pose, by_eye in seen.items():
+        lacking = [eye for eye in sizes if eye not in by_eye]
+        common = sorted(set.intersection(*[set(by_eye[eye]) for eye in sizes])) if not lacking else []
+        if len(common) < _LEAST_CORNERS:
+            why = f"no board in {', '.join(lacking)}" if lacking else f"{len(common)} corners that all cameras see"
+            left_out.append(f"{pose}: {why}")
+            continue
+        pixels = {eye: np.array([by_eye[eye][corner] for corner in common]) for eye in sizes}
+        boards.append(RecordedBoard(np.array(common, np.intp), pixels))
+    if not boards:
+        found = "; ".join(left_out[:3]) or "no pose"
+        raise InputError(path, "", found, f"poses with {_LEAST_CORNERS} corners or more", "check --board")
+    return RecordedCorners(boards, sizes, left_out)
+
+
+def _of_images(path: Path, board: Board) -> tuple[Seen, Sizes]:
+    files = sorted(one for one in path.rglob("*") if one.suffix.lower() in _IMAGES and one.is_file())
+    seen: Seen = {}
+    sizes: Sizes = {}
+    for file in files:
+        camera, pose = _named(file.relative_to(path))
+        image = read_grey(file)
+        size = (image.shape[1], image.shape[0])
+        if sizes.setdefault(camera, size) != size:
+            others = "{} x {} px, as the others".format(*sizes[camera])
+            raise InputError(file, "size", f"{size[0]} x {size[1]} px", others)
+        corners = found_corners(image, board)
+        seen.setdefault(pose, {})
+        if corners is not None:
+            seen[pose][camera] = dict(enumerate(corners))
+    for by_camera in seen.values():
+        cameras = sorted(by_camera)
+        if len(cameras) == 2:
+            first, second = (np.array(list(by_camera[name].values())) for name in cameras)
+            by_camera[cameras[1]] = dict(enumerate(turned_alike(first, second)))
+    if not files:
+        raise InputError(path, "", "no image", f"images {', '.join(sorted(_IMAGES))} of the board")
+    if len(sizes) > 2:
+        raise InputError(path, "", f"images of {', '.join(sizes)}", "one or two cameras", "name them left and right")
+    return seen, dict(sorted(sizes.items()))
+
+
+def found_corners(image: NDArray[np.generic], board: Board) -> Floats | None:
+    """Return the inner corners (n, 2) [px] of a chequerboard in an image, in the order of the board; None without."""
+    shape = (board.columns - 1, board.rows - 1)
+    levels = np.asarray(image, float)
+    low, high = np.percentile(levels, [1, 99])
+    grey = np.clip(255 * (levels - low) / max(high - low, 1e-9), 0, 255).astype(np.uint8)
+    for flags in (cv2.CALIB_CB_ACCURACY, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE):
+        found, corners = cv2.findChessboardCornersSB(grey, shape, flags=flags)
+        if found:
+            break
+    return np.asarray(corners, float).reshape(-1, 2) if found else None
+
+
+def turned_alike(first: Floats, second: Floats) -> Floats:
+    """Return the corners (n, 2) [px] of a second camera in the order of those of a first.
+
+    A board whose numbers of rows and columns are both even or both odd looks the same after half a turn. Of the two
+    orders, the one is chosen in which the diagonals of the board have the same sense in both images.
+    """
+    alike = float((first[-1] - first[0]) @ (second[-1] - second[0])) > 0
+    return second if alike else second[::-1]
+
+
+def _named(file: Path) -> tuple[str, str]:
+    """Return the camera and the pose that the name of an image states."""
+    if len(file.parts) > 1:
+        return file.parts[-2], file.stem
+    match = re.match(r"(left|right|l|r|camera\d*|cam\d*)[-_ ]?(.*)$", file.stem, re.IGNORECASE)
+    if match and match[2]:
+        return {"l": "left", "r": "right"}.get(match[1].lower(), match[1].lower()), match[2]
+    match = re.match(r"(.*?)[-_ ](left|right|l|r)$", file.stem, re.IGNORECASE)
+    if match:
+        return {"l": "left", "r": "right"}.get(match[2].lower(), match[2].lower()), match[1]
+    return "camera", file.stem
+
+
+def _of_table(path: Path, board: Board) -> tuple[Seen, Sizes]:
+    text = read_text_bounded(path)
+    sizes: Sizes = {}
+    for line in text.splitlines():
+        if match := re.match(r"#\s*size\s+(\S+)\s+(\d{1,5})\s+(\d{1,5})\s*$", line):
+            sizes[match[1]] = (int(match[2]), int(match[3]))
+    written = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
+    rows = csv.DictReader(io.StringIO(written), skipinitialspace=True)
+    if tuple(name.strip() for name in rows.fieldnames or ()) != _COLUMNS:
+        raise InputError(path, "header", ", ".join(rows.fieldnames or ()) or "nothing", ", ".join(_COLUMNS))
+    seen: Seen = {}
+    for number, row in enumerate(rows, 1):
+        try:
+            column, line_of_board = int(row["column"]), int(row["row"])
+            place = np.array([float(row["x_px"]), float(row["y_px"])])
+        except (TypeError, ValueError):
+            found = str(list(row.values()))[:60]
+            raise InputError(path, f"row {number}", found, "whole numbers, and two pixels") from None
+        inside = 0 <= column < board.columns - 1 and 0 <= line_of_board < board.rows - 1
+        if not inside or not np.isfinite(place).all():
+            corners = f"corners 0 to {board.columns - 2} and 0 to {board.rows - 2} of the board, with finite pixels"
+            raise InputError(path, f"row {number}", f"corner {column}, {line_of_board}", corners)
+        if row["camera"] not in sizes:
+            raise InputError(path, row["camera"], "no size", f"a line # size {row['camera']} WIDTH HEIGHT")
+        by_eye = seen.setdefault(row["pose"], {}).setdefault(row["camera"], {})
+        by_eye[line_of_board * (board.columns - 1) + column] = place
+    return seen, sizes
+
+
+def _of_arrays(path: Path, arrays: Mapping[str, Any], board: Board) -> tuple[Seen, Sizes]:
+    names = next((pair for pair in _PAIRS if all(name in arrays for name in pair)), None)
+    single = next((name for name in _SINGLES if name in arrays), None)
+    if names is None and single is None:
+        allowed = ", ".join([*_SINGLES, *(" and ".join(pair) for pair in _PAIRS)])
+        raise InputError(path, "", ", ".join(list(arrays)[:8]) or "no array", f"corners named {allowed}")
+    if names is not None:
+        by_eye = {"left": arrays[names[0]], "right": arrays[names[1]]}
+    else:
+        by_eye = {"camera": arrays[str(single)]}
+    size = _size(path, arrays)
+    count = len(board.corners)
+    seen: Seen = {}
+    for eye, values in by_eye.items():
+        try:
+            pixels = np.asarray(values, float).reshape(-1, count, 2)
+        except (TypeError, ValueError):
+            found = f"{np.asarray(values, object).shape}"
+            raise InputError(path, eye, found, f"(poses, {count}, 2), for {board}", "check --board") from None
+        for pose, places in enumerate(pixels):
+            known = np.isfinite(places).all(axis=1)
+            seen.setdefault(str(pose), {})[eye] = {int(k): places[k] for k in np.flatnonzero(known)}
+    return seen, dict.fromkeys(by_eye, size)
+
+
+def _size(path: Path, arrays: Mapping[str, Any]) -> tuple[int, int]:
+    given = arrays.get("image_size", [arrays.get("image_width"), arrays.get("image_height")])
+    try:
+        width, height = (int(value) for value in np.asarray(given).ravel())
+    except (TypeError, ValueError):
+        raise InputError(path, "image_size", given, "width and height of the images [px]") from None
+    if not (0 < width <= 65535 and 0 < height <= 65535):
+        raise InputError(path, "image_size", f"{width} x {height}", "1 to 65535 px")
+    return width, height
+
+
+def _npz(path: Path) -> dict[str, Any]:
+    try:
+        with np.load(io.BytesIO(read_bounded(path, largest=_MOST_BYTES)), allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (ValueError, OSError, EOFError, KeyError) as error:
+        found = str(error)[:80] or "a damaged file"
+        raise InputError(path, "", found, "arrays of numbers, saved by numpy.savez") from None
+
+
+def _opencv(path: Path) -> dict[str, Any]:
+    text = read_text_bounded(path)
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        root = storage.root()
+        out: dict[str, Any] = {}
+        for name in root.keys():  # noqa: SIM118 - a node of OpenCV, not a dictionary
+            node = root.getNode(name)
+            value = node.mat() if not (node.isInt() or node.isReal() or node.isString()) else node.real()
+            if value is not None:
+                out[name] = value
+    except (cv2.error, SystemError, UnicodeError) as error:
+        raise InputError(path, "", str(error).strip().splitlines()[-1][:80], "a file of cv::FileStorage") from None
+    return out

@@ -1,0 +1,89 @@
+"""Write a calibration from recorded corners: OpenCV's file for sensor files, covariance for statements, table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from characterisation.files.atomic_io import write_text
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.rig_covariance import write_rig_covariance
+from mitsim.sensor.rig_parameters import parameter_values
+from mitsim.study.calibration.halves import CheckedCalibration, in_words
+
+
+def write_calibration(checked: CheckedCalibration, output: Path) -> Path:
+    """Write the covariance to ``output`` and the rig beside it, as OpenCV's ``.yml``; return the path of the latter."""
+    rig_file = output.with_suffix(".yml")
+    rig = checked.calibration.rig
+    write_text(rig_file, opencv_text(rig))
+    write_rig_covariance(output, checked.calibration.covariance, rig)
+    return rig_file
+
+
+def opencv_text(rig: Rig) -> str:
+    """Return a rig as OpenCV's YAML, by the names of its stereo sample; a projector by ``proj_``."""
+    (_, first), *others = rig.cameras.items()
+    lines = ["%YAML:1.0", "---"]
+    if others:
+        lines += _eye(first, "cameraMatrix1", "distCoeffs1", "image_size")
+        lines += _eye(others[0][1], "cameraMatrix2", "distCoeffs2", "image_size_2") + _pose(others[0][1])
+    else:
+        lines += _eye(first, "cam_K", "cam_kc", "image_size")
+    if rig.projector is not None:
+        lines += _eye(rig.projector, "proj_K", "proj_kc", "projector_size")
+        lines += _pose(rig.projector)
+    return "\n".join(lines) + "\n"
+
+
+def calibration_table(checked: CheckedCalibration) -> str:
+    """Return noise, halves and the values of all parameters with their standard uncertainties, one per line."""
+    found = checked.calibration
+    names, sigma = found.covariance.names, found.covariance.one_sigma
+    lines = [
+        f"{len(found.places)} poses, tilted by up to {checked.tilt_deg:.0f} deg against one another; noise of a corner "
+        f"{found.camera_px.min():.3f} to {found.camera_px.max():.3f} px",
+        in_words(checked),
+        "",
+        f"{'parameter':<28} {'value':>12} {'one sigma':>10}",
+    ]
+    values = parameter_values(found.rig, names)
+    lines += [f"{name:<28} {value:>12.6g} {u:>10.3g}" for name, value, u in zip(names, values, sigma, strict=True)]
+    return "\n".join(lines) + "\n"
+
+
+def sensor_lines(rig: Rig, rig_file: Path, covariance_file: Path) -> str:
+    """Return the tables of a sensor file that use both files."""
+    names = ", ".join(f'"{name}"' for name in rig.cameras)
+    projector = "" if rig.projector is not None else "projector = false\n"
+    return (
+        f'[calibration]\nfile = "{rig_file.name}"\ncameras = [{names}]\n{projector}\n'
+        f'[unknowns.calibration]\ncovariance = "{covariance_file.name}"\n'
+    )
+
+
+def _eye(eye: Camera, matrix: str, distortion: str, size: str) -> list[str]:
+    return [
+        *_matrix(matrix, eye.matrix),
+        *_matrix(distortion, np.asarray(eye.distortion).reshape(1, -1)),
+        f"{size}: [ {eye.width}, {eye.height} ]",
+    ]
+
+
+def _pose(eye: Camera) -> list[str]:
+    motion = eye.sensor_from_camera.inverse()
+    return [*_matrix("R", motion.rotation), *_matrix("T", motion.translation.reshape(3, 1))]
+
+
+def _matrix(name: str, values: ArrayLike) -> list[str]:
+    array = np.asarray(values, float)
+    data = ", ".join(f"{value:.16e}" for value in array.ravel())
+    return [
+        f"{name}: !!opencv-matrix",
+        f"   rows: {array.shape[0]}",
+        f"   cols: {array.shape[1]}",
+        "   dt: d",
+        f"   data: [ {data} ]",
+    ]

@@ -1,0 +1,151 @@
+"""Corners in the forms of other programs give the same calibration, whose halves must agree."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from characterisation.files.errors import InputError
+from mitsim.sensor.camera import Camera, Rig
+from mitsim.sensor.opencv_calibration import with_calibration
+from mitsim.sensor.rig_covariance import read_rig_covariance
+from mitsim.sensor.rig_parameters import parameter_differences
+from mitsim.sensor.transforms import Transform
+from mitsim.study.calibration.board import Board
+from mitsim.study.calibration.corner_files import read_corners
+from mitsim.study.calibration.halves import calibrate_checked, in_words
+from mitsim.study.calibration.recorded import RecordedBoard
+from mitsim.study.calibration.written import write_calibration
+from tests.shell import mitsim_here
+
+BOARD = Board(9, 7, 20.0, "glass")
+SIZE = (1280, 960)
+
+
+def pair() -> Rig:
+    matrix = np.array([[1500.0, 0, 640], [0, 1502, 470], [0, 0, 1]])
+    turned = Transform(Rotation.from_rotvec([0.0, -0.1, 0.01]).as_matrix(), np.array([100.0, 1.0, 3.0]))
+    left = Camera(matrix, np.array([-0.1, 0.05, 0, 0, 0]), *SIZE)
+    return Rig({"left": left, "right": Camera(matrix, np.array([-0.1, 0.06, 0, 0, 0]), *SIZE, turned)})
+
+
+def pixels_of(seed, count=10, tilt=0.5, noise=0.08):
+    """Pixels (poses, n, 2) of each camera; the board is tilted by up to ``tilt`` rad."""
+    rng = np.random.default_rng(seed)
+    out = {"left": [], "right": []}
+    for number in range(count):
+        turn = tilt * np.array([np.cos(2.4 * number), np.sin(2.4 * number), 0.2])
+        shift = np.array([40 * np.cos(number), 30 * np.sin(2 * number), 520 + 20 * (number % 4)])
+        place = Transform(Rotation.from_rotvec(turn).as_matrix(), shift)
+        for name, eye in pair().cameras.items():
+            seen = eye.project(place.points(BOARD.corners))
+            out[name].append(seen + noise * rng.standard_normal(seen.shape))
+    return {name: np.array(values) for name, values in out.items()}
+
+
+def boards_of(pixels):
+    every = np.arange(len(BOARD.corners))
+    return [
+        RecordedBoard(every, {name: values[k] for name, values in pixels.items()}) for k in range(len(pixels["left"]))
+    ]
+
+
+def write_table(path, pixels):
+    lines = ["# size left 1280 960", "# size right 1280 960", "pose,camera,column,row,x_px,y_px"]
+    for name, values in pixels.items():
+        for pose, places in enumerate(values):
+            for corner, (x, y) in enumerate(places):
+                lines.append(f"{pose},{name},{corner % 8},{corner // 8},{x:.17g},{y:.17g}")
+    path.write_text("\n".join(lines) + "\n")
+
+
+def test_every_form_gives_the_same_corners(tmp_path):
+    pixels = pixels_of(1)
+    write_table(tmp_path / "corners.csv", pixels)
+    np.savez(tmp_path / "corners.npz", imgpoints_l=pixels["left"], imgpoints_r=pixels["right"], image_size=SIZE)
+    for name in ("corners.yml", "corners.xml", "corners.json"):
+        storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
+        storage.write("image_width", SIZE[0])
+        storage.write("image_height", SIZE[1])
+        for number, values in enumerate(pixels.values(), 1):
+            storage.write(f"image_points{number}", values)
+        storage.release()
+    for file in sorted(tmp_path.iterdir()):
+        found = read_corners(file, BOARD)
+        assert found.sizes == {"left": SIZE, "right": SIZE} and not found.left_out
+        for number, board in enumerate(found.boards):
+            for name in pixels:
+                np.testing.assert_allclose(board.pixels[name], pixels[name][number], rtol=1e-12, err_msg=file.name)
+
+
+def test_images_of_ros_give_the_corners_of_the_board(tmp_path):
+    squares = np.kron(np.indices((7, 9)).sum(axis=0) % 2, np.ones((40, 40)))
+    for pose, angle in enumerate((0.0, 8.0)):
+        for name, shift in (("left", 60), ("right", 90)):
+            motion = cv2.getRotationMatrix2D((240, 200), angle, 1.0)
+            motion[:, 2] += shift
+            image = cv2.warpAffine(255 * squares.astype(np.uint8), motion, (640, 480), borderValue=200)
+            cv2.imwrite(str(tmp_path / f"{name}-{pose:04d}.png"), image)
+    found = read_corners(tmp_path, BOARD)
+    assert found.sizes == {"left": (640, 480), "right": (640, 480)} and len(found.boards) == 2
+    for board in found.boards:  # the right image is the left one, shifted by 30 px along both axes
+        np.testing.assert_allclose(board.pixels["right"] - board.pixels["left"], 30.0, atol=0.05)
+
+
+def test_a_calibration_whose_halves_agree_is_not_widened():
+    factors = [
+        calibrate_checked(boards_of(pixels_of(seed)), BOARD, {"left": SIZE, "right": SIZE}, "x").factor
+        for seed in range(6)
+    ]
+    assert sorted(factors)[4] == 1.0  # each differs with a probability of 2 % at most
+
+
+def test_errors_of_the_lens_at_like_poses_are_refused():
+    """Half a pixel that differs between poses, and a board that is hardly tilted."""
+    pixels = pixels_of(3, 12, tilt=0.02)
+    for values in pixels.values():
+        for number in range(12):
+            values[number] += 0.5 * np.sin(values[number, :, ::-1] / 150.0 + number)
+    with pytest.raises(InputError, match="tilted by 20 to 40 deg"):
+        calibrate_checked(boards_of(pixels), BOARD, {"left": SIZE, "right": SIZE}, "x")
+
+
+def test_the_files_written_are_those_that_a_sensor_reads(tmp_path):
+    checked = calibrate_checked(boards_of(pixels_of(2)), BOARD, {"left": SIZE, "right": SIZE}, "recorded")
+    write_calibration(checked, tmp_path / "unit.toml")
+    table = {"calibration": {"file": "unit.yml", "cameras": ["left", "right"], "projector": False}}
+    cameras = with_calibration(tmp_path / "sensor.toml", table)[0]["cameras"]
+    assert cameras["right"]["width"] == SIZE[0]
+    covariance = read_rig_covariance(tmp_path / "unit.toml", checked.calibration.rig)
+    off = parameter_differences(checked.calibration.rig, pair(), covariance.names)
+    told = [not name.endswith((".k2", ".k3")) for name in covariance.names]
+    assert np.abs(off / covariance.one_sigma)[told].max() < 4.5
+    assert "agree" in in_words(checked)
+
+
+def test_the_command_calibrates_a_table(tmp_path):
+    write_table(tmp_path / "corners.csv", pixels_of(4))
+    done = mitsim_here("calibrate", tmp_path / "corners.csv", "--board", "9x7x20:glass", "-o", tmp_path / "unit.toml")
+    assert "two halves of the poses agree" in done.stdout
+    assert (tmp_path / "unit.toml").is_file() and (tmp_path / "unit.yml").is_file()
+    assert 'covariance = "unit.toml"' in done.stderr
+
+
+@pytest.mark.parametrize(
+    "name, text",
+    [
+        ("a.csv", "pose,camera\n"),
+        ("a.csv", "# size left 10 10\npose,camera,column,row,x_px,y_px\n0,left,99,0,1,1\n"),
+        ("a.csv", "pose,camera,column,row,x_px,y_px\n0,left,0,0,1,1\n"),
+        ("a.yml", "%YAML:1.0\n---\nimage_points: [1, 2\n"),
+        ("a.yml", "%YAML:1.0\n---\nother: 3\n"),
+        ("a.npz", "no archive"),
+        ("a.json", "{}"),
+    ],
+)
+def test_files_without_corners_are_refused(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError):
+        read_corners(tmp_path / name, BOARD)

@@ -1,0 +1,123 @@
+"""One capture of a board tells a calibration that holds from one that has moved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from characterisation.files.errors import InputError
+from mitsim.capture.capture import Capture
+from mitsim.capture.folder import write_capture
+from mitsim.sensor.preset import load_sensor
+from mitsim.sensor.preset_covariance import preset_covariance
+from mitsim.sensor.published_lengths import PublishedLengths
+from mitsim.sensor.rig_parameters import moved
+from mitsim.sensor.transforms import Transform
+from mitsim.study.calibration.board import Board
+from mitsim.study.calibration.verification import corners_of_board, triangulated, verify
+from tests.shell import mitsim_here
+
+BOARD = Board(9, 6, 18.0, "glass")
+PLACE = Transform(Rotation.from_euler("xy", [12.0, -8.0], degrees=True).as_matrix(), np.array([45.0, 5.0, 560.0]))
+
+
+@pytest.fixture(scope="module")
+def n10():
+    return load_sensor("ensenso-n10")
+
+
+def seen_board(camera):
+    """The image (H, W) of the board at its place: the shade of the square on each pixel's ray, two rays a side."""
+    fine = 2
+    steps = (np.arange(fine) + 0.5) / fine - 0.5
+    x, y = np.meshgrid(*[(np.arange(size)[:, None] + steps).ravel() for size in (camera.width, camera.height)])
+    rays = camera.sensor_from_camera.directions(camera.rays(np.stack([x, y], -1).reshape(-1, 2)))
+    board = PLACE.inverse()
+    start, way = board.points(camera.centre[None])[0], board.directions(rays)
+    at = start[:2] - start[2] / way[:, 2:] * way[:, :2]
+    cells = np.floor(at / BOARD.square_mm + [BOARD.columns / 2, BOARD.rows / 2]).astype(int)
+    inside = ((cells >= 0) & (cells < [BOARD.columns, BOARD.rows])).all(axis=1)
+    shade = np.where(inside & (cells.sum(axis=1) % 2 == 0), 30.0, 220.0)
+    return cv2.resize(shade.reshape(x.shape), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+
+
+@pytest.fixture(scope="module")
+def good(n10):
+    return capture_by(n10, n10.rig)
+
+
+@pytest.fixture(scope="module")
+def turned(n10):
+    """A capture whose right camera has turned about its row: rows differ by some 2.5 px."""
+    return capture_by(n10, moved(n10.rig, ("right.rotation_x_rad",), np.array([4e-3])))
+
+
+def capture_by(sensor, true):
+    images = {name: seen_board(eye)[None].astype(np.uint8) for name, eye in true.cameras.items()}
+    return Capture(sensor.name, sensor.technology, "simulated", sensor.rig, images)
+
+
+def test_a_rig_that_did_not_move_is_usable_and_its_board_is_where_it_is(n10, good):
+    known = corners_of_board(good, BOARD, None)
+    assert abs(known.scale - 1) < 4 * known.scatter < 2e-3 and np.std(known.rows_px) < 0.2
+    found = verify(known, n10, n10.rig, preset_covariance(n10))
+    assert found.usable and found.sentence().startswith("Use it")
+    assert found.distance_mm == pytest.approx(np.linalg.norm(PLACE.points(BOARD.corners), axis=1).mean(), rel=1e-3)
+
+
+def test_a_camera_that_turned_about_its_row_is_to_be_calibrated_again(n10, turned):
+    found = verify(corners_of_board(turned, BOARD, None), n10, n10.rig, preset_covariance(n10))
+    assert abs(found.row_error_px) == pytest.approx(4e-3 * 626, rel=0.1)
+    assert not found.usable and "difference of rows" in found.sentence()
+
+
+def seen_through(n10, true, base):
+    """The known points of ``base`` as the nominal rig measures what a true rig sees, without noise."""
+    pixels = [eye.project(PLACE.points(BOARD.corners)) for eye in true.cameras.values()]
+    first, second = n10.rig.cameras.values()
+    points, rows = triangulated(first, pixels[0], second, pixels[1])
+    spread = [np.sqrt(((one - one.mean(axis=0)) ** 2).sum()) for one in (points, BOARD.corners)]
+    return replace(base, points=points, rows_px=rows, scale=float(spread[0] / spread[1]))
+
+
+def test_a_changed_vergence_shows_in_lengths(n10, good):
+    true = moved(n10.rig, ("right.rotation_y_rad",), np.array([8e-3]))  # 20 times the stated drift
+    known = seen_through(n10, true, corners_of_board(good, BOARD, None))
+    found = verify(known, n10, n10.rig, preset_covariance(n10))
+    assert not found.usable and "error of lengths" in found.sentence()
+
+
+def test_rigs_drawn_from_the_covariance_are_usable(n10, good):
+    """Of 10 rigs drawn from the statement, two errors each with 5 %, at most 4 are refused (99.8 %)."""
+    covariance, rng = preset_covariance(n10), np.random.default_rng(5)
+    base = corners_of_board(good, BOARD, None)
+    drawn = [moved(n10.rig, covariance.names, covariance.draw(rng)) for _ in range(10)]
+    found = [verify(seen_through(n10, true, base), n10, n10.rig, covariance).usable for true in drawn]
+    assert found.count(False) <= 4
+
+
+def test_a_capture_without_the_board_is_refused(n10):
+    grey = np.full((1, 480, 752), 100, np.uint8)
+    blank = Capture(n10.name, n10.technology, "simulated", n10.rig, {"left": grey, "right": grey})
+    with pytest.raises(InputError, match="no such board"):
+        corners_of_board(blank, BOARD, None)
+
+
+def test_the_command_says_use_or_calibrate_again(good, turned, tmp_path):
+    write_capture(good, tmp_path / "good")
+    done = mitsim_here("calibrate", "verify", tmp_path / "good", "--board", "9x6x18:glass")
+    assert done.stdout.splitlines()[-1].startswith("Use it") and "difference of rows" in done.stdout
+    write_capture(turned, tmp_path / "bad")
+    done = mitsim_here("calibrate", "verify", tmp_path / "bad", "--board", "9x6x18:glass", code=1)
+    assert done.stdout.splitlines()[-1].startswith("Calibrate again")
+    mitsim_here("calibrate", "verify", tmp_path / "bad", code=2)
+
+
+def test_the_makers_curve_is_a_normal_error_of_its_share():
+    curve = PublishedLengths(source="maker", share=0.7, distance_mm=[500, 700], error=[2e-3, 1e-3])
+    assert curve.one_sigma(600) == pytest.approx(1.5e-3 / 1.0364, rel=1e-3)
+    assert np.isnan(curve.one_sigma(400))
