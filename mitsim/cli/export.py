@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 #: file name suffixes that each command accepts
 CLOUD_SUFFIXES = (".ply", ".pcd", ".e57", ".mcap")
 RUN_SUFFIXES = (".glb", ".usda", ".usdc", ".usdz", ".rrd", ".mcap", ".e57")
-RESULT_SUFFIXES = (".qif", ".csv", ".json")
+RESULT_SUFFIXES = (".qif", ".xml", ".csv", ".json")
 
 app = typer.Typer(
     cls=Group,
@@ -131,20 +131,34 @@ def results(
     task: Annotated[
         Path | None, typer.Option(help="Task TOML file of the run; default: the copy in the folder.")
     ] = None,
+    laboratory: Annotated[str, typer.Option(help="For .xml: who issues the certificate.")] = "",
+    country: Annotated[str, typer.Option(help="For .xml: its country after ISO 3166-1, two letters.")] = "",
+    responsible: Annotated[str, typer.Option(help="For .xml: the person who signs.")] = "",
+    customer: Annotated[str, typer.Option(help="For .xml: for whom.")] = "",
+    serial: Annotated[str, typer.Option(help="For .xml: serial number of the sensor.")] = "",
 ) -> None:
-    """Write the expected uncertainty of every measurement, and the plan of views, as QIF 3.0, CSV or JSON.
+    """Write the expected uncertainty of every measurement as QIF 3.0, CSV or JSON, or as DCC (.xml).
+
+    QIF and JSON also have the plan of views. DCC is the digital calibration certificate of PTB.
 
     Example: mitsim export results runs/two_pillars -o two_pillars.qif
     """
+    from mitsim.report.declaration import read_declaration
+    from mitsim.report.export.dcc import Issuer, write_dcc
     from mitsim.report.export.qif import write_qif
     from mitsim.report.export.results import read_results, write_results_csv, write_results_json
     from mitsim.running.progress import say
 
-    write = {".qif": write_qif, ".csv": write_results_csv, ".json": write_results_json}
     suffix = _suffix(output, RESULT_SUFFIXES)
-    found = read_results(_run_in(folder), task)
+    folder = _run_in(folder)
+    found = read_results(folder, task)
     check_file(output)
-    write[suffix](found, output)
+    if suffix == ".xml":
+        issuer = Issuer(laboratory, country, responsible, customer, serial)
+        write_dcc(found, read_declaration(folder, None), issuer, output)
+    else:
+        write = {".qif": write_qif, ".csv": write_results_csv, ".json": write_results_json}
+        write[suffix](found, output)
     views = ", ".join(str(number) for number, *_ in found.plan)
     say(f"results: {output}: {len(found.results)} measurements, planned from view {views}")
 

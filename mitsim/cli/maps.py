@@ -294,7 +294,7 @@ def sheet(
     for sensor in chosen:
         sheets.append(measure_sensor(sensor, seed, workers))
         pictures = gallery_figure(sensor.name, gallery(sensor, seed))
-        write_png(pictures, output / f"gallery_{sensor.name}.png", dpi=72)
+        write_png(pictures, output / f"gallery_{sensor.name}.png", dpi=120, colours=128)
         write_json(output / f"{sensor.name}.json", sheets[-1].numbers())
     write_png(noise_figure(sheets), output / "noise.png", dpi=90)
     write_png(residual_figure(sheets), output / "residuals.png", dpi=90)

@@ -41,6 +41,10 @@ def check(
     sensor: SensorOption = "ensenso-n10",
     task: Annotated[Path | None, typer.Option(help="Task TOML file; check that the scene has its features.")] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="PNG picture to write.")] = None,
+    bounces: Annotated[
+        Path | None,
+        typer.Option(help="PNG picture to write: the share of interreflected light, and the face that it comes from."),
+    ] = None,
     json: Json = False,
     html: Annotated[
         Path | None,
@@ -76,8 +80,17 @@ def check(
 
         check_file(output)
         first = list(checked.task.features) if checked.task else []
-        write_png(preview_figure(checked.scene, facts, chosen, pose, visible, first), output)
+        measured = checked.task.measured_shapes() if checked.task else ()
+        write_png(preview_figure(checked.scene, facts, chosen, pose, visible, first, measured), output)
         say(f"picture: {output}")
+    if bounces:
+        from mitsim.report.bounce_figure import bounce_figure, bounced_light
+        from mitsim.report.style import write_png
+
+        check_file(bounces)
+        light = bounced_light(checked.scene, chosen, pose, visible)
+        write_png(bounce_figure(light, checked.scene.names, f"{scene.stem} before {chosen.name}"), bounces)
+        say(f"picture: {bounces}")
     if html:
         from mitsim.report.author_page import author_page
 

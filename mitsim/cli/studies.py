@@ -298,14 +298,14 @@ def score(
     session.claim("score")
     scores, *_ = score_study(session)
     for name in measurement or chosen.task.measurements:
-        print(best_views(scores, name, top))
+        print(best_views(scores, name, top, chosen.task.shapes_for(name)))
     say(f"scores: {output / 'scores.csv'}\nposes: {output / 'poses'}")
 
 
 def report(
     folder: Annotated[Path, typer.Argument(help="Folder of mitsim run or mitsim study choose.")],
     pdf: Annotated[
-        bool, typer.Option("--pdf", help="Write one A4 sheet for a quotation or an inspection plan.")
+        bool, typer.Option("--pdf", help="Write a statement of uncertainty on one A4 sheet, to sign.")
     ] = False,
 ) -> None:
     """Rewrite the HTML page of a finished run or of a comparison of sensors.

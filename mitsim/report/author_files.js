@@ -25,6 +25,16 @@ const faces = data.solid.faces.map((face, number) => {
 const features = new Map(Object.entries(data.features));
 const measurements = new Map(Object.entries(data.measurements));
 
+// Add a feature without a face of its own, such as the rim of a bore, to those that can be chosen.
+function addConstructed(name) {
+  const made = { name, number: faces.length, node: null, finish: '', triangles: 0, anchor: features.get(name).point_mm ?? null, size: [0, 0, 0], area: null, constructed: true };
+  faces.push(made);
+  return made;
+}
+
+const CONSTRUCTED = new Set(['circle', 'edge_point', 'intersection', 'mid_plane']);
+[...features].filter(([name, one]) => CONSTRUCTED.has(one.kind) && !faces.some((face) => face.name === name)).forEach(([name]) => addConstructed(name));
+
 function renameKey(map, before, after) {
   const entries = [...map].map(([key, value]) => [key === before ? after : key, value]);
   map.clear();
@@ -41,7 +51,7 @@ function renameFace(face, name) {
   features.forEach((one) => { if (one.of) one.of = swap(one.of); });
   measurements.forEach((one) => { one.features = swap(one.features); });
   data.findings.forEach((one) => { if (one.about === before) one.about = name; });
-  face.node.setAttribute('id', name);
+  face.node?.setAttribute('id', name);
   face.name = name;
   return '';
 }
@@ -81,7 +91,25 @@ function newFinish() {
   return made;
 }
 
-// ---- TOML
+const SPRAY = 'sprayed_matt_white';
+
+// Spray all faces matt white, or take the spray off again.
+function spray(on) {
+  if (on && !finishes.some((one) => one.id === SPRAY)) {
+    const node = scene.createElement('bsdf');
+    node.setAttribute('type', 'matt_white');
+    node.setAttribute('id', SPRAY);
+    scene.querySelector('scene > shape').before(node, '\n    ');
+    finishes.push({ id: SPRAY, type: 'matt_white', node, metal: '', process: '', Ra: '' });
+  }
+  for (const face of faces.filter((one) => one.node && (one.finish === SPRAY) !== on)) {
+    const next = on ? SPRAY : face.below;
+    if (on) face.below = face.finish;
+    if (next) giveFinish(face, next);
+  }
+}
+
+// ---- the task and the study as text
 
 const toml = (value) => (typeof value === 'string' ? JSON.stringify(value)
   : Array.isArray(value) ? `[${value.map(toml).join(', ')}]`

@@ -80,6 +80,35 @@ function suits(kind, [p, q]) {
   return { plane_distance: angle < 1, axis_distance: angle < 45, parallelism: parallel < 1, perpendicularity: parallel > 89, angularity: parallel >= 1 && parallel <= 89 }[kind];
 }
 
+// Return the rim of a bore or a boss in a face that it meets at a right angle, as a feature; null if there is none.
+function rim(names) {
+  const named = names.map((name) => [name, features.get(name)]);
+  const [plane, face] = named.find(([, one]) => one?.kind === 'plane') ?? [], [round, tube] = named.find(([, one]) => one?.kind === 'cylinder') ?? [];
+  if (names.length !== 2 || !face || !tube || lineAngle(along(face), along(tube)) > 1) return null;
+  const centre = onAxis(face.point_mm, along(face), tube).map((value) => Math.round(value * 1e4) / 1e4);
+  const ends = (tube.outline_mm ?? []).map((one) => Math.abs(dot(less(one, centre), along(tube))));
+  if (ends.length && Math.min(...ends) > 0.05 * tube.radius_mm + 0.05) return null; // it ends elsewhere
+  return { name: `${round}_rim_${plane}`.slice(0, 78), feature: { kind: 'circle', of: [plane], point_mm: centre, radius_mm: tube.radius_mm } };
+}
+
+// Return the name of the measurement of the same kind and faces, if the task has one.
+function already(kind, names) {
+  const same = (one) => one.kind === kind && one.features.length === names.length && names.every((name) => one.features.includes(name));
+  return [...measurements].find(([, one]) => same(one))?.[0];
+}
+
+// Return the general tolerance of a measurement by the classes of a drawing's note, as ISO 2768; undefined without one.
+function generalTolerance({ kind, nominal: value, features: names }, dimensions, zones) {
+  const at = (table, name, size) => table?.[name]?.[table.to_mm.findIndex((end) => size <= end)] ?? undefined;
+  const sizes = names.map((name) => Math.max(...(faces.find((face) => face.name === name)?.size ?? [0])));
+  const longest = Math.max(...sizes), shorter = Math.min(...sizes), { unit: of, zone } = data.kinds[kind], general = data.general;
+  if (zone) return at(general.zones[kind], zones, kind === 'perpendicularity' ? shorter : longest);
+  if (of === 'deg') return Number.isFinite(shorter) && at(general.angles, dimensions, shorter) ? Math.round(at(general.angles, dimensions, shorter) / 60 * 1e4) / 1e4 : undefined;
+  if (value < 0.5) return undefined; // to be given on the drawing
+  const half = kind === 'radius' ? 2 : 1, wide = at(general.linear, dimensions, half * value); // half that of the diameter
+  return wide === undefined ? undefined : wide / half;
+}
+
 const KEYED = new Set(['plane', 'cylinder', 'cone']);
 
 const short = (value) => String(Math.round(value * 1e4) / 1e4);

@@ -3,7 +3,7 @@
 const place = (id) => document.getElementById(`author-${id}`);
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const chosen = []; // numbers of the chosen faces, in order of choice
-const state = { hover: -1, more: false, paint: 'finish', dirty: false, words: [] };
+const state = { hover: -1, more: false, paint: 'finish', dirty: false, words: [], lengths: 'm', forms: 'K' };
 
 // ---- the picture
 
@@ -202,6 +202,13 @@ function finishWarning(finish) {
   return '';
 }
 
+// Say what a feature without a face of its own is.
+function constructedText(one) {
+  if (one.kind === 'circle') return `rim, a circle of diameter ${short(2 * one.radius_mm)} mm in ${one.of[0]}`;
+  const words = { edge_point: 'point of an edge of', intersection: 'point where these meet:', mid_plane: 'plane midway between' };
+  return `${words[one.kind] ?? one.kind} ${(one.of ?? []).join(', ')}`;
+}
+
 function facePanel() {
   const panel = place('face');
   if (!chosen.length) {
@@ -219,9 +226,11 @@ function facePanel() {
         say(`The name ${value}: ${fault}`, true);
         input.value = face.name;
       } else touched();
-    }, { id: 'author-name', disabled: !face.node })));
-    parts.push(element('p', { class: 'quiet' }, `${kind ?? 'not measurable: neither plane, cylinder, cone nor sphere'}; box around it ${size} mm, area ${face.area === null ? 'not known' : `${short(face.area)} mm²`}`));
+    }, { id: 'author-name', disabled: !face.node && !face.constructed })));
+    if (face.constructed) parts.push(element('p', { class: 'quiet' }, constructedText(features.get(face.name))));
+    else parts.push(element('p', { class: 'quiet' }, `${kind ?? 'not measurable: neither plane, cylinder, cone nor sphere'}; box around it ${size} mm, area ${face.area === null ? 'not known' : `${short(face.area)} mm²`}`));
   } else parts.push(element('p', {}, `${those.length} faces: ${those.map((each) => each.name).join(', ')}`));
+  if (those.every((each) => each.constructed)) return panel.replaceChildren(...parts);
   const same = those.every((each) => each.finish === face.finish) ? face.finish : '';
   const options = [...(same ? [] : [['', '(several, or unnamed)']]), ...finishOptions(), ['+', 'a new finish']];
   parts.push(field('Finish', select(options, same, (value) => {
@@ -238,7 +247,20 @@ function facePanel() {
 function measurePanel() {
   const offers = possible(chosen.map((number) => faces[number].name)), panel = place('measure');
   if (!chosen.length) return panel.replaceChildren(element('p', { class: 'quiet' }, 'Choose one face for a size or form, two for a distance, an angle or an orientation.'));
-  if (!offers.length) return panel.replaceChildren(element('p', { class: 'quiet' }, 'A task has no measurement for this choice of faces.'));
+  const edge = rim(chosen.map((number) => faces[number].name)), rims = [];
+  if (edge) {
+    const there = faces.find((face) => face.name === edge.name);
+    rims.push(element('p', {}, button(there ? 'Choose its rim here' : 'Add its rim here', () => {
+      if (!there) {
+        features.set(edge.name, edge.feature);
+        addConstructed(edge.name);
+        say(`Added ${edge.name}: the circle in which the round face leaves the plane. It is seen where the wall is not.`);
+        state.dirty = true;
+      }
+      choose(faces.findIndex((face) => face.name === edge.name));
+    }, { id: 'author-rim' })));
+  }
+  if (!offers.length) return panel.replaceChildren(...rims, element('p', { class: 'quiet' }, 'A task has no measurement for this choice of faces.'));
   let offer = offers.find((one) => one.kind === state.kind) ?? offers[0];
   const value = element('output', { class: 'au-value' }), unit_ = element('span', {}, '');
   const tolerance = element('input', { id: 'author-tolerance', autocomplete: 'off', size: 9 });
@@ -255,6 +277,8 @@ function measurePanel() {
   const addIt = () => {
     const { zone } = data.kinds[offer.kind], allowed = readTolerance(tolerance.value, zone);
     if (allowed === null) return say(wrongTolerance(tolerance.value, zone), true);
+    const before = already(offer.kind, offer.features);
+    if (before) return say(`${before} measures the same: change its tolerance in the list below`, true);
     const base = `${offer.features.slice(0, 2).join('_to_')}_${offer.kind}`.slice(0, 78);
     let name = base, n = 1;
     while (measurements.has(name)) name = `${base}_${++n}`;
@@ -266,7 +290,7 @@ function measurePanel() {
   shown();
   panel.replaceChildren(
     field('Kind', choice), element('p', {}, 'Nominal: ', value), element('label', { class: 'au-field' }, unit_, tolerance),
-    button('Add measurement', addIt, { id: 'author-add', class: 'au-main' }),
+    button('Add measurement', addIt, { id: 'author-add', class: 'au-main' }), ...rims,
   );
 }
 
@@ -282,7 +306,7 @@ function measurementList() {
       }
       renameKey(measurements, name, wanted);
       touched();
-    }, { 'aria-label': `name of ${name}` });
+    }, { 'aria-label': `name of ${name}`, size: Math.max(12, Math.min(name.length, 48)) });
     const tolerance = entry(toleranceText(one.tolerance), (value, input) => {
       const { zone } = data.kinds[one.kind], allowed = readTolerance(value, zone);
       if (allowed === null) {
@@ -303,6 +327,26 @@ function measurementList() {
     element('tbody', {}, ...(rows.length ? rows : [element('tr', {}, element('td', { colspan: 6, class: 'quiet' }, 'No measurements yet.'))])));
 }
 
+// Give a class of general tolerances to all measurements without a tolerance.
+function generalPanel() {
+  const chosenClass = (id, options) => select(options, state[id], (value) => { state[id] = value; }, { id: `author-${id}`, 'aria-label': id === 'lengths' ? 'class of lengths and angles' : 'class of form' });
+  const lengths = [['f', 'fine (f)'], ['m', 'medium (m)'], ['c', 'coarse (c)'], ['v', 'very coarse (v)']], forms = ['H', 'K', 'L'].map((one) => [one, one]);
+  place('general').replaceChildren(
+    element('span', {}, 'General tolerances, ISO 2768: '), chosenClass('lengths', lengths), ' ', chosenClass('forms', forms), ' ',
+    button('Give to all without one', () => {
+      const open = [...measurements.values()].filter((one) => one.tolerance === undefined);
+      const given = open.filter((one) => {
+        const wide = generalTolerance(one, state.lengths, state.forms);
+        if (wide !== undefined) one.tolerance = wide;
+        return wide !== undefined;
+      });
+      const rest = open.length - given.length;
+      say(`${given.length} of ${open.length} measurements without a tolerance have one now${rest ? '; ISO 2768 has none for the others' : ''}.`);
+      if (given.length) touched();
+    }, { id: 'author-give' }),
+  );
+}
+
 function finishList() {
   const rows = finishes.map((one) => {
     const used = faces.filter((face) => face.finish === one.id).length, metal = one.type === 'machined_metal';
@@ -312,7 +356,7 @@ function finishList() {
       select(choices(data.metals, one.metal), one.metal, change('metal'), { 'aria-label': `metal of ${one.id}` }),
       select(choices(Object.keys(data.processes), one.process), one.process, change('process'), { 'aria-label': `process of ${one.id}` }),
       entry(one.Ra, change('Ra'), { 'aria-label': `Ra of ${one.id} in um`, size: 5, inputmode: 'decimal' }),
-    ] : [one.type, '', ''];
+    ] : [one.type.replaceAll('_', ' '), '', ''];
     const warning = finishWarning(one);
     return element('tr', {}, element('th', { scope: 'row' }, element('span', { class: 'au-swatch', style: `background:${colourOf(one.id)}` }), one.id),
       ...cells.map((cell) => element('td', {}, cell)), element('td', { class: 'au-number' }, String(used)),
@@ -323,13 +367,19 @@ function finishList() {
   });
   const head = ['Finish', 'Metal', 'Process', 'Ra [um]', 'Faces', ''].map((text) => element('th', { scope: 'col' }, text));
   place('finishes').replaceChildren(element('thead', {}, element('tr', {}, ...head)), element('tbody', {}, ...rows));
+  const real = faces.filter((face) => face.node), sprayed = real.length > 0 && real.every((face) => face.finish === SPRAY);
+  const back = real.some((face) => face.below);
+  place('coat').replaceChildren(...(sprayed && !back ? [] : [button(sprayed ? 'Take the spray off' : 'Spray all faces matt white', () => {
+    spray(!sprayed);
+    touched();
+  }, { id: 'author-spray' })]));
 }
 
 function faceList() {
   place('faces').replaceChildren(...faces.map((face) => {
     const found = about(face), sign = found.some((one) => one.severity === 'error') ? ' ✖' : found.some((one) => one.severity === 'warning') ? ' ▲' : '';
     const made = element('button', { type: 'button', 'aria-pressed': String(chosen.includes(face.number)), 'data-face': face.number },
-      element('span', { class: 'au-swatch', style: `background:${colourOf(face.finish)}` }), `${face.name}${sign}`);
+      face.constructed ? '◯ ' : element('span', { class: 'au-swatch', style: `background:${colourOf(face.finish)}` }), `${face.name}${sign}`);
     return element('li', {}, made);
   }));
 }
@@ -339,6 +389,7 @@ function show() {
   facePanel();
   measurePanel();
   measurementList();
+  generalPanel();
   finishList();
   faceList();
   const general = data.findings.filter((one) => !faces.some((face) => face.name === one.about) && !(one.about === 'task' && measurements.size));

@@ -25,6 +25,7 @@ from mitsim.report.templates import joined_script, rendered, script_content
 from mitsim.report.view_clouds import box_around, packed, packed_normals, smoothly_shaded
 from mitsim.report.view_data import COLOURS, as_json
 from mitsim.scene.authoring.check import SceneFinding, TaskFeatures
+from mitsim.scene.authoring.general_tolerances import ANGLES, LINEAR, ZONES
 from mitsim.scene.inspect import SceneFacts
 from mitsim.scene.load import Scene
 from mitsim.scene.ray_casting.triangles import triangles_by_shape
@@ -99,6 +100,7 @@ def page_data(about: Authored, served: str) -> dict[str, Any]:
         "processes": {key: list(one.usual) for key, one in PROCESSES.items()},
         "metals": list(CONSTANTS),
         "known": characterised(about.sensor.name),
+        "general": {"linear": LINEAR, "angles": ANGLES, "zones": ZONES},
         "colours": COLOURS,
         "served": served,
         "findings": findings_data(about.found),

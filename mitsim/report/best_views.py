@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import xarray as xr
 
 from mitsim.report.findings import ranked_views
 from mitsim.running.numbers import percent, two_digits
+from mitsim.views.no_view import why_no_view
 
 _HEAD = (
     "rank",
@@ -24,10 +26,21 @@ _HEAD = (
 )
 
 
-def best_views(scores: xr.Dataset, measurement: str, count: int) -> str:
+def best_views(scores: xr.Dataset, measurement: str, count: int, shapes: Sequence[str]) -> str:
     """Return the ``count`` best views by predicted risk as text; angles in deg, lengths in mm.
 
-    The text ends with an empty line.
+    If no view can make the measurement, the text says why. It ends with an empty line.
+
+    Parameters
+    ----------
+    scores
+        Scores of all views.
+    measurement
+        Name of the measurement.
+    count
+        Largest number of views.
+    shapes
+        Names of the shapes that the measurement depends on.
     """
     measured = scores.sel(measurement=measurement)
     unit, tolerance = str(measured["unit"].values), float(measured["tolerance"].values)
@@ -35,6 +48,8 @@ def best_views(scores: xr.Dataset, measurement: str, count: int) -> str:
     title = f"{measurement} [{unit}]: {len(ranked)} of {scores.sizes['view']} views can make it"
     if not math.isnan(tolerance):
         title += f"; tolerance {tolerance:g} {unit}"
+    if not len(ranked):
+        return f"{title}\n  {why_no_view(scores, measurement, shapes)}\n"
     rows = [_HEAD, *(_row(measured, int(v), tolerance) for v in ranked[:count])]
     widths = [max(len(row[k]) for row in rows) for k in range(len(_HEAD))]
     lines = [

@@ -53,7 +53,7 @@ def page_content(choice: ChoiceDocument, folder: Path) -> dict[str, Any]:
         "rows": [_row(choice, one) for one in taking_part],
         "incomplete": any(one.impossible for one in taking_part),
         "screened": any(one.status == "screened" for one in taking_part),
-        "sensors": [_details(choice, one, tolerances) for one in taking_part if one.status == "stated"],
+        "sensors": [_details(choice, one, tolerances) for one in taking_part],
         "excluded": [{"name": one.name, "why": one.why} for one in choice.sensors if one.status == "excluded"],
         "seconds": rounded(choice.seconds),
     }
@@ -76,7 +76,7 @@ def _row(choice: ChoiceDocument, one: SensorEntry) -> dict[str, Any]:
         "name": one.name,
         "stated": one.status == "stated",
         "why": one.why,
-        "fits": f"{one.fits} of {toleranced}" if toleranced else "",
+        "fits": f"{one.fits if one.status == 'stated' else one.expected_fits} of {toleranced}" if toleranced else "",
         "possible": one.possible_in_words,
         "ratio": NONE if one.ratio is None else two_digits(one.ratio),
         "capture": NONE if one.capture is None else f"{rounded(1e3 * one.capture.seconds)}\N{NO-BREAK SPACE}ms",
@@ -108,6 +108,9 @@ def _cell(cell: CellEntry, unit: str) -> dict[str, str]:
 def _details(choice: ChoiceDocument, one: SensorEntry, tolerances: bool) -> dict[str, Any]:
     return {
         "name": one.name,
+        "stated": one.status == "stated",
+        "why": one.why,
+        "impossible": [{"name": name, "why": with_degree_signs(why)} for name, why in one.impossible.items()],
         "words": with_degree_signs(one.words),
         "rows": sensor_rows(choice, one),
         "tolerances": tolerances,

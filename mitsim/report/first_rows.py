@@ -138,7 +138,9 @@ def breakable(name: str) -> Markup:
 
 
 def exact(value: float, unit: str) -> str:
-    """Write a given value with its unit, with all its digits: ``70 mm``, ``0.5°``."""
+    """Write a given value with its unit, with all its digits: ``70 mm``, ``0.5°``; a dash for NaN."""
+    if math.isnan(value):
+        return NONE
     return f"{value:g}".replace("-", MINUS) + _suffix(unit)
 
 

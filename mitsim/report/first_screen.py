@@ -50,6 +50,13 @@ class FirstScreen:
     trials: int = 0
 
     @property
+    def short_words(self) -> str:
+        """Return the result with its first reasons only; the table has them all."""
+        reasons = self.words.split("; ")
+        rest = len(reasons) - _MOST_REASONS
+        return "; ".join(reasons[:_MOST_REASONS]) + f"; and {rest} more, see the table" if rest > 1 else self.words
+
+    @property
     def tolerances(self) -> bool:
         """Return whether a measurement has a tolerance."""
         return any(row.tolerance != NONE for row in self.rows)
@@ -70,6 +77,9 @@ class FirstScreen:
         limits = {row.share_limit for row in self.rows if row.tolerance != NONE and row.share != NONE}
         return limits.pop() if len(limits) == 1 else ""
 
+
+#: reasons in the result in words: the first says how many tolerances fit
+_MOST_REASONS = 5
 
 #: values of a measurement, and of its decision, that documents and rows hold by the same names
 _MEASURED = ("verdict", "bias", "without_value")
@@ -148,7 +158,7 @@ def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[ResultRow]:
     return [
         RowValues(
             name=name,
-            about=measured_words("", asked.features),
+            about=measured_words(asked.kind, asked.features),
             unit=asked.unit,
             nominal=asked.nominal,
             tolerance=asked.tolerance,

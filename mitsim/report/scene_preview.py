@@ -1,12 +1,14 @@
-"""Draw a scene before anything is rendered: from the sensor and from above, with a colour for each feature.
+"""Draw a scene before anything is rendered: from the sensor and from above, with a colour for each measured face.
 
-Both views are ray cast. The left one follows the pixels of the reference camera, with lens distortion; the right one
-looks along -z of the part, to scale. Shading depends on the normal alone to show the form, not on any lamp.
+Both views are ray cast. The left one is the part of the reference camera's image that shows the part, with lens
+distortion, on finer rays than its pixels, and the whole image as a small map; the right one looks along -z of the part,
+to scale. Shading depends on the normal alone to show the form, not on any lamp. Faces that no measurement needs are
+grey.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,8 +40,11 @@ _PALE = 0.35
 #: rays along the longer side of the top view; raster of the working volume's section; pixels of its outline
 _FINE, _COARSE, _STEP = 560, 280, 2
 
-#: share of the height of the top view that the overview occupies
+#: share of the height of the top view that its small map occupies
 _OVERVIEW = 0.36
+
+#: free border around the part, relative to its size in the image
+_MARGIN = 0.06
 
 _SENSOR_MARK: dict[str, Any] = {"marker": "^", "ms": 6, "mfc": "white", "mec": INK, "mew": 1.1}
 
@@ -53,6 +58,7 @@ def preview_figure(
     pose: Transform,
     visible: VisibleSurfaces,
     first: Sequence[str] = (),
+    measured: Collection[str] = (),
 ) -> Figure:
     """Draw both views with their legend.
 
@@ -66,18 +72,22 @@ def preview_figure(
         What the reference camera's pixels see.
     first
         Names of the shapes that get the first colours; the largest of the others follow.
+    measured
+        Names of the shapes that measurements need: only they get a colour. Empty without measurements.
     """
-    colours = _colours(facts, first)
+    colours = _colours(facts, first, measured)
     with drawing():
         camera = sensor.rig.reference
-        rows = max(len(_features(facts, colours)), 6)
+        rows = max(len(_features(facts, colours, measured)), 6)
         height = _TITLE_IN + _PANEL_IN + _ROW_IN * (rows + 1)
         figure = Figure((_WIDTH_IN, height))
         bottom, tall = 1 - (_TITLE_IN + _PANEL_IN) / height, _PANEL_IN / height
-        wide = min(_PANEL_IN * camera.width / camera.height / _WIDTH_IN, 0.58)
+        wide = 0.58
         left = figure.add_axes((0.015, bottom, wide, tall))
         right = figure.add_axes((wide + 0.035, bottom, 0.95 - wide, tall))
-        _from_sensor(left, colours, sensor, visible)
+        window = _from_sensor(left, scene, colours, sensor, pose, visible)
+        below = _ROW_IN * rows / height
+        _whole_image(figure.add_axes((0.425, bottom - 0.02 - below, 0.165, below)), sensor, visible.shape >= 0, window)
         _from_above(right, scene, facts, colours, sensor, pose)
         _overview(right.inset_axes((0.30, 1 - _OVERVIEW, 0.685, _OVERVIEW - 0.02)), facts, sensor, pose)
         position = pose.points(camera.centre)
@@ -85,16 +95,19 @@ def preview_figure(
         left.set_title(f"from {sensor.name} at ({place}) mm, {camera.width} × {camera.height} px", loc="left")
         right.set_title("from above, along −z of the part", loc="left")
         under = bottom - 0.1 / height
-        for handles, x in ((_features(facts, colours), 0.008), (_marks(sensor), wide + 0.028)):
+        for handles, x in ((_features(facts, colours, measured), 0.008), (_marks(sensor), wide + 0.028)):
             figure.legend(
                 handles=handles, loc="upper left", bbox_to_anchor=(x, under), borderaxespad=0.0, handlelength=1.8
             )
     return figure
 
 
-def _colours(facts: SceneFacts, first: Sequence[str]) -> list[str]:
-    """Return one colour for each shape, in the order of the scene."""
+def _colours(facts: SceneFacts, first: Sequence[str], measured: Collection[str]) -> list[str]:
+    """Return one colour for each shape, in the order of the scene; more measured shapes than colours repeat them."""
     shapes = facts.shapes
+    if measured:
+        rank = {one.name: k for k, one in enumerate(one for one in shapes if one.name in measured)}
+        return [SHAPES[rank[one.name] % len(SHAPES)] if one.name in rank else OTHER_SHAPE for one in shapes]
     order = sorted(
         range(len(shapes)),
         key=lambda i: (shapes[i].emitter, shapes[i].name not in first, -np.nan_to_num(shapes[i].area), i),
@@ -120,29 +133,78 @@ def _painted(
     return np.asarray(image)
 
 
-def _from_sensor(axes: Axes, colours: list[str], sensor: Sensor, visible: VisibleSurfaces) -> None:
+def _from_sensor(
+    axes: Axes, scene: Scene, colours: list[str], sensor: Sensor, pose: Transform, visible: VisibleSurfaces
+) -> tuple[float, float, float, float]:
+    """Draw the part in the image; return the part of the image that is shown: left, right, top, bottom [px]."""
+    height, width = visible.shape.shape
+    seen = visible.shape >= 0
+    left, right, top, bottom = window = _part_in_image(axes, seen)
+    step = max(right - left, bottom - top) / _FINE
+    columns, rows = np.meshgrid(np.arange(left + step / 2, right, step), np.arange(top + step / 2, bottom, step))
+    camera, size = sensor.rig.reference, columns.shape
+    rays = camera.rays(np.stack([columns, rows], axis=-1).reshape(-1, 2))
+    world = pose.directions(camera.sensor_from_camera.directions(rays))
+    hits = trace(scene, np.broadcast_to(pose.points(camera.centre), world.shape), world)
     light = np.array([-0.35, -0.45, -0.82])  # from behind the sensor's left shoulder
-    lit = np.clip(visible.normal @ (light / np.linalg.norm(light)), 0, 1)
-    clear = visible.seen_by_all & np.where(visible.shape >= 0, _within(sensor, visible), False)
-    axes.imshow(_painted(visible.shape, visible.front, lit, colours, clear), interpolation="antialiased")
+    lit = np.clip(pose.inverse().directions(hits.normal) @ (light / np.linalg.norm(light)), 0, 1).reshape(size)
+    nearest = tuple(np.clip(np.rint(one).astype(int), 0, end - 1) for one, end in ((rows, height), (columns, width)))
+    clear = (visible.seen_by_all & np.where(seen, _within(sensor, visible), False))[nearest]
+    image = _painted(hits.shape.reshape(size), hits.front.reshape(size), lit, colours, clear)
+    axes.imshow(image, extent=(left, right, bottom, top), interpolation="antialiased", zorder=0)
+    _frames(axes, sensor)
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+    bare(axes)
+    if not seen.any():
+        axes.text(
+            (left + right) / 2, (top + bottom) / 2, "the image shows no part", ha="center", va="center", color=MUTED
+        )
+        return window
+    at = float(np.median(depth(sensor, visible.point[seen])))
+    pixels = float(camera.matrix[0, 0]) / at
+    length = round_length(0.2 * (right - left) / pixels)
+    place = (left + 0.03 * (right - left), bottom - 0.045 * (bottom - top))
+    scale_bar(axes, place, length * pixels, f"{length:g} mm at {at:.0f} mm", -0.02 * (bottom - top))
+    return window
+
+
+def _part_in_image(axes: Axes, seen: NDArray[np.bool_]) -> tuple[float, float, float, float]:
+    """Return left, right, top, bottom [px] in the proportions of the axes: the part, or the whole image without one."""
+    height, width = seen.shape
+    rows, columns = np.nonzero(seen)
+    low = np.array([columns.min(), rows.min()]) if len(rows) else np.zeros(2)
+    high = np.array([columns.max(), rows.max()]) if len(rows) else np.array([width - 1.0, height - 1.0])
+    box, figure = axes.get_position(), axes.get_figure()
+    assert isinstance(figure, Figure)
+    inches = figure.get_size_inches()
+    shape = box.width * inches[0] / (box.height * inches[1])
+    extent = (1 + 2 * _MARGIN) * np.maximum(high - low + 1, 8.0)
+    across = max(float(extent[0]), shape * float(extent[1]))
+    cx, cy = ((low + high) / 2).tolist()
+    return cx - across / 2, cx + across / 2, cy - across / shape / 2, cy + across / shape / 2
+
+
+def _frames(axes: Axes, sensor: Sensor) -> None:
+    """Draw which pixels all eyes see, at the ends of the working range."""
     near, far = sensor.working_range_mm
     for at, style in ((near, "--"), (far, ":")):
         region = np.pad(common_view(sensor, at, _STEP), 1).astype(float)
         rows, columns = ((np.arange(count) - 1) * _STEP for count in region.shape)
         axes.contour(columns, rows, region, [0.5], colors=INK, linewidths=0.9, linestyles=style)
-    height, width = visible.shape.shape
-    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-    bare(axes)
-    seen = visible.shape >= 0
-    if seen.any():
-        at = float(np.median(depth(sensor, visible.point[seen])))
-        pixels = float(sensor.rig.reference.matrix[0, 0]) / at
-        length = round_length(0.2 * width / pixels)
-        scale_bar(
-            axes, (0.03 * width, 0.955 * height), length * pixels, f"{length:g} mm at {at:.0f} mm", -0.02 * height
-        )
-    else:
-        axes.text(width / 2, height / 2, "the image shows no part", ha="center", va="center", color=MUTED)
+
+
+def _whole_image(
+    small: Axes, sensor: Sensor, seen: NDArray[np.bool_], window: tuple[float, float, float, float]
+) -> None:
+    """Draw the whole image of the reference camera as a small map, with the part that the large picture shows."""
+    height, width = seen.shape
+    small.imshow(np.where(seen, 0.6, 1.0), cmap="gray", vmin=0, vmax=1, interpolation="antialiased")
+    _frames(small, sensor)
+    left, right, top, bottom = window
+    small.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=MUTED, lw=0.7))
+    small.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    bare(small)
+    small.set_anchor("NE")
 
 
 def _within(sensor: Sensor, visible: VisibleSurfaces) -> NDArray[np.bool_]:
@@ -246,13 +308,20 @@ def _axes_mark(axes: Axes) -> None:
         )
 
 
-def _features(facts: SceneFacts, colours: list[str]) -> list[Patch | Line2D]:
+def _features(facts: SceneFacts, colours: list[str], measured: Collection[str]) -> list[Patch | Line2D]:
     named = [i for i, colour in enumerate(colours) if colour != OTHER_SHAPE]
     handles: list[Patch | Line2D] = [
         Patch(facecolor=colours[i], edgecolor=MUTED, lw=0.5, label=_label(facts.shapes[i])) for i in named
     ]
     if rest := len(colours) - len(named):
-        handles.append(Patch(facecolor=OTHER_SHAPE, edgecolor=MUTED, lw=0.5, label=f"{rest} more shapes"))
+        handles.append(
+            Patch(
+                facecolor=OTHER_SHAPE,
+                edgecolor=MUTED,
+                lw=0.5,
+                label=f"{rest} {'not measured' if measured else 'more shapes'}",
+            )
+        )
     return handles
 
 

@@ -1,56 +1,63 @@
-"""Write ``sheet.pdf``, one sheet of A4 for a quotation or an inspection plan, from the same data as the page.
+"""Write ``sheet.pdf``, a statement of measurement uncertainty on one A4 sheet, ready to sign.
 
-Signal chain: folder of a run or of a comparison of sensors -> picture, result in words, pose, exposures, table of
-verdicts, excluded influences, versions and digests -> one page of PDF by matplotlib, which needs no browser.
+Signal chain: folder of a run or of a comparison of sensors -> declaration (:mod:`mitsim.report.declaration`) and
+picture of the part in the colours of its verdicts -> pages of PDF by matplotlib, which needs no browser. A task whose
+rows do not fit on one page continues on the next.
 """
 
 from __future__ import annotations
 
-import hashlib
-import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
-from matplotlib.backends.backend_pdf import FigureCanvasPdf
+from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
 from characterisation.files.atomic_io import atomic_write
 from characterisation.plots.style import INK, MUTED, drawing
-from mitsim.report.first_screen import FirstScreen, Tone, of_choice, of_run
+from mitsim.report.declaration import Declaration, DeclaredRow, read_declaration
+from mitsim.report.first_screen import Tone
 from mitsim.report.placement_figure import draw_placement
-from mitsim.report.pose_texts import angles_in_words, origin_text, pose_of_view
-from mitsim.report.statement_section import exposed_in_words
-from mitsim.running.numbers import listed, rounded, two_digits
-from mitsim.study.choice_document import CHOICE, ChoiceDocument, PoseEntry, read_choice
-from mitsim.study.run_folder import Run, read_run
+from mitsim.report.sheet_layout import ACROSS, HEIGHT, LINE, MARGIN, Columns, Page, text_width, wrapped
+from mitsim.running.numbers import NONE
 from mitsim.study.scene_geometry import SceneGeometry, read_scene_geometry
-from mitsim.study.statement_file import read_statement
 
-#: an A4 page, and its margins [in]
-_WIDTH, _HEIGHT, _MARGIN = 8.27, 11.69, 0.65
+#: smallest and largest height of the picture [in]
+_PICTURE = (1.75, 3.4)
 
-#: heights [in] of a line of text, a row of the table and the picture
-_LINE, _ROW, _PICTURE = 0.165, 0.2, 3.55
+#: height of the lines to sign, and of the last line of a page [in]
+_SIGNATURE, _FOOT = 0.95, 0.22
+
+#: what only the user knows, to be written by hand
+_TO_FILL_IN = (
+    ("Part: drawing number and revision", "Sensor: serial number, date of its calibration", "Valid until"),
+    ("Place and date", "Name", "Signature"),
+)
+
+#: sizes of text [pt] and the distance of a fact's text from the margin [in]
+_SMALL, _FACT, _FACT_LEFT = 6.5, 7.2, 1.15
+
+#: size of the result in words [pt], and its most lines
+_RESULT, _RESULT_LINES = 9.5, 4
 
 #: colour of the result by its tone
 _COLOURS: dict[Tone, str] = {"good": "#00694e", "plain": INK, "warn": "#7a5600", "bad": "#a84a00"}
 
-#: characters in a line of small text, and largest number of rows in a table
-_ACROSS, _MOST_ROWS = 112, 16
-
-
-@dataclass(frozen=True)
-class Sheet:
-    """Content of the sheet: ``facts`` as (name, text); ``missing`` influences that are not included."""
-
-    title: str
-    first: FirstScreen
-    facts: Sequence[tuple[str, str]]
-    missing: Sequence[str]
-    versions: str
+#: heads of the table, in lines
+_HEADS = (
+    ("Measurement",),
+    ("Tolerance",),
+    ("Bias",),
+    ("u",),
+    ("U (95 %)",),
+    ("k",),
+    ("95 % interval", "of the error"),
+    ("N",),
+    ("Without", "value"),
+    ("Accepted", "readings"),
+    ("Verdict",),
+)
 
 
 def write_sheet(folder: str | Path) -> Path:
@@ -62,170 +69,177 @@ def write_sheet(folder: str | Path) -> Path:
         If a file is missing or damaged; the message names the file.
     """
     folder = Path(folder)
-    geometry, choice = read_scene_geometry(folder), read_choice(folder)
-    sheet = _of_run(read_run(folder), geometry) if choice is None else _of_choice(choice, geometry, folder)
-    figure = sheet_figure(sheet, geometry)
-    FigureCanvasPdf(figure)
+    geometry = read_scene_geometry(folder)
+    declaration = read_declaration(folder, geometry)
     out = BytesIO()
-    with drawing():
-        figure.savefig(out, format="pdf", facecolor="white", metadata={"Title": sheet.title, "CreationDate": None})
+    with drawing(), PdfPages(out, metadata={"Title": declaration.title, "CreationDate": None}) as pages:
+        for figure in sheet_figures(declaration, geometry):
+            pages.savefig(figure, facecolor="white")
     path = folder / "sheet.pdf"
     with atomic_write(path) as file:
         file.write_bytes(out.getvalue())
     return path
 
 
-def sheet_figure(sheet: Sheet, geometry: SceneGeometry | None) -> Figure:
-    """Return the sheet as an A4 figure."""
+def sheet_figures(declaration: Declaration, geometry: SceneGeometry | None) -> list[Figure]:
+    """Return the sheet as A4 figures: one, unless the task has too many measurements for a page."""
     with drawing():
-        figure = Figure((_WIDTH, _HEIGHT))
-        down = _Column(figure)
-        down.write(sheet.title, size=15, weight="bold", line=0.3)
-        down.write(
-            sheet.first.words,
-            size=10.5,
-            weight="bold",
-            across=86,
-            colour=_COLOURS[sheet.first.tone],
-            line=0.19,
-        )
-        if geometry is not None and len(geometry.corners) and sheet.first.poses:
-            # one cell of this grid holds the picture
-            heights = [_HEIGHT - down.place, _PICTURE, down.place - _PICTURE]
-            rows = figure.add_gridspec(3, 1, height_ratios=heights, left=0, right=1, top=1, bottom=0, hspace=0)
-            draw_placement(figure.add_subfigure(rows[1]), geometry, sheet.first.poses, sheet.first.verdicts)
-            down.place -= _PICTURE + 0.1
-        _table(down, sheet.first)
-        for name, text in sheet.facts:
-            down.fact(name, text)
-        if sheet.missing:
-            down.fact("Not included", listed(list(sheet.missing)))
-        down.fact("Made with", sheet.versions)
-        down.place = 0.35
-        down.put(_MARGIN, "Simulated: no real sensor has measured this part.", fontsize=7.5, color=MUTED, va="baseline")
-    return figure
+        columns = Columns([_cells(row) for row in declaration.rows], _HEADS)
+        pages = [Page()]
+        page = pages[0]
+        _head(page, declaration)
+        shown = geometry is not None and len(geometry.corners) and declaration.first.poses
+        below = _SIGNATURE + _FOOT + MARGIN + _facts_height(declaration)
+        room = page.place - below - (_PICTURE[0] if shown else 0)
+        rows, taken = list(declaration.rows), _head_height(columns)
+        here: list[DeclaredRow] = []
+        while rows and (taken := taken + _row_height(rows[0], columns)) <= room:
+            here.append(rows.pop(0))
+        if shown:
+            assert geometry is not None
+            table = _head_height(columns) + sum(_row_height(row, columns) for row in here)
+            height = min(_PICTURE[1], page.place - below - table)
+            grid = [HEIGHT - page.place, height, page.place - height]
+            _picture(page.figure, grid, declaration, geometry)
+            page.place -= height
+        _table(page, here, columns)
+        while rows:
+            further = Page()
+            pages.append(further)
+            further.write(f"{declaration.title}, continued", 11, weight="bold")
+            further.place -= 0.1
+            count = max(1, int((further.place - MARGIN - _FOOT - 0.4) // _row_height(rows[0], columns)))
+            _table(further, rows[:count], columns)
+            rows = rows[count:]
+        _facts(page, declaration)
+        _sign(page)
+        for number, one in enumerate(pages, 1):
+            _foot(one, declaration, number, len(pages))
+    return [one.figure for one in pages]
 
 
-class _Column:
-    """Column of text that grows down the page; ``place`` [in] above the lower edge."""
-
-    def __init__(self, figure: Figure) -> None:
-        self.figure, self.place = figure, _HEIGHT - _MARGIN
-
-    def put(self, left: float, text: str, **style: Any) -> None:
-        """Write one line at a distance [in] from the left edge."""
-        style.setdefault("fontsize", 8.5)
-        style.setdefault("va", "top")
-        self.figure.text(left / _WIDTH, self.place / _HEIGHT, text, **style)
-
-    def write(
-        self,
-        text: str,
-        *,
-        size: float = 8.5,
-        weight: str = "normal",
-        colour: str = INK,
-        left: float = _MARGIN,
-        across: int = _ACROSS,
-        line: float = _LINE,
-    ) -> None:
-        """Write wrapped lines, and move down by each."""
-        for one in textwrap.wrap(text, across) or [""]:
-            self.put(left, one, fontsize=size, fontweight=weight, color=colour)
-            self.place -= line
-
-    def fact(self, name: str, text: str) -> None:
-        self.place -= 0.05
-        self.put(_MARGIN, name, color=MUTED)
-        self.write(text, left=_MARGIN + 1.2, across=_ACROSS - 22)
+def _picture(figure: Figure, heights: Sequence[float], declaration: Declaration, geometry: SceneGeometry) -> None:
+    """Draw the part and its sensor between the margins; ``heights`` are those above, of and below the picture."""
+    whole = {"left": 0, "right": 1, "top": 1, "bottom": 0, "hspace": 0, "wspace": 0}
+    cells = figure.add_gridspec(3, 3, height_ratios=heights, width_ratios=[MARGIN, ACROSS, MARGIN], **whole)
+    draw_placement(figure.add_subfigure(cells[1, 1]), geometry, declaration.first.poses, declaration.first.verdicts)
 
 
-def _table(down: _Column, first: FirstScreen) -> None:
-    if first.tolerances:
-        head = ["Measurement", "Verdict", "Standard u", "Needed", "Tolerance", "Accepted readings"]
-    else:
-        head = ["Measurement", "Nominal", "Standard u", "No value"]
-    lefts = [0.0, 2.05, 3.2, 4.05, 4.8, 5.6]
-    down.place -= 0.05
-    rows = [
-        [
-            row.name if len(row.name) <= 28 else f"{row.name[:27]}…",
-            *(
-                (row.verdict, row.uncertainty, row.needed, row.tolerance, row.accepted)
-                if first.tolerances
-                else (row.nominal, row.uncertainty, row.without_value)
-            ),
-        ]
-        for row in first.rows
+def _head(page: Page, declaration: Declaration) -> None:
+    page.put(0, "Statement of measurement uncertainty by virtual measurements", 8.5, MUTED)
+    right = f"{declaration.date}" + (f"   No. {declaration.number}" if declaration.number else "")
+    page.put(ACROSS - text_width(right, 8.5), right, 8.5, MUTED)
+    page.place -= 0.22
+    page.write(declaration.title, 15, weight="bold")
+    page.place -= 0.03
+    page.write(_result(declaration.first.words), _RESULT, _COLOURS[declaration.first.tone], "bold")
+    page.place -= 0.04
+
+
+def _result(words: str) -> str:
+    """Return the result in at most :data:`_RESULT_LINES` lines: the reasons that do not fit are in the table."""
+    reasons = words.split("; ")
+    for kept in range(len(reasons), 0, -1):
+        rest = len(reasons) - kept
+        text = "; ".join(reasons[:kept]) + (f"; and {rest} more, see the table" if rest else "")
+        if len(wrapped(text, _RESULT, ACROSS, "bold")) <= _RESULT_LINES:
+            break
+    return text
+
+
+def _cells(row: DeclaredRow) -> list[str]:
+    result = row.result
+    known = result.tolerance != NONE
+    return [
+        result.name,
+        result.tolerance if known else "none",
+        row.bias,
+        result.uncertainty,
+        row.expanded,
+        row.factor,
+        row.interval,
+        row.trials,
+        result.without_value,
+        result.accepted,
+        f"● {result.verdict}",
     ]
-    for number, cells in enumerate([head, *rows[:_MOST_ROWS]]):
-        for left, text in zip(lefts, cells, strict=False):
-            weight = "bold" if number and first.tolerances and left == lefts[1] else "normal"
-            down.put(_MARGIN + left, text, color=INK if number else MUTED, fontweight=weight)
-        if number and first.tolerances:
-            down.put(_MARGIN + lefts[1] - 0.14, "●", fontsize=8, color=first.rows[number - 1].colour)
-        down.place -= _ROW
-    if len(rows) > _MOST_ROWS:
-        down.write(f"and {len(rows) - _MOST_ROWS} more: see the page", colour=MUTED)
-    down.place -= 0.08
 
 
-def _of_run(run: Run, geometry: SceneGeometry | None) -> Sheet:
-    first, document = of_run(run, geometry), run.statement
-    facts = [("Part", run.about.scene)]
-    missing = list[str]()
-    if document is not None:
-        pose = pose_of_view(run, document.view)
-        facts.append(("Pose", f"{_placed(pose)}; {_origin(pose)}; the full pose is in statement.json"))
-        facts.append(("Calibration", document.calibration))
-        missing = [one.name for one in document.influences if not one.included]
-    if "round" in run.about.lay.values():
-        missing.append("direction of machining marks")
-    planned = "" if document is None else exposed_in_words(document.exposure)
-    facts.append(("Exposure", f"{planned} (in place of the sensor’s own)" if planned else run.about.exposure_rule))
-    rules = sorted({one.decision.rule for one in document.measurements.values() if one.decision} if document else ())
-    facts += [("Decision rule", "; ".join(rules))] if rules else []
-    versions = f"mitsim {run.about.mitsim}, seed {run.about.seed}; {_digests(run.folder, ('statement.json', 'map.nc'))}"
-    return Sheet(f"{run.about.sensor} measures {Path(run.about.scene).stem}", first, facts, missing, versions)
+def _about(row: DeclaredRow) -> str:
+    nominal = row.result.nominal
+    return ", ".join(filter(None, [row.result.about, "" if nominal == NONE else f"nominal {nominal}"]))
 
 
-def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: Path) -> Sheet:
-    first = of_choice(choice, geometry)
-    best = next((one for one in choice.sensors if one.measurements), None)
-    facts = [("Part", choice.scene)]
-    missing = list[str]()
-    if best is not None:
-        for pose in best.poses:
-            facts.append(("Pose", f"{_placed(pose)}, {rounded(pose.standoff_mm)} mm away; {_origin(pose)}"))
-        if best.capture is not None:
-            times = listed([two_digits(1e3 * one) for one in best.capture.exposures_s])
-            facts.append(("Exposures", f"{best.capture.images} images of {times} ms each"))
-        statement = read_statement(folder / best.name / "statement.json")
-        missing = [] if statement is None else [one.name for one in statement.influences if not one.included]
-    others = [
-        f"{one.name} ({one.fits}, worst {'–' if one.ratio is None else two_digits(one.ratio)}"
-        + (f", {one.possible_in_words})" if one.impossible else ")")
-        for one in choice.sensors
-        if one is not best and one.status == "stated"
-    ]
-    facts += [("Also measured", listed(others) + ": tolerances that fit, and the largest demand")] if others else []
-    rules = sorted({one.rule for one in choice.measurements.values() if one.rule})
-    facts += [("Decision rule", "; ".join(rules))] if rules else []
-    digest = f"; map {best.map_digest}" if best is not None and best.map_digest else ""
-    versions = f"mitsim {choice.mitsim}, seed {choice.seed}; {_digests(folder, (CHOICE,))}{digest}"
-    title = f"{'No sensor' if best is None else best.name} measures {Path(choice.scene).stem}"
-    return Sheet(title, first, facts, missing, versions)
+def _row_height(row: DeclaredRow, columns: Columns) -> float:
+    names = wrapped(row.result.name, columns.size, columns.widths[0], "bold")
+    small = _small(columns)
+    return (len(names) * columns.size + len(wrapped(_about(row), small, ACROSS)) * small) * LINE + 0.05
 
 
-def _placed(pose: PoseEntry) -> str:
-    return f"view {pose.view}: {angles_in_words(pose)}"
+def _small(columns: Columns) -> float:
+    return min(_SMALL, columns.size - 0.5)
 
 
-def _origin(pose: PoseEntry) -> str:
-    return f"the sensor’s origin at ({origin_text(pose, 1)}) mm in the part’s frame"
+def _head_height(columns: Columns) -> float:
+    return 2 * columns.size * LINE + 0.1
 
 
-def _digests(folder: Path, names: Sequence[str]) -> str:
-    """Return the first sixteen hexadecimal digits of the SHA-256 of files."""
-    there = [folder / name for name in names if (folder / name).exists()]
-    return "; ".join(f"{one.name} {hashlib.sha256(one.read_bytes()).hexdigest()[:16]}" for one in there)
+def _table(page: Page, rows: Sequence[DeclaredRow], columns: Columns) -> None:
+    top = page.place
+    for left, head in zip(columns.lefts, _HEADS, strict=True):
+        page.place = top
+        for line in head:
+            page.put(left, line, columns.size, MUTED)
+            page.place -= columns.size * LINE
+    page.place = top - _head_height(columns) + 0.06
+    page.rule(MUTED)
+    page.place -= 0.04
+    for row in rows:
+        cells, top = _cells(row), page.place
+        verdict = columns.lefts[-1]
+        for left, text in zip(columns.lefts[1:-1], cells[1:-1], strict=True):
+            page.put(left, text, columns.size)
+        page.put(verdict, "●", columns.size, row.result.colour)
+        page.put(verdict + text_width("● ", columns.size, "bold"), row.result.verdict, columns.size, weight="bold")
+        page.write(row.result.name, columns.size, weight="bold", across=columns.widths[0])
+        page.write(_about(row), _small(columns), MUTED)
+        page.place = min(page.place, top - _row_height(row, columns))
+
+
+def _facts_height(declaration: Declaration) -> float:
+    lines = sum(len(wrapped(text, _FACT, ACROSS - _FACT_LEFT)) for _, text in declaration.facts)
+    notes = sum(len(wrapped(text, _SMALL, ACROSS)) for text in declaration.notes)
+    return lines * _FACT * LINE + 0.025 * len(declaration.facts) + notes * _SMALL * LINE + 0.16
+
+
+def _facts(page: Page, declaration: Declaration) -> None:
+    page.place -= 0.05
+    for note in declaration.notes:
+        page.write(note, _SMALL, MUTED)
+    page.place -= 0.06
+    for name, text in declaration.facts:
+        if text:
+            page.put(0, name, _FACT, MUTED)
+            page.write(text, _FACT, left=_FACT_LEFT, across=ACROSS - _FACT_LEFT)
+            page.place -= 0.025
+
+
+def _sign(page: Page) -> None:
+    """Draw the lines to fill in and to sign above the foot of a page."""
+    third = ACROSS / 3
+    for above, names in enumerate(reversed(_TO_FILL_IN)):
+        page.place = MARGIN + _FOOT + 0.2 + above * 0.42
+        for number, name in enumerate(names):
+            left = number * third
+            page.rule(MUTED, left, left + third - (0.2 if number < 2 else 0))
+            page.place -= 0.03
+            page.put(left, name, _SMALL, MUTED)
+            page.place += 0.03
+
+
+def _foot(page: Page, declaration: Declaration, number: int, of: int) -> None:
+    page.place = MARGIN
+    words = "Simulated: no real sensor has measured this part. Verdicts are about the measurement, not about a part."
+    page.put(0, words, _SMALL, MUTED)
+    right = f"Page {number} of {of}"
+    page.put(ACROSS - text_width(right, _SMALL), right, _SMALL, MUTED)

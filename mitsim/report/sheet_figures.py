@@ -11,9 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from characterisation.files.errors import InputError
-from characterisation.plots.style import BLUE, INK, MUTED, VERMILION, drawing
+from characterisation.plots.style import BLUE, FIELD, INK, MUTED, VERMILION, drawing
 from characterisation.point_cloud import PointCloud, Status
 from mitsim.capture.capture import Capture
 from mitsim.capture.picture import STRETCH_EXPONENT
@@ -24,6 +25,15 @@ from mitsim.running.numbers import two_digits
 from mitsim.sensor.preset_covariance import preset_covariance
 
 _LINES = ("-", "--", ":", "-.")
+
+#: distance at which the rays of a cloud are projected into the image [mm]; its origin is that of the camera
+_FAR_MM = 1000.0
+
+#: what a picture of the gallery shows dark
+_DARK = (
+    "black in the image: no light returns, since there is nothing, a shadow of the projector, or a mirror that faces "
+    "elsewhere"
+)
 
 
 def noise_figure(sheets: Sequence[DataSheet]) -> Figure:
@@ -69,17 +79,18 @@ def residual_figure(sheets: Sequence[DataSheet]) -> Figure:
 
 
 def gallery_figure(sensor: str, gallery: Sequence[tuple[str, Capture, PointCloud]]) -> Figure:
-    """Draw the reference camera's brightened image of each finish, and beside it the status of each pixel."""
+    """Draw the reference camera's brightened image of each finish, and below it the status of the same pixels."""
     with drawing():
-        figure = Figure((3.3 * len(gallery), 5.6), layout="constrained")
+        figure = Figure((3.3 * len(gallery), 5.9), layout="constrained")
         grid = np.asarray(figure.subplots(2, len(gallery), squeeze=False))
         present: set[int] = set()
         cut = _window_around(gallery[0][2])
         for (finish, capture, cloud), (upper, lower) in zip(gallery, grid.T, strict=True):
-            image = _brightest(capture)[_of_grid(cut, capture, cloud)]
-            low, high = np.percentile(image, (5, 99.7))
+            image = image_on_grid(capture, cloud)[cut]
+            low, high = np.nanpercentile(image, (5, 99.7))
             shown = np.clip((image - low) / max(high - low, 1e-9), 0, 1) ** STRETCH_EXPONENT
-            upper.imshow(shown, cmap="gray", vmin=0, vmax=1)
+            upper.imshow(np.ma.masked_invalid(shown), cmap="gray", vmin=0, vmax=1)
+            upper.set_facecolor(FIELD)
             upper.set_title(finish)
             draw_status(lower, cloud.status[cut])
             present |= set(np.unique(cloud.status[cut]).tolist())
@@ -87,8 +98,24 @@ def gallery_figure(sensor: str, gallery: Sequence[tuple[str, Capture, PointCloud
                 axes.set(xticks=[], yticks=[])
         figure.suptitle(sensor, fontsize=10)
         legend = [Patch(facecolor=REASONS[Status(s)][1], label=REASONS[Status(s)][0]) for s in sorted(present)]
-        figure.legend(handles=legend, loc="outside lower center", ncols=3, handlelength=1.1)
+        figure.legend(
+            handles=legend, loc="outside lower center", ncols=3, handlelength=1.1, title=_DARK, title_fontsize=7.5
+        )
     return figure
+
+
+def image_on_grid(capture: Capture, cloud: PointCloud) -> NDArray[np.float64]:
+    """Return the reference camera's brightest image (H, W) on the pixels of a cloud; NaN where it does not reach.
+
+    A cloud of two cameras has the pixels of the rectified image, without the lens distortion of the raw one.
+    """
+    image, camera = _brightest(capture), capture.rig.reference
+    if image.shape != (camera.height, camera.width):  # a device's own map
+        return image if image.shape == cloud.status.shape else np.full(cloud.status.shape, np.nan)
+    places = camera.project(cloud.grid.origin + _FAR_MM * cloud.grid.rays())
+    return np.asarray(
+        map_coordinates(image, [places[..., 1], places[..., 0]], order=1, mode="constant", cval=math.nan), float
+    )
 
 
 def sheet_table(sheets: Sequence[DataSheet]) -> str:
@@ -205,16 +232,14 @@ def _window_around(cloud: PointCloud) -> tuple[slice, slice]:
     return cut[0], cut[1]
 
 
-def _of_grid(cut: tuple[slice, slice], capture: Capture, cloud: PointCloud) -> tuple[slice, slice]:
-    """Return the same part of a raw image, whose size may differ from the grid's; its position is approximate."""
-    height, width = next(iter(capture.images.values())).shape[1:]
-    scales = (height / cloud.grid.height, width / cloud.grid.width)
-    rows, columns = (slice(int(part.start * s), int(part.stop * s)) for part, s in zip(cut, scales, strict=True))
-    return rows, columns
-
-
 def _brightest(capture: Capture) -> NDArray[np.float64]:
-    """Return the reference camera's image of the largest mean; for time of flight, its absolute differences."""
+    """Return the reference camera's image of the largest mean; for time of flight, the spread of its images.
+
+    An image of time of flight is a correlation about a zero level, and vanishes at some distances. Its spread over the
+    phase steps is in proportion to the light.
+    """
     stack = next(iter(capture.images.values()))
+    if capture.technology == "time_of_flight":
+        return np.asarray(stack.astype(float).std(axis=0))
     step = max(1, len(stack) // 12)
     return np.asarray(max(stack[::step], key=lambda image: float(image.mean())), float)

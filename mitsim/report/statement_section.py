@@ -69,8 +69,8 @@ def _row(name: str, one: StatedMeasurement) -> dict[str, str]:
         "bias_uncertainty": quantity(one.bias_uncertainty, one.unit),
         "uncertainty": quantity(one.standard_uncertainty, one.unit),
         "uncorrected": quantity(math.hypot(one.bias or 0, one.standard_uncertainty or 0) if known else None, one.unit),
-        "interval": _interval(one.interval, one.unit),
-        "corrected": _interval(one.interval_corrected, one.unit),
+        "interval": interval_words(one.interval, one.unit),
+        "corrected": interval_words(one.interval_corrected, one.unit),
         "without": percent(one.without_value),
         "share": percent(one.share_of_tolerance),
         "tolerance": quantity(one.tolerance, one.unit),
@@ -106,7 +106,8 @@ def _budget_row(name: str, one: StatedMeasurement, groups: list[str]) -> dict[st
     return {"name": name, "cells": cells, "whole": quantity(one.standard_uncertainty, one.unit)}
 
 
-def _interval(ends: tuple[float | None, float | None], unit: str) -> str:
+def interval_words(ends: tuple[float | None, float | None], unit: str) -> str:
+    """Write both ends of an interval with as many decimal places as two digits of the larger need."""
     low, high = ends
     if low is None or high is None:
         return NONE

@@ -20,6 +20,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from PIL import Image
 
 from characterisation.files.atomic_io import atomic_write
 from characterisation.plots.style import BLUE, FIELD, INK, MUTED, PAPER, drawing
@@ -72,12 +73,28 @@ def _lay_out(figure: Figure) -> None:
         figure.set_layout_engine("none")
 
 
-def write_png(figure: Figure, path: Path, dpi: int = _DPI) -> Path:
-    """Write a figure atomically as PNG on white."""
+def write_png(figure: Figure, path: Path, dpi: int = _DPI, colours: int | None = None) -> Path:
+    """Write a figure atomically as PNG on white.
+
+    Parameters
+    ----------
+    figure, path
+        The figure, and the file to write.
+    dpi
+        Pixels per inch of the figure.
+    colours
+        Number of colours of a palette, which halves the size of a noisy image; None for all colours.
+    """
     picture = io.BytesIO()
     with drawing():
         FigureCanvasAgg(figure)
         figure.savefig(picture, format="png", dpi=dpi, facecolor="white")
+    if colours is not None:
+        full = Image.open(picture).convert("RGB")
+        picture = io.BytesIO()
+        full.quantize(colours, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+            picture, format="png", optimize=True
+        )
     with atomic_write(path) as file:  # Pillow, given the file itself, would report "encoder error" on a full disk
         file.write_bytes(picture.getvalue())
     return path

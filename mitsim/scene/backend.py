@@ -33,6 +33,7 @@ LLVM_MINIMUM = 19
 VARIANT_VARIABLE = "MITSIM_VARIANT"
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono")
 
+#: folders of the system's libraries: Linux, macOS (Homebrew, MacPorts), LLVM's installer for Windows, and conda's
 _SYSTEM_FOLDERS = (
     "/usr/lib/x86_64-linux-gnu",
     "/usr/lib/aarch64-linux-gnu",
@@ -41,7 +42,14 @@ _SYSTEM_FOLDERS = (
     "/usr/local/lib",
     "/opt/homebrew/opt/llvm/lib",
     "/usr/local/opt/llvm/lib",
+    *(f"/opt/local/libexec/llvm-{version}/lib" for version in range(29, LLVM_MINIMUM - 1, -1)),
+    f"{os.environ.get('PROGRAMFILES', 'C:/Program Files')}/LLVM/bin",
+    f"{sys.prefix}/Library/bin",
+    f"{sys.prefix}/lib",
 )
+
+#: name of LLVM's library with the C interface: Linux, macOS, Windows
+_LIBRARY_NAME = re.compile(r"libLLVM([.-]\d[\w.]*)?(\.so[\d.]*|\.dylib)|LLVM-C\.dll")
 
 # run in a child process: a broken library may end the process that loads it
 _VERSION_SCRIPT = """
@@ -55,7 +63,8 @@ print(numbers[0].value)
 HELP = (
     f"no libLLVM of version {LLVM_MINIMUM} or later was found, and Mitsuba's CPU variants need one.\n"
     "On x86-64 Linux: pip install karellen-llvm-core. Elsewhere: install LLVM (Debian: apt-get install libllvm19; "
-    f"macOS: brew install llvm), or set {LLVM_VARIABLE} to the path of its library. mitsim doctor lists what it finds."
+    "macOS: brew install llvm; Windows: winget install LLVM.LLVM, which brings LLVM-C.dll), or set "
+    f"{LLVM_VARIABLE} to the path of its library. mitsim doctor lists what it finds."
 )
 
 
@@ -84,7 +93,8 @@ def find_llvm() -> list[Llvm]:
         return [_inspect(Path(chosen), f"the environment variable {LLVM_VARIABLE}")]
     found = [_inspect(path, "pip package karellen-llvm-core") for path in _from_pip()]
     for folder in _SYSTEM_FOLDERS:
-        found += [_inspect(path, "system") for path in sorted(Path(folder).glob("libLLVM*"), reverse=True)]
+        names = [path for path in Path(folder).glob("*LLVM*") if _LIBRARY_NAME.fullmatch(path.name)]
+        found += [_inspect(path, "system") for path in sorted(names, reverse=True)]
     unique: dict[Path, Llvm] = {}
     for candidate in found:
         unique.setdefault(candidate.path.resolve(), candidate)
@@ -106,8 +116,6 @@ def _inspect(path: Path, origin: str) -> Llvm:
     match = re.search(r"libLLVM[.-](?:so\.)?(\d+)", path.resolve().name)
     if match and int(match.group(1)) < LLVM_MINIMUM:
         return Llvm(path, int(match.group(1)), origin, f"older than {LLVM_MINIMUM}: it could abort the process")
-    if origin == "system" and not match:
-        return Llvm(path, 0, origin, "its name does not state its version")
     process = subprocess.run(
         [sys.executable, "-c", _VERSION_SCRIPT, str(path)], capture_output=True, text=True, timeout=60, check=False
     )

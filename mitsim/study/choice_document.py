@@ -23,13 +23,14 @@ CHOICE = "choice.json"
 
 
 class ComparedMeasurement(PartialDocument):
-    """One measurement: its tolerance as in the task, and its decision rule in words."""
+    """One measurement: its kind and tolerance as in the task, and its decision rule in words."""
 
     unit: str
     nominal: float
     tolerance: float | tuple[float, float] | None
     rule: str
     features: list[str]
+    kind: str = ""
 
     @property
     def tolerance_size(self) -> float | None:
@@ -43,8 +44,8 @@ class CellEntry(PartialDocument):
     """One measurement by one sensor from ``view``, in the measurement's unit; null without a value.
 
     ``by`` is ``statement`` or ``screening``, or ``none`` for an impossible measurement: by virtual measurements if
-    ``trials`` is above 0, otherwise by screening. ``demand`` is the figure that the decision rule limits to 1. Without
-    a tolerance it is the uncertainty relative to that of the best sensor.
+    ``trials`` is above 0, otherwise by screening; ``reason`` says why. ``demand`` is the figure that the decision rule
+    limits to 1. Without a tolerance it is the uncertainty relative to that of the best sensor.
     """
 
     by: Literal["statement", "screening", "none"] = "none"
@@ -62,16 +63,16 @@ class CellEntry(PartialDocument):
     false_reject: float | None = None
     trials: int = 0
     without_value: float = 1.0
+    reason: str = ""
 
     @property
     def why_impossible(self) -> str:
         """Return the reason why the measurement is impossible; empty if it is possible."""
         if self.by != "none":
             return ""
-        if not self.trials:
-            return "by screening, no view can make it"
         some = "no virtual measurement" if self.without_value == 1 else "only one virtual measurement"
-        return f"{some} of {self.trials} gave a value"
+        what = f"{some} of {self.trials} gave a value" if self.trials else "by screening, no view can make it"
+        return f"{what}: {self.reason}" if self.reason else what
 
 
 _Row = tuple[float, float, float, float]
@@ -126,6 +127,12 @@ class SensorEntry(PartialDocument):
         """Return how many of the measurements are possible; empty if all are."""
         every = len(self.measurements)
         return f"{every - len(self.impossible)} of {every} measurements possible" if self.impossible else ""
+
+    @property
+    def expected_fits(self) -> int:
+        """Return the number of tolerances that are expected to fit, or do, by their demand."""
+        cells = self.measurements.values()
+        return sum(one.verdict != "no tolerance" and one.demand is not None and one.demand <= 1 for one in cells)
 
     @property
     def fits_all(self) -> bool:

@@ -150,6 +150,7 @@ class RunDocument(PartialDocument):
 
     schema_version: Literal[1]
     mitsim: str
+    date: str = ""
     study: str
     scene: str
     sensor: str

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import platform
 from dataclasses import asdict
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -85,6 +86,7 @@ def run_record(
     return {
         "schema_version": 1,
         "mitsim": __version__,
+        "date": datetime.now(UTC).date().isoformat(),
         "study": str(study.path),
         "scene": study.scene.where,
         "sensor": study.sensor.name,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -74,13 +74,29 @@ class StatedMeasurement(PartialDocument):
     losses: list[LossEntry] = Field(default_factory=list)
     errors_of: str = ANY_PART
 
+    @property
+    def expanded_uncertainty(self) -> float | None:
+        """Return U, half the width of the 95 % interval of the error; None without one."""
+        low, high = self.interval
+        return None if low is None or high is None else (high - low) / 2
+
+    @property
+    def coverage_factor(self) -> float | None:
+        """Return k = U / u (JCGM 100:2008, 6.2.1); None without an interval."""
+        whole, u = self.expanded_uncertainty, self.standard_uncertainty
+        return None if whole is None or not u else whole / u
+
 
 class InfluenceEntry(PartialDocument):
-    """An influence, and whether the statement contains it."""
+    """An influence, and whether the statement contains it; ``simulated`` if mitsim could vary it.
+
+    Statements of older versions do not say so: their influences that are not included count as left out.
+    """
 
     name: str
     included: bool
     how: str
+    simulated: bool = False
 
 
 class ExposureEntry(PartialDocument):
@@ -97,6 +113,7 @@ class StatementDocument(PartialDocument):
     measured_by: str
     view: int
     calibration: str
+    unknowns: dict[str, dict[str, Any]] = Field(default_factory=dict)
     measurements: dict[str, StatedMeasurement]
     influences: list[InfluenceEntry]
     exposure: ExposureEntry | None = None

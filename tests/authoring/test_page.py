@@ -234,6 +234,85 @@ def test_rules_and_features_that_the_page_does_not_show_are_kept(step_file, step
     assert written["features"]["middle"] == {"kind": "mid_plane", "of": ["side", "right"]}
 
 
+@needs_step
+@pytest.mark.browser
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+def test_rims_tolerance_classes_and_a_coat_are_given_by_a_click(step_file, step_here, browser, tmp_path):
+    made = tmp_path / "made"
+    mitsim_here("part", step_file, "-o", made)
+    mitsim_here("check", made / "made.xml", "--task", made / "task.toml", "--html", tmp_path / "page.html")
+    page = Author(browser, (tmp_path / "page.html").as_uri())
+
+    page.choose("bore_12mm_left", "top_at_z12mm")
+    browser.tell("document.getElementById('author-rim').click()")
+    assert page.faces()[-1] == "◯ bore_12mm_left_rim_top_at_z12mm"
+    page.measure("diameter", "")
+    page.choose("bore_12mm_left", "top_at_z12mm")
+    browser.tell("document.getElementById('author-rim').click()")  # it is chosen, not made again
+    assert len([name for name in page.faces() if "_rim_" in name]) == 1
+    page.choose("bore_12mm_left", "left")  # a face along the axis has no rim
+    assert browser.tell("document.getElementById('author-rim')") is None
+
+    for names, kind in (
+        (("bore_12mm_left", "bore_12mm_right"), "axis_distance"),
+        (("bottom", "back"), "plane_angle"),
+        (("bottom",), "flatness"),
+        (("boss_20mm",), "radius"),
+    ):
+        page.choose(*names)
+        page.measure(kind, "0.5" if kind == "radius" else "")
+    page.choose("bore_12mm_right", "bore_12mm_left")
+    page.measure("axis_distance", "0.3")
+    assert "measures the same" in page.says
+    browser.tell("document.getElementById('author-give').click()")
+    assert page.says.startswith("4 of 4 measurements")
+    browser.tell("document.getElementById('author-spray').click()")
+    scene, task, *_ = page.downloaded()
+    written = tomllib.loads(task)
+    assert written["features"]["bore_12mm_left_rim_top_at_z12mm"] == {
+        "kind": "circle", "of": ["top_at_z12mm"], "point_mm": [-35, -8, 12], "radius_mm": 6
+    }  # fmt: skip
+    tolerances = {one["kind"]: (one["nominal"], one["tolerance"]) for one in written["measurements"].values()}
+    # ISO 2768-mK: 12 mm, 70 mm, a shorter leg of 100 mm, a plane of 100 mm; the radius keeps its own
+    assert tolerances == {
+        "diameter": (12, 0.2),
+        "axis_distance": (70, 0.3),
+        "plane_angle": (90, pytest.approx(20 / 60, abs=1e-4)),
+        "flatness": (0, 0.2),
+        "radius": (10, 0.5),
+    }
+    root = ElementTree.fromstring(scene)
+    assert {one.find("ref").get("id") for one in root.iter("shape")} == {"sprayed_matt_white"}
+    (made / "made.xml").write_text(scene)
+    (made / "task.toml").write_text(task)
+    checked = mitsim_here("check", made / "made.xml", "--task", made / "task.toml")
+    assert "matt_white" in checked.stdout
+    browser.tell("document.getElementById('author-spray').click()")
+    assert "finish" in {one.find("ref").get("id") for one in ElementTree.fromstring(page.downloaded()[0]).iter("shape")}
+    assert [one for one in browser.problems if "blob:none" not in one] == []  # downloads are caught, see Author
+
+
+@needs_step
+@pytest.mark.browser
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+def test_heads_of_tables_are_whole_on_a_narrow_screen(step_file, step_here, browser, tmp_path):
+    mitsim_here("part", step_file, "-o", tmp_path / "made")
+    mitsim_here(
+        "check", tmp_path / "made/made.xml", "--task", tmp_path / "made/task.toml", "--html", tmp_path / "p.html"
+    )
+    browser.call("Emulation.setDeviceMetricsOverride", width=400, height=800, deviceScaleFactor=1, mobile=False)
+    try:
+        page = Author(browser, (tmp_path / "p.html").as_uri())
+        page.choose("boss_20mm")
+        page.measure("diameter", "0.1")
+        # one line of text each, and the page itself does not scroll sideways
+        heights = browser.tell("[...document.querySelectorAll('th[scope=col]')].map((one) => one.clientHeight)")
+        assert len(heights) == 12 and max(heights) < 45
+        assert browser.tell("document.documentElement.scrollWidth") <= 400
+    finally:
+        browser.reset()
+
+
 @pytest.mark.parametrize(
     ("counts", "most", "share"), [([10, 20, 30], 60, 60), ([10, 200, 300], 110, 50), ([5], 3, 3), ([], 9, 9)]
 )

@@ -99,6 +99,22 @@ def test_upright_faces_between_the_axes_are_sides_and_inclined_ones_are_slopes(t
         assert {kind: sum(name.startswith(kind) for name in names) for kind in kinds} == kinds, names
 
 
+def test_the_ends_of_a_slot_are_no_fillets(tmp_path):
+    from OCP.BRepAlgoAPI import BRepAlgoAPI_Cut, BRepAlgoAPI_Fuse
+    from OCP.BRepPrimAPI import BRepPrimAPI_MakeBox
+    from OCP.gp import gp_Pnt
+
+    slot = BRepPrimAPI_MakeBox(gp_Pnt(-15, -4, -1), gp_Pnt(15, 4, 11)).Shape()
+    for x in (-15, 15):
+        slot = BRepAlgoAPI_Fuse(slot, solid("Cylinder", 4.0, 12.0, at=(x, 0, -1))).Shape()
+    plate = BRepAlgoAPI_Cut(BRepPrimAPI_MakeBox(gp_Pnt(-30, -12, 0), gp_Pnt(30, 12, 10)).Shape(), slot).Shape()
+    faces = with_names(read_step(write_step([("plate", plate, None)], tmp_path / "plate.step")).faces)
+    assert sorted(face.name for face in faces if face.kind == "cylinder") == [
+        "slot_end_r4mm_left",
+        "slot_end_r4mm_right",
+    ]
+
+
 def test_a_bore_in_two_halves_is_one_face(tmp_path):
     """A cylinder cut through its axis and glued again has two half shells, as some CAD programs write all."""
     from OCP.BRepAlgoAPI import BRepAlgoAPI_Common, BRepAlgoAPI_Fuse

@@ -156,7 +156,7 @@ def test_pictures_are_used_and_small():
     }
     assert pictures
     for picture in pictures:
-        assert picture.stat().st_size < 200_000, picture.name
+        assert picture.stat().st_size < 300_000, picture.name
         assert picture in used, picture.name
     assert {path.suffix for path in (ROOT / "docs" / "images").iterdir()} == {".png"}
 
@@ -443,6 +443,18 @@ def test_architecture_names_code_that_exists():
         source = (ROOT / path).read_text(encoding="utf-8")
         last = name.rpartition(".")[2]
         assert not last or re.search(rf"^\s*(?:def|class) {last}\b|^{last}\b", source, re.MULTILINE), (path, name)
+
+
+def test_validity_answers_every_criterion_and_names_tests_that_exist():
+    text = (ROOT / "docs" / "explanation" / "validity.md").read_text(encoding="utf-8")
+    rows = [row.split("|")[1:-1] for row in text.splitlines() if re.match(r"\| \d+ \|", row)]
+    assert [int(row[0]) for row in rows] == list(range(1, 20))
+    for _, criterion, _, answer, shown in rows:
+        named = re.findall(r"`([\w/]+\.py)::(\w+)`", shown)
+        assert len(named) == shown.count("`") // 2
+        assert named or "not met" in answer, criterion
+        for path, name in named:
+            assert re.search(rf"^def {name}\(", (ROOT / path).read_text(encoding="utf-8"), re.MULTILINE), (path, name)
 
 
 @by_page

@@ -32,6 +32,7 @@ def test_page_is_painted_in_light_and_in_dark(report, browser, scheme, paper):
     width, height = 900, 9000
     browser.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
     browser.open(report)
+    browser.tell("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
     browser.scheme(scheme)
     pixels = cv2.imdecode(np.frombuffer(browser.shot(), np.uint8), cv2.IMREAD_COLOR)
     assert pixels.shape == (height, width, 3)

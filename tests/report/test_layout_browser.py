@@ -12,6 +12,7 @@ from mitsim.running.numbers import percent
 from .choice_run import write_choice
 from .chromium import BROWSER
 from .conftest import plain_pictures
+from .test_sheet import with_rows
 from .view_sphere_run import write_expecting_run
 
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")]
@@ -101,6 +102,56 @@ def test_the_result_is_on_the_first_screen(browser, pages, page):
     ink = browser.tell("getComputedStyle(document.body).color")
     set_size(browser, 1400, "screen", "dark")
     assert browser.tell("getComputedStyle(document.body).color") != ink
+
+
+#: names in cells and headings that a line breaks elsewhere than after an underscore or a space
+BROKEN = """(() => {
+  const found = [];
+  for (const cell of document.querySelectorAll('th, td, h2, h3, .bar-name')) {
+    const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT);
+    for (let node = walker.nextNode(); node; node = walker.nextNode()) {
+      for (const word of node.data.matchAll(/[\\p{L}\\p{N}.]+/gu)) {
+        const range = document.createRange();
+        range.setStart(node, word.index);
+        range.setEnd(node, word.index + word[0].length);
+        if (new Set([...range.getClientRects()].map((one) => Math.round(one.top))).size > 1) found.push(word[0]);
+      }
+    }
+  }
+  return found;
+})()"""
+
+
+@pytest.fixture(scope="module")
+def long_report(run_folder, tmp_path_factory):
+    """Nine measurements of long names, as the statement of a bracket has."""
+    folder = shutil.copytree(run_folder, tmp_path_factory.mktemp("long") / "run")
+    with_rows(folder, 9, long=True)
+    return write_report(folder)
+
+
+def test_a_report_of_nine_measurements_is_folded_to_8000_px(browser, long_report):
+    set_size(browser, 1400, "screen", "light")
+    browser.open(long_report)
+    assert 3000 < browser.tell("document.documentElement.scrollHeight") <= 8000
+    assert browser.tell("document.querySelectorAll('details.fold:not([open])').length") >= 6
+    browser.tell("location.hash = 'map-in'")
+    browser.until("document.getElementById('map-in').closest('details').open")  # a link opens what is folded
+
+
+@pytest.mark.parametrize("width", [1400, 400])
+def test_no_word_of_a_table_is_broken(browser, long_report, width):
+    set_size(browser, width, "screen", "light")
+    browser.open(long_report)
+    browser.tell("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    assert browser.tell(BROKEN) == []
+
+
+def test_print_shows_what_is_folded(browser, long_report):
+    set_size(browser, 703, "print", "light")
+    browser.open(long_report)
+    assert browser.tell("document.getElementById('map-in').getBoundingClientRect().height") > 100
+    assert browser.tell("document.getElementById('map-in').checkVisibility({contentVisibilityAuto: true})")
 
 
 def test_the_verdicts_fit_a_telephone_without_scrolling(browser, pages):

@@ -93,3 +93,23 @@ def test_a_process_runs_one_variant():
     other = next(v for v in backend.VARIANTS if v != backend.activate())
     with pytest.raises(InputError, match="already runs"):
         backend.activate(other)
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("libLLVM.dylib", True),  # Homebrew: its name does not state its version
+        ("LLVM-C.dll", True),  # Windows
+        ("libLLVM.so.20.1", True),
+        ("libLLVM-20.so", True),
+        ("libLLVMSupport.a", False),
+        ("libLLVM-20.so.txt", False),
+    ],
+)
+def test_libraries_of_macos_and_windows_are_found_and_asked_for_their_version(tmp_path, monkeypatch, name, found):
+    monkeypatch.delenv(backend.LLVM_VARIABLE, raising=False)
+    monkeypatch.setattr(backend, "_SYSTEM_FOLDERS", (str(tmp_path),))
+    monkeypatch.setattr(backend, "_from_pip", list)
+    monkeypatch.setattr(backend, "_VERSION_SCRIPT", "print(20)")  # in place of loading it
+    (tmp_path / name).write_bytes(b"")
+    assert [(one.path.name, one.version, one.usable) for one in backend.find_llvm()] == [(name, 20, True)] * found

@@ -291,6 +291,29 @@ def test_the_picture_shows_every_feature_in_a_colour_of_its_own(scenes, n10, tmp
         assert not any(one.overlaps(other) for other in texts[i + 1 :])
 
 
+def test_the_part_fills_the_picture_and_faces_without_a_measurement_are_grey(scenes, coarse, tmp_path):
+    (tmp_path / "task.toml").write_text(
+        "[features.plane]\nkind = 'plane'\npoint_mm = [0, 0, 0]\ndirection = [0, 0, 1]\n"
+        "[features.pillar1]\nkind = 'cylinder'\npoint_mm = [-35, 0, 0]\ndirection = [0, 0, 1]\nradius_mm = 20\n"
+        "[features.hole]\nkind = 'circle'\nof = ['plane']\npoint_mm = [0, 0, 0]\nradius_mm = 2\n"
+        "[measurements.d]\nkind = 'diameter'\nfeatures = ['hole']\nnominal = 4\nunit = 'mm'\n"
+    )
+    task = read_features(tmp_path / "task.toml")
+    assert task.measured_shapes() == ("plane",)  # the circle lies in it, and the pillar is not measured
+    checked = Checked(scenes / "two_pillars/two_pillars.xml", coarse, task=task)
+    shown = preview_figure(
+        checked.scene, checked.facts, coarse, checked.pose, checked.visible, (), task.measured_shapes()
+    )
+    labels = [text.get_text() for text in shown.legends[0].get_texts()]
+    assert labels[0].startswith("plane") and labels[1:] == ["4 not measured"]
+    left = shown.axes[0]
+    rows, columns = np.nonzero(checked.visible.shape >= 0)
+    (x0, x1), (y1, y0) = left.get_xlim(), left.get_ylim()
+    assert x0 < columns.min() and columns.max() < x1 and y0 < rows.min() and rows.max() < y1
+    filled = max(np.ptp(columns) / (x1 - x0), np.ptp(rows) / (y1 - y0))
+    assert 0.85 < filled < 0.95
+
+
 def test_a_part_out_of_sight_and_one_of_many_shapes_are_drawn_too(check, coarse, tmp_path):
     row = "".join(
         f'<shape type="sphere" id="ball_{i}"><point name="center" x="{30 * i}" y="0" z="0"/>'

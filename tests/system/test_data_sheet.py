@@ -14,7 +14,14 @@ from pydantic import ValidationError
 from mitsim.cli.program import app
 from mitsim.maps import data_sheet
 from mitsim.maps.data_sheet import correlation_length, gallery, measure_sensor
-from mitsim.report.sheet_figures import gallery_figure, noise_figure, residual_figure, sheet_leaves_out, sheet_table
+from mitsim.report.sheet_figures import (
+    gallery_figure,
+    image_on_grid,
+    noise_figure,
+    residual_figure,
+    sheet_leaves_out,
+    sheet_table,
+)
 from mitsim.report.style import write_png
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.published_noise import PublishedNoise
@@ -85,6 +92,21 @@ def test_a_gallery_shows_every_finish_and_why_points_are_missing(tmp_path):
     valid = [int(cloud.valid.sum()) for _, _, cloud in seen]
     assert valid[0] > valid[2]
     assert write_png(gallery_figure("fringes", seen), tmp_path / "gallery.png").stat().st_size > 5000
+
+
+def test_the_image_of_the_gallery_lies_on_the_pixels_of_the_status():
+    """Of two cameras with lens distortion: the raw image was shown above the status of the rectified one."""
+    sensor = binned(load_sensor("ensenso-n10"), 4)
+    camera = sensor.rig.reference
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    (_, capture, cloud) = gallery(sensor)[0]
+    for raw, axis in ((columns, 0), (rows, 1)):
+        stack = {camera_name: np.stack([raw]) for camera_name in capture.images}
+        shown = image_on_grid(replace(capture, images=stack), cloud)
+        wanted = camera.project(cloud.points.astype(float))[..., axis]  # where each point is in the raw image
+        inside = cloud.valid & np.isfinite(shown)
+        assert inside.sum() > 1000 and np.abs(shown - wanted)[inside].max() < 0.05
+        assert np.abs(wanted - raw)[inside].max() > 1  # the two images differ by more than that
 
 
 @pytest.mark.parametrize("length", [0.0, 1.5, 4.0])

@@ -43,11 +43,20 @@ def with_tolerances(candidate, size):
     return replace(candidate, study=replace(candidate.study, task=task.model_copy(update={"measurements": asked})))
 
 
+def no_points(candidate):
+    """Scores of one view in which no shape has points, so that no measurement is possible."""
+    shapes = list(candidate.study.task.shapes)
+    none = {key: (("view", "feature"), np.zeros((1, len(shapes)))) for key in ("n", "n_white", "n_only_white")}
+    able = {"uncertainty_possible": (("measurement", "view"), np.zeros((len(MEASUREMENTS), 1), bool))}
+    places = {"measurement": list(MEASUREMENTS), "feature": shapes, "view": [0]}
+    return xr.Dataset(none | able, places, {"minimum_points": 100})
+
+
 def screened(candidate, demands):
     demands = np.array(demands)
     session = SimpleNamespace(study=candidate.study)
     number = candidate.study.views[0].number
-    return SensorResult(candidate, session, xr.Dataset(), demands, demands, np.full(len(demands), number))
+    return SensorResult(candidate, session, no_points(candidate), demands, demands, np.full(len(demands), number))
 
 
 def measured(candidate, spreads, trials=24, tolerance=None):
@@ -147,7 +156,28 @@ def test_screening_and_virtual_measurements_are_told_apart(candidates):
     assert [each.status for each in choice.sensors] == ["stated", "screened"]
     made, unmade = (each.impossible[MEASUREMENTS[0]] for each in choice.sensors)
     assert made == "no virtual measurement of 30 gave a value"
-    assert unmade == "by screening, no view can make it"
+    assert unmade.startswith("by screening, no view can make it: plane has at most 0 points of 100 from any view: too")
+
+
+def test_screening_says_what_is_expected_and_not_that_nothing_fits(candidates):
+    """Of a ratio below 1 the page said "fits 0 of 3"."""
+    one, other = (with_tolerances(each, 1.0) for each in candidates)
+    choice = documented([measured(one, (0.1, 0.1, 0.1), tolerance=1.0), screened(other, (0.5, 0.9, 1.2))])
+    entry = choice.sensors[1]
+    assert entry.status == "screened" and entry.fits == 0 and entry.expected_fits == 2
+    assert entry.words.startswith("by screening alone: 2 of 3 tolerances are expected to fit; the hardest is ")
+    assert "fits 0" not in entry.words and "not decided" not in entry.words
+    assert "(2 of 3)" in as_text(choice) and "0 of 3" not in as_text(choice)
+
+
+def test_every_sensor_that_takes_part_has_its_section(candidates, tmp_path):
+    """Also where time was over before any virtual measurement."""
+    choice = documented([screened(candidates[0], FIRST), screened(candidates[1], SECOND)])
+    content = page_content(choice, tmp_path)
+    assert [one["name"] for one in content["sensors"]] == [one.name for one in choice.sensors]
+    (tmp_path / "choice.json").write_text(choice.model_dump_json())
+    each = write_choice_page(tmp_path).read_text().partition('id="each"')[2]
+    assert each.count("<details") == 2 and "By screening alone" in each and "plane has at most 0 points" in each
 
 
 def test_the_page_says_which_measurement_is_impossible_and_why(candidates, tmp_path):

@@ -85,6 +85,13 @@ class TaskFeatures(Document):
     measurements: dict[str, Measurement] = Field(default_factory=dict)
     decision: Decision = Decision()
 
+    def measured_shapes(self) -> tuple[str, ...]:
+        """Return the names of the shapes of the scene that measurements depend on, each once."""
+        named = [self.features[name] for one in self.measurements.values() for name in one.features]
+        of = (parent for feature in named for parent in feature.of or ())
+        all_names = [*(name for one in self.measurements.values() for name in one.features), *of]
+        return tuple(dict.fromkeys(name for name in all_names if self.features[name].shaped))
+
 
 def read_features(path: str | Path) -> TaskFeatures:
     """Read a task, with or without measurements.
@@ -349,7 +356,7 @@ def _size(sizes: list[float], sensor: Sensor) -> Iterator[SceneFinding]:
 def _task(facts: SceneFacts, task: TaskFeatures) -> Iterator[SceneFinding]:
     names = [shape.name for shape in facts.shapes]
     if not task.measurements:
-        yield SceneFinding("note", "task", "it has no measurements yet", "Add a [measurements.NAME] before a study")
+        yield SceneFinding("note", "task", "it has no measurements yet", "Add a measurement before a study")
     for name, feature in task.features.items():
         if not feature.shaped:
             continue  # it is derived from others
@@ -369,7 +376,7 @@ def _nominal(shape: ShapeFacts, feature: Feature) -> Iterator[SceneFinding]:
     if worst > NOMINAL_MM:
         severity: Severity = "error" if worst > MISTAKE_MM else "warning"
         what = f"the shape is up to {worst:.3g} mm off the nominal {feature.kind} of the task"
-        advice = "All errors would be measured from there: correct point_mm, direction or radius_mm"
+        advice = "All errors would be measured from there: correct its position, direction or radius"
         yield SceneFinding(severity, shape.name, what, advice)
     elif shape.mesh is not None:
         middles = shape.mesh.vertices[shape.mesh.triangles].mean(axis=1)

@@ -34,6 +34,9 @@ _CHAMFER_SHARE = 0.08
 #: a cylinder that spans more than this angle is a bore or a boss, else a fillet [rad]
 _ROUND = np.deg2rad(200.0)
 
+#: a concave cylinder that spans more than this angle, half a turn, is the end of a slot; a fillet joins two faces [rad]
+_HALF = np.deg2rad(150.0)
+
 #: positions differ if their distance exceeds this share of the part's size along that axis
 _APART = 0.02
 
@@ -130,9 +133,11 @@ def described_name(face: Face, low: Floats, high: Floats) -> str:
     if isinstance(surface, Plane):
         return _plane_name(face, surface, low, high)
     if isinstance(surface, Cylinder):
-        if round_angle(face, surface.axis, surface.point) > _ROUND:
+        angle = round_angle(face, surface.axis, surface.point)
+        if angle > _ROUND:
             return f"{'boss' if face.convex else 'bore'}_{size(2 * surface.radius)}mm"
-        return f"{'round' if face.convex else 'fillet'}_r{size(surface.radius)}mm"
+        kind = "round" if face.convex else "slot_end" if angle > _HALF else "fillet"
+        return f"{kind}_r{size(surface.radius)}mm"
     if isinstance(surface, Cone):
         angle = np.rad2deg(2 * surface.half_angle)
         if not face.convex:

@@ -35,6 +35,7 @@ from mitsim.study.choose.ranking import LARGEST_DEMAND, relative_to_least
 from mitsim.study.choose.selection import SensorResult
 from mitsim.study.screened_errors import screened_errors
 from mitsim.study.virtual.plan import map_digest
+from mitsim.views.no_view import why_no_view
 
 
 def document(
@@ -62,6 +63,7 @@ def document(
             nominal=one.nominal,
             tolerance=one.tolerance,
             features=list(one.features),
+            kind=one.kind,
             rule="" if one.tolerance is None else WORDS[task.decision_of(name).rule],
         )
         for name, one in task.measurements.items()
@@ -111,7 +113,7 @@ def words(one: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) 
     verdicts = [replace(each, unit=named_measurements[each.name].unit) for each in judged(one)]
     toleranced = {each.name for each in verdicts if each.verdict != "no tolerance"}
     if toleranced:
-        result = result_in_words(verdicts)
+        result = result_in_words(verdicts) if one.status == "stated" else _expected_in_words(one, named_measurements)
     elif one.ratio is not None and one.ratio > 1:
         result = f"{one.ratio:.2g} times the least uncertainty of all sensors at worst"
     else:
@@ -120,11 +122,24 @@ def words(one: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) 
     return "; ".join(filter(None, [result, one.possible_in_words, _reasons(one, toleranced)]))
 
 
+def _expected_in_words(one: SensorEntry, named_measurements: dict[str, ComparedMeasurement]) -> str:
+    """Return how many tolerances a sensor is expected to fit by screening, and its largest demand."""
+    cells = {name: cell for name, cell in one.measurements.items() if cell.verdict != "no tolerance"}
+    text = f"{one.expected_fits} of {len(cells)} tolerances are expected to fit"
+    known = {name: cell for name, cell in cells.items() if cell.demand is not None and cell.uncertainty is not None}
+    if not known:
+        return text
+    name = max(known, key=lambda each: known[each].demand or 0.0)
+    unit, needed, u = named_measurements[name].unit, known[name].needed, known[name].uncertainty
+    limit = "" if needed is None else f", {needed:.2g} {unit} needed"
+    return f"{text}; the hardest is {name}: standard uncertainty {u:.2g} {unit}{limit}"
+
+
 def _reasons(one: SensorEntry, but: Collection[str] = ()) -> str:
     """Return the reasons of impossible measurements, measurements of one reason together, ``but`` some."""
     by_reason = dict[str, list[str]]()
     for name, why in one.impossible.items():
-        if name not in but:
+        if name not in but or one.status == "screened":
             by_reason.setdefault(why, []).append(name)
     return "; ".join(f"{', '.join(names)} impossible ({why})" for why, names in by_reason.items())
 
@@ -140,7 +155,7 @@ def as_text(choice: ChoiceDocument) -> str:
         rows.append(
             (
                 one.name + ("" if one.status == "stated" else " *"),
-                f"{one.fits} of {toleranced}" if toleranced else "-",
+                _fits(one, toleranced),
                 "-" if one.ratio is None else f"{one.ratio:.2g}",
                 "-" if one.capture is None else f"{1e3 * one.capture.seconds:.0f} ms",
                 *(_cell(one.measurements[name], choice.measurements[name]) for name in names),
@@ -153,7 +168,7 @@ def as_text(choice: ChoiceDocument) -> str:
     if any(one.status == "screened" for one in choice.sensors):
         least = "" if any(one.tolerance is not None for one in choice.measurements.values()) else " times the best"
         reasons = f"fewer measurements are possible there, its demand there is above {LARGEST_DEMAND:g}{least}"
-        lines.append(f"* by screening alone: {reasons}, or time was over")
+        lines.append(f"* by screening alone, (n of m) expected to fit: {reasons}, or time was over")
     lines += [
         f"{one.name}: {one.possible_in_words}; {_reasons(one)}"
         for one in choice.sensors
@@ -164,6 +179,13 @@ def as_text(choice: ChoiceDocument) -> str:
 
 
 _SIGNS = {"fits": "fits", "does not fit": "no", "undecidable": "undecidable", "not decided": "?", "no tolerance": ""}
+
+
+def _fits(one: SensorEntry, toleranced: int) -> str:
+    if not toleranced:
+        return "-"
+    known = one.status == "stated"
+    return f"{one.fits} of {toleranced}" if known else f"({one.expected_fits} of {toleranced})"
 
 
 def _cell(cell: CellEntry, measurement: ComparedMeasurement) -> str:
@@ -206,8 +228,12 @@ def _impossible(one: SensorResult, m: int, name: str) -> CellEntry:
     trials = sum(each.trials for each in statements)
     lost = sum(each.trials * each.without_value for each in statements) / trials
     toleranced = tolerance_of(one.candidate.study.task, name) is not None
+    reasons = [loss for each in statements for loss in each.losses]
     return CellEntry(
-        verdict="undecidable" if toleranced else "no tolerance", trials=trials, without_value=min(lost, 1.0)
+        verdict="undecidable" if toleranced else "no tolerance",
+        trials=trials,
+        without_value=min(lost, 1.0),
+        reason=max(reasons, key=lambda loss: loss.count).reason if reasons else "",
     )
 
 
@@ -244,7 +270,8 @@ def _screened(found: SensorResult, m: int, name: str) -> CellEntry:
     """Return a cell from screening; its verdict is decided only if the demand exceeds :data:`LARGEST_DEMAND`."""
     u, tolerance = float(found.screened_u[m]), tolerance_of(found.candidate.study.task, name)
     if not math.isfinite(u):
-        return CellEntry(verdict="no tolerance" if tolerance is None else "undecidable")
+        reason = why_no_view(found.scores, name, found.candidate.study.task.shapes_for(name))
+        return CellEntry(verdict="no tolerance" if tolerance is None else "undecidable", reason=reason)
     demand = float(found.screened[m])
     cell = CellEntry(by="screening", view=int(found.screened_view[m]), uncertainty=u, demand=demand, without_value=0.0)
     if tolerance is None:

@@ -13,11 +13,16 @@ from mitsim.sensor.unknowns import UnknownsTable
 
 @dataclass(frozen=True)
 class Influence:
-    """One influence: its ``name``, whether it is ``included``, and ``how``, or how to include or reduce it."""
+    """One influence: its ``name``, whether it is ``included``, and ``how``, or how to include or reduce it.
+
+    An influence that is not included is fixed at its nominal value if mitsim could vary it (``simulated``), and left
+    out otherwise.
+    """
 
     name: str
     included: bool
     how: str
+    simulated: bool = True
 
 
 #: how a statement from a map includes effects outside the map
@@ -40,7 +45,9 @@ def influences(table: UnknownsTable, source: str, depth: int) -> list[Influence]
         ),
         Influence("temperature of the sensor", temperature.sensor_kelvin > 0, "drawn; expands the baseline evenly"),
         Influence("temperature of the part", temperature.part_kelvin > 0, "drawn; expands the part evenly"),
-        Influence("temperature gradients and warming up", False, "let the sensor warm up, and measure its drift"),
+        Influence(
+            "temperature gradients and warming up", False, "let the sensor warm up, and measure its drift", False
+        ),
         Influence(
             "finish of the part",
             rendered and table.finish.alpha > 0,
@@ -76,11 +83,14 @@ def influences(table: UnknownsTable, source: str, depth: int) -> list[Influence]
         ),
         Influence("edges and curved faces", True, "rendered and decoded" if rendered else _OTHER_PARTS),
         Influence(
-            "the maker's own software", False, "mitsim decodes with OpenCV instead; compare with captures of your unit"
+            "the maker's own software",
+            False,
+            "mitsim decodes with OpenCV instead; compare with captures of your unit",
+            False,
         ),
-        Influence("vibration, motion during a capture", False, "hold the sensor and the part still"),
-        Influence("dirt, oil, coatings, marks on the part", False, "clean the part as for the characterisation"),
-        Influence("deformation by clamping", False, "clamp as in use"),
-        Influence("datums and choice of features", False, "the task is assumed to agree with the drawing"),
+        Influence("vibration, motion during a capture", False, "hold the sensor and the part still", False),
+        Influence("dirt, oil, coatings, marks on the part", False, "clean the part as for the characterisation", False),
+        Influence("deformation by clamping", False, "clamp as in use", False),
+        Influence("datums and choice of features", False, "the task is assumed to agree with the drawing", False),
     ]
     return listed_influences

@@ -1,0 +1,128 @@
+"""Draw the interreflected light of a view: its share of each pixel, and the face from which most of it comes.
+
+Signal chain: image of the part -> camera of pixels so large that the part has about :data:`_PIXELS` of them -> light of
+each pixel by the face that it met before -> two pictures, and for each face its share with the faces it comes from.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from characterisation.plots.style import FIELD, MUTED, OTHER_SHAPE, SEQUENTIAL, SHAPES, bare, drawing
+from characterisation.region_of_interest import Roi
+from mitsim.report.style import colour_scale
+from mitsim.running.numbers import percent
+from mitsim.scene.first_hits import VisibleSurfaces
+from mitsim.scene.light_transport.light_from_faces import LightFromFaces, light_from_faces
+from mitsim.scene.load import Scene
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
+
+#: width of the figure and of a picture [in]
+_WIDTH_IN, _WIDE_IN = 9.4, 4.1
+
+#: pixels of the part, and paths of each
+_PIXELS, _SAMPLES = 16_000, 256
+
+#: faces with a colour of their own; largest number of faces in the list, and of the faces one gets light from
+_COLOURED, _LISTED, _SOURCES = len(SHAPES), 12, 3
+
+#: share below which a face is not named as a source
+_LEAST = 0.005
+
+
+def bounced_light(
+    scene: Scene, sensor: Sensor, pose: Transform, visible: VisibleSurfaces, seed: int = 1
+) -> LightFromFaces:
+    """Estimate the light of a view by face, in the part of the image that shows the part.
+
+    Parameters
+    ----------
+    scene, sensor
+        The scene, and the sensor.
+    pose
+        world_from_sensor.
+    visible
+        Surfaces that the reference camera sees from there.
+    seed
+        Of the light paths.
+    """
+    rows, columns = np.nonzero(visible.shape >= 0)
+    camera = sensor.rig.reference
+    step = max(1, math.floor(math.sqrt(len(rows) / _PIXELS)))
+    coarse = camera.binned(step)
+    if not len(rows):
+        return light_from_faces(scene, coarse, sensor.projector, pose, 1, seed)
+    left, top = (max(0, int(one.min()) // step - 2) for one in (columns, rows))
+    right, bottom = (
+        min(size, int(one.max()) // step + 3)
+        for one, size in ((columns, coarse.width), (rows, coarse.height))
+    )  # fmt: skip
+    roi = Roi(left, top, right - left, bottom - top)
+    return light_from_faces(scene, coarse, sensor.projector, pose, _SAMPLES, seed, roi)
+
+
+def bounce_figure(found: LightFromFaces, names: Sequence[str], title: str) -> Figure:
+    """Draw the share of interreflected light, and the main source of each pixel."""
+    share = found.share
+    main = np.where(np.nan_to_num(share) > 0, found.by_face.argmax(axis=0), -1)
+    order = np.argsort(-found.by_face.sum(axis=(1, 2)), kind="stable")
+    strong = [int(k) for k in order[:_COLOURED] if found.by_face[k].any()]
+    colours = {k: SHAPES[place] for place, k in enumerate(strong)}
+    height, width = share.shape
+    with drawing():
+        lines = [line for line in (_line(found, names, k) for k in range(len(names))) if line]
+        shown = lines[:_LISTED] + ([f"and {len(lines) - _LISTED} more faces"] if len(lines) > _LISTED else [])
+        tall = min(max(_WIDE_IN * height / width, 1.4), 5.0)
+        below = 0.2 * max(len(shown), math.ceil(len(strong) / 2)) + 0.35
+        figure = Figure((_WIDTH_IN, tall + below + 0.6))
+        scale = figure.get_size_inches()[1]
+        bottom, part = below / scale, tall / scale
+        wide = _WIDE_IN / _WIDTH_IN
+        left, right = (figure.add_axes((x, bottom, wide, part)) for x in (0.01, 0.99 - wide))
+        drawn = left.imshow(np.ma.masked_invalid(share), cmap=SEQUENTIAL, vmin=0, vmax=1)
+        scale_axes = figure.add_axes((0.02 + wide, bottom, 0.012, part))
+        colour_scale(figure, drawn, None, "share of the light [1]", extend="neither", cax=scale_axes)
+        right.imshow(_sources(main, share, colours))
+        for axes, words in ((left, "light that met another face before"), (right, "the face that most of it met")):
+            axes.set_facecolor(FIELD)
+            bare(axes)
+            axes.set_title(words, loc="left")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+        handles = [Patch(facecolor=colour, edgecolor=MUTED, lw=0.5, label=names[k]) for k, colour in colours.items()]
+        if len(strong) < len({int(k) for k in np.unique(main) if k >= 0}):
+            handles.append(Patch(facecolor=OTHER_SHAPE, edgecolor=MUTED, lw=0.5, label="other faces"))
+        at = bottom - 0.06 / scale
+        figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.99 - wide, at), ncols=2, borderaxespad=0.0)
+        figure.text(
+            0.01, at - 0.03 / scale, "\n".join(shown) or "no face is lit", va="top", fontsize=8, linespacing=1.5
+        )
+    return figure
+
+
+def _sources(main: NDArray[np.integer], share: NDArray[np.floating], colours: dict[int, str]) -> NDArray[np.float64]:
+    """Return an image (H, W, 3): the colour of the main source, paler where the share is small."""
+    palette = np.array([to_rgb(colours.get(k, OTHER_SHAPE)) for k in range(int(main.max(initial=0)) + 1)] + [(1, 1, 1)])
+    strength = np.clip(np.nan_to_num(share), 0, 1)[..., None] ** 0.5
+    image = strength * palette[main] + (1 - strength) * np.ones(3)
+    image[~np.isfinite(share)] = to_rgb(FIELD)
+    return np.asarray(image)
+
+
+def _line(found: LightFromFaces, names: Sequence[str], shape: int) -> str:
+    """Return what a face gets from others: ``pillar1: 91 % of its light met plane (90 %) or pillar2 (1 %) before``."""
+    shares = found.shares_of(shape)
+    if not np.isfinite(shares).all():
+        return ""
+    best = [int(k) for k in np.argsort(-shares, kind="stable")[:_SOURCES] if shares[k] >= _LEAST]
+    of = ", ".join(f"{names[k]} {percent(float(shares[k]))}" for k in best)
+    return f"{names[shape]}: {percent(float(shares.sum()))} of its light met another face before" + (
+        f": {of}" if of else ""
+    )

@@ -1,0 +1,280 @@
+"""Collect what an auditor reads beside the results of a statement: the declaration of ISO/TS 15530-4.
+
+Signal chain: folder of a run, or of a comparison of sensors -> part, sensor, pose, calibration, exposures, decision
+rule, influences that are varied, fixed or left out, versions and digests -> texts for :mod:`mitsim.report.sheet`.
+The numbers of a measurement are those that JCGM 101:2008, 5.5 asks to report: estimate of the error, standard
+uncertainty u, 95 % interval, number of trials; and U and k = U / u of JCGM 100:2008, 7.2.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from scipy.spatial.transform import Rotation
+
+from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
+from mitsim.report.first_rows import ResultRow
+from mitsim.report.first_screen import FirstScreen, of_choice, of_run
+from mitsim.report.pose_texts import angles_in_words, origin_text, pose_of_view
+from mitsim.report.statement_section import exposed_in_words, interval_words
+from mitsim.running.numbers import NONE, SPACE, count, listed, quantity, rounded, signed, two_digits
+from mitsim.study.choice_document import CHOICE, ChoiceDocument, PoseEntry, SensorEntry, read_choice
+from mitsim.study.run_folder import Run, read_run
+from mitsim.study.scene_geometry import SceneGeometry
+from mitsim.study.statement_file import InfluenceEntry, StatedMeasurement, StatementDocument, read_statement
+
+#: hexadecimal digits of a digest that are printed
+_DIGITS = 16
+
+#: the end of a key of the unknowns, and its unit
+_UNITS = {"mrad": "mrad", "mm": "mm", "deg": "°", "kelvin": "K", "nm": "nm", "k": "K", "relative": "relative"}
+
+
+@dataclass(frozen=True)
+class DeclaredRow:
+    """One measurement as texts: the row of the first screen, and the numbers of its statement."""
+
+    result: ResultRow
+    bias: str
+    expanded: str
+    factor: str
+    interval: str
+    trials: str
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """Content of a sheet; ``facts`` are (name, text). ``date`` is the day of the virtual measurements, ISO 8601."""
+
+    title: str
+    date: str
+    number: str
+    first: FirstScreen
+    rows: list[DeclaredRow]
+    facts: list[tuple[str, str]]
+    notes: list[str]
+
+
+def read_declaration(folder: Path, geometry: SceneGeometry | None) -> Declaration:
+    """Read the declaration of a finished run, or of a comparison of sensors.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or damaged; the message names the file.
+    """
+    choice = read_choice(folder)
+    return _of_run(read_run(folder), geometry) if choice is None else _of_choice(choice, geometry, folder)
+
+
+def _of_run(run: Run, geometry: SceneGeometry | None) -> Declaration:
+    first, document = of_run(run, geometry), run.statement
+    facts = [("Part", _part(run.about.scene, list(run.about.features.values()))), ("Sensor", run.about.sensor)]
+    if document is not None:
+        facts.append(("Pose of the sensor", pose_in_full(pose_of_view(run, document.view))))
+        facts += _of_statement(document, "" if document.exposure else run.about.exposure_rule)
+        facts += _influences(document, "round" in run.about.lay.values())
+        facts += _rules(one.decision.rule for one in document.measurements.values() if one.decision)
+    digests = _digests(run.folder, ("statement.json", "task.json", "part.ply", "map.nc"))
+    facts.append(("Made with", f"mitsim {run.about.mitsim}, seed {run.about.seed}; SHA-256 of {digests}"))
+    date = run.about.date or _day(run.folder / "run.json")
+    return _declared(
+        run.folder, f"{run.about.sensor} measures {Path(run.about.scene).stem}", date, first, document, facts
+    )
+
+
+def _of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None, folder: Path) -> Declaration:
+    first = of_choice(choice, geometry)
+    best = next((one for one in choice.sensors if one.measurements), None)
+    if best is None:
+        title = f"No sensor measures {Path(choice.scene).stem}"
+        return _declared(folder, title, _day(folder / CHOICE), first, None, [("Part", _part(choice.scene, []))])
+    own = folder / best.name
+    document = read_statement(own / "statement.json") if best.status == "stated" else None
+    about = read_run(own).about if (own / "run.json").exists() else None
+    finishes = [] if about is None else list(about.features.values())
+    facts = [("Part", _part(choice.scene, finishes)), ("Sensor", best.name)]
+    facts += [("Pose of the sensor", pose_in_full(pose)) for pose in best.poses[:1]]
+    exposures = ""
+    if best.capture is not None:
+        times = listed([two_digits(1e3 * one) for one in best.capture.exposures_s])
+        exposures = f"{best.capture.images} images of {times} ms each"
+    if document is not None:
+        facts += _of_statement(document, exposures)
+        facts += _influences(document, about is not None and "round" in about.lay.values())
+    else:
+        facts.append(("Made by", "screening alone, from a performance map: no virtual measurement, no statement"))
+    facts += _rules(one.rule for one in choice.measurements.values())
+    facts += _others(choice, best)
+    digests = _digests(folder, (CHOICE,), own, ("statement.json",))
+    maps = f"; map {best.map_digest}" if best.map_digest else ""
+    facts.append(("Made with", f"mitsim {choice.mitsim}, seed {choice.seed}; SHA-256 of {digests}{maps}"))
+    title = f"{best.name} measures {Path(choice.scene).stem}"
+    date = (about.date if about else "") or _day(folder / CHOICE)
+    return _declared(own, title, date, first, document, facts)
+
+
+def _declared(
+    folder: Path,
+    title: str,
+    date: str,
+    first: FirstScreen,
+    document: StatementDocument | None,
+    facts: list[tuple[str, str]],
+) -> Declaration:
+    stated: Mapping[str, StatedMeasurement] = {} if document is None else document.measurements
+    rows = [_row(row, stated.get(row.name)) for row in first.rows]
+    number = _digest(folder / "statement.json")[:_DIGITS] if document is not None else ""
+    return Declaration(title, date, number, first, rows, facts, _notes(document))
+
+
+def _row(result: ResultRow, one: StatedMeasurement | None) -> DeclaredRow:
+    if one is None:
+        return DeclaredRow(result, result.bias, NONE, NONE, NONE, NONE)
+    factor = one.coverage_factor
+    return DeclaredRow(
+        result,
+        _bias(one),
+        quantity(one.expanded_uncertainty, one.unit),
+        NONE if factor is None else rounded(factor, 2),
+        interval_words(one.interval, one.unit),
+        count(one.trials),
+    )
+
+
+def _bias(one: StatedMeasurement) -> str:
+    """Write the bias with as many decimal places as its standard uncertainty u has (JCGM 100:2008, 7.2.6)."""
+    if one.bias is None or not one.standard_uncertainty:
+        return quantity(one.bias, one.unit)
+    places = len(two_digits(one.standard_uncertainty).partition(".")[2])
+    sign = "+" if round(one.bias, places) > 0 else ""
+    return f"{sign}{rounded(one.bias, places)}" + ("°" if one.unit == "deg" else f"{SPACE}{one.unit}")
+
+
+def _notes(document: StatementDocument | None) -> list[str]:
+    """Return how to read the table, and what its numbers do not say."""
+    if document is None:
+        return []
+    notes = [
+        "Error = measured − true; bias = mean error over the virtual measurements, not subtracted; u = standard "
+        "uncertainty, standard deviation about the bias; U = half the 95 % interval of the error; k = U / u; N = "
+        "number of virtual measurements. If y is read, the true value lies between y − (upper end) and y − (lower end)."
+    ]
+    by_part = {
+        AT_THE_LIMIT: "for a part at the limit of its tolerance",
+        FAR_FROM_NOMINAL: "for a part far from nominal",
+    }
+    for part, words in by_part.items():
+        if names := [name for name, one in document.measurements.items() if one.errors_of == part]:
+            notes.append(f"{listed(names)}: errors {words}.")
+    if names := [name for name, one in document.measurements.items() if not one.settled and one.trials]:
+        which = "all" if len(names) == len(document.measurements) else listed(names)
+        notes.append(f"Not settled after JCGM 101, 7.9 (more virtual measurements may change a digit): {which}.")
+    return notes
+
+
+def _part(scene: str, finishes: Sequence[str]) -> str:
+    kinds = list(dict.fromkeys(one.replace(" um", " µm") for one in finishes))
+    name = Path(scene).name
+    return f"{name}; finish: {listed(kinds)}" if kinds else name
+
+
+def pose_in_full(pose: PoseEntry) -> str:
+    """Return view, angles, standoff, position [mm] and unit quaternion (x, y, z, w) of a pose in the part frame."""
+    matrix = [row[:3] for row in pose.world_from_sensor[:3]]
+    turn = Rotation.from_matrix(matrix).as_quat(canonical=True)
+    quaternion = ", ".join(signed(f"{value + 0.0:.6f}") for value in turn)
+    return (
+        f"view {pose.view}: {angles_in_words(pose)}, {rounded(pose.standoff_mm)} mm away. Part from sensor: origin "
+        f"({origin_text(pose, 3)}) mm, quaternion x, y, z, w ({quaternion})"
+    )
+
+
+def _of_statement(document: StatementDocument, exposures: str) -> list[tuple[str, str]]:
+    trials = max((one.trials for one in document.measurements.values()), default=0)
+    how = "rendered and decoded" if document.measured_by == "render" else "drawn from a performance map"
+    exposed = exposed_in_words(document.exposure)
+    return [
+        ("Method", f"{count(trials)} virtual measurements, {how}: a virtual experiment, “simulate and analyse”"),
+        ("Calibration", document.calibration.split("; drift:")[0]),
+        ("Exposure", exposed or exposures),
+    ]
+
+
+def _influences(document: StatementDocument, lay_left_out: bool) -> list[tuple[str, str]]:
+    """Return the influences that are varied, fixed and left out (ISO/TS 15530-4)."""
+    varied = [one for one in document.influences if one.included]
+    fixed = [one for one in document.influences if not one.included and one.simulated]
+    left_out = [one for one in document.influences if not one.included and not one.simulated]
+    missing = _names(left_out) + (["direction of machining marks"] if lay_left_out else [])
+    # a map has its own finish and light
+    drawn = {
+        k: v for k, v in document.unknowns.items() if document.measured_by != "map" or k not in ("finish", "light")
+    }
+    out = [("Varied", ", ".join(_names(varied))), ("with sizes of", unknowns_in_words(drawn))]
+    out += [("Fixed", ", ".join(_names(fixed)))] if fixed else []
+    return [*out, ("Left out", ", ".join(missing))]
+
+
+def _names(influences: Sequence[InfluenceEntry]) -> list[str]:
+    return [one.name for one in influences]
+
+
+def unknowns_in_words(unknowns: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the sizes that the virtual measurements drew from: ``pose: placement 1 mm, ...; form: plane 0.02 mm``."""
+    groups = {name: list(_sizes(table)) for name, table in unknowns.items()}
+    return "; ".join(f"{name}: {', '.join(sizes)}" for name, sizes in groups.items() if sizes)
+
+
+def _sizes(table: Mapping[str, Any]) -> Iterator[str]:
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from (f"{name} {size:g} mm" for name, size in value.items() if isinstance(size, int | float) and size)
+        elif isinstance(value, int | float) and not isinstance(value, bool) and value:
+            name, _, end = key.rpartition("_")
+            unit = _UNITS.get(end, "")
+            if name.endswith("_per"):
+                name, unit = name.removesuffix("_per"), f"per {unit}"
+            label = (name if unit else key).replace("_", " ").replace("told", "assumed pose")
+            yield f"{label} {value:g}" + ("°" if unit == "°" else f" {unit}" if unit else "")
+
+
+def _rules(rules: Iterable[str]) -> list[tuple[str, str]]:
+    some = sorted({rule for rule in rules if rule})
+    return [("Decision rule", "; ".join(some))] if some else []
+
+
+def _others(choice: ChoiceDocument, best: SensorEntry) -> list[tuple[str, str]]:
+    asked = sum(one.tolerance is not None for one in choice.measurements.values())
+    words = []
+    for one in choice.sensors:
+        if one is best or one.status == "excluded":
+            continue
+        by = "" if one.status == "stated" else ", by screening alone"
+        fits = (
+            f"fits {one.fits} of {asked}"
+            if one.status == "stated"
+            else f"{one.expected_fits} of {asked} expected to fit"
+        )
+        words.append(f"{one.name} ({fits if asked else one.possible_in_words or 'all possible'}{by})")
+    return [("Also compared", ", ".join(words))] if words else []
+
+
+def _digests(folder: Path, names: Sequence[str], other: Path | None = None, more: Sequence[str] = ()) -> str:
+    """Return the first digits of the SHA-256 of the files that exist."""
+    paths = [folder / name for name in names] + [other / name for name in more if other is not None]
+    return ", ".join(f"{path.name} {_digest(path)[:_DIGITS]}" for path in paths if path.exists())
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _day(path: Path) -> str:
+    """Return the day on which a file was written, for folders of older versions, whose files do not say it."""
+    return datetime.fromtimestamp(path.stat().st_mtime, UTC).date().isoformat()

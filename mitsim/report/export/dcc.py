@@ -1,0 +1,235 @@
+"""Write the statement of a run as a digital calibration certificate: DCC 3.2.0 of PTB, numbers after D-SI 2.1.0.
+
+Signal chain: results of a run, who issues them -> administrative data, then for each measurement its nominal value,
+error with u and 95 % interval, expected reading with U and k, number of virtual measurements, verdict -> one document.
+
+The elements are those of PTB's schema (https://ptb.de/dcc/v3.2.0/dcc.xsd), which is LGPL-3.0 and no part of mitsim. The
+document calls itself simulated and not traceable: it is the statement of a virtual experiment in the form that programs
+for certificates read, and no calibration. The laboratory signs it, mitsim does not.
+"""
+
+from __future__ import annotations
+
+import uuid
+from dataclasses import dataclass, fields
+from pathlib import Path
+from xml.etree.ElementTree import Element, ElementTree, SubElement, indent, register_namespace
+
+from characterisation.files.atomic_io import atomic_write
+from characterisation.files.errors import InputError
+from mitsim.report.declaration import Declaration
+from mitsim.report.export.results import ExpectedResult, RunResults
+from mitsim.running.version import __version__
+
+DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
+
+_SCHEMA = f"{DCC} https://ptb.de/dcc/v3.2.0/dcc.xsd"
+_XSI = "http://www.w3.org/2001/XMLSchema-instance"
+
+#: units of D-SI by those of a task
+_UNITS = {"mm": r"\milli\metre", "deg": r"\degree"}
+
+_NOT_TRACEABLE = (
+    "Simulated: no real sensor has measured a part. The results are those of virtual measurements, and valid for the "
+    "sensor, pose, part and influences stated here. They are no calibration."
+)
+
+
+@dataclass(frozen=True)
+class Issuer:
+    """Who issues a certificate: ``laboratory``, its ``country`` (ISO 3166-1, two capital letters), ``responsible``
+    person, ``customer``, and the ``serial`` number of the sensor.
+    """
+
+    laboratory: str
+    country: str
+    responsible: str
+    customer: str
+    serial: str
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not value.strip():
+                hint = "a digital calibration certificate names its issuer"
+                raise InputError(f"--{field.name}", "", "nothing", "a text", hint)
+        if not (len(self.country) == 2 and self.country.isascii() and self.country.isupper()):
+            raise InputError("--country", "", repr(self.country), "two capital letters after ISO 3166-1: GB")
+
+
+def write_dcc(found: RunResults, declared: Declaration, issuer: Issuer, path: str | Path) -> None:
+    """Write results as one DCC document.
+
+    Parameters
+    ----------
+    found, declared
+        Results of a run, and their declaration.
+    issuer
+        Who issues the certificate.
+    path
+        File to write.
+    """
+    register_namespace("dcc", DCC)
+    register_namespace("si", SI)
+    register_namespace("xsi", _XSI)
+    root = dcc_document(found, declared, issuer)
+    indent(root)
+    with atomic_write(path) as file:
+        ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
+
+
+def dcc_document(found: RunResults, declared: Declaration, issuer: Issuer) -> Element:
+    """Return the document; its identifier derives from the statement's digest and the issuer."""
+    root = Element(f"{{{DCC}}}digitalCalibrationCertificate", {"schemaVersion": "3.2.0"})
+    root.set(f"{{{_XSI}}}schemaLocation", _SCHEMA)
+    _administrative(_add(root, "administrativeData"), found, declared, issuer)
+    result = _add(_add(root, "measurementResults"), "measurementResult")
+    _text(result, "name", "Measurement uncertainty by virtual measurements")
+    _methods(result, found, declared)
+    _software(_add(result, "usedSoftware"), found)
+    _equipment(result, found, issuer)
+    results = _add(result, "results")
+    for one in found.results:
+        _result(results, one)
+    return root
+
+
+def _administrative(to: Element, found: RunResults, declared: Declaration, issuer: Issuer) -> None:
+    _software(_add(to, "dccSoftware"), found)
+    core = _add(to, "coreData")
+    _add(core, "countryCodeISO3166_1", issuer.country)
+    _add(core, "usedLangCodeISO639_1", "en")
+    _add(core, "mandatoryLangCodeISO639_1", "en")
+    named = "/".join((declared.number, issuer.laboratory, issuer.customer, issuer.serial))
+    _add(core, "uniqueIdentifier", str(uuid.uuid5(uuid.NAMESPACE_URL, f"{DCC}/{named}")))
+    _identified(_add(core, "identifications"), "calibrationLaboratory", declared.number, "SHA-256 of statement.json")
+    for name in ("beginPerformanceDate", "endPerformanceDate"):
+        _add(core, name, declared.date)
+    _add(core, "performanceLocation", "other")
+    item = _add(_add(to, "items"), "item")
+    _text(item, "name", f"3D vision sensor {found.sensor}, simulated")
+    _text(_add(item, "manufacturer"), "name", "see the sensor’s name")
+    _add(item, "model", found.sensor)
+    _identified(_add(item, "identifications"), "owner", issuer.serial, "serial number")
+    _contact(_add(_add(to, "calibrationLaboratory"), "contact"), issuer.laboratory, issuer.country)
+    person = _add(_add(to, "respPersons"), "respPerson")
+    _text(_add(person, "person"), "name", issuer.responsible)
+    _add(person, "mainSigner", "true")
+    _contact(_add(to, "customer"), issuer.customer, issuer.country)
+    statements = _add(to, "statements")
+    simulated = _add(statements, "statement")
+    _add(simulated, "traceable", "false")
+    _text(simulated, "declaration", _NOT_TRACEABLE)
+    for name, text in declared.facts:
+        if text:
+            statement = _add(statements, "statement")
+            _text(statement, "name", name)
+            _text(statement, "declaration", text)
+
+
+def _methods(to: Element, found: RunResults, declared: Declaration) -> None:
+    used = _add(_add(to, "usedMethods"), "usedMethod", refType="basic_uncertainty")
+    _text(used, "name", "Simulate and analyse, a virtual experiment")
+    how = "rendered and decoded" if found.source == "render" else "drawn from a performance map"
+    _text(used, "description", " ".join([f"Virtual measurements {how}.", *declared.notes]))
+    for norm in ("JCGM 101:2008", "ISO/TS 15530-4:2008"):
+        _add(used, "norm", norm)
+
+
+def _software(to: Element, found: RunResults) -> None:
+    one = _add(to, "software")
+    _text(one, "name", "mitsim")
+    _add(one, "release", __version__)
+
+
+def _equipment(to: Element, found: RunResults, issuer: Issuer) -> None:
+    one = _add(_add(to, "measuringEquipments"), "measuringEquipment")
+    _text(one, "name", f"3D vision sensor {found.sensor}, simulated")
+    _identified(_add(one, "identifications"), "owner", issuer.serial, "serial number")
+
+
+def _result(to: Element, one: ExpectedResult) -> None:
+    result = _add(to, "result")
+    _text(result, "name", one.measurement)
+    _text(result, "description", f"{one.kind.replace('_', ' ')} of {', '.join(one.features)}, from view {one.view}")
+    table = _add(_add(result, "data"), "list")
+    unit = _UNITS[one.unit]
+    _real(_quantity(table, "nominal value", "basic_nominalValue"), one.nominal, unit)
+    if one.bias is not None and one.uncertainty is not None and one.low is not None and one.high is not None:
+        error = _real(_quantity(table, "error, measured less true", "basic_measurementError"), one.bias, unit)
+        interval = _si(error, "coverageInterval")
+        _si(interval, "standardUnc", _number(one.uncertainty))
+        _si(interval, "intervalMin", _number(one.low - one.nominal))
+        _si(interval, "intervalMax", _number(one.high - one.nominal))
+        _si(interval, "coverageProbability", "0.95")
+        reading = _real(
+            _quantity(table, "expected reading of a nominal part", "basic_measuredValue"), one.nominal + one.bias, unit
+        )
+        half = (one.high - one.low) / 2
+        if half >= one.uncertainty > 0:  # D-SI has no coverage factor below 1
+            expanded = _si(reading, "expandedUnc")
+            _si(expanded, "uncertainty", _number(half))
+            _si(expanded, "coverageFactor", f"{half / one.uncertainty:.4f}")
+            _si(expanded, "coverageProbability", "0.95")
+    for name, value in zip(("lower deviation", "upper deviation"), _limits(one), strict=True):
+        if value is not None:
+            _real(_quantity(table, f"tolerance, {name}"), value, unit)
+    _real(_quantity(table, "number of virtual measurements"), float(one.trials), r"\one")
+    _real(_quantity(table, "share without a value"), one.without_value, r"\one")
+    _text(_quantity(table, "verdict on the measurement, not on a part"), "noQuantity", one.verdict)
+
+
+def _limits(one: ExpectedResult) -> tuple[float | None, float | None]:
+    """Return the lower and upper deviation that the tolerance allows, None where it has no limit."""
+    if isinstance(one.tolerance, tuple):
+        return one.tolerance
+    if one.tolerance is None:
+        return None, None
+    return (None if one.nominal - one.tolerance <= 0 else -one.tolerance), one.tolerance
+
+
+def _quantity(to: Element, name: str, reference: str = "") -> Element:
+    one = _add(to, "quantity", **({"refType": reference} if reference else {}))
+    _text(one, "name", name)
+    return one
+
+
+def _real(to: Element, value: float, unit: str) -> Element:
+    real = _si(to, "real")
+    _si(real, "value", _number(value))
+    _si(real, "unit", unit)
+    return real
+
+
+def _number(value: float) -> str:
+    """Format a number as D-SI's decimal, with all its digits."""
+    return repr(float(value))
+
+
+def _identified(to: Element, issuer: str, value: str, name: str) -> None:
+    one = _add(to, "identification")
+    _add(one, "issuer", issuer)
+    _add(one, "value", value)
+    _text(one, "name", name)
+
+
+def _contact(to: Element, name: str, country: str) -> None:
+    _text(to, "name", name)
+    _add(_add(to, "location"), "countryCode", country)
+
+
+def _text(to: Element, tag: str, text: str) -> None:
+    """Add an element with a text in English."""
+    _add(_add(to, tag), "content", text, lang="en")
+
+
+def _add(to: Element, tag: str, text: str = "", **attributes: str) -> Element:
+    out = SubElement(to, f"{{{DCC}}}{tag}", attributes)
+    out.text = " ".join(text.split()) or None
+    return out
+
+
+def _si(to: Element, tag: str, text: str = "") -> Element:
+    out = SubElement(to, f"{{{SI}}}{tag}")
+    out.text = text or None
+    return out

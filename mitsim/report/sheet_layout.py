@@ -1,0 +1,164 @@
+"""Set text on an A4 page by its measured width: wrapped lines, and a table whose columns never overlap.
+
+Signal chain: text, size, weight -> width [in] by the renderer's own font metrics -> lines that fit, or columns as
+wide as their widest cell, set smaller until the table fits -> texts on a figure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.lines import Line2D
+
+from characterisation.plots.style import INK, STYLE
+
+#: an A4 page, its margins, and the distance between columns [in]
+WIDTH, HEIGHT, MARGIN, GAP = 8.27, 11.69, 0.6, 0.1
+
+#: width between the margins [in]
+ACROSS = WIDTH - 2 * MARGIN
+
+#: height of a line over the size of its text [in / pt]
+LINE = 1.35 / 72
+
+#: sizes that a table may have [pt], largest first
+_SIZES = (8.0, 7.5, 7.0, 6.5, 6.0, 5.5)
+
+_DPI = 200
+
+
+@lru_cache(maxsize=1)
+def _renderer() -> Any:
+    canvas: Any = FigureCanvasAgg(Figure(dpi=_DPI))
+    return canvas.get_renderer()
+
+
+@lru_cache(maxsize=4096)
+def text_width(text: str, size: float, weight: str = "normal") -> float:
+    """Return the width [in] of one line of text of a size [pt]."""
+    font = FontProperties(family=STYLE["font.family"], size=size, weight=weight)
+    return float(_renderer().get_text_width_height_descent(text, font, False)[0]) / _DPI
+
+
+def wrapped(text: str, size: float, across: float, weight: str = "normal") -> list[str]:
+    """Return the lines of a text that are at most ``across`` [in] wide.
+
+    A line breaks at a space, or after an underscore or a slash; a longer word breaks where it must.
+
+    Parameters
+    ----------
+    text
+        The text.
+    size, weight
+        Size [pt] and weight of the font.
+    across
+        Largest width of a line [in].
+    """
+    lines, line = list[str](), ""
+    for word in text.split(" "):
+        for number, piece in enumerate(_pieces(word)):
+            trial = line + (" " if line and number == 0 else "") + piece
+            if text_width(trial, size, weight) <= across:
+                line = trial
+                continue
+            if line:
+                lines.append(line)
+            line = piece
+            while text_width(line, size, weight) > across and len(line) > 1:
+                cut = next(k for k in range(len(line), 0, -1) if text_width(line[:k], size, weight) <= across or k == 1)
+                lines.append(line[:cut])
+                line = line[cut:]
+    return [*lines, line]
+
+
+def _pieces(word: str) -> list[str]:
+    """Return a word divided after its underscores and slashes."""
+    out, piece = [], ""
+    for character in word:
+        piece += character
+        if character in "_/":
+            out.append(piece)
+            piece = ""
+    return [*out, piece] if piece or not out else out
+
+
+class Page:
+    """One A4 page; ``place`` [in] above its lower edge is where the next line goes."""
+
+    def __init__(self) -> None:
+        self.figure = Figure((WIDTH, HEIGHT), dpi=_DPI)
+        self.place = HEIGHT - MARGIN
+
+    def put(self, left: float, text: str, size: float = 8.0, colour: str = INK, weight: str = "normal") -> None:
+        """Write one line, its top at ``place``.
+
+        Parameters
+        ----------
+        left
+            Distance from the margin [in].
+        text
+            The line.
+        size, colour, weight
+            Of the font; the size in pt.
+        """
+        x, y = (MARGIN + left) / WIDTH, self.place / HEIGHT
+        self.figure.text(x, y, text, fontsize=size, color=colour, fontweight=weight, va="top")
+
+    def write(
+        self,
+        text: str,
+        size: float = 8.0,
+        colour: str = INK,
+        weight: str = "normal",
+        left: float = 0.0,
+        across: float = ACROSS,
+    ) -> None:
+        """Write wrapped lines, and move down by each.
+
+        Parameters
+        ----------
+        text
+            The text.
+        size, colour, weight
+            Of the font; the size in pt.
+        left, across
+            Distance from the margin, and largest width of a line [in].
+        """
+        for line in wrapped(text, size, across, weight):
+            self.put(left, line, size, colour, weight)
+            self.place -= size * LINE
+
+    def rule(self, colour: str, left: float = 0.0, right: float = ACROSS) -> None:
+        """Draw a thin horizontal line at ``place``."""
+        ends = [(MARGIN + left) / WIDTH, (MARGIN + right) / WIDTH]
+        height = self.place / HEIGHT
+        self.figure.add_artist(Line2D(ends, [height, height], color=colour, lw=0.6))
+
+
+class Columns:
+    """Columns of a table as wide as their widest cell, at the largest size of text at which they fit a page.
+
+    ``lefts`` [in] from the margin, ``widths`` [in], ``size`` [pt]. Cells of the first column wrap if they are wider
+    than ``first`` [in] and the others leave no more.
+    """
+
+    def __init__(self, rows: Sequence[Sequence[str]], heads: Sequence[Sequence[str]], first: float = 1.3) -> None:
+        for size in _SIZES:
+            self.size = size
+            self.widths = [
+                max(text_width(line, size, "bold") for line in (*(row[k] for row in rows), *head))
+                for k, head in enumerate(heads)
+            ]
+            rest = sum(self.widths[1:]) + GAP * (len(heads) - 1)
+            if min(self.widths[0], first) + rest <= ACROSS:
+                break
+        self.widths[0] = max(min(self.widths[0], ACROSS - rest), first / 2)
+        spare = max(0.0, ACROSS - self.widths[0] - rest) / max(len(heads) - 1, 1)
+        self.lefts = [0.0]
+        for width in self.widths[:-1]:
+            self.lefts.append(self.lefts[-1] + width + GAP + spare)

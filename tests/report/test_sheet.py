@@ -1,0 +1,146 @@
+"""The sheet to sign: complete, on one page, and no text over another, for runs and for comparisons of sensors."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from scipy.spatial.transform import Rotation
+
+from mitsim.report.declaration import pose_in_full, read_declaration, unknowns_in_words
+from mitsim.report.sheet import sheet_figures, write_sheet
+from mitsim.report.sheet_layout import text_width, wrapped
+from mitsim.study.choice_document import PoseEntry
+from mitsim.study.scene_geometry import read_scene_geometry
+from mitsim.study.statement_file import read_statement
+
+from .choice_run import write_choice
+
+
+def figures_of(folder):
+    geometry = read_scene_geometry(folder)
+    return sheet_figures(read_declaration(folder, geometry), geometry)
+
+
+def boxes_of(figure):
+    """Every text of a page with its box [px]."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    drawn = canvas.get_renderer()
+    texts = [one for one in figure.texts if one.get_text().strip()]
+    for part in figure.subfigs:
+        texts += [one for axes in part.axes for one in axes.texts if one.get_text()]
+        texts += [one for legend in part.legends for one in legend.get_texts()]
+    return [(one.get_text(), one.get_window_extent(drawn)) for one in texts]
+
+
+def with_rows(folder, count, long=False):
+    """The same run with a statement of ``count`` measurements, all of which have a value and a tolerance."""
+    statement = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
+    known = next(iter(statement["measurements"].values())) | {"tolerance": 0.4, "verdict": "does not fit"}
+    tail = "_to_the_far_end_of_the_guide_rail_left_of_the_bore" if long else ""
+    statement["measurements"] = {f"distance_{k}{tail}": known for k in range(count)}
+    (folder / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
+
+
+@pytest.mark.parametrize(("rows", "long", "pages"), [(2, False, 1), (9, True, 1), (45, False, 3)])
+def test_no_text_overlaps_another_or_leaves_the_page(run_folder, tmp_path, rows, long, pages):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    with_rows(folder, rows, long)
+    figures = figures_of(folder)
+    assert len(figures) == pages
+    shown = ""
+    for figure in figures:
+        boxes = boxes_of(figure)
+        shown += "\n".join(text for text, _ in boxes)
+        page = figure.bbox.padded(-0.5 * figure.dpi)
+        assert [text for text, box in boxes if box.x0 < page.x0 or box.x1 > page.x1 or box.y0 < 0.4 * figure.dpi] == []
+        # boxes of neighbouring lines may share their ascent
+        small = [(text, box.padded(-1.5)) for text, box in boxes]
+        assert [(a, b) for k, (a, one) in enumerate(small) for b, other in small[:k] if one.overlaps(other)] == []
+    assert all(f"distance_{k}" in shown for k in range(rows)) and "Signature" in shown
+
+
+def test_a_sheet_has_what_iso_ts_15530_4_and_jcgm_101_ask_for(run_folder, tmp_path):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    statement = json.loads((folder / "statement.json").read_text(encoding="utf-8"))
+    statement["influences"] = [
+        {"name": "noise", "included": True, "how": "drawn", "simulated": True},
+        {"name": "form", "included": False, "how": "drawn", "simulated": True},
+        {"name": "coatings", "included": False, "how": "clean", "simulated": False},
+    ]
+    statement["unknowns"] = {"pose": {"placement_mm": 1.0, "told_deg": 0.0}}
+    (folder / "statement.json").write_text(json.dumps(statement), encoding="utf-8")
+    declaration = read_declaration(folder, None)
+    facts = dict(declaration.facts)
+    assert facts["Varied"] == "noise" and facts["Fixed"] == "form" and facts["Left out"] == "coatings"
+    assert facts["with sizes of"] == "pose: placement 1 mm"
+    assert {"Part", "Sensor", "Pose of the sensor", "Method", "Calibration", "Exposure", "Decision rule"} <= set(facts)
+    assert "200 virtual measurements" in facts["Method"] and "seed 7" in facts["Made with"]
+    row = declaration.rows[0]
+    # U = (0.47 + 0.52) / 2 and k = U / 0.25
+    assert row.expanded == "0.49\N{NO-BREAK SPACE}mm" and row.factor == "1.98" and row.trials == "200"
+    assert row.interval == "−0.52 to 0.47 mm" and row.bias == "−0.03\N{NO-BREAK SPACE}mm"
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", declaration.date) and declaration.number in facts["Made with"]
+
+
+def test_the_date_is_that_of_the_run(run_folder, tmp_path):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    about = json.loads((folder / "run.json").read_text(encoding="utf-8")) | {"date": "2025-02-03"}
+    (folder / "run.json").write_text(json.dumps(about), encoding="utf-8")
+    assert read_declaration(folder, None).date == "2025-02-03"
+
+
+def test_a_sheet_is_one_page_of_pdf_and_the_same_at_every_call(run_folder, tmp_path):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    first = write_sheet(folder).read_bytes()
+    assert first.startswith(b"%PDF") and len(re.findall(rb"/Type /Page\b", first)) == 1
+    assert write_sheet(folder).read_bytes() == first
+
+
+def test_the_sheet_of_a_comparison_has_the_statement_of_the_best_sensor(tmp_path):
+    folder = write_choice(tmp_path / "choice")
+    declaration = read_declaration(folder, read_scene_geometry(folder))
+    facts = dict(declaration.facts)
+    assert declaration.title == "sensor-a-of-a-long-name measures part" and facts["Left out"] == "dirt"
+    assert "sensor-b (fits 1 of 3)" in facts["Also compared"] and "sensor-d" not in facts["Also compared"]
+    assert [row.result.verdict for row in declaration.rows] == ["fits"] * 3
+    (figure,) = sheet_figures(declaration, read_scene_geometry(folder))
+    assert [text for text, box in boxes_of(figure) if box.x0 < 0.5 * figure.dpi] == []
+
+
+def test_a_pose_in_full_gives_the_pose_back(run_folder):
+    turn = Rotation.from_euler("xyz", [0.3, -1.1, 2.2])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = turn.as_matrix(), [1.5, -2.25, 300.0]
+    pose = PoseEntry(
+        view=3, azimuth_deg=0, elevation_deg=0, roll_deg=0, standoff_mm=300, world_from_sensor=matrix.tolist()
+    )
+    text = pose_in_full(pose).replace("\N{MINUS SIGN}", "-")
+    origin, quaternion = ([float(x) for x in one.split(", ")] for one in re.findall(r"\(([-0-9., ]+)\)", text))
+    assert origin == [1.5, -2.25, 300.0]
+    assert Rotation.from_quat(quaternion).as_matrix() == pytest.approx(turn.as_matrix(), abs=2e-6)
+
+
+def test_sizes_of_unknowns_have_units_and_nothing_else():
+    table = {
+        "temperature": {"body_per_kelvin": 2.3e-5, "part_kelvin": 1.0, "expansion_per_kelvin": None},
+        "form": {"features": {"plane": 0.02, "pin": 0.0}},
+        "light": {"room": "office"},
+    }
+    assert unknowns_in_words(table) == "temperature: body 2.3e-05 per K, part 1 K; form: plane 0.02 mm"
+
+
+def test_lines_fit_and_lose_no_character():
+    text = "the distance_between_the_two_bores_of_the_part is undecidable " + "x" * 90
+    lines = wrapped(text, 8.0, 1.2)
+    assert max(text_width(line, 8.0) for line in lines) <= 1.2 and len(lines) > 5
+    assert "".join(lines).replace(" ", "") == text.replace(" ", "")
+
+
+def test_u_and_k_of_an_interval_without_ends_are_none(run_folder):
+    statement = read_statement(run_folder / "statement.json")
+    nothing = list(statement.measurements.values())[1]
+    assert nothing.expanded_uncertainty is None and nothing.coverage_factor is None
