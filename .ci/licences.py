@@ -54,6 +54,7 @@ READ: dict[str, tuple[str, str]] = {
         "Apache-2.0 AND LGPL-2.1-only WITH OCCT-exception-1.0",
         "the binding; OpenCASCADE, which is linked dynamically",
     ),
+    "apsw": ("Zlib", "LICENSE in the wheel, which allows any licence that OSI approves"),
     "karellen-llvm-core": ("Apache-2.0 WITH LLVM-exception", "LICENSE.TXT of LLVM"),
     "pye57": ("MIT AND BSL-1.0 AND Apache-2.0", "itself, libE57Format, Xerces"),
     "opencv-contrib-python-headless": ("Apache-2.0 AND LGPL-2.1-or-later", "OpenCV; FFmpeg, a library beside it"),

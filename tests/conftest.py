@@ -41,6 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
     is there without it.
     """
     os.fsync = lambda handle: None
+    os.environ.setdefault("MITSIM_CACHE", "")  # no cloud of a test is kept for another
     gc.disable()  # until all files are imported: nothing dies before
     # typer would read the signatures of all commands again whenever a test calls one
     typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)

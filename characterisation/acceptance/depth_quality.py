@@ -48,6 +48,9 @@ Floats = NDArray[np.float64]
 #: share of the points excluded at either end of the depths (rs-depth-quality, depthai-experiments)
 TRIMMED_SHARE = 0.005
 
+#: distance of a least-squares plane over that of its points, below which false matches have turned it on edge
+ON_EDGE = 0.1
+
 #: percentile of |distance from the plane| used as planarity trueness; *assumed*
 TRUENESS_PERCENTILE = 95.0
 
@@ -134,6 +137,8 @@ def plane_quality(
     from_plane = (points - middle) @ normal
     rms = float(np.sqrt(np.mean(from_plane**2)))
     plane_distance = float(normal @ middle)
+    if plane_distance < ON_EDGE * float(np.linalg.norm(middle)):
+        return PlaneQuality(fill_rate, *(np.nan,) * 4, len(points))
     z_accuracy = subpixel = np.nan
     if ground_truth is not None:
         truth = abs(float((ground_truth.centre - cloud.grid.origin) @ ground_truth.normal))

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from characterisation.features.fitted import ConeFit, CylinderFit, PlaneFit, SphereFit
 from characterisation.features.robust_fit import FitError, covariance_of, rays_from, robust_fit, usable
+from characterisation.features.starts import plane_start
 from characterisation.features.surfaces import (
     Cone,
     Cylinder,
@@ -73,10 +74,7 @@ def fit_plane(points: ArrayLike, viewpoint: ArrayLike | None = None) -> PlaneFit
     [ 0.  0. -1.]
     """
     points = _usable(points, Plane)
-    centroid = points.mean(axis=0)
-    from_middle = points - centroid
-    start = Plane(centroid, np.linalg.eigh(from_middle.T @ from_middle)[1][:, 0])
-    plane, kept = _fit(start, points, viewpoint)
+    plane, kept = _fit(plane_start(points), points, viewpoint)
     centroid = points[kept].mean(axis=0)
     outward = plane.normal[np.argmax(np.abs(plane.normal))]
     if viewpoint is not None:

@@ -1,7 +1,8 @@
-"""Estimate a cylinder from its points alone, as the starting value of a fit.
+"""Estimate a cylinder or a plane from its points alone, as the starting value of a fit.
 
-Signal chain: points -> normals of some of them, from the plane through the neighbours of each -> axis, the direction
-perpendicular to all normals -> circle through the points projected along the axis (Pratt's algebraic fit) -> cylinder.
+Signal chain of a cylinder: points -> normals of some of them, from the plane through the neighbours of each -> axis,
+the direction perpendicular to all normals -> circle through the points projected along the axis (Pratt's algebraic fit)
+-> cylinder.
 
 The number of neighbours is large enough for a normal if noise is up to a tenth of their extent. A few points of another
 surface tilt the axis by some degrees, which the subsequent robust fit tolerates
@@ -16,7 +17,7 @@ from scipy.linalg import eig
 from scipy.spatial import cKDTree
 
 from characterisation.features.robust_fit import FitError, usable
-from characterisation.features.surfaces import Cylinder, tangents
+from characterisation.features.surfaces import Cylinder, Plane, tangents
 
 Array = NDArray[np.float64]
 
@@ -79,3 +80,43 @@ def _circle(places: Array) -> tuple[Array, float]:
         return np.zeros(2), np.inf
     centre = -np.array([b, c]) / (2 * a)
     return centre * scale, float(np.sqrt(max(centre @ centre - d / a, 0.0)) * scale)
+
+
+def plane_start(points: Array) -> Plane:
+    """Return a plane from which a fit to points (n, 3) [mm] may start, also if a third of them are far outliers.
+
+    It is the plane of total least squares. If the points are not flat about it, a plane through three of the points is
+    used that is much nearer to half of them (least median of squares: Rousseeuw, J. Am. Stat. Assoc. 79 (1984) 871). So
+    the outliers of a matcher, which may lie farther from the surface than it is wide, do not turn the start.
+    """
+    middle = points.mean(axis=0)
+    about = points - middle
+    moments, axes = np.linalg.eigh(about.T @ about)
+    squares = Plane(middle, axes[:, 0])
+    if moments[0] < _FLAT**2 * moments[1]:
+        return squares
+    rng = np.random.default_rng(len(points))
+    some = points if len(points) <= _SOME else points[rng.choice(len(points), _SOME, replace=False)]
+    corners = some[rng.integers(len(some), size=(_TRIPLES, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    usable = lengths > 1e-9 * lengths.max(initial=1e-300)
+    if not usable.any():
+        return squares
+    normals, corners = normals[usable] / lengths[usable, None], corners[usable]
+    offsets = np.abs(some @ normals.T - np.einsum("ij,ij->i", corners[:, 0], normals))
+    medians = np.median(offsets, axis=0)
+    best = int(np.argmin(medians))
+    if medians[best] * _MUCH < np.median(np.abs((some - middle) @ squares.normal)):
+        return Plane(corners[best, 0], normals[best])
+    return squares
+
+
+#: points and triples of them that are tried: a triple without an outlier has a probability of 0.3 for a third of them
+_SOME, _TRIPLES = 1000, 60
+
+#: largest thickness over width of points that are flat
+_FLAT = 0.1
+
+#: ratio of the medians from which the plane of three points replaces that of least squares
+_MUCH = 4.0

@@ -37,6 +37,7 @@ from characterisation.tasks.definitions import (
     point_plane_distance,
 )
 from characterisation.tasks.evaluation import evaluate
+from characterisation.tasks.places_in_frame import PLACE_QUANTITIES, place_functions
 from characterisation.tasks.result import Result, failed
 
 Shape = Literal["plane", "sphere", "cylinder"]
@@ -106,12 +107,15 @@ class WindowPlan:
                 )
 
 
-def measure_windows(cloud: PointCloud, plan: WindowPlan) -> list[Result]:
+def measure_windows(cloud: PointCloud, plan: WindowPlan, frame: NDArray[np.float64] | None = None) -> list[Result]:
     """Measure every feature of a plan in a cloud, then the angles and distances between features.
 
     - Plane: flatness, noise, distance from the grid's origin along the ray to the middle of the points.
     - Sphere: diameter, noise, distance of the centre from the grid's origin.
     - Cylinder: diameter, cylindricity, noise.
+
+    Then follow place and direction of each (:mod:`characterisation.tasks.places_in_frame`), in the frame that ``frame``
+    (4, 4) gives from the sensor frame; by default in the sensor frame.
 
     Flatness and cylindricity are ranges of the low-order form (:mod:`characterisation.features.form`). Noise is the
     standard deviation of the residuals along the view rays. Lengths are in mm, angles in deg.
@@ -133,9 +137,11 @@ def measure_windows(cloud: PointCloud, plan: WindowPlan) -> list[Result]:
         counts[name] = len(points)
         fits[name] = fit = _fit_shape(points, shape, cloud.grid.origin)
         if isinstance(fit, FitError):
-            results += [failed(f"{name} {quantity}", "mm", str(fit), 0, len(points)) for quantity in _QUANTITIES[shape]]
+            quantities = [*((one, "mm") for one in _QUANTITIES[shape]), *PLACE_QUANTITIES[shape]]
+            results += [failed(f"{name} {quantity}", unit, str(fit), 0, len(points)) for quantity, unit in quantities]
         else:
             results += _shape_results(name, fit, points, cloud.grid.origin)
+            results += _place_results(name, fit, len(points), np.eye(4) if frame is None else frame)
     for kind, first, second in plan.pairs:
         results.append(_pair_result(kind, (first, second), fits, counts, plan))
     return results
@@ -215,6 +221,14 @@ def _shape_results(
         "distance", lambda plane: float((plane.point - viewpoint) @ plane.normal / (ray @ plane.normal))
     )
     return [form_result, noise, distance]
+
+
+def _place_results(name: str, fit: ShapeFit, given: int, frame: NDArray[np.float64]) -> list[Result]:
+    """Return place and direction of one fitted feature in a frame."""
+    return [
+        Result(f"{name} {quantity}", unit, *evaluate(function, [fit]), "fit", fit.count, given)
+        for quantity, unit, function in place_functions(fit, frame)
+    ]
 
 
 def _pair_result(

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from characterisation.files.errors import InputError
-from mitsim.cli.options import Clouds, DecodedAs, Json
+from mitsim.cli.options import Clouds, DecodedAs, Frame, Json, Seed, Simulated, Topic, Variant, start
+
+if TYPE_CHECKING:
+    from characterisation.point_cloud import PointCloud
+    from characterisation.region_of_interest import Roi
+    from characterisation.tasks.result import Result
 
 
 def acceptance(
@@ -35,39 +40,71 @@ def acceptance(
     baseline: Annotated[
         float | None, typer.Option(min=1.0, max=10000.0, help="Baseline of a stereo camera [mm]: adds sub-pixel RMS.")
     ] = None,
+    simulated: Simulated = None,
+    topic: Topic = None,
+    frame: Frame = None,
     as_json: Json = False,
     sensor: DecodedAs = None,
+    seed: Seed = 1,
+    variant: Variant = None,
 ) -> None:
     """Compute acceptance figures of VDI/VDE 2634-2 and of makers' data sheets from clouds of planes and spheres.
 
     Several clouds of one pose add the figures that need repeats: temporal noise, global planarity trueness, mean depth
     error. Exit code 1 if a figure could not be computed.
 
-    Example: mitsim measure acceptance captures/plate --plane plate=200,150,300,200,600
+    Example: mitsim measure acceptance captures/plate --plane plate=200,150,300,200,600 --simulated zivid-2-m70
     """
     from characterisation.tasks.result import repeatability
-    from mitsim.cli.acceptance_request import cloud_figures, joint_figures, read_artefacts
+    from mitsim.cli.acceptance_request import Artefacts, cloud_figures, joint_figures, read_artefacts
+    from mitsim.cli.simulated_beside import RecordedTarget, beside_simulated, beside_table
     from mitsim.decoding.input_clouds import cloud_paths, read_cloud
-    from mitsim.decoding.measured_document import measured_document, result_table, result_tables, result_values, summary
+    from mitsim.decoding.measured_document import (
+        beside_document,
+        measured_document,
+        result_table,
+        result_tables,
+        result_values,
+        summary,
+    )
     from mitsim.running.progress import say
 
     artefacts = read_artefacts(plane or [], sphere or [], spacing or [])
     if not (artefacts.planes or artefacts.spheres):
         command = "mitsim measure acceptance"
         raise InputError(command, "", "no artefact", "--plane or --sphere", f"see {command} --help")
-    given = [read_cloud(path, sensor) for path in cloud_paths(clouds)]
+    chosen = tuple(topic) if topic else None
+    given = [read_cloud(path, sensor, topic=chosen, frame=frame) for path in cloud_paths(clouds)]
     results = [cloud_figures(one.cloud, artefacts, baseline) for one in given]
     several = len(given) > 1
     together = joint_figures([one.cloud for one in given], artefacts) if several else []
     over = repeatability(results) if several else []
+    beside: tuple[list[Result], list[Result]] | None = None
+    if simulated is not None:
+        start(variant)
+
+        def figures(cloud: PointCloud, name: str, window: Roi | None) -> list[Result]:
+            if name in artefacts.planes:
+                own = Artefacts({name: (window, artefacts.planes[name][1])}, {}, [])
+            else:
+                own = Artefacts({}, {name: (window, artefacts.spheres[name][1])}, [])
+            return cloud_figures(cloud, own, baseline)
+
+        targets = {name: RecordedTarget("plane", *one) for name, one in artefacts.planes.items()}
+        targets |= {name: RecordedTarget("sphere", window) for name, (window, _) in artefacts.spheres.items()}
+        beside = beside_simulated(given[0].cloud, targets, simulated, figures, seed)
     if as_json:
         whose = [(one.path, one.cloud.sensor, one.cloud.source) for one in given]
         document = measured_document(whose, results, over) | {"all_clouds": [result_values(one) for one in together]}
+        if beside is not None:
+            document |= {"beside": beside_document(simulated or "", *beside)}
         print(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False))
     else:
         print(result_tables([one.path for one in given], results, over))
         if together:
             print("\nall clouds\n" + result_table(together))
+        if beside is not None:
+            print(f"\n{given[0].path}, beside a simulation\n" + beside_table(*beside, simulated or ""))
     say(summary([*results, together] if together else results))
     if not all(result.possible for found in [*results, together] for result in found):
         raise typer.Exit(1)

@@ -181,13 +181,14 @@ def _plane_figures(
         values["sub-pixel RMS", "px"] = quality.subpixel_rms if enough else np.nan
     too_few = f"{len(points)} points in the window, at least {LEAST_POINTS} are needed"
     holes = "no patch of 9 x 9 pixels has all points"
+    on_edge = "the least-squares plane of the points stands on edge: too many false matches for these figures"
     uncertainty = {"flatness error": flatness_uncertainty(points)} if enough else {}
     return [
         _figure_or_reason(
             f"{name} {quantity}",
             unit,
             value,
-            too_few if not enough else holes,
+            too_few if not enough else holes if quantity == "local planarity precision" else on_edge,
             len(points),
             count,
             uncertainty.get(quantity, math.nan),

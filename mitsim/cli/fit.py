@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from mitsim.cli.options import Defines, ObjectWindow, Seed, Variant, check_file, definitions, start
+from mitsim.cli.options import Defines, ObjectWindow, Seed, Variant, Yes, asking, check_file, definitions, start
 
 
 def finish(
@@ -87,19 +87,34 @@ def sensor_(
     off: Annotated[list[Path] | None, typer.Option(help="Capture with the projector off; once for each.")] = None,
     dark: Annotated[list[Path] | None, typer.Option(help="Capture with all light off; once for each.")] = None,
     window: ObjectWindow = None,
+    study: Annotated[
+        Path | None,
+        typer.Option(
+            help="Study TOML file: after the fit, also make the map of the sensor, and run the study with both."
+        ),
+    ] = None,
+    campaign: Annotated[
+        Path | None, typer.Option(help="With --study: campaign TOML file of the map; default: the one of the study.")
+    ] = None,
+    minutes: Annotated[
+        float | None, typer.Option(min=0.1, help="With --study: time limit for comparing views [min].")
+    ] = None,
+    yes: Yes = False,
     seed: Seed = 1,
     variant: Variant = None,
 ) -> None:
     """Fit a sensor file to captures of a flat object by your own camera in your own room.
 
     Estimates room light, projector power, pattern, noise and row error, each with its uncertainty and its captures.
-    A parameter that the captures do not determine keeps its value. Prints a table.
+    A parameter that the captures do not determine keeps its value. Prints a table, and last a verdict: good, fair, bad,
+    or not tested. With --study, map and report follow, unless the fit is bad; each step announces its time.
 
     Example: mitsim fit sensor captures/sheet_* --off captures/no_projector --sensor ensenso-n10 -o my-camera.toml
     """
     start(variant)
     from characterisation.files.errors import InputError
     from characterisation.region_of_interest import Roi
+    from mitsim.cli.fit_journey import map_and_run, read_journey
     from mitsim.running.progress import say
     from mitsim.twin.sensor.run import fit_sensor
     from mitsim.twin.sensor.write import fit_table, write_sensor
@@ -109,8 +124,20 @@ def sensor_(
     if output.suffix != ".toml":
         raise InputError("--output", "", str(output), "a .toml file")
     check_file(output)
+    if study is None and (campaign is not None or minutes is not None):
+        raise InputError("--campaign" if campaign is not None else "--minutes", "", "no --study", "--study study.toml")
+    journey = None if study is None else read_journey(study, campaign, output, minutes, asking(yes))
+    if journey is not None:
+        say("step 1 of 3: the fit; its first message of every capture states the time of a round")
     roi = Roi(*window) if window else None
     found = fit_sensor(captures or [], sensor, off=off or [], dark=dark or [], roi=roi, seed=seed)
     write_sensor(found, sensor, output)
     print(fit_table(found), end="")
     say(f"sensor: {output}, {len(found.estimates)} fitted parameters, {len(found.undetermined)} not determined")
+    say(f"verdict: {found.verdict.word}: {found.verdict.why}")
+    if journey is None:
+        return
+    if found.verdict.word == "bad":
+        hint = f"to go on nevertheless: mitsim map make {journey.campaign} --sensor {output}, and mitsim run"
+        raise InputError(output, "verdict", "bad", "good or fair, for a map and a report", hint)
+    map_and_run(journey, output)

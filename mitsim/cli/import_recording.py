@@ -9,11 +9,15 @@ import typer
 
 from characterisation.files.errors import InputError
 from mitsim.cli.folder_lock import remove_partial_beside
-from mitsim.cli.options import definitions
+from mitsim.cli.options import Topic, definitions
 
 #: settings of an imported capture that the user should check
 SETTINGS_TO_CHECK = (
     "image_set",
+    "topic",
+    "stamp_s",
+    "frame_id",
+    "grid_from",
     "unit_of_file",
     "axes_of_file",
     "fitted_camera_rms_px",
@@ -48,7 +52,7 @@ def import_(
         str | None,
         typer.Option(
             "--as",
-            help="Kind of recording: ensenso, depthai, robi, stereo-pair, images, depth, ply or pcd; "
+            help="Kind of recording: ensenso, depthai, ros, robi, stereo-pair, images, depth, ply, pcd, zdf or npy; "
             "default: detected.",
         ),
     ] = None,
@@ -56,6 +60,7 @@ def import_(
     frame: Annotated[
         str | None, typer.Option(help="Image set, pair or frame to import: its number, from 0, or its name.")
     ] = None,
+    topic: Topic = None,
     images: Annotated[
         list[str] | None,
         typer.Option(help="For a folder of images: files of one camera, NAME=PATTERN (left='cam0_*.png'). Repeatable."),
@@ -124,6 +129,7 @@ def import_(
         axes=axes,
         link=None if link is None else str(link),
         subpixel_bits=subpixel_bits,
+        topic=tuple(topic) if topic else None,
         images=_patterns(images),
         channel=channel,
         exposure_s=exposure,

@@ -13,8 +13,12 @@ from mitsim.cli.options import (
     Clouds,
     DecodedAs,
     Defines,
+    Frame,
     Json,
     PoseFile,
+    Seed,
+    Simulated,
+    Topic,
     Variant,
     ViewOfPoses,
     check_file,
@@ -23,6 +27,8 @@ from mitsim.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from characterisation.point_cloud import PointCloud
+    from characterisation.region_of_interest import Roi
     from characterisation.tasks.result import Result
     from mitsim.decoding.input_clouds import InputCloud
 
@@ -35,11 +41,12 @@ def clouds(
         list[str] | None,
         typer.Option(
             metavar=_WINDOW,
-            help="Flatness, noise and distance of the plane in a window [px]; NAME alone: the whole cloud.",
+            help="Flatness, noise, distance and normal of the plane in a window [px]; NAME alone: the whole cloud.",
         ),
     ] = None,
     sphere: Annotated[
-        list[str] | None, typer.Option(metavar=_WINDOW, help="Diameter, noise and distance of the sphere in a window.")
+        list[str] | None,
+        typer.Option(metavar=_WINDOW, help="Diameter, noise, distance and centre of the sphere in a window."),
     ] = None,
     cylinder: Annotated[
         list[str] | None,
@@ -95,8 +102,21 @@ def clouds(
             help="PNG picture to write: the difference, or the distances and windows; numbered for several clouds."
         ),
     ] = None,
+    points_in: Annotated[
+        str,
+        typer.Option(
+            metavar="FRAME",
+            help="Frame of centres, axes, normals and perpendicular distances: sensor; workspace (an Ensenso's Link); "
+            "board=COLUMNS,ROWS,PITCH, the inner corners of a chequerboard in the images [mm]; or the pose.json of "
+            "the sensor in another frame.",
+        ),
+    ] = "sensor",
+    simulated: Simulated = None,
+    topic: Topic = None,
+    frame: Frame = None,
     as_json: Json = False,
     sensor: DecodedAs = None,
+    seed: Seed = 1,
     define: Defines = None,
     variant: Variant = None,
 ) -> None:
@@ -109,9 +129,12 @@ def clouds(
     Example: mitsim measure cloud.ply --plane top=100,50,200,150 --plane side=400,60,90,300 --angle top,side
     """
     from characterisation.tasks.result import NOT_INCLUDED, repeatability
+    from characterisation.tasks.windows import WindowPlan, measure_windows
+    from mitsim.cli.measure_frame import read_frame
     from mitsim.cli.measure_request import read_request
+    from mitsim.cli.simulated_beside import RecordedTarget, beside_simulated, beside_table
     from mitsim.decoding.input_clouds import cloud_paths, read_cloud
-    from mitsim.decoding.measured_document import measured_document, result_tables, summary
+    from mitsim.decoding.measured_document import beside_document, measured_document, result_tables, summary
     from mitsim.running.progress import say
 
     request = read_request(
@@ -123,7 +146,10 @@ def clouds(
         by,
         window,
     )
-    if task is None and (given := _given(scene=scene, pose=pose, view=view, correct=correct)):
+    places_in = read_frame(points_in)
+    if task is None and places_in.file is None and view is not None:
+        raise InputError("--view", "", "no --task", "a task for the scene: --task task.toml")
+    if task is None and (given := _given(scene=scene, pose=pose, correct=correct)):
         raise InputError(f"--{given}", "", "no --task", "a task for the scene: --task task.toml")
     if task is not None and scene is None:
         raise InputError("--scene", "", "none", "the scene of the task's part: --scene part.xml")
@@ -133,20 +159,38 @@ def clouds(
     if picture is not None:
         check_file(picture)
     of_task = None
-    if task is not None and scene is not None:
+    if simulated is not None or (task is not None and scene is not None):
         start(variant)
+    if task is not None and scene is not None:
         of_task = _task(task, scene, pose, view, correct, definitions(define))
     reference = None if against is None else read_cloud(against, sensor, reference=True)
     paths = cloud_paths(inputs)
+    beside: tuple[list[Result], list[Result]] | None = None
+    targets = {
+        name: RecordedTarget(shape, window)
+        for name, (shape, window) in request.plan.features.items()
+        if shape != "cylinder"
+    }
+    if simulated is not None and not targets:
+        raise InputError("--simulated", "", "no --plane and no --sphere", "a plane or a sphere to simulate")
+
+    def figures(cloud: PointCloud, name: str, window: Roi | None) -> list[Result]:
+        return measure_windows(cloud, WindowPlan({name: (request.plan.features[name][0], window)}))
+
     whose: list[tuple[Path, str, str]] = []
     results: list[list[Result]] = []
     for number, path in enumerate(paths):
         if len(paths) > 1:
             say(f"{path} ({number + 1}/{len(paths)})")
-        one = read_cloud(path, sensor)
+        one = read_cloud(path, sensor, topic=tuple(topic) if topic else None, frame=frame)
         if picture is not None and one.cloud.grid.height == 1:
             raise InputError("--picture", "", f"{path}, a cloud without a grid", "a cloud with rows and columns")
-        found, drawn = request.measure(one, reference)
+        to_frame, about_frame = places_in.of(one, view)
+        if about_frame:
+            say(about_frame)
+        found, drawn = request.measure(one, reference, to_frame)
+        if simulated is not None and beside is None:
+            beside = beside_simulated(one.cloud, targets, simulated, figures, seed)
         if of_task is not None:
             found += of_task(one)
         if picture is not None:
@@ -159,11 +203,16 @@ def clouds(
         results.append(found)
     over = repeatability(results) if len(results) > 1 else []
     if as_json:
-        print(json.dumps(measured_document(whose, results, over), indent=2, ensure_ascii=False, allow_nan=False))
+        document = measured_document(whose, results, over)
+        if beside is not None:
+            document |= {"beside": beside_document(simulated or "", *beside)}
+        print(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False))
     elif request.empty and of_task is None:
         pass
     else:
         print(result_tables(paths, results, over))
+        if beside is not None:
+            print(f"\n{paths[0]}, beside a simulation\n" + beside_table(*beside, simulated or ""))
         if any(result.origin == "fit" for found in results for result in found):
             left_out = "; ".join(NOT_INCLUDED)
             say(f"u: standard uncertainty (k = 1) from the covariance of the fit; it does not include: {left_out}")

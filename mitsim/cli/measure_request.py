@@ -63,10 +63,13 @@ class Request:
         """Whether no measurement is requested."""
         return not (self.plan.features or self.plates or self.has_reference)
 
-    def measure(self, given: InputCloud, reference: InputCloud | None) -> tuple[list[Result], Callable[[], Figure]]:
+    def measure(
+        self, given: InputCloud, reference: InputCloud | None, frame: NDArray[np.float64] | None = None
+    ) -> tuple[list[Result], Callable[[], Figure]]:
         """Return the results of a cloud, and a function that draws its picture.
 
-        ``reference`` is the reference cloud of a difference, None without one.
+        ``reference`` is the reference cloud of a difference, None without one; ``frame`` (4, 4), from the sensor frame,
+        that of places and directions.
 
         Raises
         ------
@@ -74,7 +77,7 @@ class Request:
             If a window does not lie in the cloud's grid, or dots are requested of a cloud without images.
         """
         cloud = given.cloud
-        results = measure_windows(cloud, self.plan)
+        results = measure_windows(cloud, self.plan, frame)
         if self.plates:
             if given.capture is None or not given.capture.images:
                 allowed = "a capture folder, whose images show the dots"

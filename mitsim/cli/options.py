@@ -46,7 +46,25 @@ Clouds = Annotated[
     list[Path],
     typer.Argument(
         metavar="CLOUD...",
-        help="Point clouds (.ply, .pcd, .npy, .mat, .xyz), capture folders (decoded first), or folders of either.",
+        help="Point clouds (.ply, .pcd, .zdf, .npy, .mat, .xyz), recordings and capture folders (decoded first), or "
+        "folders of these.",
+    ),
+]
+Topic = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="For a bag of ROS: the topic of depth images or of clouds; twice for the left and the right images."
+    ),
+]
+Frame = Annotated[
+    str | None, typer.Option(help="For a recording with several: image set, pair or frame, its number or name.")
+]
+Simulated = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SENSOR",
+        help="Sensor to simulate before the same planes and spheres, a preset or TOML file: its figures beside those "
+        "of the first cloud, with F and sigma of the planes.",
     ),
 ]
 MapFile = Annotated[str, typer.Argument(metavar="MAP", help="A map.nc file, or a sensor whose map comes with mitsim.")]

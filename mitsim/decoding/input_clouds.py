@@ -8,7 +8,7 @@ capture if there is one.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from characterisation import cloud_files
@@ -17,15 +17,16 @@ from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.capture.recordings.organised_cloud import read_organised_cloud, read_stored_cloud
-from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+from mitsim.capture.recordings.recognise import KINDS, ReadOptions, kind_of, read_recording, unorganised_cloud
 from mitsim.decoding.cloud import Settings, decoder_settings
 from mitsim.decoding.coded_images import decoded_once
+from mitsim.decoding.kept_clouds import kept_cloud
 from mitsim.decoding.plain_clouds import is_array_or_text, plain_cloud, read_plain_cloud
 from mitsim.running.progress import say
 from mitsim.sensor.matcher import MatcherSettings
 
 #: suffixes of cloud files that are found in a folder
-_SUFFIXES = (".ply", ".pcd")
+_SUFFIXES = (".ply", ".pcd", ".zdf")
 
 #: text that identifies a cloud file of ``mitsim decode``, and the length of the header in which it stands [bytes]
 _MARK, _HEAD = b"\ncomment mitsim ", 4096
@@ -67,11 +68,27 @@ def cloud_paths(paths: Iterable[Path]) -> list[Path]:
     return out
 
 
-def read_cloud(path: Path, sensor: str | None = None, reference: bool = False) -> InputCloud:
+def read_cloud(
+    path: Path,
+    sensor: str | None = None,
+    reference: bool = False,
+    *,
+    topic: tuple[str, ...] | None = None,
+    frame: str | None = None,
+) -> InputCloud:
     """Read a cloud file, or decode a capture folder or recording.
 
-    ``sensor`` is the preset or sensor file whose settings decode it; by default, those of the capture. The points of a
-    ``reference`` may lie anywhere; those of another cloud with a grid lie on the view rays of its camera.
+    Parameters
+    ----------
+    path
+        Cloud file, capture folder or recording.
+    sensor
+        Preset or sensor file whose settings decode it; by default, those of the capture. It also supplies the camera of
+        a recording that has none.
+    reference
+        Whether its points may lie anywhere; those of another cloud with a grid lie on the view rays of its camera.
+    topic, frame
+        Message of a recording, as of ``mitsim import``.
 
     Raises
     ------
@@ -95,7 +112,15 @@ def read_cloud(path: Path, sensor: str | None = None, reference: bool = False) -
                 raise
             return _plain(path, *plain_cloud(stored.points, path))
     elif path.exists():
-        capture = read_recording(path, ReadOptions()).capture
+        options = ReadOptions(topic=topic, frame=frame, sensor=sensor)
+        if "sensor" not in KINDS[kind_of(path, options)].options:
+            options = replace(options, sensor=None)
+        plain = unorganised_cloud(path, options)
+        if plain is not None:
+            return _plain(path, *plain_cloud(plain, path))
+        capture = read_recording(path, options).capture
+        for warning in capture.settings.get("warnings", []):
+            say(f"warning: {warning}")
     else:
         raise InputError(
             path,
@@ -104,7 +129,9 @@ def read_cloud(path: Path, sensor: str | None = None, reference: bool = False) -
             "a cloud (.ply, .pcd, .npy, .mat, .xyz), a capture folder, or folders of these",
         )
     settings, imager = decoder_settings(capture, sensor)
-    return InputCloud(path, decoded_once(capture, settings, imager)[0], capture, margin_of(settings))
+    chosen = (settings, imager, topic, frame, sensor)
+    cloud = kept_cloud(path, chosen, lambda: decoded_once(capture, settings, imager)[0])
+    return InputCloud(path, cloud, capture, margin_of(settings))
 
 
 def _plain(path: Path, cloud: PointCloud, about: str) -> InputCloud:

@@ -23,12 +23,12 @@ def result_table(results: Sequence[Result]) -> str:
     rows = [head + (["bias subtracted"] if corrected else [])]
     for one in results:
         points = f"{one.points}/{one.points_given}" if one.points_given else ""
-        row = [one.name, _value_text(one.value, one.uncertainty), one.unit, _uncertainty_text(one.uncertainty)]
+        row = [one.name, number_with_decimals(one.value, one.uncertainty), one.unit, _uncertainty_text(one.uncertainty)]
         if nominal:
-            row += [_number_text(one.nominal), _value_text(one.error, one.uncertainty)]
+            row += [_number_text(one.nominal), number_with_decimals(one.error, one.uncertainty)]
         row += [points] + ([_number_text(one.bias)] if corrected else [])
         rows.append(row + ([f"not possible: {one.reason}"] if not one.possible else []))
-    return _aligned(rows)
+    return aligned(rows)
 
 
 def repeatability_table(found: Sequence[Repeatability]) -> str:
@@ -42,14 +42,14 @@ def repeatability_table(found: Sequence[Repeatability]) -> str:
             [
                 one.name,
                 f"{one.count}/{one.cloud_count}",
-                _value_text(one.mean, one.deviation),
+                number_with_decimals(one.mean, one.deviation),
                 _uncertainty_text(one.deviation),
                 one.unit,
                 _uncertainty_text(one.uncertainty),
-                *([_value_text(one.mean - one.nominal, one.deviation)] if nominal else []),
+                *([number_with_decimals(one.mean - one.nominal, one.deviation)] if nominal else []),
             ]
         )
-    return _aligned(rows)
+    return aligned(rows)
 
 
 def result_tables(
@@ -107,6 +107,15 @@ def measured_document(
     }
 
 
+def beside_document(sensor: str, recorded: Sequence[Result], simulated: Sequence[Result]) -> dict[str, Any]:
+    """Return the figures of the first cloud and of a simulated sensor before its targets, as JSON values."""
+    return {
+        "sensor": sensor,
+        "recorded": [result_values(one) for one in recorded],
+        "simulated": [result_values(one) for one in simulated],
+    }
+
+
 def result_values(one: Result) -> dict[str, Any]:
     """Return a measurement as JSON values; NaN becomes None."""
     return {
@@ -127,7 +136,7 @@ def _uncertainty_text(value: float) -> str:
     return f"{value:.{_DIGITS}g}" if math.isfinite(value) else "-"
 
 
-def _value_text(value: float, uncertainty: float) -> str:
+def number_with_decimals(value: float, uncertainty: float) -> str:
     """Return a value with the decimals of its uncertainty, at least three and at most six; three without one."""
     if not math.isfinite(value):
         return "-"
@@ -141,7 +150,8 @@ def _number_text(value: float) -> str:
     return f"{value:g}" if math.isfinite(value) else "-"
 
 
-def _aligned(rows: list[list[str]]) -> str:
+def aligned(rows: list[list[str]]) -> str:
+    """Return rows of texts as a table; a last text beyond the columns of the first row is not aligned."""
     columns = max(len(row) for row in rows)
     widths = [
         max((len(row[k]) for row in rows if k < len(row) - (len(row) > len(rows[0]))), default=0)

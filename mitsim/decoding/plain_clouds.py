@@ -10,7 +10,6 @@ and no picture.
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
+from mitsim.capture.recordings.array_file import numbers_of_npy
 from mitsim.capture.recordings.number_text import number_words
 from mitsim.capture.recordings.organised_cloud import scale_to_mm
 from mitsim.sensor.mat_structure import read_mat
@@ -86,12 +86,7 @@ def _through(points: NDArray[np.float64]) -> ViewGrid:
 def _of_arrays(path: Path, data: bytes, suffix: str) -> NDArray[np.floating]:
     """Return the points (n, 3) or (H, W, 3) of a file of NumPy or MATLAB, in its unit."""
     if suffix == ".npy":
-        try:
-            arrays = {path.name: np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)}
-        except Exception as error:  # NumPy raises many types of errors for damaged files
-            reason = " ".join(str(error).split())[:120] or type(error).__name__
-            hint = "np.save writes such a file, np.savez an archive"
-            raise InputError(path, "", f"an unreadable file ({reason})", "a .npy file with numbers", hint) from None
+        arrays = {path.name: numbers_of_npy(data, path)}
     else:
         read = read_mat(path, data, _MOST_NUMBERS)
         arrays = {name: value for name, value in read.items() if isinstance(value, np.ndarray)}

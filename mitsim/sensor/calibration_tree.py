@@ -136,6 +136,11 @@ def read_tree(files: list[Path]) -> CalibrationTree:
     return CalibrationTree([file for file, _ in read], [values for _, values in read])
 
 
+def tree_of(tables: dict[str, dict[str, Any]]) -> CalibrationTree:
+    """Return the tree of tables that have been read from a recording, by the names of their sources."""
+    return CalibrationTree([Path(name) for name in tables], [with_usual_names(table) for table in tables.values()])
+
+
 def _read(file: Path) -> list[dict[str, Any]]:
     """Return the names and values of each document of a file."""
     data = read_bounded(file, _KINDS, "" if file.exists() else _beside(file), largest=_LARGEST)

@@ -72,7 +72,7 @@ class CalibrationTable(Document):
 
 
 def with_calibration(
-    path: Path, table: dict[str, Any], size: tuple[int, int] | None = None
+    path: Path, table: dict[str, Any], size: tuple[int, int] | None = None, tree: CalibrationTree | None = None
 ) -> tuple[dict[str, Any], list[str]]:
     """Return a sensor file's table completed with the optics of its ``[calibration]`` files, and warnings.
 
@@ -87,6 +87,8 @@ def with_calibration(
         Its content.
     size
         (width, height) [px] of the cameras' images, if known; cameras without a size get it.
+    tree
+        Values of the files, if they have been read.
 
     Raises
     ------
@@ -104,7 +106,7 @@ def with_calibration(
     for name, keys in calibration_table.keys.items():
         if keys.file is not None and keys.file not in named:
             raise InputError(path, f"calibration.keys.{name}.file", repr(keys.file), " | ".join(named))
-    tree = read_tree([path.parent / name for name in named])
+    tree = tree or read_tree([path.parent / name for name in named])
     values = _Values(tree, _with_files_of_ros(calibration_table, named, tree), size)
     out = dict(table)
     out["cameras"] = {}

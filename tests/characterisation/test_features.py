@@ -308,3 +308,16 @@ def test_a_sheet_of_false_matches_is_told_by_where_the_sensor_stands(share):
     assert np.abs((points - nominal.point) @ nominal.normal).max() < 4.5  # nearer than the border, but for its ray
     assert (belonging(points, nominal, np.zeros(3)) == ~false).all()
     assert belonging(points, nominal).all() == (share == 1.0)  # without the ray, all false is a scale of their own
+
+
+@pytest.mark.parametrize("share", [0.03, 0.1, 0.25])
+def test_a_plane_is_found_among_false_matches_far_in_front_and_behind(share, rng):
+    """A wall 234 mm wide at 1000 mm, with points anywhere from 300 to 4000 mm along their rays."""
+    x, y = np.meshgrid(np.linspace(-117, 117, 60), np.linspace(-117, 117, 60))
+    points = np.stack([x, y, 1000 + 0.2 * x], axis=-1).reshape(-1, 3)
+    points *= 1 + rng.normal(0, 5e-4, (len(points), 1))
+    wrong = rng.random(len(points)) < share
+    points[wrong] *= rng.uniform(0.3, 4, (wrong.sum(), 1))
+    found = fit_plane(points, np.zeros(3))
+    assert abs(np.dot(found.normal, [0.2, 0, -1]) / np.hypot(1, 0.2)) > np.cos(np.deg2rad(0.1))
+    assert found.count > 0.95 * (~wrong).sum()

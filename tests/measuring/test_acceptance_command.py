@@ -118,3 +118,15 @@ def test_options_that_make_no_sense_are_refused_with_what_can_be_asked(options, 
 
 def test_nothing_asked_is_refused(walls):
     assert "--plane or --sphere" in mitsim_here("measure", "acceptance", "walls", code=2, cwd=walls).stderr
+
+
+def test_a_plane_that_false_matches_turn_on_edge_has_no_figures(tmp_path, rng):
+    """A twentieth of the points of a small window lies at up to four times the distance."""
+    wall = plane([0, 0, 600], [0, 0, -1])
+    wall = np.where(rng.random(wall.shape) < 0.05, wall * rng.uniform(1, 4, wall.shape), wall)
+    write_cloud(cloud_of(wall), tmp_path / "wall.ply")
+    only, _ = of(tmp_path, "wall.ply", "--plane", "wall=80,60,40,40,600", code=1)
+    for name in ("plane-fit RMS", "Z accuracy"):
+        assert only[f"wall {name}"]["value"] is None
+        assert "stands on edge" in only[f"wall {name}"]["reason"]
+    assert only["wall fill rate"]["value"] == 100.0

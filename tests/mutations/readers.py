@@ -513,6 +513,68 @@ def _recording(name):
     return make
 
 
+def _bag(form, compression=None):
+    def make(folder):
+        sys.path.insert(0, str(ROOT / "tests" / "recordings"))
+        from ros_bags import ROS1, ROS2, cloud, depth_messages, points_m, write_bag
+
+        store = ROS1 if form == "bag" else ROS2
+        messages = [*depth_messages(store), ("/points", cloud(store, points_m()))]
+        path = write_bag(folder / ("b.bag" if form == "bag" else "b"), messages, form, compression)
+        return path.rename(folder / f"recording.{form}")
+
+    return make
+
+
+def _zdf(folder):
+    sys.path.insert(0, str(ROOT / "tests" / "recordings"))
+    from test_grids_and_lenses import CAMERA, LENS, bent_cloud, zdf
+
+    return zdf(folder / "a.zdf", bent_cloud(), camera_matrix=CAMERA.matrix, distortion=LENS)
+
+
+def _gridless(folder):
+    sys.path.insert(0, str(ROOT / "tests" / "recordings"))
+    from cloud_files_of_others import ply
+    from test_grids_and_lenses import bent_cloud
+
+    path = folder / "gridless.ply"
+    path.write_bytes(ply(bent_cloud(), grid="none"))
+    return path
+
+
+def _array(channels):
+    def make(folder):
+        sys.path.insert(0, str(ROOT / "tests" / "recordings"))
+        from cloud_files_of_others import pinhole_cloud
+
+        cloud = pinhole_cloud()
+        np.save(folder / "array.npy", cloud if channels else cloud[..., 2])
+        return folder / "array.npy"
+
+    return make
+
+
+def _read_any(path):
+    from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+
+    read_recording(path, ReadOptions())
+
+
+def _read_depths(path):
+    from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+
+    read_recording(path, ReadOptions(sensor="realsense-d435"))
+
+
+def _read_bag(path):
+    """Both topics, of which one may be damaged alone."""
+    from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+
+    read_recording(path, ReadOptions(topic=("/points",), frame="0"))
+    read_recording(path, ReadOptions(topic=("/camera/depth/image_rect_raw",), frame="0"))
+
+
 def _read_recording(path):
     from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 
@@ -549,6 +611,14 @@ READERS: dict[str, Reader] = {
         name: Reader(_recording(name), _read_recording)
         for name in ("ascii.pcd", "compressed.pcd", "recording.zip", "calib.json")
     },
+    "recording.bag": Reader(_bag("bag"), _read_bag),
+    "packed.bag": Reader(_bag("bag", "LZ4"), _read_bag),
+    "recording.db3": Reader(_bag("db3"), _read_bag),
+    "recording.mcap": Reader(_bag("mcap"), _read_bag),
+    "cloud.zdf": Reader(_zdf, _read_any),
+    "gridless.ply": Reader(_gridless, _read_any),
+    "points.npy": Reader(_array(3), _read_any),
+    "depths.npy": Reader(_array(0), _read_depths),
     "cloud.ply": Reader(_cloud, _read_cloud),
     "foreign.ply": Reader(_foreign, _decode_foreign),
     "image.png": Reader(_image, _read_image),

@@ -104,7 +104,7 @@ def test_clouds_with_y_up_are_refused_or_turned(tmp_path):
 @pytest.mark.parametrize("mirrored", [[-1, 1, 1], [1, -1, 1]])
 def test_mirrored_clouds_are_refused(tmp_path, mirrored):
     path = save(tmp_path / "left.pcd", pcd(CLOUD * np.array(mirrored, np.float32), "binary"))
-    with pytest.raises(InputError, match="points that match no pinhole at the origin"):
+    with pytest.raises(InputError, match="points that match no camera at the origin"):
         read_organised_cloud(path)
 
 
@@ -138,25 +138,30 @@ def test_a_cloud_in_a_workspace_is_refused_and_its_link_undone(tmp_path):
         read_organised_cloud(path, link=bare)
 
 
-def test_clouds_without_a_grid_are_refused_or_take_that_of_their_camera(tmp_path):
+def test_clouds_that_state_no_grid_have_the_one_of_their_points_or_are_refused(tmp_path):
     for name, content in (("a.ply", ply(CLOUD, grid="none")), ("b.pcd", pcd(CLOUD, "binary", height=1))):
         path = save(tmp_path / name, content)
+        for calibration in (None, pinhole(tmp_path)):
+            capture = read_organised_cloud(path, calibration=calibration)
+            np.testing.assert_array_equal(capture.derived["points"], CLOUD)
+    held = np.isfinite(CLOUD[..., 0])
+    for name, content in (("a.ply", ply(CLOUD[held][None], grid="none")), ("b.pcd", pcd(CLOUD[held][None], "binary"))):
         with pytest.raises(InputError, match=r"without a grid.*--calibration"):
-            read_organised_cloud(path)
-        capture = read_organised_cloud(path, calibration=pinhole(tmp_path))
-        np.testing.assert_array_equal(capture.derived["points"], CLOUD)
-    with pytest.raises(InputError, match="3072 points; allowed: 64 x 47"):
-        read_organised_cloud(tmp_path / "a.ply", calibration=pinhole(tmp_path, height=47))
+            read_organised_cloud(save(tmp_path / name, content))
+        with pytest.raises(InputError, match=f"{held.sum()} points; allowed: 64 x 48"):
+            read_organised_cloud(tmp_path / name, calibration=pinhole(tmp_path))
 
 
-def test_a_lens_with_distortion_needs_its_calibration(tmp_path):
+def test_a_lens_with_distortion_is_fitted_or_given(tmp_path):
     matrix = np.array([[60.0, 0, 31.3], [0, 61.0, 22.8], [0, 0, 1]])
     camera = Camera(matrix, np.array([-0.2, 0.05, 0, 0, 0]), WIDTH, HEIGHT)
     local = camera.rays(camera.pixel_grid())
     points = (local / local[..., 2:] * CLOUD[..., 2:]).astype(np.float32)
     path = save(tmp_path / "d.pcd", pcd(points, "binary"))
-    with pytest.raises(InputError, match=r"points that match no pinhole at the origin: .* px rms.*--calibration"):
-        read_organised_cloud(path)
+    assert read_organised_cloud(path).rig.reference.distortion[:2] == pytest.approx([-0.2, 0.05], abs=1e-2)
+    shifted = save(tmp_path / "e.pcd", pcd(points + np.float32([30, 0, 0]), "binary"))
+    with pytest.raises(InputError, match=r"points that match no camera at the origin: .* px rms.*--calibration"):
+        read_organised_cloud(shifted)
     capture = read_organised_cloud(path, calibration=pinhole(tmp_path, distortion=[-0.2, 0.05, 0, 0, 0]))
     assert capture.settings["off_the_rays_px"] < 1e-3
     cloud = decoded(capture, tmp_path / "c")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import replace
 from functools import partial
@@ -100,6 +101,11 @@ def test_a_file_of_ones_own_camera(recorded, tmp_path, monkeypatch):
     assert mine.imager.read_noise == pytest.approx(50, rel=0.05)
     assert "| imager.full_well_e |" in result.stdout and "not determined, kept" in result.stdout
     assert "photon transfer of repeats" in output.read_text()
+    assert result.stderr.splitlines()[-1].startswith("verdict: ")
+    preset = run.sensor_path("ensenso-n10").read_text(encoding="utf-8")
+    for kept in re.findall(r"(?m)^\| ([\w.]+) \| [^|]* \| (?!repeats of one pose)[^|]* \|$", result.stdout):
+        line = next((one for one in preset.splitlines() if one.startswith(f"{kept.rpartition('.')[2]} ")), None)
+        assert line is None or line in output.read_text(), kept  # what is not determined is as it was
     assert mine.name == "my-camera"
 
 

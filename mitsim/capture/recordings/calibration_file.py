@@ -14,7 +14,7 @@ others                    YAML, XML or JSON of OpenCV, ROS, Kalibr; .mat, .npz, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,6 +30,7 @@ from mitsim.capture.recordings.json_fields import parsed_json
 from mitsim.capture.recordings.nxlib_calibration import nxlib_rig
 from mitsim.capture.recordings.nxlib_tree import NxLibTree
 from mitsim.sensor.calibration_qualifiers import check_camera
+from mitsim.sensor.calibration_tree import tree_of
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.opencv_calibration import CalibrationTable, has_pair, with_calibration
 from mitsim.sensor.preset import load_sensor, presets
@@ -40,13 +41,14 @@ from mitsim.sensor.sensor_file import OpticsTable
 class Calibrated:
     """A ``rig`` read from a file, the name of its ``sensor``, and its range if the file states one.
 
-    ``notes``: warnings for the user.
+    ``notes``: warnings for the user. ``nominal``: whether the cameras are those of a type of device, not of one unit.
     """
 
     rig: Rig
     sensor: str
     range_mm: tuple[float, float] | None = None
     notes: tuple[str, ...] = ()
+    nominal: bool = False
 
 
 class RigFile(Document):
@@ -79,7 +81,7 @@ def read_calibration(source: str | Path, size: tuple[int, int] | None = None) ->
         Name of a preset, or path of a file.
     size
         (width, height) [px] of the images: the size of an OpenCV file without one, and the size to which the cameras
-        of a DepthAI calibration are scaled.
+        of a preset or of a DepthAI calibration are scaled.
 
     Raises
     ------
@@ -87,6 +89,8 @@ def read_calibration(source: str | Path, size: tuple[int, int] | None = None) ->
         If there is no such file, it has none of the formats above, or its numbers cannot belong to its images.
     """
     read = _read(source, size)
+    if read.nominal and size is not None:
+        read = _at_size(read, size)
     for name, camera in read.rig.cameras.items():
         check_camera(camera, source, f"cameras.{name}")
     return read
@@ -113,6 +117,36 @@ def _read(source: str | Path, size: tuple[int, int] | None) -> Calibrated:
     if isinstance(table, dict) and "fx" in table:
         return _of_pinhole(path, table)
     return _of_opencv(path, size)
+
+
+def calibrated_by(tables: dict[str, dict[str, Any]], where: Path, size: tuple[int, int] | None) -> Calibrated:
+    """Return the cameras of ROS's ``camera_info`` messages, by topic: one camera, or the left and the right of a pair.
+
+    Parameters
+    ----------
+    tables
+        The fields of each message by name, in the order of the cameras.
+    where
+        The recording, for messages.
+    size
+        (width, height) [px] of the images.
+
+    Raises
+    ------
+    InputError
+        If values are missing, or cannot belong to the images.
+
+    See Also
+    --------
+    read_calibration : of a file
+    """
+    cameras = ["camera"] if len(tables) == 1 else ["left", "right"]
+    asked = {"file": list(tables), "projector": False, "cameras": cameras}
+    table, notes = with_calibration(where, {"calibration": asked}, size, tree_of(tables))
+    rig = Rig({name: each.camera() for name, each in validate(where, table, RigFile).cameras.items()})
+    for name, camera in rig.cameras.items():
+        check_camera(camera, where, f"cameras.{name}")
+    return Calibrated(rig, "", notes=tuple(notes))
 
 
 def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], where: str | Path) -> Camera:
@@ -165,6 +199,27 @@ def _scaled_hint(camera: Camera, size: tuple[int, int]) -> str:
     )
 
 
+def _at_size(read: Calibrated, size: tuple[int, int]) -> Calibrated:
+    """Return nominal cameras of images of another size: scaled by the longer share of the sides, and cut at the middle.
+
+    A device that shows fewer pixels in another shape cuts its images so (RealSense: 640 x 480 of 1280 x 720).
+    """
+    full = {(camera.width, camera.height) for camera in read.rig.cameras.values()}
+    if len(full) != 1 or full == {size} or read.rig.rectification is not None:
+        return read
+    (width, height), cameras = full.pop(), {}
+    scale = max(size[0] / width, size[1] / height)
+    for name, camera in read.rig.cameras.items():
+        matrix = np.diag([scale, scale, 1.0]) @ camera.matrix
+        matrix[:2, 2] += scale / 2 - 0.5 - (scale * np.array([width, height]) - size) / 2
+        cameras[name] = replace(camera, matrix=matrix, width=size[0], height=size[1])
+    note = (
+        f"{read.sensor}: its cameras of {width} x {height} px are scaled by {scale:.4g} to images of {size[0]} x "
+        f"{size[1]} px, which is wrong for depths that the device has aligned to another camera: give --calibration"
+    )
+    return replace(read, rig=replace(read.rig, cameras=cameras), notes=(*read.notes, note))
+
+
 def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
     if path.suffix.lower() == ".toml":
         written = read_toml_table(path)
@@ -174,7 +229,7 @@ def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
             rig = Rig({name: each.camera() for name, each in table.cameras.items()})
             return Calibrated(rig, table.name, notes=tuple(notes))
     sensor = load_sensor(path, "decoding", size)
-    return Calibrated(sensor.rig, sensor.name, sensor.range_mm, sensor.notes)
+    return Calibrated(sensor.rig, sensor.name, sensor.range_mm, sensor.notes, nominal=str(path) in presets())
 
 
 def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:

@@ -1,7 +1,7 @@
-"""Read a 16-bit depth image and its camera as a capture.
+"""Read a 16-bit depth image, or depths in an ``.npy``, and its camera as a capture.
 
-Signal chain: PNG or TIFF of 16 bits -> grey levels, one of which marks missing depths -> times ``scale_mm`` -> depth
-along the camera's axis [mm].
+Signal chain: PNG or TIFF of 16 bits, or an array -> levels, one of which marks missing depths -> times ``scale_mm`` ->
+depth along the camera's axis [mm].
 
 The image uses the camera's own pixels: if the calibration has lens distortion, the image has it too.
 """
@@ -12,21 +12,33 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import read_grey
-from mitsim.capture.recordings.calibration_file import camera_of, read_calibration
+from mitsim.capture.recordings.array_file import NPY_MAGIC, numbers_of_npy
+from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.sensor.camera import Rig
+from mitsim.sensor.png import LONGEST_SIDE_PX
+
+Depth = NDArray[np.float32]
+
+#: median of depths in floating point below which they are in metres, as for clouds
+METRES_UNDER = 20.0
+
+#: depths beyond this are not measurements [mm]
+FARTHEST_MM = 1e6
 
 
 def read_depth_image(
     path: str | Path,
     calibration: str | Path,
     *,
-    scale_mm: float = 1.0,
-    invalid: int = 0,
+    scale_mm: float | None = None,
+    invalid: int | None = None,
     camera: str | None = None,
     sensor: str | None = None,
 ) -> Capture:
@@ -39,9 +51,9 @@ def read_depth_image(
     calibration
         A preset's name or a file, see :mod:`mitsim.capture.recordings.calibration_file`.
     scale_mm
-        Depth of one grey level [mm].
+        Depth of one level [mm]; by default 1, or 1000 for floating point with a median under :data:`METRES_UNDER`.
     invalid
-        Grey level of missing depths.
+        Level of missing depths; by default 0.
     camera
         Name of the camera in the calibration; by default the first.
     sensor
@@ -53,27 +65,92 @@ def read_depth_image(
         If the image or the calibration cannot be read, the image has 8 bits, or its size differs from the camera's.
     """
     path = Path(path)
-    image = read_grey(path)
-    if image.dtype != np.uint16:
+    image = _levels(path)
+    if image.dtype == np.uint8:
         hint = "an 8-bit picture has lost its depths: save the device's 16 bits"
         raise InputError(path, "depth", "8 bits", "16 bits", hint)
-    height, width = image.shape
-    read = read_calibration(calibration, (width, height))
-    eye = camera_of(read, camera, (width, height), path)
-    depth = image.astype(np.float32) * np.float32(scale_mm)
-    depth[image == invalid] = np.nan
-    if not np.isfinite(depth).any():
+    settings: dict[str, Any] = {"imported_from": path.name}
+    if image.dtype.kind == "f":
+        invalid = 0 if invalid is None else invalid
+        seen = image[np.isfinite(image) & (image != invalid)]
+        in_metres = scale_mm is None and seen.size and float(np.median(seen)) < METRES_UNDER
+        scale_mm = 1000.0 if in_metres else scale_mm
+    scale_mm, invalid = 1.0 if scale_mm is None else scale_mm, invalid or 0
+    settings |= {"depth_scale_mm": float(scale_mm), "depth_invalid": int(invalid)}
+    if (image == invalid).all():
         raise InputError(path, "", f"an image with only the level {invalid}", "an image with some depths")
-    settings: dict[str, Any] = {"depth_scale_mm": float(scale_mm), "depth_invalid": int(invalid)}
-    settings["imported_from"] = path.name
-    if read.notes:
-        settings["warnings"] = list(read.notes)
-    near, far = read.range_mm or (None, None)
+    with np.errstate(over="ignore"):
+        depth = image.astype(np.float32) * np.float32(scale_mm)
+    depth[(image == invalid) | ~np.isfinite(depth)] = np.nan
+    read = read_calibration(calibration, (image.shape[1], image.shape[0]))
+    return depth_capture(depth, read, path, settings, camera=camera, sensor=sensor)
+
+
+def _levels(path: Path) -> NDArray[Any]:
+    """Return the numbers (H, W) of an image file or an ``.npy``; integers of ``.npy`` of any size as floating point."""
+    data = read_bounded(path, "a depth image")
+    if not data.startswith(NPY_MAGIC):
+        return read_grey(path)
+    values = numbers_of_npy(data, path)
+    values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
+    if values.ndim != 2 or not all(1 <= side <= LONGEST_SIDE_PX for side in values.shape):
+        raise InputError(path, "shape", " x ".join(map(str, values.shape)), "depths of rows x columns")
+    if values.dtype.kind == "f" or values.dtype in (np.uint8, np.uint16):
+        return values
+    return values.astype(np.uint16) if values.min() >= 0 and values.max() < 1 << 16 else values.astype(np.float64)
+
+
+def depth_capture(
+    depth: Depth,
+    calibrated: Calibrated,
+    where: Path,
+    settings: dict[str, Any],
+    *,
+    camera: str | None = None,
+    sensor: str | None = None,
+) -> Capture:
+    """Return the capture of a map of depths.
+
+    Parameters
+    ----------
+    depth
+        (H, W) along the axis of the camera [mm], NaN where missing.
+    calibrated
+        The cameras.
+    where
+        File of the map, for messages.
+    settings
+        Records of the import.
+    camera
+        Name of the camera; by default the first.
+    sensor
+        Name of the sensor; by default that of the calibration, or ``depth-camera``.
+
+    Raises
+    ------
+    InputError
+        If no pixel has a depth, a depth is no measurement, or the size of the map differs from the camera's.
+
+    See Also
+    --------
+    read_depth_image : of a file
+    """
+    height, width = depth.shape
+    eye = camera_of(calibrated, camera, (width, height), where)
+    seen = depth[np.isfinite(depth)]
+    if not seen.size:
+        raise InputError(where, "", "no pixel with a depth", "an image with some depths")
+    if seen.min() <= 0 or seen.max() > FARTHEST_MM:
+        found = f"{seen.min():g} to {seen.max():g} mm"
+        raise InputError(where, "depth", found, f"over 0 to {FARTHEST_MM:g} mm", "check --scale")
+    if calibrated.notes:
+        settings = settings | {"warnings": [*settings.get("warnings", []), *calibrated.notes]}
+    near, far = calibrated.range_mm or (None, None)
     return Capture(
-        sensor=sensor or read.sensor or "depth-camera",
+        sensor=sensor or calibrated.sensor or "depth-camera",
         technology="depth_map",
         source="device",
-        rig=Rig({camera or next(iter(read.rig.cameras)): eye}, read.rig.projector),
+        rig=Rig({camera or next(iter(calibrated.rig.cameras)): eye}, calibrated.rig.projector),
         images={},
         bits=16,
         decoding=Decoding(near_mm=near, far_mm=far),

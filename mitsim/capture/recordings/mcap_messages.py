@@ -12,7 +12,9 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from io import BytesIO
+from mmap import mmap
 from pathlib import Path
 
 import lz4.frame
@@ -47,28 +49,57 @@ _RECORD = struct.Struct("<BQ")
 _FOOTER_SIZE = _RECORD.size + 16
 
 
-def mcap_messages(data: bytes, where: str | Path) -> Iterator[tuple[Schema, Channel, Message]]:
+@dataclass(frozen=True)
+class Expected:
+    """What a file should be in words (``made_by``), how to avoid a truncated one, and its limits.
+
+    ``chunk``: largest chunk and message [bytes]; ``records``: largest number of records.
+    """
+
+    made_by: str = "a recording of DepthAI's RecordMessage"
+    truncated: str = "stop the pipeline before the device is closed"
+    chunk: int = LARGEST_CHUNK
+    records: int = MOST_RECORDS
+
+
+def mcap_messages(
+    data: bytes | mmap, where: str | Path, expected: Expected | None = None
+) -> Iterator[tuple[Schema, Channel, Message]]:
     """Yield the messages in the order of the file, with the schema and the channel of each.
 
     The overall checksums and the number of messages are checked after the last message.
+
+    Parameters
+    ----------
+    data
+        Content of the file.
+    where
+        Name of the file in messages.
+    expected
+        What the file should be; by default a recording of DepthAI.
 
     Raises
     ------
     InputError
         If the file is truncated or damaged, or exceeds a limit when unpacked.
     """
-    if not data.startswith(MCAP_MAGIC):
-        raise InputError(where, "", "a file that is not MCAP", "a recording of DepthAI's RecordMessage")
-    if not data.endswith(MCAP_MAGIC) or len(data) < 2 * len(MCAP_MAGIC):
-        raise InputError(where, "", "a truncated file", WHOLE, "stop the pipeline before the device is closed")
-    view = memoryview(data)[: -len(MCAP_MAGIC)]
+    expected = expected or Expected()
+    if data[: len(MCAP_MAGIC)] != MCAP_MAGIC:
+        raise InputError(where, "", "a file that is not MCAP", expected.made_by)
+    if data[-len(MCAP_MAGIC) :] != MCAP_MAGIC or len(data) < 2 * len(MCAP_MAGIC):
+        raise InputError(where, "", "a truncated file", WHOLE, expected.truncated)
+    yield from _messages(memoryview(data)[: -len(MCAP_MAGIC)], where, expected)
+
+
+def _messages(view: memoryview, where: str | Path, expected: Expected) -> Iterator[tuple[Schema, Channel, Message]]:
+    """Yield the messages of a file without its last magic bytes."""
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     kind, at, ended = 0, len(MCAP_MAGIC), 0  # end of the data; 0 until found
     seen, unpacked, count, stated = 0, 0, 0, None
     try:
         for kind, at, body in _records(view, len(MCAP_MAGIC)):
-            seen = _bounded(seen + 1, MOST_RECORDS, "records")
+            seen = _bounded(seen + 1, expected.records, "records")
             if kind == Opcode.DATA_END:
                 _check_crc(view[:at], DataEnd.read(_stream(body)).data_section_crc, "data section")
                 ended = at + _RECORD.size + len(body)
@@ -81,8 +112,8 @@ def mcap_messages(data: bytes, where: str | Path) -> Iterator[tuple[Schema, Chan
                 stated = Statistics.read(_stream(body)).message_count
             if ended:  # later records repeat earlier ones
                 continue
-            for inner, record in _data(kind, body):
-                seen = _bounded(seen + 1, MOST_RECORDS, "records")
+            for inner, record in _data(kind, body, expected.chunk):
+                seen = _bounded(seen + 1, expected.records, "records")
                 unpacked = _bounded(unpacked + len(record), LARGEST_RECORDING, "bytes in all chunks")
                 if inner == Opcode.SCHEMA:
                     _bounded(len(record), LARGEST_SCHEMA, "bytes in a schema")
@@ -92,7 +123,7 @@ def mcap_messages(data: bytes, where: str | Path) -> Iterator[tuple[Schema, Chan
                     channel = Channel.read(_stream(record))
                     channels[channel.id] = channel
                 elif inner == Opcode.MESSAGE:
-                    _bounded(len(record), LARGEST_CHUNK, "bytes in a message")
+                    _bounded(len(record), expected.chunk, "bytes in a message")
                     message = Message.read(_stream(record), len(record))
                     channel = channels[message.channel_id]
                     count += 1
@@ -117,22 +148,22 @@ def _records(view: memoryview, at: int = 0) -> Iterator[tuple[int, int, memoryvi
         at += _RECORD.size + length
 
 
-def _data(kind: int, body: memoryview) -> Iterator[tuple[int, memoryview]]:
+def _data(kind: int, body: memoryview, largest: int) -> Iterator[tuple[int, memoryview]]:
     """Yield type and body of a record of the data section, or of the records in a chunk."""
     if kind != Opcode.CHUNK:
         yield kind, body
         return
-    for inner, _, record in _records(memoryview(_unpacked(Chunk.read(_stream(body))))):
+    for inner, _, record in _records(memoryview(_unpacked(Chunk.read(_stream(body)), largest))):
         yield inner, record
 
 
-def _unpacked(chunk: Chunk) -> bytes:
+def _unpacked(chunk: Chunk, largest: int) -> bytes:
     """Unpack the records of a chunk, never beyond its stated size."""
-    size = _bounded(chunk.uncompressed_size, LARGEST_CHUNK, "bytes in a chunk")
+    size = _bounded(chunk.uncompressed_size, largest, "bytes in a chunk")
     if chunk.compression == "lz4":
         records: bytes = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
     elif chunk.compression == "zstd":
-        unpacker = zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK)
+        unpacker = zstandard.ZstdDecompressor(max_window_size=largest)
         records = unpacker.stream_reader(chunk.data).read(size + 1)
     elif chunk.compression == "":
         records = chunk.data

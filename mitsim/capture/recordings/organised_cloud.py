@@ -1,4 +1,4 @@
-"""Read organised point clouds in PLY and PCD files as captures.
+"""Read organised point clouds in PLY, PCD, ZDF and NumPy files as captures.
 
 Signal chain: file -> points on their grid -> axes and unit -> inverse of an Ensenso's ``Link`` -> the camera of the
 grid, fitted or given -> points in the sensor frame [mm], NaN where missing.
@@ -7,12 +7,15 @@ A device with a rectified pair outputs its points on the pixels and in the frame
 sensor frame of mitsim is that of the raw first camera. The points are therefore rotated by the rectifying rotation,
 from the ``--link`` file or from a calibration with a rectification.
 
-F needs the number of possible points, so a cloud must keep its grid: WIDTH x HEIGHT of a PCD, the size stated in a PLY,
-or the size of a given camera if the number of points matches. A cloud without a grid is rejected.
+F needs the number of possible points, so a cloud must keep its grid: WIDTH x HEIGHT of a PCD, the size stated in a PLY
+or found from its points, or the size of a given camera if the number of points matches. A cloud without a grid is
+rejected.
 """
 
 from __future__ import annotations
 
+import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -24,13 +27,15 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
+from mitsim.capture.recordings.array_file import NPY_MAGIC, numbers_of_npy
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.nxlib_calibration import sensor_from_rectified
 from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of
 from mitsim.capture.recordings.pcd import decode_pcd
-from mitsim.capture.recordings.pinhole_fit import LEAST_POINTS, PINHOLE_RMS_PX, fit_pinhole, off_the_rays
+from mitsim.capture.recordings.pinhole_fit import LEAST_POINTS, PINHOLE_RMS_PX, fit_pinhole, grid_of, off_the_rays
 from mitsim.capture.recordings.ply import decode_ply
-from mitsim.sensor.calibration_qualifiers import UNITS_MM
+from mitsim.capture.recordings.zdf import HDF5_MAGIC, read_zdf
+from mitsim.sensor.calibration_qualifiers import UNITS_MM, check_camera
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import Transform
 
@@ -56,37 +61,78 @@ class StoredCloud:
     """Points of a PLY or PCD file, as they are in it.
 
     - ``path`` of the file.
-    - ``points`` (n, 3) of a PLY, (HEIGHT, WIDTH, 3) of a PCD.
+    - ``points`` (n, 3) of a PLY, (H, W, 3) of others.
     - ``size`` (width, height) of the grid; None without one.
     - ``records`` that a capture of them keeps.
+    - ``camera`` that the file states; None if it states none.
+    - ``grey``: image (H, W) of the grid, uint8; None without one.
     """
 
     path: Path
     points: Points
     size: tuple[int, int] | None
     records: dict[str, Any]
+    camera: Calibrated | None = None
+    grey: NDArray[np.uint8] | None = None
 
 
 def read_stored_cloud(path: Path) -> StoredCloud:
-    """Read a PLY or PCD file of another program; what its bytes are counts, not its suffix.
+    """Read a PLY, PCD, ZDF or NumPy file of another program; what its bytes are counts, not its suffix.
+
+    A PLY often does not state its grid, though it has a point for every pixel, as PhoXi Control and Zivid Studio write
+    it: the grid is then found from the points.
 
     Raises
     ------
     InputError
-        If the file is damaged, neither PLY nor PCD, or was written by mitsim.
+        If the file is damaged, of none of these formats, or was written by mitsim.
     """
-    data = read_bounded(path, "a PLY or PCD file")
+    data = read_bounded(path, "a PLY, PCD, ZDF or NumPy file")
     if data.startswith(b"ply"):
         read = decode_ply(data, path)
         if any(line.startswith("comment mitsim ") for line in read.lines):
             raise InputError(path, "", "a cloud written by mitsim", "a cloud of another program", "it needs no import")
-        return StoredCloud(path, read.points, read.size, {})
+        size = read.size or grid_of(read.points)
+        found = {} if read.size or size is None else {"grid_from": "the points"}
+        return StoredCloud(path, read.points, size, found)
+    if data.startswith(HDF5_MAGIC) or path.suffix.lower() == ".zdf":
+        return _of_zdf(path)
+    if data.startswith(NPY_MAGIC):
+        return _of_npy(path, data)
     if path.suffix.lower() == ".ply" and b"FIELDS" not in data[:4096]:
         raise InputError(path, "", "a file without the header of a PLY", "a PLY file, whose first line is ply")
     points, header = decode_pcd(data, path)
     height, width = points.shape[:2]
-    size = (width, height) if height > 1 else None
+    size = (width, height) if height > 1 else grid_of(points.reshape(-1, 3))
     return StoredCloud(path, points, size, {"viewpoint_of_file": header.get("VIEWPOINT", "")})
+
+
+def _of_zdf(path: Path) -> StoredCloud:
+    read = read_zdf(path)
+    height, width = read.points.shape[:2]
+    records: dict[str, Any] = {}
+    if read.snr is not None and np.isfinite(read.snr).any():
+        records["snr_median"] = round(float(np.nanmedian(read.snr)), 3)
+    camera = None
+    if read.matrix is not None:
+        lens = np.zeros(5) if read.distortion is None else read.distortion
+        eye = Camera(read.matrix, lens, width, height)
+        # where the file keeps its matrix is not published: it is believed only if it sees the points on their pixels
+        with suppress(InputError):
+            check_camera(eye, path, "camera matrix")
+            camera = Calibrated(Rig({"camera": eye}), "", nominal=True)
+    grey = None if read.colour is None else np.ascontiguousarray(read.colour[..., 1])
+    return StoredCloud(path, read.points, (width, height), records, camera, grey)
+
+
+def _of_npy(path: Path, data: bytes) -> StoredCloud:
+    values = numbers_of_npy(data, path)
+    if values.ndim != 3 or values.shape[2] < 3 or min(values.shape[:2]) < 2:
+        found = f"{values.dtype} of {' x '.join(map(str, values.shape))}"
+        raise InputError(path, "shape", found, "points of rows x columns x 3, or depths of rows x columns")
+    with np.errstate(over="ignore"):
+        points = values[..., :3].astype(np.float32)
+    return StoredCloud(path, points, (values.shape[1], values.shape[0]), {})
 
 
 def read_organised_cloud(
@@ -132,7 +178,7 @@ def read_organised_cloud(
     settings: dict[str, Any] = {"imported_from": path.name, "axes_of_file": axes} | stored.records
     settings["unit_of_file"], _ = scale_to_mm(points, path, unit, "check --unit")
     count = int(np.isfinite(points[..., 0]).sum())
-    if count < LEAST_POINTS:
+    if count < LEAST_POINTS and given is None:
         raise InputError(path, "", f"{count} points", f"{LEAST_POINTS} or more")
     if axes == "opengl":
         points *= np.array([1, -1, -1], np.float32)
@@ -146,8 +192,9 @@ def read_organised_cloud(
             settings["sensor_from_workspace"] = (turn @ rectified_from_workspace).matrix().tolist()
     rig, found = _seen_by(points, path, given, camera, turn)
     settings |= found
+    images = {} if stored.grey is None else {next(iter(rig.cameras)): stored.grey[None]}
     points = rig.reference.sensor_from_camera.points(points).astype(np.float32)
-    if given is not None and given.notes:
+    if given is not None and "off_the_rays_px" in found and given.notes:
         settings["warnings"] = list(given.notes)
     near, far = (given.range_mm if given else None) or (None, None)
     return Capture(
@@ -155,8 +202,8 @@ def read_organised_cloud(
         technology="point_map",
         source="device",
         rig=rig,
-        images={},
-        bits=16,
+        images=images,
+        bits=8 if images else 16,
         decoding=Decoding(near_mm=near, far_mm=far),
         settings=settings,
         derived={"points": points},
@@ -172,6 +219,7 @@ def _on_grid(
     if size is None and given is not None:
         eye = given.rig.reference if camera is None else given.rig.cameras.get(camera, given.rig.reference)
         size = eye.width, eye.height
+    given = given or stored.camera
     hint = "save it organised, a point or NaN for each pixel, or give the camera of its pixels: --calibration"
     if size is None:
         of_pcd = stored.points.ndim == 3
@@ -231,7 +279,7 @@ def _seen_by(
     height, width = points.shape[:2]
     hint = (
         "if they are in the frame of a robot or workspace, save them in the camera's, or invert an Ensenso's Link with "
-        "--link; for a lens with distortion give --calibration"
+        "--link; for an unusual lens give --calibration"
     )
     ahead = points[..., 2] > 0
     if ahead.sum() < 0.5 * np.isfinite(points[..., 2]).sum():
@@ -243,23 +291,21 @@ def _seen_by(
             "if y is up and z backward, use --axes opengl",
         )
     if given is not None:
-        off, eye = min(
-            (
-                (off_the_rays(eye.sensor_from_camera.points(points), eye), eye)
-                for eye in _possible_cameras(given, name, (width, height), path, turn)
-            ),
-            key=lambda each: each[0],
-        )
-        if not off <= CAMERA_OFF_PX:
+        eyes = _possible_cameras(given, name, (width, height), path, turn)
+        measured = [(off_the_rays(eye.sensor_from_camera.points(points), eye), eye) for eye in eyes]
+        off, best = min(measured, key=lambda each: each[0], default=(math.inf, None))
+        if best is not None and off <= CAMERA_OFF_PX:
+            alone = Rig({name or next(iter(given.rig.cameras)): best}, given.rig.projector)
+            return alone, {"off_the_rays_px": round(off, 6)}
+        if not given.nominal:
             found = f"points {off:.3g} px from the view rays of their pixels (median)"
             allowed = f"up to {CAMERA_OFF_PX:g} px: points in the frame of the calibrated camera"
             raise InputError(path, "", found, allowed, hint)
-        alone = Rig({name or next(iter(given.rig.cameras)): eye}, given.rig.projector)
-        return alone, {"off_the_rays_px": round(off, 6)}
     fitted = fit_pinhole(points)
     if fitted is None or fitted[1] > PINHOLE_RMS_PX:
-        found = "points that match no pinhole at the origin" + (f": {fitted[1]:.3g} px rms" if fitted else "")
-        raise InputError(path, "", found, f"points on the view rays of a pinhole, to {PINHOLE_RMS_PX:g} px", hint)
+        found = "points that match no camera at the origin" + (f": {fitted[1]:.3g} px rms" if fitted else "")
+        allowed = f"points on the view rays of a pinhole or a lens, to {PINHOLE_RMS_PX:g} px"
+        raise InputError(path, "", found, allowed, hint)
     placed = replace(fitted[0], sensor_from_camera=turn)
     return Rig({"camera": placed}), {"fitted_camera_rms_px": round(fitted[1], 6)}
 
@@ -281,6 +327,8 @@ def _possible_cameras(
             matrix = np.diag([scale, scale, 1.0]) @ pair.matrix_left
             eyes.append(Camera(matrix, np.zeros(5), *size, sensor_from_camera=place))
     if not eyes or size == (left.width, left.height):
+        if given.nominal and size != (left.width, left.height):
+            return eyes
         eye = camera_of(given, name, size, path)
         eyes.append(replace(eye, sensor_from_camera=eye.sensor_from_camera @ turn))
     return eyes

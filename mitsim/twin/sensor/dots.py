@@ -31,6 +31,7 @@ from mitsim.twin.sensor.figures import TERMS, SpecimenField, field_figures
 from mitsim.twin.sensor.moments import MomentFit, Prior, match_moments
 from mitsim.twin.sensor.parameters import CORNER_BLUR, FLUX, SMOOTHING, Parameter, room_parameters, with_room
 from mitsim.twin.sensor.specimen_simulator import SpecimenSimulator
+from mitsim.twin.sensor.verdict import CHANCE
 
 Floats = NDArray[np.float64]
 
@@ -40,7 +41,7 @@ PATCH_PX, FEWEST_PATCHES = 40, 8
 _ALONE = ("crossings", "sharpness", "noise in the dark half", "noise in the bright half", "grain")
 
 #: initial room light as a share of the projector's; significance level of a misfit
-_FIRST_ROOM, _CHANCE = 0.2, 0.01
+_FIRST_ROOM = 0.2
 
 #: step of the derivatives of the file's numbers, and least significance of a smoothing, in standard uncertainties
 _DIFFERENCE, _SURE = 0.3, 2.0
@@ -207,7 +208,7 @@ def fit_dots(
 
 
 def _misses(found: MomentFit) -> bool:
-    return bool(found.chi_square > chi2.isf(_CHANCE, max(found.freedom, 1)))
+    return bool(found.chi_square > chi2.isf(CHANCE, max(found.freedom, 1)))
 
 
 def _is_determined(found: MomentFit, index: int, parameter: Parameter) -> bool:

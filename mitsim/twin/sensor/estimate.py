@@ -62,11 +62,15 @@ class FittedKey:
 
 @dataclass(frozen=True)
 class Undetermined:
-    """A number that no capture determines. It keeps the file's ``value``; ``determined_by`` is a capture that would."""
+    """A number that no capture determines. It keeps the file's ``value``; ``determined_by`` is a capture that would.
+
+    ``contained``: it is ``value`` in the fitted file, because fitted numbers contain it.
+    """
 
     key: str
     value: float
     determined_by: str
+    contained: bool = False
 
 
 def combined(values: Sequence[float], uncertainties: Sequence[float]) -> tuple[float, float]:

@@ -49,7 +49,7 @@ _LEAST_QUIET = 0.2
 
 #: parts of the noise that one image of a light does not separate
 UNSEPARATED = tuple(
-    Undetermined(f"imager.{key}", 0.0, "repeats of one pose; until then read_noise_e and full_well_e include it")
+    Undetermined(f"imager.{key}", 0.0, "repeats of one pose; until then read_noise_e and full_well_e include it", True)
     for key in ("dsnu_e", "prnu", "row_noise_e", "column_pattern_e")
 )
 

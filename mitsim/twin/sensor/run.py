@@ -44,22 +44,28 @@ from mitsim.twin.sensor.parameters import (
 from mitsim.twin.sensor.room import RoomFit, fit_room
 from mitsim.twin.sensor.rows import row_turns
 from mitsim.twin.sensor.stripes import fit_stripes
+from mitsim.twin.sensor.verdict import Agreement, Verdict, verdict_of
 
 Floats = NDArray[np.float64]
 
 
-#: reduced chi-square above which the user is warned
-_MISFIT = 10.0
-
-
 @dataclass(frozen=True)
 class SensorFit:
-    """Result of a fit: ``estimates``, and numbers that no capture determines (``undetermined``)."""
+    """Result of a fit: ``estimates``, and numbers that no capture determines (``undetermined``).
+
+    ``agreements`` of the dots of each capture with the best simulation.
+    """
 
     sensor: Sensor = field(repr=False)
     input_captures: tuple[InputCapture, ...] = field(repr=False)
     estimates: tuple[FittedKey, ...]
     undetermined: tuple[Undetermined, ...]
+    agreements: tuple[Agreement, ...] = ()
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return whether the fitted file reproduces the captures."""
+        return verdict_of(self.agreements)
 
 
 def fit_sensor(
@@ -127,7 +133,9 @@ def fit_sensor(
         for key, pair in turns.items():
             turned.append(FittedKey(f"misalignment.{key}", *pair, "mrad", (source.name,), method))
     estimates += pooled(turned)
-    return SensorFit(base, tuple(input_captures), tuple(estimates), tuple(undetermined))
+    fits = {name: found.moment_fit for name, found in dots.items()}
+    agreements = tuple(Agreement(name, fit.chi_square, fit.freedom) for name, fit in fits.items())
+    return SensorFit(base, tuple(input_captures), tuple(estimates), tuple(undetermined), agreements)
 
 
 def sensor_path(name: str | Path) -> Path:
@@ -184,8 +192,6 @@ def _dots(
             f"{source.name}: {found.patches} patches, chi-square {fit.chi_square:.1f} of {fit.freedom}, "
             f"unevenness beyond the model {100 * found.uneven:.1f} %"
         )
-        if fit.chi_square > _MISFIT * max(fit.freedom, 1):
-            say(f"{source.name}: no parameters reproduce these dots with the file's pattern; the best fit is used")
     return out
 
 

@@ -40,7 +40,8 @@ def write_sensor(fit: SensorFit, sensor: str | Path, output: Path) -> None:
         "name": Entry(
             f'"{output.stem}"',
             f"fitted by `mitsim fit sensor` from {path.stem}: "
-            + ", ".join(sorted({source.name for source in fit.input_captures})),
+            + ", ".join(sorted({source.name for source in fit.input_captures}))
+            + f"\nverdict: {fit.verdict.word}: {fit.verdict.why}",
         )
     }
     entries |= _entries(fit)
@@ -94,9 +95,8 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
         comment = f"fitted: standard uncertainties {', '.join(spreads)}; {some.method}; {', '.join(some.captures)}"
         entries[key] = Entry(numbers(np.clip(values, -limit, limit), 5), comment)
     for kept in fit.undetermined:
-        if _ARRAY.match(kept.key):
-            continue  # a term of the room without an estimate: none
-        entries[kept.key] = Entry(number(kept.value), f"not determined; needs {kept.determined_by}")
+        if kept.contained:
+            entries[kept.key] = Entry(number(kept.value), f"not determined; needs {kept.determined_by}")
     if "misalignment.row_mrad" in entries:
         row, roll = (next(e for e in fit.estimates if e.key == f"misalignment.{key}_mrad") for key in ("row", "roll"))
         comment = "rotation of one unit's second camera off its calibration, assumed for the next unit too"
@@ -139,11 +139,18 @@ def with_entries(text: str, entries: Mapping[str, Entry]) -> str:
 
 
 def with_cameras(text: str, cameras: Mapping[str, Camera], source: str) -> str:
-    """Replace the tables of the cameras."""
+    """Replace the tables of the cameras; comments on lines of their own are kept above them."""
     blocks = _blocks(text)
+    remarks = [
+        line
+        for table, lines in blocks
+        if table.startswith("cameras.")
+        for line in lines
+        if line.lstrip().startswith("#")
+    ]
     kept = [lines for table, lines in blocks if not table.startswith("cameras.")]
     index = next((n for n, (table, _) in enumerate(blocks) if table.startswith("cameras.")), 1)
-    made: list[str] = [f"# cameras of this unit, from {source}"]
+    made: list[str] = [*remarks, f"# cameras of this unit, from {source}"]
     for name, camera in cameras.items():
         matrix, place = camera.matrix, camera.sensor_from_camera
         made += [
@@ -165,12 +172,14 @@ def with_cameras(text: str, cameras: Mapping[str, Camera], source: str) -> str:
 
 
 def with_exposure(text: str, seconds: float, comment: str) -> str:
-    """Set a fixed exposure; limits and bracket stay."""
+    """Set a fixed exposure; limits and bracket stay, and the former rule as a comment."""
     out = []
     for table, lines in _blocks(text):
         if table == "exposure":
-            kept = [line for line in lines[1:] if not _EXPOSURE_RULE.match(line)]
-            lines = [lines[0], 'rule = "fixed"', f"# {comment}", f"exposure_s = {number(seconds)}", *kept]
+            at = next(index for index, line in enumerate(lines) if _TABLE.match(line))
+            kept = [f"# before: {line.strip()}" if _EXPOSURE_RULE.match(line) else line for line in lines[at + 1 :]]
+            fixed = ['rule = "fixed"', f"# {comment}", f"exposure_s = {number(seconds)}"]
+            lines = [*lines[: at + 1], *fixed, *kept]
         out += lines
     return "\n".join(out)
 
@@ -196,10 +205,17 @@ def _blocks(text: str) -> list[tuple[str, list[str]]]:
     blocks: list[tuple[str, list[str]]] = [("", [])]
     for line in text.split("\n"):
         header = _ARRAY_OF_TABLES.match(line) or _TABLE.match(line)
-        if header:
-            blocks.append((header[1], [line]))
-        else:
+        if not header:
             blocks[-1][1].append(line)
+            continue
+        above: list[str] = []
+        before = blocks[-1][1]
+        while before and before[-1].startswith("#"):
+            above.insert(0, before.pop())
+        if not any(not one.lstrip().startswith("#") and one.strip() for one in before) and not blocks[-1][0]:
+            before += above  # the title of the file
+            above = []
+        blocks.append((header[1], [*above, line]))
     return blocks
 
 
@@ -212,11 +228,45 @@ def _with_entry(text: str, table: str, key: str, entry: Entry) -> str:
         for index, line in enumerate(lines):
             match = _KEY.match(line)
             if match and match[2] == key:
-                before, mark, beside = match[3].partition("#")
-                said = f"before: {before.strip()}" + f"; {beside.strip()}" * bool(mark)
-                lines[index : index + 1] = [*comment, f"{key} = {entry.value}  # {said}"]
+                end = _end_of_value(lines, index)
+                if end > index:  # an array over several lines stays as it was, as a comment
+                    old = [f"# before: {one.strip()}" for one in lines[index : end + 1]]
+                    lines[index : end + 1] = [*comment, *old, f"{key} = {entry.value}"]
+                else:
+                    before, remark = _value_and_remark(match[3])
+                    said = f"before: {before}" + f"; {remark}" * bool(remark)
+                    lines[index : index + 1] = [*comment, f"{key} = {entry.value}  # {said}"]
                 return "\n".join(line for _, part in blocks for line in part)
-        at = 1 if table else 0
+        at = next((n for n, line in enumerate(lines) if _TABLE.match(line)), -1) + 1 if table else _first_key(lines)
         lines[at:at] = [*comment, f"{key} = {entry.value}"]
         return "\n".join(line for _, part in blocks for line in part)
     return "\n".join([text.rstrip("\n"), "", f"[{table}]", *comment, f"{key} = {entry.value}", ""])
+
+
+def _first_key(lines: list[str]) -> int:
+    """Return the number of the first line of keys, below the title of the file."""
+    return next((n for n, line in enumerate(lines) if _KEY.match(line)), len(lines))
+
+
+def _value_and_remark(text: str) -> tuple[str, str]:
+    """Return the value of a key and the comment after it; a # in quotes is part of the value."""
+    quote = ""
+    for place, letter in enumerate(text):
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "\"'":
+            quote = letter
+        elif letter == "#":
+            return text[:place].strip(), text[place + 1 :].strip()
+    return text.strip(), ""
+
+
+def _end_of_value(lines: list[str], index: int) -> int:
+    """Return the last line of the value that begins in a line: an array may extend over several."""
+    depth = 0
+    for end in range(index, len(lines)):
+        text = _value_and_remark(lines[end])[0]
+        depth += text.count("[") - text.count("]")
+        if depth <= 0:
+            return end
+    return index

@@ -1,0 +1,304 @@
+"""Read a depth image, an organised cloud or a stereo pair of a bag of ROS as a capture.
+
+Signal chain: bag -> topic, chosen or the only one that fits -> one message of it -> its ``camera_info``, or the
+calibration of the user -> capture.
+
+A ``camera_info`` belongs to the images whose topic begins like its own: ``/camera/depth/camera_info`` to
+``/camera/depth/image_rect_raw``. Images whose topic says ``rect`` are rectified: their camera is the projection matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from characterisation.files.errors import InputError, nearest
+from mitsim.capture.capture import Capture
+from mitsim.capture.decoding import Decoding
+from mitsim.capture.recordings.calibration_file import Calibrated, calibrated_by, camera_of, read_calibration
+from mitsim.capture.recordings.depth_image import depth_capture
+from mitsim.capture.recordings.organised_cloud import StoredCloud
+from mitsim.capture.recordings.recording_files import chosen_frame
+from mitsim.capture.recordings.ros_bag import RosBag, Topic
+from mitsim.capture.recordings.ros_messages import (
+    CAMERA_INFO,
+    CLOUD,
+    IMAGE,
+    PACKED_IMAGE,
+    calibration_of,
+    depth_of,
+    grey_of,
+    is_depth,
+    label_of,
+    points_of,
+    read_message,
+    unit_of_depths,
+)
+from mitsim.sensor.camera import Rig
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The topics of a ``bag`` that are read, and what they are: ``depth``, ``cloud`` or ``pair``."""
+
+    bag: RosBag
+    topics: tuple[Topic, ...]
+    what: str
+
+
+def chosen_topics(bag: RosBag, names: Sequence[str]) -> Chosen:
+    """Return the topics of these names; without names, the only depth image or cloud.
+
+    Raises
+    ------
+    InputError
+        If there is no such topic, or it has nothing that is read, or there are several; the error lists the topics.
+    """
+    known = {topic.name: what for topic in bag.topics.values() if (what := _what(bag, topic))}
+    usable = {name: what for name, what in known.items() if what != "image"}
+    for name in names:
+        if name not in bag.topics:
+            hint = nearest(name, list(bag.topics))
+            raise InputError("--topic", "", repr(name), _listed(bag, known) or "a topic of the bag", hint)
+        if name not in known:
+            kind = f"{bag.topics[name].kind}, {bag.topics[name].count} messages"
+            raise InputError("--topic", "", f"{name}, {kind}", _listed(bag, known) or "images or clouds")
+    if len(names) == 2 and {known[name] for name in names} == {"image"}:
+        return Chosen(bag, (bag.topics[names[0]], bag.topics[names[1]]), "pair")
+    if len(names) == 1 and names[0] in usable:
+        return Chosen(bag, (bag.topics[names[0]],), usable[names[0]])
+    if names:
+        allowed = "one topic of depths or of a cloud, or the left and the right images of a pair"
+        raise InputError("--topic", "", " and ".join(names), allowed, _listed(bag, known))
+    if len(usable) == 1:
+        name, what = next(iter(usable.items()))
+        return Chosen(bag, (bag.topics[name],), what)
+    if usable:
+        hint = f"choose with --topic: {_listed(bag, known)}"
+        raise InputError(bag.path, "--topic", f"{len(usable)} topics with depths or clouds", "one of them", hint)
+    if len(known) >= 2:
+        hint = f"choose a pair with --topic LEFT --topic RIGHT: {_listed(bag, known)}"
+        raise InputError(bag.path, "--topic", "images without depth", "depths, a cloud, or a pair", hint)
+    there = ", ".join(f"{topic.name} ({topic.kind})" for topic in list(bag.topics.values())[:6]) or "nothing"
+    raise InputError(bag.path, "", f"a bag with {there}", "depth images, organised clouds, or a pair of images")
+
+
+def _what(bag: RosBag, topic: Topic) -> str:
+    """Return what a topic holds: ``depth``, ``image`` or ``cloud``; empty for others."""
+    if topic.count < 1:
+        return ""
+    if topic.kind == CLOUD:
+        return "cloud"
+    if topic.kind in (IMAGE, PACKED_IMAGE):
+        infrared = any(word in topic.name.lower() for word in ("infra", "/ir", "thermal"))
+        return "depth" if not infrared and is_depth(read_message(bag, topic, 0)) else "image"
+    return ""
+
+
+def _listed(bag: RosBag, known: dict[str, str]) -> str:
+    counts = {name: bag.topics[name].count for name in known}
+    return ", ".join(f"{name} ({what}, {counts[name]})" for name, what in list(known.items())[:12])
+
+
+def read_ros_cloud(chosen: Chosen, frame: int | None) -> StoredCloud:
+    """Return the points of one message of a cloud, as they are in it.
+
+    A ``camera_info`` in the namespace of its topic is its camera if it sees the points on their pixels.
+    """
+    bag, topic = chosen.bag, chosen.topics[0]
+    number = chosen_frame(frame, topic.count, bag.path, f"messages of {topic.name}")
+    message = read_message(bag, topic, number)
+    points = points_of(message, label_of(topic, bag.path))
+    height, width = points.shape[:2]
+    records = {"topic": topic.name} | _stamp(message)
+    if min(height, width) < 2:
+        return StoredCloud(bag.path, points, None, records)
+    camera = None
+    with suppress(InputError):  # then the camera is fitted to the points
+        camera = replace(_calibrated(chosen, (width, height), None), nominal=True)
+    return StoredCloud(bag.path, points, (width, height), records, camera)
+
+
+def read_ros_depth(
+    chosen: Chosen,
+    frame: int | None,
+    *,
+    calibration: str | Path | None = None,
+    scale_mm: float | None = None,
+    invalid: int | None = None,
+    camera: str | None = None,
+    sensor: str | None = None,
+) -> Capture:
+    """Read one depth image of a bag.
+
+    Parameters
+    ----------
+    chosen
+        The topic of depth images.
+    frame
+        Number of the message, from 0; required if there are several.
+    calibration
+        The camera; by default the ``camera_info`` of the topic.
+    scale_mm
+        Depth of one level [mm]; by default that of the encoding, or the one that RealSense's viewer recorded.
+    invalid
+        Level of missing depths; by default 0.
+    camera, sensor
+        As of :func:`~mitsim.capture.recordings.depth_image.read_depth_image`.
+
+    Raises
+    ------
+    InputError
+        If the message or the calibration cannot be read, or they do not belong together.
+    """
+    bag, topic = chosen.bag, chosen.topics[0]
+    where = label_of(topic, bag.path)
+    number = chosen_frame(frame, topic.count, bag.path, f"messages of {topic.name}")
+    message = read_message(bag, topic, number)
+    levels, unit = depth_of(message, where)
+    if levels.dtype == np.uint8:
+        raise InputError(where, "depth", "8 bits", "16 bits or floating point")
+    recorded = unit_of_depths(bag, topic) if levels.dtype == np.uint16 else None
+    scale = scale_mm or recorded or unit
+    depth = levels.astype(np.float32) * np.float32(scale)
+    depth[(levels == (invalid or 0)) | ~np.isfinite(depth)] = np.nan
+    size = (depth.shape[1], depth.shape[0])
+    calibrated = _calibrated(chosen, size, calibration)
+    settings: dict[str, Any] = {"imported_from": bag.path.name, "topic": topic.name, "depth_scale_mm": float(scale)}
+    return depth_capture(depth, calibrated, Path(where), settings | _stamp(message), camera=camera, sensor=sensor)
+
+
+def read_ros_pair(
+    chosen: Chosen,
+    frame: int | None,
+    *,
+    calibration: str | Path | None = None,
+    channel: int = 1,
+    sensor: str | None = None,
+) -> Capture:
+    """Read one stereo pair of a bag: the left image by its number, and the right image that is nearest in time.
+
+    Parameters
+    ----------
+    chosen
+        The topics of the left and the right images.
+    frame
+        Number of the left message, from 0; required if there are several.
+    calibration
+        Of both cameras; by default the ``camera_info`` of both topics.
+    channel
+        Channel of colour images.
+    sensor
+        Name of the sensor.
+
+    Raises
+    ------
+    InputError
+        If a message or the calibration cannot be read, or they do not belong together.
+    """
+    bag, (left, right) = chosen.bag, chosen.topics
+    number = chosen_frame(frame, left.count, bag.path, f"messages of {left.name}")
+    first = read_message(bag, left, number)
+    second = _of_same_time(bag, right, first, number)
+    images = [
+        grey_of(message, label_of(topic, bag.path), channel) for topic, message in ((left, first), (right, second))
+    ]
+    size = (images[0].shape[1], images[0].shape[0])
+    calibrated = _calibrated(chosen, size, calibration)
+    names = list(calibrated.rig.cameras)[:2]
+    if len(names) < 2:
+        raise InputError(calibration or bag.path, "cameras", ", ".join(names), "two cameras: a stereo pair")
+    for name, image, topic in zip(names, images, chosen.topics, strict=True):
+        where = label_of(topic, bag.path)
+        camera_of(calibrated, name, (image.shape[1], image.shape[0]), where)
+        if image.dtype != images[0].dtype:
+            raise InputError(where, "depth", f"{8 * image.itemsize} bits", f"{8 * images[0].itemsize}, as the left")
+    settings: dict[str, Any] = {"imported_from": bag.path.name, "topic": [left.name, right.name]} | _stamp(first)
+    if calibrated.notes:
+        settings["warnings"] = list(calibrated.notes)
+    near, far = calibrated.range_mm or (None, None)
+    rig = calibrated.rig
+    return Capture(
+        sensor=sensor or calibrated.sensor or "stereo-pair",
+        technology="active_stereo",
+        source="device",
+        rig=Rig({name: rig.cameras[name] for name in names}, rig.projector, rig.rectification),
+        images={name: image[None] for name, image in zip(names, images, strict=True)},
+        bits=8 * images[0].itemsize,
+        decoding=Decoding(near_mm=near, far_mm=far),
+        settings=settings,
+    )
+
+
+def _of_same_time(bag: RosBag, topic: Topic, first: Any, number: int) -> Any:
+    """Return the message of a topic whose stamp is that of another one; it is searched near its number.
+
+    Raises
+    ------
+    InputError
+        If none of them is of the same time.
+    """
+    near = [each for each in range(number - 2, number + 3) if 0 <= each < topic.count]
+    found = [read_message(bag, topic, each) for each in near]
+    apart = [abs(_seconds(message) - _seconds(first)) for message in found]
+    if not apart or min(apart) > _SAME_TIME_S:
+        nearest_one = f"{min(apart):.3g} s from the left image" if apart else "no message"
+        where = label_of(topic, bag.path)
+        raise InputError(where, "stamp", nearest_one, f"an image within {_SAME_TIME_S:g} s", "choose another --frame")
+    return found[int(np.argmin(apart))]
+
+
+#: largest difference in time of the two images of a pair; assumed: under a quarter of a frame at 60 Hz
+_SAME_TIME_S = 0.004
+
+
+def _calibrated(chosen: Chosen, size: tuple[int, int], given: str | Path | None) -> Calibrated:
+    if given is not None:
+        return read_calibration(given, size)
+    bag, tables = chosen.bag, {}
+    for topic in chosen.topics:
+        info = _info_of(bag, topic)
+        rectified = "rect" in topic.name.rpartition("/")[2]
+        tables[info.name] = calibration_of(read_message(bag, info, 0), rectified)
+    if len(tables) < len(chosen.topics):
+        names = " and ".join(topic.name for topic in chosen.topics)
+        raise InputError(
+            bag.path, ", ".join(tables), f"one camera_info for {names}", "one for each: --calibration FILE"
+        )
+    if len(tables) == 2 and not any(table["p"][3:4] not in ([], [0.0]) for table in tables.values()):
+        hint = "--calibration FILE with both cameras, R and T"
+        raise InputError(bag.path, ", ".join(tables), "projection matrices without a baseline", "a pair of ROS", hint)
+    return calibrated_by(tables, bag.path, size)
+
+
+def _info_of(bag: RosBag, topic: Topic) -> Topic:
+    """Return the ``camera_info`` in the namespace of a topic; the longest one if there are several.
+
+    RealSense's viewer names it ``NAMESPACE/info/camera_info``, others ``NAMESPACE/camera_info``.
+    """
+    spaces = {}
+    for info in bag.topics.values():
+        if info.kind == CAMERA_INFO and info.count:
+            space = info.name.removesuffix("/camera_info").removesuffix("/info")
+            if f"{topic.name}/".startswith(f"{space}/"):
+                spaces[space] = info
+    if not spaces:
+        there = ", ".join(one.name for one in bag.topics.values() if one.kind == CAMERA_INFO)[:200]
+        raise InputError(
+            bag.path, topic.name, there or "no camera_info", "a camera_info of this topic", "or --calibration FILE"
+        )
+    return spaces[max(spaces, key=len)]
+
+
+def _seconds(message: Any) -> float:
+    stamp = message.header.stamp
+    return float(stamp.sec) + float(stamp.nanosec) * 1e-9
+
+
+def _stamp(message: Any) -> dict[str, Any]:
+    return {"stamp_s": round(_seconds(message), 6), "frame_id": str(message.header.frame_id)[:200]}

@@ -1,0 +1,129 @@
+"""State the figures of a recorded cloud beside those of a simulated sensor before the same targets: ``--simulated``.
+
+Signal chain: targets of the recorded cloud -> simulated clouds of the same targets
+(:mod:`mitsim.twin.compare.target_twin`) -> the figures of both, with F and sigma of the planes -> one table.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from characterisation.coupon.patch_table import overall
+from characterisation.coupon_cloud import measure_coupon
+from characterisation.features.robust_fit import FitError
+from characterisation.files.errors import InputError
+from characterisation.point_cloud import PointCloud
+from characterisation.region_of_interest import Roi
+from characterisation.tasks.result import Result, failed
+from mitsim.decoding.measured_document import aligned, number_with_decimals
+from mitsim.running.progress import say
+
+
+@dataclass(frozen=True)
+class RecordedTarget:
+    """A target: its ``shape``, its ``window`` [px] of the recorded grid, and the true ``distance`` [mm] of a plane."""
+
+    shape: str
+    window: Roi | None
+    distance: float | None = None
+
+
+#: figures of one target in a window of a cloud
+Figures = Callable[[PointCloud, str, Roi | None], list[Result]]
+
+
+def beside_simulated(
+    recorded: PointCloud, targets: Mapping[str, RecordedTarget], sensor: str, figures: Figures, seed: int
+) -> tuple[list[Result], list[Result]]:
+    """Return the figures of every target in the recorded and in the simulated cloud, in the same order.
+
+    Parameters
+    ----------
+    recorded
+        The recorded cloud.
+    targets
+        Planes and spheres by name.
+    sensor
+        Preset or sensor file to simulate.
+    figures
+        Function that states the figures of a target.
+    seed
+        Of the noise.
+
+    Raises
+    ------
+    InputError
+        If the sensor is not known, or does not see a target.
+    """
+    from mitsim.sensor.preset import load_sensor
+    from mitsim.twin.compare.target_twin import seen_target, simulated_target
+
+    if recorded.grid.height == 1:
+        raise InputError("--simulated", "", "a cloud without a grid", "a cloud with rows and columns")
+    preset = load_sensor(sensor)
+    preset.require("simulation")
+    real: list[Result] = []
+    twin: list[Result] = []
+    for name, target in targets.items():
+        real += _with_coupon(recorded, name, target, target.window, figures)
+        try:
+            seen = seen_target(target.shape, target.window, recorded, name, target.distance)
+        except FitError as error:
+            twin += [failed(one.name, one.unit, f"no twin: {error}") for one in real[len(twin) :]]
+            continue
+        say(f"simulating {preset.name} before {name}")
+        cloud, window = simulated_target(seen, recorded, preset, name, seed)
+        twin += _with_coupon(cloud, name, target, window, figures)
+    return real, twin
+
+
+def _with_coupon(
+    cloud: PointCloud, name: str, target: RecordedTarget, window: Roi | None, figures: Figures
+) -> list[Result]:
+    """Return F and sigma of a plane, before its other figures."""
+    results = figures(cloud, name, window)
+    if target.shape != "plane":
+        return results
+    region = None if window is None else (window.left, window.top, window.width, window.height)
+    try:
+        pooled = overall(measure_coupon(cloud, window=region))
+    except InputError as error:
+        return [failed(f"{name} F", "1", str(error)), failed(f"{name} sigma", "mm", str(error)), *results]
+    return [
+        _pooled(f"{name} F", "1", pooled.fraction, pooled.fraction_error),
+        _pooled(f"{name} sigma", "mm", pooled.sigma, pooled.sigma_error),
+        *results,
+    ]
+
+
+def _pooled(name: str, unit: str, value: float, error: float) -> Result:
+    if not math.isfinite(value):
+        return failed(name, unit, "too few points in every disc")
+    return Result(name, unit, value, error, "fit" if math.isfinite(error) else "none")
+
+
+def beside_table(recorded: Sequence[Result], simulated: Sequence[Result], sensor: str) -> str:
+    """Return the table of both, with the ratio of simulated to recorded where both have a value other than 0."""
+    rows = [["measurement", "recorded", "u", sensor, "u", "unit", "simulated / recorded"]]
+    for one, other in zip(recorded, simulated, strict=True):
+        ratio = other.value / one.value if one.possible and other.possible and one.value else math.nan
+        rows.append(
+            [
+                one.name,
+                number_with_decimals(one.value, one.uncertainty),
+                _digits(one.uncertainty),
+                number_with_decimals(other.value, other.uncertainty),
+                _digits(other.uncertainty),
+                one.unit,
+                f"{ratio:.3g}" if math.isfinite(ratio) else "-",
+            ]
+        )
+        reason = one.reason or other.reason
+        rows[-1] += [f"not possible: {reason}"] if reason else []
+    return aligned(rows)
+
+
+def _digits(value: float) -> str:
+    return f"{value:.2g}" if math.isfinite(value) else "-"

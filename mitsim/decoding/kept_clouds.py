@@ -1,0 +1,108 @@
+"""Keep decoded clouds between commands, so that several measurements of one capture decode it once.
+
+Signal chain: files of the capture, settings of the decoder, source text of the decoder -> SHA-256 -> cloud file of that
+name in the user's cache folder, read if it is there and whole, else written after decoding.
+
+The folder is ``mitsim/clouds`` in ``$XDG_CACHE_HOME`` or ``~/.cache``. ``MITSIM_CACHE`` names another one; if it is
+empty, nothing is kept. The oldest clouds beyond :data:`MOST_CLOUDS` are removed. A folder that cannot be written is not
+used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+import mitsim
+from characterisation.cloud_files import read_cloud, write_cloud
+from characterisation.files.errors import InputError
+from characterisation.point_cloud import PointCloud
+from mitsim.capture.recordings.recording_files import MOST_FILES
+
+#: clouds that are kept
+MOST_CLOUDS = 20
+
+#: time of decoding [s] from which a cloud is kept
+SLOW_S = 1.0
+
+#: largest capture whose files are hashed [bytes]
+_LARGEST = 4 * 1024**3
+
+
+def kept_cloud(path: Path, settings: Iterable[object], decode: Callable[[], PointCloud]) -> PointCloud:
+    """Return the cloud of a capture or recording: the kept one, or that of ``decode``, which is kept if it took long.
+
+    Parameters
+    ----------
+    path
+        File or folder of the capture; all its files count.
+    settings
+        Everything else that determines the cloud; each object by its ``repr``.
+    decode
+        Function that decodes the capture.
+    """
+    folder = _folder()
+    name = None if folder is None else _digest(path, settings)
+    file = None if folder is None or name is None else folder / f"{name}.ply"
+    if file is not None and file.is_file():
+        with suppress(InputError, OSError):
+            cloud = read_cloud(file)
+            os.utime(file)
+            return cloud
+    begun = time.monotonic()
+    cloud = decode()
+    if folder is not None and file is not None and time.monotonic() - begun > SLOW_S:
+        with suppress(OSError, InputError):
+            folder.mkdir(parents=True, exist_ok=True)
+            write_cloud(cloud, file)
+            _remove_oldest(folder)
+    return cloud
+
+
+def _folder() -> Path | None:
+    given = os.environ.get("MITSIM_CACHE")
+    if given is not None:
+        return Path(given) / "clouds" if given else None
+    with suppress(RuntimeError):  # no home
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mitsim" / "clouds"
+    return None
+
+
+def _digest(path: Path, settings: Iterable[object]) -> str | None:
+    """Return the SHA-256 of everything that determines a cloud; None if the files are too many, too large or gone."""
+    sha = hashlib.sha256(_source_digest().encode())
+    for one in settings:
+        sha.update(repr(one).encode())
+    files = [path] if path.is_file() else sorted(one for one in path.rglob("*") if one.is_file())
+    try:
+        if len(files) > MOST_FILES or sum(file.stat().st_size for file in files) > _LARGEST:
+            return None
+        for file in files:
+            sha.update(file.name.encode())
+            with file.open("rb") as stream:
+                sha.update(hashlib.file_digest(stream, "sha256").digest())
+    except OSError:
+        return None
+    return sha.hexdigest()
+
+
+@cache
+def _source_digest() -> str:
+    """Return the SHA-256 of the source of mitsim that turns images into clouds."""
+    root = Path(mitsim.__file__).parent
+    sha = hashlib.sha256()
+    for room in ("capture", "decoding", "sensor"):
+        for file in sorted((root / room).rglob("*.py")):
+            sha.update(file.read_bytes())
+    return sha.hexdigest()
+
+
+def _remove_oldest(folder: Path) -> None:
+    files = sorted(folder.glob("*.ply"), key=lambda file: file.stat().st_mtime)
+    for file in files[:-MOST_CLOUDS]:
+        file.unlink(missing_ok=True)

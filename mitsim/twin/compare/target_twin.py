@@ -1,0 +1,163 @@
+"""Simulate a preset before the planes and spheres of a recorded cloud, to state the same figures of both.
+
+Signal chain: target in the recorded cloud -> its plane or sphere -> the same target, matt white, before the simulated
+sensor -> capture, decoded -> window of the simulated grid that shows the recorded window.
+
+Only points of the recorded device are needed: neither its images nor its calibration enter the simulation. Both grids
+see the target from the origin of the sensor frame. So a figure for each pixel (F, sigma) is one of the pixels of the
+grid of each, which may differ in size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.features.fits import fit_plane, fit_sphere
+from characterisation.features.robust_fit import FitError
+from characterisation.features.surfaces import Plane, Sphere, tangents
+from characterisation.files.errors import InputError
+from characterisation.point_cloud import PointCloud, ViewGrid
+from characterisation.region_of_interest import Roi
+from characterisation.tasks.windows import LEAST_POINTS, window_points
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.capture.simulated.simulate import SimulatedSensor
+from mitsim.decoding.cloud import capture_cloud, decoder_settings
+from mitsim.scene.load import Scene
+from mitsim.scene.test_targets import ball, plate
+from mitsim.sensor.preset import Sensor
+from mitsim.sensor.transforms import Transform
+
+Floats = NDArray[np.float64]
+
+#: rays per pixel
+SAMPLES = 16
+
+#: side of the sheet over its distance: it fills a field of view of 127 deg
+_SHEET = 4.0
+
+#: cosine of the tilt below which a sheet is centred at its recorded points, not on the optical axis
+_ASKEW = 0.2
+
+#: pixels of the simulated window that are given up at each edge of a plane's window
+_EDGE_PX = 2
+
+#: side of the recorded window that is projected, in steps
+_STEPS = 24
+
+
+@dataclass(frozen=True)
+class Target:
+    """A target in the sensor frame [mm]: its ``surface``, and the ``window`` [px] of the recorded grid; None is all."""
+
+    surface: Plane | Sphere
+    window: Roi | None
+
+
+def seen_target(shape: str, window: Roi | None, cloud: PointCloud, name: str, distance: float | None = None) -> Target:
+    """Return a target as a recorded cloud shows it.
+
+    Parameters
+    ----------
+    shape
+        ``plane`` or ``sphere``.
+    window
+        Of the recorded grid [px]; None is all.
+    cloud
+        Recorded cloud.
+    name
+        Name of the target in messages.
+    distance
+        True distance of a plane that is perpendicular to the axis of the grid [mm], in place of the recorded plane.
+
+    Raises
+    ------
+    FitError
+        If the points are too few or do not lie on the shape.
+    InputError
+        If the window does not lie in the grid.
+    """
+    points, grid = window_points(window, cloud, name), cloud.grid
+    if distance is not None:
+        axis = grid.rotation[:, 2]
+        return Target(Plane(grid.origin + distance * axis, -axis), window)
+    if len(points) < LEAST_POINTS:
+        raise FitError(f"{len(points)} points in the window, at least {LEAST_POINTS} are needed")
+    fit = fit_plane(points, grid.origin) if shape == "plane" else fit_sphere(points, grid.origin)
+    surface = Plane(fit.point, fit.normal) if isinstance(fit, Plane) else Sphere(fit.centre, fit.radius)
+    return Target(surface, window)
+
+
+def simulated_target(
+    target: Target, recorded: PointCloud, sensor: Sensor, name: str, seed: int = 1
+) -> tuple[PointCloud, Roi]:
+    """Return the cloud of a simulated sensor before a target, and the window of its grid that shows the recorded one.
+
+    Parameters
+    ----------
+    target
+        The target.
+    recorded
+        Cloud in whose grid its window lies.
+    sensor
+        Sensor to simulate.
+    name
+        Name of the target in messages.
+    seed
+        Of the noise.
+
+    Raises
+    ------
+    InputError
+        If the sensor does not see the target.
+    """
+    scene, pose = _scene(target.surface, sensor)
+    capture = SimulatedSensor(sensor).capture(scene, pose, rendering=Rendering(samples=SAMPLES), seed=seed)
+    settings, imager = decoder_settings(capture, sensor)
+    cloud = capture_cloud(capture, settings, imager=imager)
+    window = _same_window(target, recorded.grid, cloud.grid)
+    if window is None:
+        found = f"{name} outside the field of view of {sensor.name}"
+        raise InputError("--simulated", "", found, "a window that both sensors see")
+    return cloud, window
+
+
+def _scene(surface: Plane | Sphere, sensor: Sensor) -> tuple[Scene, Transform]:
+    """Return the scene of a target, and the pose of the sensor in it."""
+    if isinstance(surface, Sphere):
+        scene = ball(float(surface.radius), "matt white", sensor.wavelength_nm)
+        return scene, Transform(np.eye(3), -np.asarray(surface.centre, float))
+    turn = np.vstack([tangents(surface.normal), surface.normal])  # from the sensor frame to that of the sheet
+    axis, reach = np.array([0.0, 0.0, 1.0]), float(surface.point @ surface.normal)
+    cosine = float(axis @ surface.normal)
+    middle = axis * reach / cosine if abs(cosine) > _ASKEW else surface.point
+    size = _SHEET * float(np.linalg.norm(middle))
+    return plate(size, "matt white", sensor.wavelength_nm), Transform(turn, -turn @ middle)
+
+
+def _same_window(target: Target, recorded: ViewGrid, simulated: ViewGrid) -> Roi | None:
+    """Return the window of the simulated grid around what the recorded window shows of the target; None outside."""
+    if isinstance(target.surface, Sphere):
+        reach = 1.05 * float(target.surface.radius)
+        seen = target.surface.centre + reach * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float)
+        edge = 0
+    else:
+        window = target.window or Roi.whole(recorded.width, recorded.height)
+        columns, rows = np.meshgrid(
+            np.linspace(window.left, window.right - 1, _STEPS).round().astype(int),
+            np.linspace(window.top, window.bottom - 1, _STEPS).round().astype(int),
+        )
+        rays = recorded.rays_at(columns.ravel(), rows.ravel())
+        reach_of = ((target.surface.point - recorded.origin) @ target.surface.normal) / (rays @ target.surface.normal)
+        seen = recorded.origin + rays * reach_of[:, None]
+        edge = _EDGE_PX
+    pixels = simulated.project(seen)
+    pixels = pixels[np.isfinite(pixels).all(axis=1)]
+    if not len(pixels):
+        return None
+    size = np.array([simulated.width, simulated.height])
+    low = np.clip(np.ceil(pixels.min(axis=0)) + edge, 0, size).astype(int)
+    high = np.clip(np.floor(pixels.max(axis=0)) + 1 - edge, 0, size).astype(int)
+    return None if (high - low < 3).any() else Roi.between(*low, *high)

@@ -1,0 +1,73 @@
+"""The verdict of a fit, and what its file keeps of the file that it started from."""
+
+import re
+
+import pytest
+from scipy.stats import chi2
+
+from mitsim.sensor.preset import load_sensor, presets
+from mitsim.twin.sensor.run import sensor_path
+from mitsim.twin.sensor.verdict import Agreement, verdict_of
+from mitsim.twin.sensor.write import Entry, with_cameras, with_entries, with_exposure
+
+ENTRIES = {
+    "projector.flux_w": "0.5",
+    "imager.smoothing_px": "0.4",
+    "imager.read_noise_e": "12",
+    "room.gradient": "[0.5, -0.2]",
+    "name": '"mine"',
+}
+
+
+@pytest.mark.parametrize(
+    ("chi_square", "freedom", "word"),
+    [
+        (14.0, 14, "good"),
+        (chi2.isf(0.011, 14), 14, "good"),
+        (chi2.isf(0.009, 14), 14, "fair"),
+        (43.0, 14, "bad"),
+        (83.7, 14, "bad"),
+    ],
+)
+def test_the_verdict_follows_from_chance_and_ratio(chi_square, freedom, word):
+    assert verdict_of((Agreement("sheet", chi_square, freedom),)).word == word
+
+
+def test_the_worst_capture_decides_and_is_named():
+    found = verdict_of((Agreement("a", 10, 14), Agreement("b", 83.7, 14), Agreement("c", 40, 14)))
+    assert found.word == "bad"
+    assert "chi-square 83.7 of 14 for b" in found.why
+    assert verdict_of(()).word == "not tested"
+
+
+def comments(text):
+    """Words of all comments, in order of the file; a # in quotes begins none."""
+    return [found[1].strip() for line in text.splitlines() if (found := re.search(r"#\s*(.*)$", line))]
+
+
+@pytest.mark.parametrize("name", [name for name in presets() if name != "kinect-v2"])
+def test_every_comment_of_the_file_is_whole(name):
+    """Those of the cameras' own numbers go with the numbers."""
+    text = sensor_path(name).read_text(encoding="utf-8")
+    tables = re.split(r"(?m)^(?=\[)", text)
+    own = [line for table in tables if table.startswith("[cameras.") for line in table.splitlines() if line[:1] != "#"]
+    fitted = with_cameras(text, dict(load_sensor(name).rig.cameras), "test")
+    fitted = with_exposure(fitted, 1e-3, "as recorded")
+    fitted = with_entries(fitted, {key: Entry(value, "fitted") for key, value in ENTRIES.items()})
+    replaced = set(comments("\n".join(own)))
+    for comment in comments(text):
+        assert comment in replaced or comment in fitted
+
+
+def test_an_array_over_several_lines_is_replaced_whole():
+    text = '[room]\n# the light\ngradient = [\n  1.0,  # east\n  2.0,\n]\nnote = "a # in quotes"  # a remark\n'
+    made = with_entries(text, {"room.gradient": Entry("[3, 4]", "fitted"), "room.note": Entry('"b"', "")})
+    assert made.count("gradient = [3, 4]") == 1
+    for kept in ("# the light", "east", "before: gradient = ["):
+        assert kept in made
+    assert 'note = "b"  # before: "a # in quotes"; a remark' in made
+
+
+def test_the_title_of_a_file_stays_above_its_first_key():
+    made = with_entries('# A camera.\n\ntechnology = "x"\n', {"name": Entry('"mine"', "fitted")})
+    assert made.splitlines()[:4] == ["# A camera.", "", "# fitted", 'name = "mine"']
