@@ -48,7 +48,7 @@ Floats = NDArray[np.float64]
 #: share of the points excluded at either end of the depths (rs-depth-quality, depthai-experiments)
 TRIMMED_SHARE = 0.005
 
-#: distance of a least-squares plane over that of its points, below which false matches have turned it on edge
+#: distance of a least-squares plane over that of its points, below which false matches have turned it on edge; assumed
 ON_EDGE = 0.1
 
 #: percentile of |distance from the plane| used as planarity trueness; *assumed*

@@ -115,8 +115,8 @@ def plane_start(points: Array) -> Plane:
 #: points and triples of them that are tried: a triple without an outlier has a probability of 0.3 for a third of them
 _SOME, _TRIPLES = 1000, 60
 
-#: largest thickness over width of points that are flat
+#: largest thickness over width of points that are flat; assumed
 _FLAT = 0.1
 
-#: ratio of the medians from which the plane of three points replaces that of least squares
+#: ratio of the medians from which the plane of three points replaces that of least squares; assumed
 _MUCH = 4.0

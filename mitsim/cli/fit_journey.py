@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
+from mitsim.running.numbers import time_in_words
 from mitsim.running.progress import say
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def map_and_run(journey: Journey, sensor: Path) -> None:
     begun = time.monotonic()
     made = journey.folder / "map"
     write_map_figures(_map(journey.campaign, sensor, made), made)
-    say(f"map: {made / 'map.nc'}, after {_minutes(time.monotonic() - begun)}")
+    say(f"map: {made / 'map.nc'}, after {time_in_words(time.monotonic() - begun)}")
     limit = "no limit: see --minutes" if journey.minutes is None else f"at most {journey.minutes:g} min"
     say(f"step 3 of 3: run {journey.study}; views are compared for {limit}, and the best are then stated")
     run = journey.folder / "run"
@@ -96,7 +97,7 @@ def map_and_run(journey: Journey, sensor: Path) -> None:
     report_lays(chosen)
     run_study(chosen, run, journey.minutes, None)
     write_report(run)
-    say(f"report: {run / 'report.html'}, {_minutes(time.monotonic() - begun)} after the fit")
+    say(f"report: {run / 'report.html'}, {time_in_words(time.monotonic() - begun)} after the fit")
 
 
 def _map(campaign: Path, sensor: Path, folder: Path) -> PerformanceMap:
@@ -118,11 +119,7 @@ def _map(campaign: Path, sensor: Path, folder: Path) -> PerformanceMap:
         seconds = time.monotonic() - start
     more = ", and more where F or sigma changes fast" if plan.file.refine is not None else ""
     say(
-        f"step 2 of 3: the map, {count} captures of about {seconds:.1f} s: {_minutes(count * seconds)}{more}. "
+        f"step 2 of 3: the map, {count} captures of about {seconds:.1f} s: {time_in_words(count * seconds)}{more}. "
         "An interrupted map is continued"
     )
     return simulate_campaign(plan, folder)
-
-
-def _minutes(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"

@@ -17,7 +17,7 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.result import Result, failed
-from mitsim.decoding.measured_document import aligned, number_with_decimals
+from mitsim.decoding.measured_document import aligned, number_with_decimals, uncertainty_text
 from mitsim.running.progress import say
 
 
@@ -113,9 +113,9 @@ def beside_table(recorded: Sequence[Result], simulated: Sequence[Result], sensor
             [
                 one.name,
                 number_with_decimals(one.value, one.uncertainty),
-                _digits(one.uncertainty),
+                uncertainty_text(one.uncertainty),
                 number_with_decimals(other.value, other.uncertainty),
-                _digits(other.uncertainty),
+                uncertainty_text(other.uncertainty),
                 one.unit,
                 f"{ratio:.3g}" if math.isfinite(ratio) else "-",
             ]
@@ -123,7 +123,3 @@ def beside_table(recorded: Sequence[Result], simulated: Sequence[Result], sensor
         reason = one.reason or other.reason
         rows[-1] += [f"not possible: {reason}"] if reason else []
     return aligned(rows)
-
-
-def _digits(value: float) -> str:
-    return f"{value:.2g}" if math.isfinite(value) else "-"

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from characterisation.features.fits import fit_plane
 from characterisation.features.robust_fit import FitError
 from characterisation.point_cloud import PointCloud
+from mitsim.decoding.plate import rays_between, turn_and_scale
 
 #: least number of points of the cloud on the board
 _LEAST_POINTS = 100
@@ -66,16 +67,13 @@ def board_frame(board: Board, cloud: PointCloud, image: NDArray[np.uint8]) -> tu
         raise FitError(f"{len(points)} points of the cloud on the board, at least {_LEAST_POINTS} are needed")
     grid = cloud.grid
     plane = fit_plane(points, grid.origin)
-    rays = _rays_between(cloud, pixels)
+    rays = rays_between(grid, pixels)
     distances = ((plane.point - grid.origin) @ plane.normal) / (rays @ plane.normal)
     measured = grid.origin + rays * distances[:, None]
     row, column = np.divmod(np.arange(len(pixels)), board.columns)
     printed = np.column_stack([column, row, np.zeros(len(pixels))]) * board.pitch
     middle, centre = measured.mean(axis=0), printed.mean(axis=0)
-    u, singular, vt = np.linalg.svd((measured - middle).T @ (printed - centre))
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = u @ np.diag(sign) @ vt  # from the board to the sensor
-    scale = float((singular * sign).sum() / ((printed - centre) ** 2).sum())
+    rotation, scale = turn_and_scale(measured - middle, printed - centre)
     residual = measured - middle - (printed - centre) @ rotation.T
     rms = float(np.sqrt((residual**2).sum(axis=1).mean()))
     if rms > _LARGEST_SHARE * board.pitch:
@@ -85,16 +83,3 @@ def board_frame(board: Board, cloud: PointCloud, image: NDArray[np.uint8]) -> tu
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = rotation.T, centre - rotation.T @ middle
     return out, scale, rms
-
-
-def _rays_between(cloud: PointCloud, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit view rays (n, 3) at places (n, 2) between pixels, by bilinear interpolation of x/z and y/z."""
-    grid = cloud.grid
-    low = np.clip(np.floor(pixels).astype(int), 0, [grid.width - 2, grid.height - 2])
-    a, b = (pixels - low).T
-    mixed = np.zeros((len(pixels), 3))
-    for right, below, weight in ((0, 0, (1 - a) * (1 - b)), (1, 0, a * (1 - b)), (0, 1, (1 - a) * b), (1, 1, a * b)):
-        local = grid.rays_at(low[:, 0] + right, low[:, 1] + below) @ grid.rotation
-        mixed += weight[:, None] * local / local[:, 2:]
-    turned = mixed @ grid.rotation.T
-    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))

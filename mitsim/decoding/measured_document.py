@@ -23,7 +23,7 @@ def result_table(results: Sequence[Result]) -> str:
     rows = [head + (["bias subtracted"] if corrected else [])]
     for one in results:
         points = f"{one.points}/{one.points_given}" if one.points_given else ""
-        row = [one.name, number_with_decimals(one.value, one.uncertainty), one.unit, _uncertainty_text(one.uncertainty)]
+        row = [one.name, number_with_decimals(one.value, one.uncertainty), one.unit, uncertainty_text(one.uncertainty)]
         if nominal:
             row += [_number_text(one.nominal), number_with_decimals(one.error, one.uncertainty)]
         row += [points] + ([_number_text(one.bias)] if corrected else [])
@@ -43,9 +43,9 @@ def repeatability_table(found: Sequence[Repeatability]) -> str:
                 one.name,
                 f"{one.count}/{one.cloud_count}",
                 number_with_decimals(one.mean, one.deviation),
-                _uncertainty_text(one.deviation),
+                uncertainty_text(one.deviation),
                 one.unit,
-                _uncertainty_text(one.uncertainty),
+                uncertainty_text(one.uncertainty),
                 *([number_with_decimals(one.mean - one.nominal, one.deviation)] if nominal else []),
             ]
         )
@@ -132,7 +132,8 @@ def result_values(one: Result) -> dict[str, Any]:
     }
 
 
-def _uncertainty_text(value: float) -> str:
+def uncertainty_text(value: float) -> str:
+    """Return an uncertainty with two significant digits; a hyphen without one."""
     return f"{value:.{_DIGITS}g}" if math.isfinite(value) else "-"
 
 

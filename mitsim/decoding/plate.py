@@ -219,14 +219,20 @@ def plate_scale(dots: PlateDots, pitch: float) -> tuple[float, float, Array]:
     plate = np.column_stack([dots.indices * pitch, np.zeros(len(dots.indices))]).astype(float)
     plate -= plate.mean(axis=0)
     found = dots.centres - dots.centres.mean(axis=0)
-    u, singular, vt = np.linalg.svd(found.T @ plate)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = u @ np.diag(sign) @ vt
-    inertia = float((plate**2).sum())
-    scale = float((singular * sign).sum()) / inertia
+    rotation, scale = turn_and_scale(found, plate)
     residual = found @ rotation - scale * plate
     sigma = math.sqrt(float((residual[:, :2] ** 2).sum()) / (2 * len(plate) - 4))
-    return scale, sigma / math.sqrt(inertia), residual
+    return scale, sigma / math.sqrt(float((plate**2).sum())), residual
+
+
+def turn_and_scale(found: Array, printed: Array) -> tuple[Array, float]:
+    """Return the rotation (3, 3) from print to sensor, and the scale, that take printed points to found ones.
+
+    Both (n, 3) [mm] have their mean at 0. Least squares: Umeyama, IEEE PAMI 13(4), 1991.
+    """
+    u, singular, vt = np.linalg.svd(found.T @ printed)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    return u @ np.diag(sign) @ vt, float((singular * sign).sum()) / float((printed**2).sum())
 
 
 def _largest_group(pairs: NDArray[Any], count: int) -> NDArray[np.intp]:
@@ -259,7 +265,7 @@ def _dot_positions(cloud: PointCloud, pixels: Array, radius_px: float) -> Array:
         residual = residual[np.abs(residual) <= _GATE * max(plane.residual_std, SMALLEST_SCALE)]
         if len(residual) < _LEAST_POINTS:
             continue
-        ray = _ray(grid, position)
+        ray = rays_between(grid, position[None])[0]
         distance = (plane.point - grid.origin) @ plane.normal / (ray @ plane.normal) + float(np.median(residual))
         out.append(grid.origin + distance * ray)
     return np.array(out).reshape(-1, 3)
@@ -275,17 +281,16 @@ def _points_near(cloud: PointCloud, position: Array, radius_px: float) -> Array:
     return np.asarray(points[near], np.float64)
 
 
-def _ray(grid: ViewGrid, position: Array) -> Array:
-    """Return the unit view direction (3,) at a position (2,) between pixels, by bilinear interpolation."""
-    column, row = np.minimum(position.astype(int), [grid.width - 2, grid.height - 2])
-    a, b = position - [column, row]
-    columns, rows = np.array([column, column + 1, column, column + 1]), np.array([row, row, row + 1, row + 1])
-    rays = grid.rays_at(columns, rows)
-    local = rays @ grid.rotation
-    local /= local[:, 2:]
-    mixed = np.array([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b]) @ local
-    ray: Array = grid.rotation @ (mixed / np.linalg.norm(mixed))
-    return ray
+def rays_between(grid: ViewGrid, pixels: Array) -> Array:
+    """Return the unit view rays (n, 3) at places (n, 2) between pixels, by bilinear interpolation of x/z and y/z."""
+    low = np.clip(np.floor(pixels).astype(int), 0, [grid.width - 2, grid.height - 2])
+    a, b = (pixels - low).T
+    mixed = np.zeros((len(pixels), 3))
+    for right, below, weight in ((0, 0, (1 - a) * (1 - b)), (1, 0, a * (1 - b)), (0, 1, (1 - a) * b), (1, 1, a * b)):
+        local = grid.rays_at(low[:, 0] + right, low[:, 1] + below) @ grid.rotation
+        mixed += weight[:, None] * local / local[:, 2:]
+    turned = mixed @ grid.rotation.T
+    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
 
 
 def _grid_indices(centres: Array, pairs: NDArray[Any], pitch: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

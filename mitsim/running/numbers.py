@@ -72,6 +72,11 @@ def finish_name(finish: str, roughness: float) -> str:
     return name if math.isnan(roughness) else f"{name}, Ra {roughness:g} µm"
 
 
+def time_in_words(seconds: float) -> str:
+    """Write a time in seconds, or in minutes from 100 s on."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+
+
 def listed(parts: list[str]) -> str:
     """Join words to a list: ``a``, ``a and b``, ``a, b and c``."""
     return " and ".join(filter(None, [", ".join(parts[:-1]), parts[-1]])) if parts else ""

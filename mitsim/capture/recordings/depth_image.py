@@ -21,16 +21,11 @@ from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import read_grey
 from mitsim.capture.recordings.array_file import NPY_MAGIC, numbers_of_npy
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
+from mitsim.capture.recordings.organised_cloud import FARTHEST_MM, METRES_UNDER
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.png import LONGEST_SIDE_PX
 
 Depth = NDArray[np.float32]
-
-#: median of depths in floating point below which they are in metres, as for clouds
-METRES_UNDER = 20.0
-
-#: depths beyond this are not measurements [mm]
-FARTHEST_MM = 1e6
 
 
 def read_depth_image(
@@ -51,7 +46,8 @@ def read_depth_image(
     calibration
         A preset's name or a file, see :mod:`mitsim.capture.recordings.calibration_file`.
     scale_mm
-        Depth of one level [mm]; by default 1, or 1000 for floating point with a median under :data:`METRES_UNDER`.
+        Depth of one level [mm]; by default 1, or 1000 for floating point with a median under
+        :data:`~mitsim.capture.recordings.organised_cloud.METRES_UNDER`.
     invalid
         Level of missing depths; by default 0.
     camera

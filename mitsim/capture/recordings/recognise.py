@@ -27,7 +27,7 @@ from mitsim.capture.recordings.ensenso import ensenso_originals, image_sets, rea
 from mitsim.capture.recordings.image_folder import read_image_folder, size_of_images
 from mitsim.capture.recordings.organised_cloud import CLOUD_UNITS_MM, Axes, StoredCloud, read_organised_cloud
 from mitsim.capture.recordings.pose_file import read_pose
-from mitsim.capture.recordings.recording_files import MCAP_MAGIC, frame_of, plain_name
+from mitsim.capture.recordings.recording_files import BAG_MAGIC, MCAP_MAGIC, SQLITE_MAGIC, frame_of, plain_name
 from mitsim.capture.recordings.robi import is_robi, read_robi
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
 from mitsim.capture.recordings.zdf import HDF5_MAGIC
@@ -332,8 +332,8 @@ def kind_of(path: str | Path, options: ReadOptions | None = None) -> str:
         (NPY_MAGIC, "npy"),
         (b"ply\n", "ply"),
         (b"ply\r\n", "ply"),
-        (b"#ROSBAG V", "ros"),
-        (b"SQLite format 3", "ros"),
+        (BAG_MAGIC, "ros"),
+        (SQLITE_MAGIC, "ros"),
         (b"\x89PNG", "depth"),
         (b"II*\x00", "depth"),
         (b"MM\x00*", "depth"),

@@ -28,10 +28,13 @@ from rosbags.rosbag1.reader import decompressors
 
 from characterisation.files.errors import InputError
 from mitsim.capture.recordings.mcap_messages import Expected, mcap_messages
-from mitsim.capture.recordings.recording_files import LARGEST_RECORDING, MCAP_MAGIC, MOST_FILES
-
-#: first bytes of a ROS 1 bag and of an SQLite file
-BAG_MAGIC, SQLITE_MAGIC = b"#ROSBAG V", b"SQLite format 3\0"
+from mitsim.capture.recordings.recording_files import (
+    BAG_MAGIC,
+    LARGEST_RECORDING,
+    MCAP_MAGIC,
+    MOST_FILES,
+    SQLITE_MAGIC,
+)
 
 #: first bytes of data packed by Zstandard
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"

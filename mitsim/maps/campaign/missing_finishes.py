@@ -21,6 +21,7 @@ from characterisation.maps.samples import Samples
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.maps.campaign.finish_cache import cache_folder, expected_seconds, keep_rate, kept_finish, made_finish
 from mitsim.maps.campaign.one_finish import OneFinish, largest_incidence_deg
+from mitsim.running.numbers import time_in_words
 from mitsim.running.progress import say
 from mitsim.scene.load import Scene
 from mitsim.scene.materials import Finish
@@ -97,11 +98,12 @@ def map_with_finishes(
         seconds = sum(expected_seconds(ones[name]) for name, _ in to_make)
         names = list(dict.fromkeys(name for name, _ in to_make))
         lacking = ", ".join(_in_words(ones[name].finish) for name in names)
-        question = f"{needed.sensor.name}: its map lacks {lacking}; characterise now (about {_minutes(seconds)})?"
+        about = f"about {time_in_words(seconds)}"
+        question = f"{needed.sensor.name}: its map lacks {lacking}; characterise now ({about})?"
         if ask is None or not ask(question):
-            hint = f"add --yes to characterise it now, in about {_minutes(seconds)}; the result is kept"
+            hint = f"add --yes to characterise it now, in {about}; the result is kept"
             raise _unknown_finish_error(performance_map, needed, names[0], missing[names[0]], hint)
-        say(f"{needed.sensor.name}: characterising {lacking} in about {_minutes(seconds)}; kept in {cache_folder()}")
+        say(f"{needed.sensor.name}: characterising {lacking} in {about}; kept in {cache_folder()}")
         kept |= _characterise(ones, to_make, needed.sensor)
     found = [one for one in kept.values() if one is not None]
     joined = with_samples(performance_map, found)
@@ -143,10 +145,6 @@ def _unknown_finish_error(
 def _in_words(finish: Finish) -> str:
     light = finish.light
     return str(finish) if light is None or light.as_made else f"{finish} ({light.in_words()})"
-
-
-def _minutes(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
 def samples_of(labelled: Iterable[tuple[str, float, Light | None]], where: str) -> Samples:
