@@ -8,7 +8,8 @@ import pytest
 from characterisation.region_of_interest import Roi
 from mitsim.scene.backend import mi
 from mitsim.scene.light_transport.kept_paths import Candidates, KeptPaths, broad, light_of, mattering
-from mitsim.scene.light_transport.kept_tracing import Tracing, camera_paths, photon_paths
+from mitsim.scene.light_transport.kept_tracing import camera_paths, photon_paths
+from mitsim.scene.light_transport.kept_walks import Tracing
 from mitsim.scene.light_transport.light_paths import LightPaths
 from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
 from mitsim.scene.light_transport.projector_light import ModulatedLight, ProjectedPatterns

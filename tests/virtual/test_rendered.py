@@ -341,6 +341,68 @@ def test_unit_and_decoder_that_are_off_contribute_nothing(coarse_n10):
     assert "decoder" in budget_groups(on.unknowns, "render", study.sensor)
 
 
+def metal_study(sensor, folder=None, extra=""):
+    """The pillars in ground metal, light of two surfaces; with ``extra`` elements in a scene of ``folder``."""
+    scene = "two_pillars.xml"
+    if folder is not None:
+        text = (SCENES / scene).read_text(encoding="utf-8").replace("</scene>", f"{extra}</scene>")
+        (folder / "lit.xml").write_text(text, encoding="utf-8")
+        scene = str(folder / "lit.xml")
+    return study_of(sensor, scene=scene, measure={"light_path_depth": 2})
+
+
+def outcomes(study, *jobs):
+    """Errors of jobs by new measurements, one after the other."""
+    maker = measurements_of(study, study_unknowns(study))
+    return maker, [outcome.errors for _, outcome in maker.run(jobs)]
+
+
+def test_a_trial_does_not_depend_on_those_before_it(coarse_n10):
+    """Every trial changes the finishes of one scene in place."""
+    study = metal_study(coarse_n10)
+    first, second = study.views[:2]
+    wanted = Job(first, Trial(5))
+    _, alone = outcomes(study, wanted)
+    _, after = outcomes(study, Job(second, Trial(5)), Job(first, Trial(7)), Job(first, Trial(5, capture=1)), wanted)
+    np.testing.assert_equal(after[-1], alone[0])
+    assert after[1] != after[-1]
+
+
+def test_interreflections_of_a_trial_are_those_of_its_finish(coarse_n10):
+    """Kept paths against a rendering of the same finish at 256 paths a pixel, light of the whole region within 3 %."""
+    study = metal_study(coarse_n10)
+    maker, view = measurements_of(study, study_unknowns(study)), study.views[0]
+    shared = maker._view_light(view)
+    for day in range(3):
+        drawn = maker.unknowns.draw(Trial(day))
+        scene = maker._scene(drawn.finish)[0]
+        kept = maker._indirect(maker.simulated, scene, view.world_from_sensor, view, drawn, shared)
+        for name, images in kept.images.items():
+            rendered = maker.simulated.indirect_radiance(
+                scene, view.world_from_sensor, name, IndirectLight(256, 1.5), seed=day, depth=2, roi=kept.rois[name]
+            )
+            assert images.sum() == pytest.approx(rendered.sum(), rel=0.03)
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [
+        '<emitter type="constant"><float name="radiance" value="1e-9"/></emitter>',
+        '<shape type="sphere" id="ball"><float name="radius" value="5"/><transform name="to_world">'
+        '<translate y="40" z="5"/></transform><bsdf type="twosided"><bsdf type="matt_white"/></bsdf></shape>',
+    ],
+    ids=["a lamp", "a finish inside another BSDF"],
+)
+def test_scenes_whose_paths_cannot_be_kept_are_rendered_in_every_finish(coarse_n10, tmp_path, extra):
+    study = metal_study(coarse_n10, tmp_path, extra)
+    view = study.views[0]
+    jobs = [Job(view, Trial(day)) for day in range(2)]
+    maker, found = outcomes(study, *jobs)
+    assert not maker._view_light(view).kept
+    assert found[0] != found[1]
+    np.testing.assert_equal(outcomes(study, jobs[1])[1], found[1:])
+
+
 def test_unknowns_of_a_study_are_checked(tmp_path):
     from characterisation.files.errors import InputError
 

@@ -23,7 +23,8 @@ from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.scene.light_transport.ambient import has_emitters
 from mitsim.scene.light_transport.kept_paths import Candidates, KeptPaths, broad, mattering
-from mitsim.scene.light_transport.kept_tracing import Tracing, camera_paths, photon_paths
+from mitsim.scene.light_transport.kept_tracing import camera_paths, photon_paths
+from mitsim.scene.light_transport.kept_walks import Tracing
 from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
 from mitsim.scene.load import Scene, bsdf_of
 from mitsim.scene.ray_casting.raycast import shapes_met

@@ -38,7 +38,15 @@ class SeenSurfaces:
 
     @classmethod
     def of(cls, scene: Scene, rays: PixelRays, world_from_sensor: Transform, roi: Roi | None = None) -> SeenSurfaces:
-        """Return what the rays of a region meet, by default of the whole image."""
+        """Return what rays meet.
+
+        Parameters
+        ----------
+        scene, rays, world_from_sensor
+            The scene, the rays of the pixels, and the pose of the sensor.
+        roi
+            Region of the image, by default all of it.
+        """
         surfaces = cast(scene, rays, world_from_sensor, np.empty((0, 3)))
         directions = vectors_to_host(rays.directions).reshape(*rays.size, 3)
         some = slice(None) if roi is None else roi.slices
