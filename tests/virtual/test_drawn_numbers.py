@@ -12,8 +12,9 @@ from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_parameters import parameter_values
 from mitsim.sensor.unknowns import UnknownsTable
-from mitsim.study.virtual.drawn_numbers import drawn_numbers, finish_numbers, related, seeds, statement_trials
-from mitsim.study.virtual.world import STATEMENT_DAYS, Trial, Unknowns, finish_deviation
+from mitsim.study.virtual.drawn_finish import finish_deviation, finish_numbers
+from mitsim.study.virtual.drawn_numbers import drawn_numbers, related, seeds, statement_trials
+from mitsim.study.virtual.world import STATEMENT_DAYS, Trial, Unknowns
 
 GROUPS = ("calibration", "finish", "form", "light", "temperature", "unit", "pose", "noise")
 
@@ -70,7 +71,10 @@ def test_the_numbers_are_those_behind_the_draws(unknowns):
         assert shift == pytest.approx(table.pose.told_mm * pose[9:])
         own = finish_deviation(unknowns, world.finish, "plate")
         assert found["finish"][i, :2] == pytest.approx([own.alpha, own.wide_angle])
-        assert found["finish"].shape[1] == 4  # the reflectance is known; one finish, and squares
+        assert found["finish"][i, 2] == own.tail
+        double = 2 * np.radians(own.lay_deg)
+        assert found["finish"][i, 4:6] == pytest.approx(np.sqrt(2) * np.array([np.cos(double), np.sin(double)]))
+        assert found["finish"].shape[1] == 12  # the reflectance is known; one finish, and squares
 
 
 def test_the_errors_of_the_rig_are_linear_in_the_numbers_of_the_calibration(unknowns):

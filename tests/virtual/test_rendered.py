@@ -30,7 +30,7 @@ from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import displaced
 from mitsim.study.virtual.stated import budget_groups, statement_document
 from mitsim.study.virtual.study_unknowns import study_unknowns
-from mitsim.study.virtual.world import GROUPS, Trial
+from mitsim.study.virtual.world import Trial
 from tests.smaller_sensors import binned, coarse_sensor, middle_part
 
 SCENES = Path(__file__).parents[2] / "scenes" / "two_pillars"
@@ -320,25 +320,25 @@ def test_a_statement_from_a_few_trials(coarse_n10, tmp_path):
     assert trial_digest(other, study_unknowns(other), "render") != session.digest
 
 
-def test_unit_and_decoder_that_are_off_contribute_nothing(coarse_n10):
+@pytest.mark.parametrize("group", ["unit", "decoder"])
+def test_unit_and_decoder_change_errors_where_they_are_drawn_alone(coarse_n10, group):
     study = study_of(coarse_n10)
     view = min(study.views, key=lambda one: abs(one.elevation_deg - 45))
-    groups = ("unit", "decoder")
-    trials = [Trial(4), Trial(4), *(Trial(4, 0, group) for group in groups)]
-    off = measurements_of(study, study_unknowns(study, tuple(one for one in GROUPS if one not in groups)))
-    outcomes = [outcome.errors for _, outcome in off.run([Job(view, trial) for trial in trials])]
-    assert outcomes[0][DISTANCE] == outcomes[0][DISTANCE]
-    assert all(outcome == outcomes[0] for outcome in outcomes[1:])  # to the last bit
-    on = measurements_of(study, study_unknowns(study))
-    first, again, *swapped = [outcome.errors for _, outcome in on.run([Job(view, trial) for trial in trials])]
-    assert first == again != outcomes[0]
-    assert all(outcome[DISTANCE] != first[DISTANCE] for outcome in swapped)
-    known = study_of(coarse_n10, unknowns={"decoder": {"known": True}, "unit": {"mask": "own"}})
-    maker = measurements_of(known, study_unknowns(known, ("decoder",)))
-    errors = [outcome.errors for _, outcome in maker.run([Job(view, Trial(day)) for day in (4, 5)])]
-    assert errors[0] == errors[1]
-    assert "decoder" not in budget_groups(maker.unknowns, "render", known.sensor)
-    assert "decoder" in budget_groups(on.unknowns, "render", study.sensor)
+    jobs = [Job(view, Trial(day)) for day in (4, 5)]
+
+    def distances(study, varied):
+        maker = measurements_of(study, study_unknowns(study, varied))
+        return maker, [outcome.errors[DISTANCE] for _, outcome in maker.run(jobs)]
+
+    _, nominal = distances(study, ())
+    assert nominal[0] == nominal[1]  # to the last bit
+    on, drawn = distances(study, (group,))
+    assert len({*drawn, nominal[0]}) == 3
+    off = study_of(coarse_n10, unknowns={"decoder": {"known": True}, "unit": {"mask": "own"}})
+    maker, without = distances(off, (group,))
+    assert without[0] == without[1] or group == "unit"  # of the unit, the fixed pattern of the imagers remains
+    assert "decoder" not in budget_groups(maker.unknowns, "render", off.sensor)
+    assert group in budget_groups(on.unknowns, "render", study.sensor)
 
 
 def metal_study(sensor, folder=None, extra=""):
