@@ -161,6 +161,10 @@ class RunDocument(PartialDocument):
     raced_views: int = 0
     race_trials: int = 0
     race_decided: bool = False
+    race_margin: float = 0.1
+    finished: bool = True
+    lacks: list[str] = Field(default_factory=list)
+    losses: dict[str, float] = Field(default_factory=dict)
     leaders: dict[str, int] = Field(default_factory=dict)
     confidence: dict[str, float] = Field(default_factory=dict)
     light_path_depth: int

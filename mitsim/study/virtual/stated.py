@@ -7,7 +7,7 @@ redrawn -> :class:`characterisation.statements.statement.Statement` of every mea
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,9 +21,10 @@ from characterisation.statements.one_sided import stated_errors
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
 from mitsim.running.text_table import aligned
+from mitsim.running.time_limit import TimeLimit
 from mitsim.running.version import __version__
 from mitsim.sensor.exposure import PlannedExposure
-from mitsim.study import StatementTable
+from mitsim.study import StatementTable, Study
 from mitsim.study.exposures.planned import with_exposure
 from mitsim.study.virtual.influences import influences
 from mitsim.study.virtual.mapped import MappedMeasurements
@@ -34,6 +35,13 @@ from mitsim.views import View
 
 if TYPE_CHECKING:
     from mitsim.study.session import Session
+
+
+#: trials after which a statement asks whether it is settled, or time is over
+BATCH = 40
+
+#: largest number of trials of a statement within a time limit, if the study names none
+MOST_WITHIN_A_LIMIT = 4000
 
 
 @dataclass(frozen=True)
@@ -48,11 +56,31 @@ class StatedView:
     planned: PlannedExposure | None
 
 
-def state_view(session: Session, view: View, table: StatementTable | None = None) -> StatedView:
+def state_view(
+    session: Session,
+    view: View,
+    table: StatementTable | None = None,
+    limit: TimeLimit | None = None,
+    after_batch: Callable[[StatedView], None] | None = None,
+) -> StatedView:
     """State every measurement from one view at its exposures, and reuse trials in the folder of the session.
 
-    Draws of the race are not used: they selected the view, and are biased in its favour. ``table`` replaces the
-    study's numbers of trials.
+    Draws of the race are not used: they selected the view, and are biased in its favour. Trials end when every
+    measurement is settled (JCGM 101:2008, 7.9), when they have the number of the study, or when time is over.
+
+    Parameters
+    ----------
+    session
+        Of the study, with a folder.
+    view
+        The view.
+    table
+        Replaces the study's numbers of trials, which are then made whether or not fewer would settle the statement.
+    limit
+        Time of the statement. Within it, a study that names no number of trials may make
+        :data:`MOST_WITHIN_A_LIMIT`. Without time for it, there is no budget.
+    after_batch
+        Receives the statement, without a budget, after every :data:`BATCH` trials but the last.
     """
     study, runner, trials, planned = session.study, session.runner, session.trials, session.exposures(view)
     if planned is not None:
@@ -62,14 +90,25 @@ def state_view(session: Session, view: View, table: StatementTable | None = None
             runner.exposed_as(planned),
             TrialFolder.of(session.folder / "planned_trials", digest, study.task),
         )
+    limit = TimeLimit() if limit is None else limit
+    label = f"state view {view.number}"
+    base = list[Trial]()
+    for count in batches(table or study.file.statement, table is None, limit):
+        wanted = [Trial(STATEMENT_DAYS + k) for k in range(count)]
+        complete(trials, runner, [Job(view, trial) for trial in wanted], label, limit.over)
+        base = [trial for trial in wanted if trial in trials.known(view.number)]
+        so_far = StatedView(view, _statements(study, trials, view, base), planned)
+        if limit.over() or (table is None and count > BATCH and _settled(so_far.statements)):
+            break
+        if after_batch is not None:
+            after_batch(so_far)
     table = table or study.file.statement
-    base = [Trial(STATEMENT_DAYS + k) for k in range(table.trials)]
-    pairs = base[: min(table.pairs, table.trials)]
+    pairs = [] if limit.over() else base[: min(table.pairs, len(base))]
     groups = budget_groups(session.unknowns, session.source)
     swapped = {group: [Trial(one.day, one.capture, group) for one in pairs] for group in groups}
     repeats = [Trial(one.day, one.capture + 1) for one in pairs]
     wanted = [*base, *repeats, *(trial for some in swapped.values() for trial in some)]
-    complete(trials, runner, [Job(view, trial) for trial in wanted], f"state view {view.number}")
+    complete(trials, runner, [Job(view, trial) for trial in wanted], label)
     by_trial = trials.errors_of_parts(view.number, base)
     second = trials.stated_errors(view.number, repeats)
     again = {group: trials.stated_errors(view.number, some) for group, some in swapped.items()}
@@ -84,6 +123,31 @@ def state_view(session: Session, view: View, table: StatementTable | None = None
         stated = statement(name, asked.unit, by_trial[m], tolerance_of(study.task, name), lines, second[m])
         out.append(replace(stated, losses=losses(trials.reasons(view.number, base, name))))
     return StatedView(view, out, planned)
+
+
+def batches(table: StatementTable, by_settled: bool, limit: TimeLimit) -> list[int]:
+    """Return the numbers of trials at which a statement may end: with ``by_settled`` several, else that of the table.
+
+    A limit replaces the largest number of a table that names none.
+    """
+    most = table.trials
+    if by_settled and limit.end is not None and "trials" not in table.model_fields_set:
+        most = MOST_WITHIN_A_LIMIT
+    return [*range(BATCH, most, BATCH), most] if by_settled else [most]
+
+
+def _statements(study: Study, trials: TrialFolder, view: View, base: list[Trial]) -> list[Statement]:
+    """Return the statement of every measurement from finished trials, without budget and repeats."""
+    by_trial = trials.errors_of_parts(view.number, base)
+    return [
+        statement(name, one.unit, errors, tolerance_of(study.task, name))
+        for (name, one), errors in zip(study.task.measurements.items(), by_trial, strict=True)
+    ]
+
+
+def _settled(stated: Sequence[Statement]) -> bool:
+    """Return whether all statements are settled but those without values."""
+    return all(one.settled or not math.isfinite(one.standard_uncertainty) for one in stated)
 
 
 def budget_groups(unknowns: Unknowns, source: str) -> list[str]:
