@@ -74,16 +74,21 @@ class Standing:
     """Current estimate of the views of a race for one measurement.
 
     ``risk`` (v,) is the posterior median, in the measurement's unit; ``leader`` the view of least expected loss.
-    ``loss`` is that loss: the expected ratio of the leader's risk to the least of all, less 1. ``confidence`` is the
-    probability that this ratio is at most ``1 + margin``. ``gain`` (v,) is the expected logarithm by which a view is
-    better than the leader, 0 where it is worse.
+    ``loss`` is that loss: the expected ratio of the leader's risk to the least of all, less 1. ``near`` (v,) is the
+    probability that this ratio of a view is at most ``1 + margin``, ``confidence`` that of the leader. ``gain`` (v,) is
+    the expected logarithm by which a view is better than the leader, 0 where it is worse.
     """
 
     risk: Floats
     leader: int
     loss: float
-    confidence: float
+    near: Floats
     gain: Floats
+
+    @property
+    def confidence(self) -> float:
+        """Return the probability that the leader is the best, or within the margin of it."""
+        return float(self.near[self.leader])
 
 
 def judge(samples: Floats, margin: float = 0.1) -> Standing:
@@ -91,9 +96,9 @@ def judge(samples: Floats, margin: float = 0.1) -> Standing:
     ahead = samples - samples.min(axis=1, keepdims=True)
     ratio = np.exp(np.minimum(ahead, _LARGEST_LOSS)).mean(axis=0)
     leader = int(np.argmin(ratio))
-    sure = (ahead[:, leader] <= np.log1p(margin)).mean()
+    near = (ahead <= np.log1p(margin)).mean(axis=0)
     gain = np.maximum(samples[:, [leader]] - samples, 0).mean(axis=0)
-    return Standing(np.exp(np.median(samples, axis=0)), leader, float(ratio[leader] - 1), float(sure), gain)
+    return Standing(np.exp(np.median(samples, axis=0)), leader, float(ratio[leader] - 1), near, gain)
 
 
 def sampled(mean: Floats, covariance: Floats, standard: Floats | None = None) -> Floats:

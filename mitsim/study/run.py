@@ -37,7 +37,7 @@ from mitsim.running.time_limit import TimeLimit, stopped_by_user
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
 from mitsim.study.run_files import digests_of
-from mitsim.study.run_record import draw_clouds, own_files, run_record
+from mitsim.study.run_record import draw_clouds, own_files, run_record, runners_up
 from mitsim.study.scoring import score_study, write_raced
 from mitsim.study.session import Session
 from mitsim.study.time_plan import time_plan
@@ -149,7 +149,7 @@ def run_study(
     tried = [] if limit.over() else _confirm(session, chosen, search)
     chosen = tried[-1].chosen if tried else chosen
     clock.lap("confirm")
-    pictured = limit.part(1.0, plan.report / 2)
+    pictured = limit.part(1.0, plan.page(limit) if whole is not None else 0.0)
     drawn = sorted({*leaders, *(() if pictured.over() else _best(scores)), *(chosen.views if chosen else ())})
     draw_clouds(session, performance_map, drawn)
     shown = leaders[: study.file.check.views] if twin is not None else []
@@ -160,6 +160,7 @@ def run_study(
     about = run_record(study, performance_map, raced, shown, largest_residual(residuals))
     about["view_sets"] = [] if chosen is None else [_set_record(study, chosen, tried)]
     about["seconds"] = clock.steps
+    about["runners_up"] = runners_up(session, raced)
     about["lacks"] = lacking(study, raced, stated, limit)
     about["finished"] = not limit.over()
     about["files"] = digests_of(folder, own_files(study, drawn, shown, stated is not None))
@@ -219,7 +220,7 @@ class _Answers:
             draw_clouds(session, self.map, [leader])
             self.drawn.add(leader)
         about = run_record(study, self.map, raced, [], None)
-        about |= {"seconds": self.clock.steps, "finished": False}
+        about |= {"seconds": self.clock.steps, "finished": False, "runners_up": runners_up(session, raced)}
         about["lacks"] = ["the run goes on", *([] if stated is not None else ["no statement of uncertainty yet"])]
         about["files"] = digests_of(folder, own_files(study, [leader], [], stated is not None))
         write_json(folder / "run.json", about)

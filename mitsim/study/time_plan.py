@@ -6,6 +6,7 @@ of the steps, each from the time that is left when it starts.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 
 from mitsim.running.time_limit import TimeLimit
@@ -15,6 +16,9 @@ SCREENING_S, _SCREENING_SHARE = 0.2, 0.3
 
 #: share of the whole for pictures and report, with its bounds [s]
 _REPORT_SHARE, _REPORT_S = 0.15, (5.0, 40.0)
+
+#: processor time of clouds and page without pictures [s]; largest factor of a busy machine, and share of what is left
+_PAGE_S, _BUSIEST, _PAGE_SHARE = 6.0, 6.0, 0.4
 
 #: share of the rest for the race; the statement gets what the race leaves
 _RACE_SHARE = 0.45
@@ -46,11 +50,16 @@ class TimePlan:
 
     def race_limit(self, limit: TimeLimit) -> TimeLimit:
         """Return the limit of the race, which starts now."""
-        return limit.part(_RACE_SHARE, self.report)
+        return limit.part(_RACE_SHARE, self.page(limit))
 
     def statement_limit(self, limit: TimeLimit) -> TimeLimit:
         """Return the limit of the statement, which starts now."""
-        return limit.part(1.0, self.report)
+        return limit.part(1.0, max(self.page(limit), min(self.report, 0.2 * limit.left)))
+
+    def page(self, limit: TimeLimit) -> float:
+        """Return the time [s] that clouds and page will take, on a machine as busy as it has been so far."""
+        busy = min(max(limit.elapsed / max(time.process_time(), 0.1), 0.5), _BUSIEST)
+        return min(busy * _PAGE_S, _PAGE_SHARE * limit.left)
 
 
 def time_plan(seconds: float, views: int) -> TimePlan:

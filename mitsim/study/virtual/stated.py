@@ -30,7 +30,7 @@ from mitsim.study.virtual.influences import influences
 from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.race import Job, complete
 from mitsim.study.virtual.trials import TrialFolder
-from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, STATEMENT_DAYS, Trial, Unknowns
+from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, SET_DAYS, STATEMENT_DAYS, Trial, Unknowns
 from mitsim.views import View
 
 if TYPE_CHECKING:
@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 
 #: trials after which a statement asks whether it is settled, or time is over
 BATCH = 40
+
+#: fewest trials of a statement with which views are compared
+LEAST_COMPARED = 20
 
 #: largest number of trials of a statement within a time limit, if the study names none
 MOST_WITHIN_A_LIMIT = 4000
@@ -123,6 +126,29 @@ def state_view(
         stated = statement(name, asked.unit, by_trial[m], tolerance_of(study.task, name), lines, second[m])
         out.append(replace(stated, losses=losses(trials.reasons(view.number, base, name))))
     return StatedView(view, out, planned)
+
+
+def compared(session: Session, view: int, other: int) -> float | None:
+    """Return the ratio of root mean square errors of two views: the geometric mean over the measurements, as the race.
+
+    With tolerances for all measurements, it is the ratio of the largest errors relative to the tolerance. It is None if
+    a view lacks trials of a statement, or a value.
+    """
+    figures, task = [], session.study.task
+    for number in (view, other):
+        base = [trial for trial in session.trials.known(number) if STATEMENT_DAYS <= trial.day < SET_DAYS]
+        base = sorted((one for one in base if not one.capture and not one.swapped), key=lambda one: one.day)
+        if len(base) < LEAST_COMPARED:
+            return None
+        stated = _statements(session.study, session.trials, session.study.view(number), base)
+        figures.append(np.array([one.root_mean_square for one in stated]))
+    sizes = np.array([one.tolerance_size or math.nan for one in task.measurements.values()])
+    first, second = (each / sizes if np.isfinite(sizes).all() else each for each in figures)
+    if not (np.isfinite(first) & np.isfinite(second) & (first > 0) & (second > 0)).all():
+        return None
+    if np.isfinite(sizes).all():
+        return float(first.max() / second.max())
+    return float(np.exp(np.log(first / second).mean()))
 
 
 def batches(table: StatementTable, by_settled: bool, limit: TimeLimit) -> list[int]:
