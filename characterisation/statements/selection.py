@@ -32,16 +32,15 @@ Floats = NDArray[np.float64]
 #: standard uncertainty of the logarithm of the map's u, common to all views
 PRIOR_COMMON = 1.0
 
-#: standard uncertainty of the logarithm of the map's u, of each view: root mean square over 19 measurements of the raced
-#: open cases of scenes/parts, 95 % interval 0.7 to 1.5; of structured light 0.74, active stereo 0.80, time of flight
-#: 1.6, of one or two cases each, too few to tell them apart.
-#: Command: python tests/benchmarks/race_probabilities.py --prior
+#: standard uncertainty of the logarithm of the map's u, of each view: root mean square over the measurements of five
+#: raced open cases of scenes/parts. Structured light 0.74, active stereo 0.80 and time of flight 1.6 are of one or two
+#: cases each, too few to tell them apart. Command: python tests/benchmarks/race_probabilities.py prior
 PRIOR_OWN = 1.1
 
-#: median of k - 1 of the errors of a view, and standard deviations of its logarithm between measurements and between the
-#: views of one: of 97 series of at least 100 trials, one for each measurement of a stated view of the open parts of
+#: median of k - 1 of the errors of a view, and standard deviations of its logarithm between measurements and between
+#: the views of one: of 97 series of at least 100 trials, one for each measurement of a stated view of the open parts of
 #: scenes/parts/measured. Halves of the parts give 3.9, 1.2, 0.8 and 2.5, 1.2, 0.9.
-#: Command: python tests/benchmarks/race_probabilities.py --kurtosis
+#: Command: python tests/benchmarks/race_probabilities.py kurtosis
 EXCESS, EXCESS_OF_MEASUREMENTS, EXCESS_OF_VIEWS = 3.2, 1.2, 0.9
 
 #: number of degrees of freedom of the trials at which the variance of the logarithm of their k - 1 is 1
@@ -134,10 +133,7 @@ def joint_samples(
     independent = deviates(*every.shape[:2])
     standard = np.tensordot(np.linalg.cholesky(_between_measurements(every)), independent, 1)
     return np.stack(
-        [
-            sampled(*posterior(every[m], risk[m], chance[m], prior_own), standard=standard[m])
-            for m in range(len(every))
-        ]
+        [sampled(*posterior(every[m], risk[m], chance[m], prior_own), standard=standard[m]) for m in range(len(every))]
     )
 
 

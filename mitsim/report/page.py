@@ -32,7 +32,7 @@ from mitsim.report.statement_section import statement_section
 from mitsim.report.templates import write_page
 from mitsim.report.view_sphere import view_sphere
 from mitsim.running.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
-from mitsim.study.run_folder import read_run, Run, RunnerUp
+from mitsim.study.run_folder import Run, RunnerUp, read_run
 from mitsim.study.scene_geometry import read_scene_geometry
 
 #: rows of the ranked table; scores.csv holds all views

@@ -169,12 +169,24 @@ def run_study(
 
 
 def lacking(study: Study, raced: Raced, stated: StatedView | None, limit: TimeLimit) -> list[str]:
-    """Return what a run that ended for lack of time has not done, each in a few words."""
-    out = []
+    """Return what a run with a limit has not done, each in a few words; nothing for a run that ended by its own rules.
+
+    Parameters
+    ----------
+    study
+        Study of the run.
+    raced, stated
+        Results of race and statement.
+    limit
+        Time of the run.
+    """
+    out = list[str]()
     if not limit.over() and limit.end is None:
         return out
     if len(raced.views) and not raced.decided:
-        out.append(f"views compared by {raced.trials} trials: the best is {in_words(raced.standings[ALL], raced.margin)}")
+        out.append(
+            f"views compared by {raced.trials} trials: the best is {in_words(raced.standings[ALL], raced.margin)}"
+        )
     if len(raced.views) and stated is None:
         out.append("no statement of uncertainty")
     elif stated is not None:

@@ -25,7 +25,6 @@ from mitsim.study.session import Session
 from mitsim.study.virtual.race import ALL, Raced
 from mitsim.study.virtual.stated import compared
 
-
 #: number of runners-up in the record of a run
 RUNNERS_UP = 5
 

@@ -145,7 +145,19 @@ class Session:
         limit: TimeLimit | None = None,
         after_round: Callable[[Raced], None] = lambda _: None,
     ) -> Raced:
-        """Race the views with scores, by default by the rules of the study and until they end it."""
+        """Race the views.
+
+        Parameters
+        ----------
+        scores
+            Of all views.
+        rules
+            By default those of the study.
+        limit
+            Time of the race; by default its rules alone end it.
+        after_round
+            Receives the state after every round but the last.
+        """
         rules = race_rules(self.study.file.race) if rules is None else rules
         limit = TimeLimit() if limit is None else limit
         return run_race(self.study.views, scores, self.runner, self.trials, rules, limit.over, after_round)
@@ -168,7 +180,15 @@ class Session:
         limit: TimeLimit | None = None,
         after_batch: Callable[[StatedView], None] | None = None,
     ) -> StatedView:
-        """State every measurement from one view at its exposures: :func:`mitsim.study.virtual.stated.state_view`."""
+        """State every measurement from one view at its exposures.
+
+        Parameters
+        ----------
+        view
+            The view.
+        table, limit, after_batch
+            As of :func:`mitsim.study.virtual.stated.state_view`.
+        """
         return state_view(self, view, table, limit, after_batch)
 
     def release(self) -> None:
