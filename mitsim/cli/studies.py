@@ -173,6 +173,14 @@ def state(
     study: StudyFile,
     output: Out,
     view: ViewNumber,
+    minutes: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1,
+            help="Time for the whole command [min]; default: until every measurement is settled, or the largest number "
+            "of trials of the study is made.",
+        ),
+    ] = None,
     plan: PlanExposures = False,
     scheduler: Scheduler = None,
     processes: Processes = 1,
@@ -181,10 +189,13 @@ def state(
 ) -> None:
     """State the uncertainty of every measurement from one view of a study, with a budget of its sources.
 
-    Exit code 1 if a measurement with a tolerance does not fit it.
+    The first Ctrl-C ends it with the statement so far, and the same command goes on from there. Exit code 1 if a measurement with a tolerance does not fit it.
 
     Example: mitsim study state scenes/two_pillars/study.toml --view 12 -o runs/view_12
     """
+    from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
+
+    limit = TimeLimit(None if minutes is None else 60 * minutes)
     start(variant)
     from characterisation.files.atomic_io import write_json
     from mitsim.study import open_study, with_plan
@@ -196,8 +207,12 @@ def state(
     seen_from = chosen.view(view, "--view")
     session = Session(chosen, output, requested_workers(scheduler, processes))
     session.claim(f"budget of view {view}")
-    stated = session.state(seen_from)
+    with ending_in_order():
+        stated = session.state(seen_from, None, limit)
+        stopped = stopped_by_user()
     write_json(output / "statement.json", statement_document(session, stated))
+    if stopped:
+        raise KeyboardInterrupt  # exit code 130
     _tell_statement(stated.statements, output)
 
 

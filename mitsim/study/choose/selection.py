@@ -328,7 +328,7 @@ def _state(one: SensorResult, view: int, count: int, limit: TimeLimit) -> None:
     """State a view from ``count`` trials, or those within the limit, without a budget."""
     table = StatementTable(trials=count, pairs=0)
     stated = one.session.state(one.session.study.view(view), table, limit)
-    if stated.statements and stated.statements[0].trials >= _FEWEST:
+    if stated.statements and stated.statements[0].trials >= min(_FEWEST, count):
         one.stated[view] = stated
 
 
