@@ -11,7 +11,7 @@ from characterisation.files.errors import InputError
 from mitsim.cli.options import keep_finished
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study import RaceTable, StatementTable, StudyFile, open_study, session
-from mitsim.study.run import run_study
+from mitsim.study.run import run_study, run_within
 from mitsim.study.run_folder import read_run
 from mitsim.study.session import Session
 from mitsim.study.virtual.stated import BATCH, batches, statement_document
@@ -85,7 +85,7 @@ def test_a_settled_statement_needs_no_more_trials():
 def test_a_run_within_a_limit_says_what_it_lacks_and_goes_on_without_one(study, tmp_path):
     """A run that is out of time at its start writes a whole folder, which the same command completes."""
     out_of_time = TimeLimit(1.0, time.monotonic() - 2.0)
-    run_study(study, tmp_path, limit=out_of_time)
+    run_within(study, tmp_path, out_of_time)
     about = read_run(tmp_path).about
     assert not about.finished and about.raced_views and any("statement" in one for one in about.lacks)
     rules = {"race": RaceTable(shortlist=1, trials=4), "statement": StatementTable(trials=2, pairs=0)}

@@ -73,7 +73,7 @@ def run(
     from mitsim.report.page import write_report
     from mitsim.running.progress import say
     from mitsim.study import open_study, report_lays, with_plan
-    from mitsim.study.run import run_study
+    from mitsim.study.run import run_within
     from mitsim.study.run_folder import read_run
 
     check_folder(output)
@@ -82,7 +82,7 @@ def run(
     report_lays(chosen)
     workers = requested_workers(scheduler, processes)
     with ending_in_order():
-        stated = run_study(chosen, output, None, workers, limit, lambda: write_report(output))
+        stated = run_within(chosen, output, limit, workers, lambda: write_report(output))
         stopped = stopped_by_user()
     write_report(output)
     about = read_run(output).about
@@ -189,7 +189,8 @@ def state(
 ) -> None:
     """State the uncertainty of every measurement from one view of a study, with a budget of its sources.
 
-    The first Ctrl-C ends it with the statement so far, and the same command goes on from there. Exit code 1 if a measurement with a tolerance does not fit it.
+    The first Ctrl-C ends it with the statement so far, and the same command goes on from there. Exit code 1 if a
+    measurement with a tolerance does not fit it.
 
     Example: mitsim study state scenes/two_pillars/study.toml --view 12 -o runs/view_12
     """

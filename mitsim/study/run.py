@@ -79,8 +79,6 @@ def run_study(
     folder: str | Path,
     minutes: float | None = None,
     workers: Executor | None = None,
-    limit: TimeLimit | None = None,
-    report: Callable[[], object] | None = None,
 ) -> list[Statement]:
     """Run a study into a folder, and reuse results that an earlier run of the same study finished there.
 
@@ -94,10 +92,6 @@ def run_study(
         Time limit of the whole run [min]; by default the race and the statement end by their own rules.
     workers
         Processes or cluster that make the trials of the race and of the statement; by default this process makes them.
-    limit
-        Time limit that began before this call; it replaces ``minutes``.
-    report
-        Writes the report of the folder. Called for the first answer after :data:`FIRST_ANSWER_S`, and as it improves.
 
     Returns
     -------
@@ -112,8 +106,27 @@ def run_study(
     >>> stated[0].measurement, stated[0].standard_uncertainty  # doctest: +SKIP
     ('point1_point2_distance', 1.9)
     """
-    if limit is None:
-        limit = TimeLimit(None if minutes is None else 60 * minutes)
+    return run_within(study, folder, TimeLimit(None if minutes is None else 60 * minutes), workers)
+
+
+def run_within(
+    study: Study,
+    folder: str | Path,
+    limit: TimeLimit,
+    workers: Executor | None = None,
+    report: Callable[[], object] | None = None,
+) -> list[Statement]:
+    """Run a study as :func:`run_study` within a time limit that may have begun before, and report early.
+
+    Parameters
+    ----------
+    study, folder, workers
+        As of :func:`run_study`.
+    limit
+        Time of the whole command.
+    report
+        Writes the report of the folder. Called for the first answer after :data:`FIRST_ANSWER_S`, and as it improves.
+    """
     whole = None if limit.end is None else limit.end - limit.began
     plan = time_plan(whole or 0.0, len(study.views))
     if whole is not None:
