@@ -252,7 +252,8 @@ def check_file(file: Path) -> None:
 def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
     """Check that a folder holds no finished run; ``last`` is the file that a run writes at its end.
 
-    With ``overwrite``, remove that file: an interrupted run must not look finished.
+    With ``overwrite``, remove that file: an interrupted run must not look finished. A run that ended for lack of time
+    says so in the file, and goes on.
 
     Raises
     ------
@@ -261,10 +262,20 @@ def keep_finished(folder: Path, overwrite: bool, last: str) -> None:
     """
     if not (folder / last).exists():
         return
-    if not overwrite:
+    if not overwrite and _is_finished(folder / last):
         hint = "to repeat the run, add --overwrite (it reuses finished trials); to rewrite its page, use mitsim report"
         raise InputError("--output", "", f"{folder}, a finished run", "a folder without one", hint)
     (folder / last).unlink()
+
+
+def _is_finished(path: Path) -> bool:
+    """Return whether the file of a run says that it is finished; a damaged or old one does."""
+    from characterisation.files.checked_files import read_json_object
+
+    try:
+        return read_json_object(path).get("finished", True) is not False
+    except InputError:
+        return True
 
 
 def check_folder(folder: Path, locked: bool = True) -> None:

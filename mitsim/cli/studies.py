@@ -47,8 +47,8 @@ def run(
         float | None,
         typer.Option(
             min=0.1,
-            help="Time limit for comparing views by virtual measurements [min]; default: that of the study's [race], "
-            "otherwise none.",
+            help="Time for the whole command [min], shared among screening, comparing views, statement and report; "
+            "default: until the statement is settled, or has the largest number of trials of the study.",
         ),
     ] = None,
     plan: PlanExposures = False,
@@ -66,21 +66,32 @@ def run(
 
     Example: mitsim run scenes/two_pillars/study.toml -o runs/two_pillars
     """
+    from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
+
+    limit = TimeLimit(None if minutes is None else 60 * minutes)
     start(variant)
     from mitsim.report.page import write_report
     from mitsim.running.progress import say
     from mitsim.study import open_study, report_lays, with_plan
-    from mitsim.study.run import run_study
+    from mitsim.study.run import run_within
     from mitsim.study.run_folder import read_run
 
     check_folder(output)
     chosen = with_plan(open_study(study, ask=asking(yes)), plan)
     keep_finished(output, overwrite, "run.json")
     report_lays(chosen)
-    stated = run_study(chosen, output, minutes, requested_workers(scheduler, processes))
+    workers = requested_workers(scheduler, processes)
+    with ending_in_order():
+        stated = run_within(chosen, output, limit, workers, lambda: write_report(output))
+        stopped = stopped_by_user()
     write_report(output)
+    about = read_run(output).about
     say(f"scores: {output / 'scores.csv'}\nreport: {output / 'report.html'}")
-    _tell_statement(stated, output, read_run(output).about.view_sets)
+    if about.lacks:
+        say(f"after {limit.elapsed:.0f} s; not done: {'; '.join(about.lacks)}. The same command goes on")
+    if stopped:
+        raise KeyboardInterrupt  # exit code 130
+    _tell_statement(stated, output, about.view_sets)
 
 
 def choose(
@@ -107,9 +118,11 @@ def choose(
 
     Example: mitsim study choose scenes/two_pillars/tolerances.toml --sensors all -o runs/choice
     """
+    from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
+
+    limit = TimeLimit(60 * minutes)
     start(variant)
     import json
-    import time
     from dataclasses import replace
 
     from characterisation.files.atomic_io import write_json
@@ -134,13 +147,15 @@ def choose(
         say(f"{one.name} is excluded: {one.reason}")
     if candidates[0].study.file.set is not None:
         say("[set] of the study is not used: sensors are compared by single views; `mitsim run` chooses the set")
-    began = time.monotonic()
+    say(f"about {minutes:g} min for {len(candidates)} sensors: screening, then rounds of those that can still win")
 
     def report_results(found: list[SensorResult], finished: bool) -> None:
-        known = document(candidates[0].study, found, excluded, time.monotonic() - began, finished)
+        known = document(candidates[0].study, found, excluded, limit.elapsed, finished and not stopped_by_user())
         write_json(output / CHOICE, known.model_dump(mode="json"))
 
-    found = choose_sensor(candidates, output, minutes, report_results, requested_workers(scheduler, processes))
+    with ending_in_order():
+        found = choose_sensor(candidates, output, limit, report_results, requested_workers(scheduler, processes))
+        stopped = stopped_by_user()
     best = found[0].candidate.study
     write_scene_geometry(output, best.scene, best.sensor)
     write_choice_page(output)
@@ -148,6 +163,8 @@ def choose(
     assert known is not None
     print(json.dumps(known.model_dump(mode="json"), indent=2) if as_json else as_text(known))
     say(f"page: {output / 'choice.html'}\n{known.words}")
+    if stopped:
+        raise KeyboardInterrupt  # exit code 130
     if not any(one.status == "stated" and fits_all(judged(one)) for one in known.sensors):
         raise typer.Exit(1)
 
@@ -156,6 +173,14 @@ def state(
     study: StudyFile,
     output: Out,
     view: ViewNumber,
+    minutes: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1,
+            help="Time for the whole command [min]; default: until every measurement is settled, or the largest number "
+            "of trials of the study is made.",
+        ),
+    ] = None,
     plan: PlanExposures = False,
     scheduler: Scheduler = None,
     processes: Processes = 1,
@@ -164,10 +189,14 @@ def state(
 ) -> None:
     """State the uncertainty of every measurement from one view of a study, with a budget of its sources.
 
-    Exit code 1 if a measurement with a tolerance does not fit it.
+    The first Ctrl-C ends it with the statement so far, and the same command goes on from there. Exit code 1 if a
+    measurement with a tolerance does not fit it.
 
     Example: mitsim study state scenes/two_pillars/study.toml --view 12 -o runs/view_12
     """
+    from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
+
+    limit = TimeLimit(None if minutes is None else 60 * minutes)
     start(variant)
     from characterisation.files.atomic_io import write_json
     from mitsim.study import open_study, with_plan
@@ -179,8 +208,12 @@ def state(
     seen_from = chosen.view(view, "--view")
     session = Session(chosen, output, requested_workers(scheduler, processes))
     session.claim(f"budget of view {view}")
-    stated = session.state(seen_from)
+    with ending_in_order():
+        stated = session.state(seen_from, None, limit)
+        stopped = stopped_by_user()
     write_json(output / "statement.json", statement_document(session, stated))
+    if stopped:
+        raise KeyboardInterrupt  # exit code 130
     _tell_statement(stated.statements, output)
 
 

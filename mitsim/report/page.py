@@ -32,7 +32,7 @@ from mitsim.report.statement_section import statement_section
 from mitsim.report.templates import write_page
 from mitsim.report.view_sphere import view_sphere
 from mitsim.running.numbers import NONE, count, listed, percent, quantity, rounded, two_digits
-from mitsim.study.run_folder import Run, read_run
+from mitsim.study.run_folder import Run, RunnerUp, read_run
 from mitsim.study.scene_geometry import read_scene_geometry
 
 #: rows of the ranked table; scores.csv holds all views
@@ -90,6 +90,9 @@ def page_content(run: Run) -> dict[str, Any]:
         "statement": None if run.statement is None else statement_section(run.statement),
         "stated_pose": None if run.statement is None else pose_texts(pose_of_view(run, run.statement.view)),
         "race_confidence": percent(about.confidence.get(ALL, 0.0)),
+        "race_margin": percent(about.race_margin),
+        "race_loss": percent(about.losses[ALL]) if ALL in about.losses else "",
+        "runners_up": [_runner_up(run, one) for one in about.runners_up],
         "answers": [_answer(run, name) for name in run.measurements],
         "tolerances": bool(np.isfinite(scores["tolerance"].values).any()),
         "coverage": percent(NORMAL_COVERAGE),
@@ -168,6 +171,13 @@ def _answer(run: Run, name: str) -> dict[str, Any]:
         "confidence": percent(run.about.confidence.get(name, 0.0)),
     }
     return row | pose_texts(pose_of_view(run, best)) | _expected(run, name, best) | measured
+
+
+def _runner_up(run: Run, one: RunnerUp) -> dict[str, Any]:
+    """Return the texts of a view that comes next for all measurements."""
+    stated = NONE if one.stated_ratio is None else rounded(one.stated_ratio, 2)
+    texts = {"ratio": rounded(one.ratio, 2), "near": percent(one.near), "trials": count(one.trials), "stated": stated}
+    return pose_texts(pose_of_view(run, one.view)) | texts
 
 
 def _expected(run: Run, name: str, view: int) -> dict[str, str]:

@@ -9,6 +9,7 @@ best view (:mod:`mitsim.study.virtual.stated`) -> predicted clouds, and images, 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +34,14 @@ from mitsim.maps.campaign.run import run_campaign
 from mitsim.maps.prediction.faces_in_sight import faces_in_sight
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say, track
+from mitsim.running.time_limit import TimeLimit, stopped_by_user
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
 from mitsim.study.run_files import digests_of
-from mitsim.study.run_record import draw_clouds, own_files, run_record
+from mitsim.study.run_record import draw_clouds, own_files, run_record, runners_up
 from mitsim.study.scoring import score_study, write_raced
 from mitsim.study.session import Session
+from mitsim.study.time_plan import time_plan
 from mitsim.study.view_sets.confirmed_set import (
     Search,
     TriedSet,
@@ -49,12 +52,15 @@ from mitsim.study.view_sets.confirmed_set import (
     tried_entries,
     write_set_csv,
 )
-from mitsim.study.virtual.plan import race_rules
+from mitsim.study.virtual.race import ALL, Raced, in_words
 from mitsim.study.virtual.rendered import RenderedMeasurements
-from mitsim.study.virtual.stated import statement_document
+from mitsim.study.virtual.stated import StatedView, statement_document
 
 #: number of best views per measurement whose predicted clouds are written to the run folder
 SHOWN = 3
+
+#: time after which a run writes its first report [s], and at least that between later ones
+FIRST_ANSWER_S = 50.0
 
 
 class _Clock:
@@ -70,7 +76,10 @@ class _Clock:
 
 
 def run_study(
-    study: Study, folder: str | Path, minutes: float | None = None, workers: Executor | None = None
+    study: Study,
+    folder: str | Path,
+    minutes: float | None = None,
+    workers: Executor | None = None,
 ) -> list[Statement]:
     """Run a study into a folder, and reuse results that an earlier run of the same study finished there.
 
@@ -81,14 +90,15 @@ def run_study(
     folder
         Where scores, poses, trials, clouds and the statement are kept.
     minutes
-        Time limit of the race [min]; it replaces the limit in the study.
+        Time limit of the whole run [min]; by default the race and the statement end by their own rules.
     workers
         Processes or cluster that make the trials of the race and of the statement; by default this process makes them.
 
     Returns
     -------
     list of Statement
-        The statement of every measurement from the best view; empty if no view allows every measurement.
+        The statement of every measurement from the best view; empty if no view allows every measurement, or time did
+        not suffice for one.
 
     Examples
     --------
@@ -97,6 +107,31 @@ def run_study(
     >>> stated[0].measurement, stated[0].standard_uncertainty  # doctest: +SKIP
     ('point1_point2_distance', 1.9)
     """
+    return run_within(study, folder, TimeLimit(None if minutes is None else 60 * minutes), workers)
+
+
+def run_within(
+    study: Study,
+    folder: str | Path,
+    limit: TimeLimit,
+    workers: Executor | None = None,
+    report: Callable[[], object] | None = None,
+) -> list[Statement]:
+    """Run a study as :func:`run_study` within a time limit that may have begun before, and report early.
+
+    Parameters
+    ----------
+    study, folder, workers
+        As of :func:`run_study`.
+    limit
+        Time of the whole command.
+    report
+        Writes the report of the folder. Called for the first answer after :data:`FIRST_ANSWER_S`, and as it improves.
+    """
+    whole = None if limit.end is None else limit.end - limit.began
+    plan = time_plan(whole or 0.0, len(study.views))
+    if whole is not None:
+        say(plan.in_words())
     session, clock = Session(study, folder, workers), _Clock()
     folder, twin = session.folder, session.renderer
     session.claim("run")
@@ -108,23 +143,33 @@ def run_study(
 
     scores, chosen, search = score_study(session, performance_map)
     clock.lap("score")
-    raced = session.race(scores, race_rules(study.file.race, minutes))
+    answers = _Answers(session, performance_map, scores, limit, clock, report)
+    minutes_of_race = study.file.race.minutes
+    race_limit = plan.race_limit(limit) if whole is not None else TimeLimit(minutes_of_race and 60 * minutes_of_race)
+    raced = session.race(scores, None, race_limit, answers.improve)
     scores = write_raced(session, scores, raced)
     clock.lap("race")
     leaders = list(dict.fromkeys(raced.leaders().values()))
-    stated = session.state(study.view(leaders[0])) if leaders else None
+    stated = None
+    if leaders:
+        statement_limit = plan.statement_limit(limit)
+        stated = session.state(
+            study.view(leaders[0]), None, statement_limit, lambda known: answers.improve(raced, known)
+        )
+        stated = stated if len(stated.statements) and stated.statements[0].trials else None
     if stated is not None:
         write_json(folder / "statement.json", statement_document(session, stated))
     clock.lap("state")
-    tried = _confirm(session, chosen, search)
+    tried = [] if limit.over() else _confirm(session, chosen, search)
     chosen = tried[-1].chosen if tried else chosen
     clock.lap("confirm")
-    drawn = sorted({*leaders, *_best(scores), *(chosen.views if chosen else ())})
+    pictured = limit.part(1.0, plan.page(limit) if whole is not None else 0.0)
+    drawn = sorted({*leaders, *(() if pictured.over() else _best(scores)), *(chosen.views if chosen else ())})
     draw_clouds(session, performance_map, drawn)
     shown = leaders[: study.file.check.views] if twin is not None else []
     if twin is not None:
-        _show(twin, shown, folder, {} if stated is None else {leaders[0]: stated.planned})
-        residuals += [_residual(twin, number) for number in shown[:1]]
+        shown = _show(twin, shown, folder, {} if stated is None else {leaders[0]: stated.planned}, pictured)
+        residuals += [_residual(twin, number) for number in shown[:1] if not pictured.over()]
     clock.lap("pictures")
     about = run_record(study, performance_map, raced, shown, largest_residual(residuals))
     reported = leaders[:1] or _best(scores)[:1]
@@ -136,9 +181,86 @@ def run_study(
     }
     about["view_sets"] = [] if chosen is None else [_set_record(study, chosen, tried)]
     about["seconds"] = clock.steps
+    about["runners_up"] = runners_up(session, raced)
+    about["lacks"] = lacking(study, raced, stated, limit)
+    about["finished"] = not limit.over()
     about["files"] = digests_of(folder, own_files(study, drawn, shown, stated is not None))
     write_json(folder / "run.json", about)
     return [] if stated is None else stated.statements
+
+
+def lacking(study: Study, raced: Raced, stated: StatedView | None, limit: TimeLimit) -> list[str]:
+    """Return what a run with a limit has not done, each in a few words; nothing for a run that ended by its own rules.
+
+    Parameters
+    ----------
+    study
+        Study of the run.
+    raced, stated
+        Results of race and statement.
+    limit
+        Time of the run.
+    """
+    out = list[str]()
+    if not limit.over() and limit.end is None:
+        return out
+    if len(raced.views) and not raced.decided:
+        out.append(
+            f"views compared by {raced.trials} trials: the best is {in_words(raced.standings[ALL], raced.margin)}"
+        )
+    if len(raced.views) and stated is None:
+        out.append("no statement of uncertainty")
+    elif stated is not None:
+        open_ones = [one.measurement for one in stated.statements if not one.settled]
+        if open_ones:
+            trials = stated.statements[0].trials
+            out.append(f"statement from {trials} trials: {len(open_ones)} of {len(stated.statements)} not settled")
+        if not any(one.budget for one in stated.statements):
+            out.append("no budget")
+    if limit.over():
+        out.append("pictures" if not stopped_by_user() else "stopped by the user")
+    return out
+
+
+class _Answers:
+    """Answers before the end of a run: its folder and report, first after a minute and then as they improve."""
+
+    def __init__(
+        self,
+        session: Session,
+        performance_map: PerformanceMap,
+        scores: xr.Dataset,
+        limit: TimeLimit,
+        clock: _Clock,
+        report: Callable[[], object] | None,
+    ) -> None:
+        self.session, self.map, self.scores = session, performance_map, scores
+        self.limit, self.clock, self.report = limit, clock, report
+        self.next_s = FIRST_ANSWER_S
+        self.drawn: set[int] = set()
+
+    def improve(self, raced: Raced, stated: StatedView | None = None) -> None:
+        """Write the answer so far, if it is time for one. Each takes at most a tenth of the time since the last."""
+        if self.report is None or self.limit.elapsed < self.next_s or self.limit.over():
+            return
+        began = time.monotonic()
+        session, study, folder = self.session, self.session.study, self.session.folder
+        write_raced(session, self.scores, raced)
+        if stated is not None:
+            write_json(folder / "statement.json", statement_document(session, stated))
+        leader = raced.leader(ALL)
+        if leader not in self.drawn:
+            draw_clouds(session, self.map, [leader])
+            self.drawn.add(leader)
+        about = run_record(study, self.map, raced, [], None)
+        about |= {"seconds": self.clock.steps, "finished": False, "runners_up": runners_up(session, raced)}
+        about["lacks"] = ["the run goes on", *([] if stated is not None else ["no statement of uncertainty yet"])]
+        about["files"] = digests_of(folder, own_files(study, [leader], [], stated is not None))
+        write_json(folder / "run.json", about)
+        self.report()
+        first = self.next_s == FIRST_ANSWER_S
+        say(f"{'first answer' if first else 'answer'} after {self.limit.elapsed:.0f} s: view {leader}, report.html")
+        self.next_s = self.limit.elapsed + max(FIRST_ANSWER_S, 10 * (time.monotonic() - began))
 
 
 def _confirm(session: Session, chosen: ViewSet | None, search: Search) -> list[TriedSet]:
@@ -192,13 +314,25 @@ def _residual(renderer: RenderedMeasurements, number: int) -> RenderResidual:
 
 
 def _show(
-    renderer: RenderedMeasurements, numbers: list[int], folder: Path, planned: dict[int, PlannedExposure | None]
-) -> None:
-    """Write image and cloud of some views, rendered with best estimates of all unknowns and planned exposures."""
+    renderer: RenderedMeasurements,
+    numbers: list[int],
+    folder: Path,
+    planned: dict[int, PlannedExposure | None],
+    limit: TimeLimit,
+) -> list[int]:
+    """Write image and cloud of some views, with best estimates of all unknowns and planned exposures, within a limit.
+
+    Returns the views that were written.
+    """
+    shown = []
     for number in track(numbers, "render pictures"):
+        if limit.over():
+            break
         capture, cloud = renderer.exposed_as(planned.get(number)).at_best_estimates(renderer.study.view(number))
         write_capture(capture, folder / "captures" / f"view_{number:04d}", overwrite=True)
         write_cloud(cloud, folder / "clouds" / f"rendered_{number:04d}.ply")
+        shown.append(number)
+    return shown
 
 
 def _set_record(study: Study, chosen: ViewSet, tried: list[TriedSet]) -> dict[str, Any]:

@@ -145,6 +145,19 @@ class ViewSetEntry(PartialDocument):
     tried: list[TriedEntry] = Field(default_factory=list)
 
 
+class RunnerUp(PartialDocument):
+    """A view that comes next for all measurements: its risk over the leader's, by the race and by statements.
+
+    ``near`` is the probability of being the best or within the margin of it.
+    """
+
+    view: int
+    ratio: float
+    near: float
+    trials: int
+    stated_ratio: float | None = None
+
+
 class RunDocument(PartialDocument):
     """``run.json``, as far as a report needs it; other keys are ignored."""
 
@@ -162,6 +175,11 @@ class RunDocument(PartialDocument):
     raced_views: int = 0
     race_trials: int = 0
     race_decided: bool = False
+    race_margin: float = 0.1
+    finished: bool = True
+    lacks: list[str] = Field(default_factory=list)
+    losses: dict[str, float] = Field(default_factory=dict)
+    runners_up: list[RunnerUp] = Field(default_factory=list)
     leaders: dict[str, int] = Field(default_factory=dict)
     confidence: dict[str, float] = Field(default_factory=dict)
     light_path_depth: int

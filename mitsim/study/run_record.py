@@ -23,7 +23,11 @@ from mitsim.scene.surface.lay import lay_left_out
 from mitsim.study import Study, finishes_of_features
 from mitsim.study.run_files import TASK
 from mitsim.study.session import Session
-from mitsim.study.virtual.race import Raced
+from mitsim.study.virtual.race import ALL, Raced
+from mitsim.study.virtual.stated import compared
+
+#: number of runners-up in the record of a run
+RUNNERS_UP = 5
 
 
 def draw_clouds(session: Session, performance_map: PerformanceMap, numbers: list[int]) -> None:
@@ -63,6 +67,32 @@ def own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) ->
     return names + [f"captures/view_{view:04d}/capture.json" for view in shown]
 
 
+def runners_up(session: Session, raced: Raced) -> list[dict[str, Any]]:
+    """Return the views that come next for all measurements together, best first, relative to the leading view.
+
+    ``ratio`` is the risk by the race over the leader's; ``near`` the probability of being the best or within the margin
+    of it; ``stated_ratio`` that of root mean square errors of statements, where trials for one exist, else None.
+    """
+    if not len(raced.views):
+        return []
+    standing, trials = raced.standings[ALL], (~np.isinf(raced.errors[0])).sum(axis=1)
+    order = [int(v) for v in np.argsort(standing.risk, kind="stable") if v != standing.leader][:RUNNERS_UP]
+    out = []
+    for v in order:
+        number = int(raced.views[v])
+        stated = compared(session, number, raced.leader(ALL))
+        out.append(
+            {
+                "view": number,
+                "ratio": float(standing.risk[v] / standing.risk[standing.leader]),
+                "near": float(standing.near[v]),
+                "trials": int(trials[v]),
+                "stated_ratio": stated,
+            }
+        )
+    return out
+
+
 def run_record(
     study: Study, performance_map: PerformanceMap, raced: Raced, shown: list[int], residual: RenderResidual | None
 ) -> dict[str, Any]:
@@ -100,8 +130,12 @@ def run_record(
         "raced_views": len(raced.views),
         "race_trials": raced.trials,
         "race_decided": raced.decided,
+        "race_margin": raced.margin,
+        "finished": True,
+        "lacks": [],
         "leaders": raced.leaders(),
         "confidence": {name: one.confidence for name, one in raced.standings.items()},
+        "losses": {name: one.loss for name, one in raced.standings.items()},
         "light_path_depth": study.file.measure.light_path_depth,
         "score_light_path_depth": study.file.score.light_path_depth,
         "render_residual": None if residual is None else asdict(residual),

@@ -7,6 +7,7 @@ used again under the same digest -> scores of all views, race, exposures and sta
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +24,7 @@ from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say
+from mitsim.running.time_limit import TimeLimit
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable, Study
 from mitsim.study.exposures.planned import planned_for
@@ -135,10 +137,29 @@ class Session:
         assert performance_map is not None
         return screen(self.study, self.predictor, performance_map, self.unknowns)
 
-    def race(self, scores: xr.Dataset, rules: RaceRules | None = None) -> Raced:
-        """Race the views with scores, by default by the rules of the study."""
+    def race(
+        self,
+        scores: xr.Dataset,
+        rules: RaceRules | None = None,
+        limit: TimeLimit | None = None,
+        after_round: Callable[[Raced], None] = lambda _: None,
+    ) -> Raced:
+        """Race the views.
+
+        Parameters
+        ----------
+        scores
+            Of all views.
+        rules
+            By default those of the study.
+        limit
+            Time of the race; by default its rules alone end it.
+        after_round
+            Receives the state after every round but the last.
+        """
         rules = race_rules(self.study.file.race) if rules is None else rules
-        return run_race(self.study.views, scores, self.runner, self.trials, rules)
+        limit = TimeLimit() if limit is None else limit
+        return run_race(self.study.views, scores, self.runner, self.trials, rules, limit.over, after_round)
 
     def exposures(self, view: View) -> PlannedExposure | None:
         """Return the exposures of a view: those of the study, or planned ones; None for the sensor's own rule.
@@ -151,9 +172,23 @@ class Session:
         """
         return planned_for(self, view)
 
-    def state(self, view: View, table: StatementTable | None = None) -> StatedView:
-        """State every measurement from one view at its exposures; ``table`` replaces the study's number of trials."""
-        return state_view(self, view, table)
+    def state(
+        self,
+        view: View,
+        table: StatementTable | None = None,
+        limit: TimeLimit | None = None,
+        after_batch: Callable[[StatedView], None] | None = None,
+    ) -> StatedView:
+        """State every measurement from one view at its exposures.
+
+        Parameters
+        ----------
+        view
+            The view.
+        table, limit, after_batch
+            As of :func:`mitsim.study.virtual.stated.state_view`.
+        """
+        return state_view(self, view, table, limit, after_batch)
 
     def release(self) -> None:
         """Free the memory of the measurements, which are prepared again when they are needed."""

@@ -61,15 +61,18 @@ class MeasureTable(Document):
 class RaceTable(Document):
     """Views that are measured virtually, and the end of the race.
 
-    The race measures the best ``shortlist`` views of each measurement according to the map, with at most ``trials`` of
-    each. A choice is decided if, with the probability ``confidence``, its view is the best or its error is within
-    ``margin`` of the best. The race ends after ``minutes``.
+    The race measures the best ``shortlist`` views for all measurements together according to the map, with at most
+    ``trials`` of each. It ends when the error of the leading view is expected to exceed the least by no more than the
+    share ``loss``, or after ``minutes``. ``margin`` is that of the stated probability: a view within it is nearly the
+    best. With ``each``, the best view of each measurement alone is asked for as well, which takes several times as many
+    trials.
     """
 
     shortlist: int = Field(default=24, ge=1, le=1000)
     trials: int = Field(default=16, ge=4, le=100_000)
     margin: Annotated[float, Field(gt=0, le=1)] = 0.1
-    confidence: Annotated[float, Field(ge=0.5, lt=1)] = 0.95
+    loss: Annotated[float, Field(gt=0, le=1)] = 0.05
+    each: bool = False
     minutes: Annotated[float, Field(gt=0, le=100_000)] | None = None
 
 

@@ -82,7 +82,7 @@ def race(risk, errors, shortlist, first, batch, budget):
     while True:
         seen = np.where(np.arange(RACED) < counts[:, None], errors[views], np.inf)
         standing = judge(sampled(*posterior(seen, risk[views], np.full(len(views), 0.98))))
-        rivals = [v for v in np.argsort(-standing.chance, kind="stable") if standing.chance[v] > 0.01]
+        rivals = [v for v in np.argsort(-standing.gain, kind="stable") if standing.gain[v] > 0.001]
         growing = [v for v in [standing.leader, *rivals[:CHALLENGERS]] if counts[v] < RACED]
         if standing.confidence >= 0.95 or counts.sum() >= budget or not growing:
             return views[standing.leader], counts.sum()

@@ -32,7 +32,7 @@ DRAWN = STUDY.replace("[measure]\n", '[measure]\nby = "map"\n')
 COMMANDS = {"run": [], "study state": ["--view", "1"], "study choose": ["--sensors", "ensenso-n10.toml"]}
 #: what each command does with the map, once it has it; and an exit code that says that it came so far
 WORK = {
-    "run": "mitsim.study.run.run_study",
+    "run": "mitsim.study.run.run_within",
     "study state": "mitsim.study.session.Session",
     "study choose": "mitsim.study.choose.choose_sensor",
 }

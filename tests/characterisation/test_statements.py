@@ -6,7 +6,16 @@ from scipy.stats import binom, norm
 
 from characterisation.statements.coverage import coverage_interval
 from characterisation.statements.decision import plus_minus
-from characterisation.statements.selection import Standing, judge, posterior, sampled
+from characterisation.statements.selection import (
+    EXCESS,
+    EXCESS_OF_VIEWS,
+    PRIOR_OWN,
+    Standing,
+    joint_samples,
+    judge,
+    posterior,
+    sampled,
+)
 from characterisation.statements.statement import numerical_tolerance, statement
 
 
@@ -99,20 +108,38 @@ def test_the_uncertainty_of_the_bias_knows_that_captures_of_a_day_are_alike():
 
 
 def test_a_leader_is_as_often_the_best_as_is_said():
-    # views of known risks, a map that is wrong by a factor, worlds in common
+    # views of known risks, a map that is wrong by a factor, worlds in common, tails of different weight
     rng = np.random.default_rng(11)
-    said, right = [], []
-    for _ in range(250):
-        risk = np.exp(rng.normal(0, 0.6, 15))
-        u = risk * np.exp(rng.normal(0.5, 0.6, 15))
-        errors = risk[:, None] * (0.6 * rng.standard_normal(10) + 0.8 * rng.standard_normal((15, 10)))
+    said, right, expected, lost = [], [], [], []
+    for _ in range(300):
+        u = np.exp(rng.normal(0, 0.6, 15))
+        risk = u * np.exp(rng.normal(0.5, PRIOR_OWN, 15))
+        excess = EXCESS * np.exp(rng.normal(0, EXCESS_OF_VIEWS, 15))
+        spread = np.sqrt(np.log(np.maximum((1 + excess) / 3, 1.0)))[:, None]  # a normal error times a log-normal size
+        size = np.exp(spread * rng.standard_normal((15, 10)) - spread**2)
+        errors = risk[:, None] * size * (0.6 * rng.standard_normal(10) + 0.8 * rng.standard_normal((15, 10)))
         found = standing(errors, u, np.ones(15))
         said.append(found.confidence)
         right.append(risk[found.leader] <= 1.1 * risk.min())
+        expected.append(found.loss)
+        lost.append(min(risk[found.leader] / risk.min() - 1, 1.0))  # a mean of losses of many times tells little
     said, right = np.array(said), np.array(right)
-    for part in (said < 0.85, said >= 0.85):
+    for part in (said < 0.6, said >= 0.6):
         error = np.sqrt(said[part].mean() * (1 - said[part].mean()) / part.sum())
         assert abs(right[part].mean() - said[part].mean()) < 3.5 * error + 0.03
+    assert np.mean(lost) == pytest.approx(np.mean(expected), rel=0.5)
+
+
+def test_measurements_of_one_trial_are_not_counted_as_independent():
+    """Two names of one measurement tell no more than one: the mean of both is as uncertain as each."""
+    rng = np.random.default_rng(15)
+    errors = np.repeat(rng.standard_normal((1, 6, 60)), 2, axis=0)
+    samples = joint_samples(errors, np.ones((2, 6)), np.ones((2, 6)))
+    alone, together = samples[0].var(axis=0).mean(), samples.mean(axis=0).var(axis=0).mean()
+    assert together > 0.9 * alone
+    errors[1] = rng.standard_normal((6, 60))
+    samples = joint_samples(errors, np.ones((2, 6)), np.ones((2, 6)))
+    assert samples.mean(axis=0).var(axis=0).mean() < 0.7 * samples[0].var(axis=0).mean()
 
 
 def test_a_view_that_measures_half_the_time_loses_to_one_that_always_does():

@@ -37,7 +37,7 @@ from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say
 from mitsim.study import Study
-from mitsim.study.virtual.race import FIRST, first_of_each, prior_risk
+from mitsim.study.virtual.race import FIRST, combined_cost, first_of_each, prior_risk
 from mitsim.views.view_scores import RAYS, screening_risk
 from tests.proofs.case_trials import days, keep_trials, measure_worlds, measured_truth, trials_by_kind
 from tests.proofs.part_cases import PartCase
@@ -154,7 +154,8 @@ def measured_cost(cost: Floats, u: Floats, chance: Floats, once: Floats, count: 
     ``cost``, ``u`` and ``chance`` (measurement, view) are known before; ``once`` (measurement, view, world) are the
     errors of the round; ``count`` is the length of the shortlist. Views off the list stay behind those on it.
     """
-    listed = np.array(sorted(first_of_each(cost, count)), int)
+    together = combined_cost(cost, np.full(len(cost), np.nan))
+    listed = np.array(sorted(first_of_each(np.vstack([cost, together]), count)), int)
     out = np.where(np.isfinite(cost), 0.0, np.inf)
     if not len(listed):
         return out

@@ -164,6 +164,14 @@ def write_run(folder: Path, checked: list[int] = CHECKED) -> Path:
         "race_trials": 8 * len(checked),
         "leaders": dict.fromkeys(["all measurements", *MEASUREMENTS], checked[1]) if checked else {},
         "confidence": dict.fromkeys(["all measurements", *MEASUREMENTS], 0.87) if checked else {},
+        "losses": {"all measurements": 0.034} if checked else {},
+        "lacks": ["no <b>budget"] if checked else [],
+        "runners_up": [
+            {"view": checked[0], "ratio": 1.04, "near": 0.31, "trials": 5, "stated_ratio": 1.13},
+            {"view": checked[2], "ratio": 1.27, "near": 0.02, "trials": 3, "stated_ratio": None},
+        ]
+        if checked
+        else [],
         "render_residual": {"noise": 0.0, "quadrature": 0.0614, "outliers": 0.013},
         "features": dict.fromkeys(FEATURES, "steel/ground Ra 0.4 um"),
         "measurements": {

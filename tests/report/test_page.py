@@ -47,6 +47,15 @@ def test_holds_every_measurement_and_says_that_it_is_simulated(text):
     assert "fixed at 1 ms" in text
 
 
+def test_names_the_next_best_views_what_is_missing_and_the_expected_loss(text):
+    section = text[text.index('<section id="runners-up">') : text.index('<section id="answer">')]
+    rows = [re.sub(r"<[^>]*>", " ", row).split() for row in re.findall(r"<tr>(.*?)</tr>", section, re.DOTALL)[1:]]
+    assert [row[0] for row in rows] == [str(CHECKED[0]), str(CHECKED[2])]
+    assert [row[1:4] for row in rows] == [["1.04", "5", "1.13"], ["1.27", "3", "\N{EN DASH}"]]
+    assert re.search(r"expected to be 3\.4\s%\slarger than the least", text)
+    assert "no &lt;b&gt;budget" in text and "no <b>budget" not in text
+
+
 def test_has_every_picture_each_with_a_text_and_a_caption(text):
     tags = Tags(text)
     # the sensor before the part; fraction, noise, patches; two for each measurement; two views of clouds
@@ -76,7 +85,7 @@ def test_names_are_text_and_never_markup(text):
 
 def test_identifiers_of_the_page_are_unique(text):
     mine = re.findall(r'<section id="([^"]+)"', text)
-    assert len(mine) == len(set(mine)) == 12
+    assert len(mine) == len(set(mine)) == 13
     linked = [a["href"][1:] for a in Tags(text).all("a")]
     assert {one.removesuffix("-in") for one in linked} == set(mine)  # -in: inside what is folded, which a link opens
     assert all(text.count(f'id="{one}"') == 1 for one in linked)

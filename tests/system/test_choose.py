@@ -11,6 +11,7 @@ import shell
 import trimesh
 from small_study import MEASUREMENTS, few_measurements
 
+from mitsim.running.time_limit import TimeLimit
 from mitsim.study.choose import choose_sensor, read_candidates
 from tests.smaller_sensors import coarse_sensor
 
@@ -158,7 +159,7 @@ def test_another_mesh_of_the_same_size_is_measured_anew(tmp_path):
 
     def radius_error(name):
         candidates, _ = read_candidates(tmp_path / "study.toml", [str(tmp_path / "ensenso-n10.toml")])
-        (result,) = choose_sensor(candidates, tmp_path / name, 1.0, lambda *_: None)
+        (result,) = choose_sensor(candidates, tmp_path / name, TimeLimit(60.0), lambda *_: None)
         return next(row[2].bias for row in result.best() if row is not None)
 
     coarse_sensor("ensenso-n10", 2, tmp_path)

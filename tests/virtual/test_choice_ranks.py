@@ -19,7 +19,7 @@ from mitsim.study.choose import read_candidates, selection
 from mitsim.study.choose.ranking import rank_key, rank_keys, relative_to_least, unpromising
 from mitsim.study.choose.selection import SensorResult
 from mitsim.study.choose.table import as_text, document
-from mitsim.study.virtual.race import first_of_each, possible_measurements
+from mitsim.study.virtual.race import combined_cost, first_of_each, possible_measurements
 from mitsim.study.virtual.stated import StatedView
 
 INF = math.inf
@@ -222,7 +222,8 @@ def test_no_sensor_fits_all_where_one_measurement_is_impossible(candidates):
 
 def test_views_are_raced_for_the_measurements_that_are_possible():
     cost = np.array([[INF, INF, INF], [3.0, 1.0, 1.4], [1.0, 3.0, 1.4]])
-    assert first_of_each(cost, 1) == {0, 1, 2}  # the last is the best for both
+    together = combined_cost(np.log(cost), np.full(3, np.nan))
+    assert first_of_each(np.vstack([cost, together]), 1) == {0, 1, 2}  # the last is the best for both
     u = np.where(np.isfinite(cost), cost, np.nan)
     errors = np.full((3, 3, 2), np.nan)
     assert possible_measurements(u, errors).tolist() == [False, True, True]

@@ -11,7 +11,7 @@ import xarray as xr
 
 from characterisation.files.documents import validate
 from characterisation.tasks.task_file import Task
-from mitsim.study.virtual.race import ALL, FIRST, Job, RaceRules, raced_errors, run_race, shortlist, with_race
+from mitsim.study.virtual.race import ALL, Job, RaceRules, raced_errors, run_race, shortlist, with_race
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
 
@@ -62,12 +62,12 @@ def scores_of(u, chance=None, tolerance=(np.nan, np.nan)):
     )
 
 
-RULES = RaceRules(shortlist=5, most=200, margin=0.1, confidence=0.95, seconds=None)
+RULES = RaceRules(shortlist=5, most=200, margin=0.1, loss=0.02, each=True)
 
 
-def race(maker, scores, folder, rules=RULES):
+def race(maker, scores, folder, rules=RULES, over=lambda: False):
     views = [View(number) for number in range(scores.sizes["view"])]
-    return run_race(views, scores, maker, TrialFolder(folder, "digest", NAMES), rules)
+    return run_race(views, scores, maker, TrialFolder(folder, "digest", NAMES), rules, over)
 
 
 SPREADS = [[3.0, 1.0, 2.0, 4.0, 2.5, 9.0], [0.2, 0.5, 0.1, 0.3, 0.4, 9.0]]
@@ -102,9 +102,30 @@ def test_a_race_that_is_stopped_goes_on_and_ends_in_the_same(tmp_path):
 
 
 def test_time_that_is_over_ends_a_race_undecided(tmp_path):
-    rules = RaceRules(shortlist=5, most=200, margin=0.1, confidence=0.95, seconds=0.0)
-    raced = race(KnownMaker(np.ones((2, 6))), scores_of(np.ones((2, 6))), tmp_path, rules)
-    assert not raced.decided and raced.trials <= 6 * FIRST
+    maker = KnownMaker(np.ones((2, 6)))
+    raced = race(maker, scores_of(np.ones((2, 6))), tmp_path, over=lambda: maker.made >= 3)
+    assert not raced.decided and raced.trials == 3
+
+
+def test_only_the_view_for_all_measurements_is_asked_for_by_default(tmp_path):
+    """Views that are the best of one measurement alone get no trials for it."""
+    spreads = [[1.0, 1.0, 3.0, 3.0, 3.0, 3.0], [1.0, 3.0, 3.0, 3.0, 3.0, 3.0]]  # two equals for the first
+    trials = {}
+    for each in (False, True):
+        rules = RaceRules(shortlist=5, most=60, margin=0.1, loss=0.05, each=each)
+        raced = race(KnownMaker(spreads), scores_of(spreads), tmp_path / str(each), rules)
+        assert raced.decided and raced.leader(ALL) == 0
+        trials[each] = raced.trials
+    assert trials[False] < 0.7 * trials[True]
+
+
+def test_between_equals_the_race_ends_by_expected_loss(tmp_path):
+    """No view of equals can be told to be the best, and no trial is worth that."""
+    rules = RaceRules(shortlist=2, most=2000, margin=0.02, loss=0.05)
+    raced = race(KnownMaker(np.ones((2, 2))), scores_of(np.ones((2, 2))), tmp_path, rules)
+    best = raced.standings[ALL]
+    assert raced.decided and best.loss <= 0.05
+    assert best.confidence < 0.9 and raced.trials < 2000
 
 
 def test_a_view_that_often_gives_no_value_falls_behind(tmp_path):

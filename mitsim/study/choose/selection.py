@@ -2,25 +2,27 @@
 
 Signal chain: sensors -> scores of all views of each sensor (kept in its folder) -> order by impossible measurements,
 then by the worst of the others (:mod:`mitsim.study.choose.ranking`) -> exclusion of sensors that can make fewer
-measurements, or whose demand is far too large -> for the others a short race -> a statement from the view that is best
-for all measurements, with as many trials as its verdicts need -> a statement from a measurement's own best view, where
-the common view does not suffice -> more trials for the leader -> its folder, as of a run
-(:mod:`mitsim.study.choose.winner`), and ``choice.json``.
+measurements, or whose demand is far too large -> rounds of those that can still win, each with more trials than the
+round before: a short race -> a statement from the view that is best for all measurements -> a statement from a
+measurement's own best view, where the common view does not suffice -> more trials for the leader -> its folder, as of a
+run (:mod:`mitsim.study.choose.winner`), and ``choice.json``.
+
+The first round gives every sensor the same share of the time. Each later one keeps the sensors whose demand may still
+be the least, and gives each a share of half of the time that is left (successive halving: Karnin et al., ICML 2013).
 
 Screening includes noise and calibration, but not finish, interreflections at edges and false points. It is therefore
 more often too small than too large, and a sensor is excluded if even the screened demand of its best view exceeds
 :data:`mitsim.study.choose.ranking.LARGEST_DEMAND`. A measurement that screening excludes for every sensor excludes none
 of them.
 
-Finished work is on the disk, so an interrupted command continues. The sensors are measured one after the other, and the
-memory of each is released before the next.
+Finished work is on the disk, so an interrupted command continues. In a round the sensors are measured one after the
+other, and the memory of each is released before the next.
 """
 
 from __future__ import annotations
 
 import gc
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,11 +35,13 @@ from characterisation.files.atomic_io import write_json
 from characterisation.files.datasets import Schema, Variable, read_dataset
 from characterisation.files.errors import InputError
 from characterisation.statements.decision import demand, tolerance_of
+from characterisation.statements.selection import EXCESS
 from characterisation.statements.statement import Statement
 from characterisation.tasks.task_file import Task
 from mitsim.maps.campaign.run import write_netcdf
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say
+from mitsim.running.time_limit import TimeLimit
 from mitsim.study import StatementTable
 from mitsim.study.choose.candidates import CandidateSensor
 from mitsim.study.choose.ranking import rank_keys, unpromising
@@ -54,11 +58,20 @@ Floats = NDArray[np.float64]
 #: number of views raced for each measurement, and of trials of each of them
 SHORTLIST, RACE_TRIALS = 3, 8
 
-#: trials at the start of a statement
-FIRST_TRIALS = 24
+#: trials of a statement in the first round, and their factor from round to round
+FIRST_TRIALS, GROWTH = 24, 2
+
+#: share of the time for the rounds after the first, and largest number of rounds
+_LATER_SHARE, _ROUNDS = 0.5, 6
+
+#: a sensor can still win if its demand divided by this many standard errors of a factor is below the least
+_STANDARD_ERRORS = 2.0
 
 #: a measurement's own best view is stated if its risk in the race is below this fraction of the common view's risk
 _WORTH_STATING = 0.8
+
+#: fewest trials that make a statement worth showing
+_FEWEST = 4
 
 #: fraction of a sensor's time that its race may take
 _RACE_SHARE = 0.4
@@ -123,7 +136,7 @@ def _demand(one: Statement) -> float:
 def choose_sensor(
     candidates: list[CandidateSensor],
     folder: Path,
-    minutes: float,
+    limit: TimeLimit,
     report_results: Callable[[list[SensorResult], bool], None],
     workers: Executor | None = None,
 ) -> list[SensorResult]:
@@ -135,34 +148,76 @@ def choose_sensor(
         Sensors, each with the study for it.
     folder
         Finished work is kept in a folder of it for each sensor.
-    minutes
-        Total time, shared among the sensors [min].
+    limit
+        Time of the whole, shared among the sensors.
     report_results
         Receives the results so far, and whether they are final, after each sensor.
     workers
         Processes or cluster that make the trials; by default this process makes them.
     """
-    end = time.monotonic() + 60 * minutes
     found = list[SensorResult]()
     for number, candidate in enumerate(candidates, 1):
         found.append(_screened(candidate, Session(candidate.study, folder / candidate.name, workers)))
-        _say(found, f"{number} of {len(candidates)} screened", end)
-    promising = _promising(found)
+        _say(found, f"{number} of {len(candidates)} screened", limit)
+    rivals, count = _promising(found), FIRST_TRIALS
     report_results(_ordered(found), False)
-    for place, one in enumerate(promising):
-        left = end - time.monotonic()
-        if left <= 0 and place:
-            say(f"choose: time is over; {len(promising) - place} sensors are judged by screening alone")
+    for turn in range(_ROUNDS):
+        work = limit.part(_LATER_SHARE if turn or len(rivals) > 1 else 1.0, _reserve(limit))
+        for place, one in enumerate(rivals):
+            if limit.over() and (place or turn):
+                unmeasured = sum(not each.stated for each in rivals)
+                if unmeasured:
+                    say(f"choose: time is over; {unmeasured} sensors are judged by screening alone")
+                break
+            _measure_sensor(one, count, work.part(1 / (len(rivals) - place)))
+            _say(found, f"round {turn + 1}: {place + 1} of {len(rivals)} sensors measured", limit)
+            report_results(_ordered(found), False)
+        rivals, count = _able_to_win(found, rivals), GROWTH * count
+        if limit.over() or len(rivals) < 2:
             break
-        _measure_sensor(one, max(left, 1.0) / (len(promising) - place))
-        _say(found, f"{place + 1} of {len(promising)} sensors measured", end)
-        report_results(_ordered(found), False)
     leader = _ordered(found)[0]
-    if leader.stated and time.monotonic() < end:
-        _refine_leader(leader, end)
+    if leader.stated and not limit.over():
+        _refine_leader(leader, limit.part(1.0, _reserve(limit)))
     _complete(_ordered(found)[0])
     report_results(_ordered(found), True)
     return _ordered(found)
+
+
+def _reserve(limit: TimeLimit) -> float:
+    """Return the time [s] that the pages and the winner's folder need; nothing without a limit."""
+    return 0.0 if limit.end is None else min(10.0, 0.1 * (limit.end - limit.began))
+
+
+def _able_to_win(found: list[SensorResult], rivals: list[SensorResult]) -> list[SensorResult]:
+    """Return the measured sensors that more trials may show to be the best, and that have not all of theirs.
+
+    A sensor that lacks more measurements than the best cannot win. Of the others, one can if its worst demand may be as
+    small as that of the best may be large: of n trials the demand has a relative standard error of about
+    sqrt((k - 1) / (4 n)), as a standard deviation has, with the usual kurtosis k of errors.
+    """
+    stated = [one for one in _ordered(found) if one.stated]
+    if not stated:
+        return []
+    keys = rank_keys([one.demands() for one in stated], stated[0].has_tolerance, [True] * len(stated))
+    first = keys[0]
+    highest = max(first[1], default=math.inf) * math.exp(_STANDARD_ERRORS * _relative_error(stated[0]))
+    out = []
+    for one, key in zip(stated, keys, strict=True):
+        lowest = max(key[1], default=math.inf) * math.exp(-_STANDARD_ERRORS * _relative_error(one))
+        most = one.session.study.file.statement.trials
+        if any(one is rival for rival in rivals) and key[0] <= first[0] and lowest <= highest and _trials(one) < most:
+            out.append(one)
+    return out
+
+
+def _trials(one: SensorResult) -> int:
+    """Return the least number of trials of the sensor's statements."""
+    return min((stated.statements[0].trials for stated in one.stated.values() if stated.statements), default=0)
+
+
+def _relative_error(one: SensorResult) -> float:
+    """Return the relative standard error of a demand from the sensor's trials."""
+    return math.sqrt(EXCESS / (4 * max(_trials(one), 1)))
 
 
 def _complete(winner: SensorResult) -> None:
@@ -248,35 +303,32 @@ def _screened_demand(task: Task, name: str, u: float) -> float:
     return u if tolerance is None else demand(screened_errors(u), tolerance)
 
 
-def _measure_sensor(one: SensorResult, seconds: float) -> None:
-    """Race and state one sensor in approximately ``seconds``."""
-    began = time.monotonic()
+def _measure_sensor(one: SensorResult, count: int, limit: TimeLimit) -> None:
+    """Race a sensor at its first turn, and state it from ``count`` trials, within a limit."""
     session, study = one.session, one.session.study
-    table = study.file.race
-    rules = RaceRules(
-        min(SHORTLIST, table.shortlist), min(RACE_TRIALS, table.trials), table.margin, 0.9, _RACE_SHARE * seconds
-    )
-    one.raced = session.race(one.scores, rules)
+    if one.raced is None:
+        table = study.file.race
+        rules = RaceRules(
+            min(SHORTLIST, table.shortlist), min(RACE_TRIALS, table.trials), table.margin, table.loss, each=True
+        )
+        one.raced = session.race(one.scores, rules, limit.part(_RACE_SHARE))
     if not len(one.raced.views):
         return
-    view, most = one.raced.leader(ALL), study.file.statement.trials
-    count = min(FIRST_TRIALS, most)
-    while True:
-        _state(one, view, count)
-        for number in _own_views(one, list(study.task.measurements), view):
-            if time.monotonic() - began > seconds:
-                break
-            _state(one, number, count)
-        if time.monotonic() - began > seconds or count >= most or not _is_undecided(one):
+    view, count = one.raced.leader(ALL), min(count, study.file.statement.trials)
+    _state(one, view, count, limit)
+    for number in _own_views(one, list(study.task.measurements), view) if view in one.stated else ():
+        if limit.over():
             break
-        count = min(2 * count, most)
-    _finish(one, view)
+        _state(one, number, count, limit)
+    if view in one.stated:
+        _finish(one, view)
 
 
-def _state(one: SensorResult, view: int, count: int) -> None:
-    """State a view from ``count`` trials."""
-    table = StatementTable(trials=count)
-    one.stated[view] = one.session.state(one.session.study.view(view), table)
+def _state(one: SensorResult, view: int, count: int, limit: TimeLimit) -> None:
+    """State a view from ``count`` trials, or those within the limit."""
+    stated = one.session.state(one.session.study.view(view), StatementTable(trials=count), limit)
+    if stated.statements and stated.statements[0].trials >= min(_FEWEST, count):
+        one.stated[view] = stated
 
 
 def _finish(one: SensorResult, view: int) -> None:
@@ -286,13 +338,13 @@ def _finish(one: SensorResult, view: int) -> None:
     gc.collect()
 
 
-def _say(found: list[SensorResult], done: str, end: float) -> None:
+def _say(found: list[SensorResult], done: str, limit: TimeLimit) -> None:
     """Print the progress and the leading sensor."""
     first = _ordered(found)[0]
     names = list(first.candidate.study.task.measurements)
     rows = first.demands()
     by = "measured" if first.stated else "by the screening"
-    left = max(0.0, end - time.monotonic())
+    left = limit.left
     possible = [m for m, value in enumerate(rows) if math.isfinite(value)]
     if not possible:
         say(f"choose: {done}; no sensor can make a measurement {by}; {left:.0f} s left")
@@ -305,11 +357,6 @@ def _say(found: list[SensorResult], done: str, end: float) -> None:
     if len(possible) < len(rows):
         demand_in_words += f", {len(possible)} of {len(rows)} measurements possible"
     say(f"choose: {done}; {first.candidate.name} leads {by}, at worst {demand_in_words}; {left:.0f} s left")
-
-
-def _is_undecided(one: SensorResult) -> bool:
-    """Return whether more trials could change a verdict."""
-    return any(row is not None and row[2].verdict == "not decided" for row in one.best())
 
 
 def _own_views(one: SensorResult, names: list[str], view: int) -> list[int]:
@@ -329,7 +376,7 @@ def _own_views(one: SensorResult, names: list[str], view: int) -> list[int]:
     return list(dict.fromkeys(out))
 
 
-def _refine_leader(leader: SensorResult, end: float) -> None:
+def _refine_leader(leader: SensorResult, limit: TimeLimit) -> None:
     """Add trials of the leader up to the number in the study, as long as there is time."""
     most = leader.session.study.file.statement.trials
     used = {row[0] for row in leader.best() if row is not None}
@@ -337,10 +384,10 @@ def _refine_leader(leader: SensorResult, end: float) -> None:
     def trials(view: int) -> int:
         return leader.stated[view].statements[0].trials
 
-    while time.monotonic() < end:
+    while not limit.over():
         behind = [view for view in used if leader.stated[view].statements and trials(view) < most]
         if not behind:
             break
         view = min(behind, key=trials)
-        _state(leader, view, min(trials(view) + 40, most))
+        _state(leader, view, min(trials(view) + 40, most), limit)
     _finish(leader, next(iter(leader.stated)))

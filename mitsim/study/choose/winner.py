@@ -6,7 +6,7 @@ import xarray as xr
 
 from characterisation.files.atomic_io import write_json
 from mitsim.study.run_files import digests_of
-from mitsim.study.run_record import draw_clouds, own_files, run_record
+from mitsim.study.run_record import draw_clouds, own_files, run_record, runners_up
 from mitsim.study.scoring import write_inputs, write_raced
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import Raced
@@ -37,5 +37,6 @@ def complete_winner(session: Session, scores: xr.Dataset, raced: Raced, leaders:
     drawn = sorted(set(leaders.values()))
     draw_clouds(session, performance_map, drawn)
     about = run_record(study, performance_map, raced, [], None) | {"leaders": leaders}
+    about["runners_up"] = runners_up(session, raced)
     about["files"] = digests_of(folder, own_files(study, drawn, [], stated=True))
     write_json(folder / "run.json", about)

@@ -83,11 +83,9 @@ def measurements_of(
     return RenderedMeasurements(study, unknowns, rendering_of(study), separate_light)
 
 
-def race_rules(table: RaceTable, minutes: float | None = None) -> RaceRules:
-    """Return the rules of a race; ``minutes`` replace those of the table."""
-    most = table.minutes if minutes is None else minutes
-    seconds = None if most is None else 60 * most
-    return RaceRules(table.shortlist, table.trials, table.margin, table.confidence, seconds)
+def race_rules(table: RaceTable) -> RaceRules:
+    """Return the rules of a race."""
+    return RaceRules(table.shortlist, table.trials, table.margin, table.loss, table.each)
 
 
 def map_digest(study: Study) -> str:

@@ -2,17 +2,17 @@
 
 Signal chain: scores of all candidate views -> shortlist -> trials of every view on it, with the same draws -> posterior
 of their risks (:mod:`characterisation.statements.selection`) -> more trials where the choice is open -> the best view
-of every measurement, and of all together.
+for all measurements together, and that of each alone as far as the same trials tell it.
 
-No view is excluded for good. A view gets trials as long as it may be better than the leader by more than the margin.
-The race ends when every leader is, with the stated probability, the best or within the margin of the best. It also ends
-when all views that could decide have the largest number of trials, or when time is over.
+No view is excluded for good. The leader and the views that are expected to gain most on it get the next trials. The
+race ends when the leader's risk is expected to exceed the least by no more than the loss that the rules allow. It also
+ends when all views that could decide have the largest number of trials, or when time is over.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -20,7 +20,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from characterisation.statements.selection import Standing, judge, posterior, sampled
+from characterisation.statements.selection import Standing, joint_samples, judge
 from characterisation.tasks.task_file import Task
 from mitsim.running.progress import say, say_progress, track
 from mitsim.study.virtual.trials import Outcome, TrialFolder
@@ -34,11 +34,14 @@ Floats = NDArray[np.float64]
 #: than many trials of few (tests/benchmarks/race_starts.py, on the open cases of scenes/parts)
 FIRST, BATCH = 1, 2
 
-#: probability of being better than the leader below which a view gets no more trials
-_LEAST_CHANCE = 0.01
+#: expected gain on the leader, of the logarithm of the risk, below which a view gets no more trials
+_LEAST_GAIN = 0.001
 
-#: number of views that get a batch in a round, for each undecided measurement
+#: number of views beside the leader that get a batch in a round, for each choice that is open
 _CHALLENGERS = 4
+
+#: number of trials after which a round can end for lack of time; within them, trials share the light of a finish
+_AT_ONCE = 16
 
 #: time between lines of progress [s]
 _SAY_EVERY_S = 10.0
@@ -67,7 +70,13 @@ class TrialRunner(Protocol):
         """Yield the outcome of every virtual measurement, job by job."""
 
 
-def complete(trials: TrialFolder, runner: TrialRunner, jobs: Iterable[Job], label: str) -> None:
+def complete(
+    trials: TrialFolder,
+    runner: TrialRunner,
+    jobs: Iterable[Job],
+    label: str,
+    over: Callable[[], bool] = lambda: False,
+) -> None:
     """Make the jobs whose trials are not finished yet, and keep each in the folder as soon as it is.
 
     Parameters
@@ -80,25 +89,30 @@ def complete(trials: TrialFolder, runner: TrialRunner, jobs: Iterable[Job], labe
         Requested trials of views.
     label
         Name of the work in the line of progress.
+    over
+        Returns whether to stop after the trial at hand.
     """
     missing = [job for job in jobs if job.trial not in trials.known(job.view.number)]
     for job, outcome in track(runner.run(runner.in_order(missing)), label, len(missing)):
         trials.add(job.view.number, job.trial, outcome)
+        if over():
+            break
 
 
 @dataclass(frozen=True)
 class RaceRules:
-    """Rules of a race: ``shortlist`` views of each measurement, at most ``most`` trials of each view.
+    """Rules of a race: ``shortlist`` views, at most ``most`` trials of each view.
 
-    A choice is decided if its view is within ``margin`` of the best with the probability ``confidence``. ``seconds``
-    limit the race.
+    The choice for all measurements is made if the risk of its view is expected to exceed the least by no more than the
+    share ``loss``. ``margin`` is that of the stated probability: within it a view is nearly the best. With ``each``,
+    the best view of each measurement alone is asked for as well: each has a shortlist and is a choice to make.
     """
 
     shortlist: int
     most: int
     margin: float
-    confidence: float
-    seconds: float | None
+    loss: float
+    each: bool = False
 
 
 @dataclass(frozen=True)
@@ -107,13 +121,14 @@ class Raced:
 
     ``views`` (v,) are view numbers. ``standings`` are by measurement, with :data:`ALL` for all together. ``errors``
     (measurement, v, trial) are in the units of the task, NaN without a value, infinite if not tried. ``decided`` says
-    whether every leader reached the confidence.
+    whether the choices that were asked for are made. ``margin`` is that of the confidences.
     """
 
     views: NDArray[np.int64]
     standings: dict[str, Standing]
     errors: Floats
     decided: bool
+    margin: float = 0.1
 
     def leader(self, name: str) -> int:
         """Return the number of the leading view."""
@@ -130,28 +145,40 @@ class Raced:
         return int((~np.isinf(self.errors[0])).sum()) if self.errors.size else 0
 
 
-def shortlist(scores: xr.Dataset, count: int) -> list[int]:
+def shortlist(scores: xr.Dataset, count: int, each: bool = False) -> list[int]:
     """Return the numbers of the views worth a trial, in the order of the predicted risk u / sqrt(chance).
 
-    These are the first ``count`` views of each measurement and of all together, by the map. A view with zero chance
-    counts as impossible.
+    These are the first ``count`` views for all measurements together, by the map, and with ``each`` also of each
+    measurement. A view with zero chance counts as impossible; for all measurements together, a view that lacks one
+    counts with three times the largest risk of the others. The best for all together come first.
     """
-    return sorted(int(scores["view"].values[i]) for i in first_of_each(screening_risk(scores), count))
+    cost = screening_risk(scores)
+    together = combined_cost(cost, scores["tolerance"].values)
+    chosen = first_of_each(np.concatenate([cost, together[None]]) if each else together[None], count)
+    return [int(scores["view"].values[i]) for i in sorted(chosen, key=lambda i: (together[i], i))]
+
+
+def combined_cost(cost: Floats, tolerances: Floats) -> Floats:
+    """Return the predicted log of the combined risk (view,) from that of each measurement (measurement, view).
+
+    A measurement that a view cannot make counts with three times the largest risk of all views. A view that can make
+    none has an infinite cost. Measurements that no view can make do not count.
+    """
+    able = np.isfinite(cost)
+    possible = able.any(axis=1)
+    if not possible.any():
+        return np.full(cost.shape[1], np.inf)
+    worst = np.where(able, cost, -np.inf).max(axis=1, keepdims=True) + np.log(3)
+    filled = np.where(able, cost, worst)[possible]
+    return np.where(able.any(axis=0), combined_risk(filled[:, None], tolerances[possible])[0], np.inf)
 
 
 def first_of_each(cost: Floats, count: int) -> set[int]:
-    """Return the indices of the ``count`` views of least cost, for each measurement and for the mean cost.
+    """Return the indices of the ``count`` views of least cost, for each row of ``cost`` (row, view).
 
-    ``cost`` has the shape (measurement, view). Views of infinite cost are excluded. A measurement of infinite cost in
-    all views does not count for the mean.
+    Views of infinite cost are excluded.
     """
-    possible = cost[np.isfinite(cost).any(axis=1)]
-    return {
-        int(i)
-        for row in [*possible, *([possible.mean(axis=0)] if len(possible) else [])]
-        for i in np.argsort(row, kind="stable")[:count]
-        if np.isfinite(row[i])
-    }
+    return {int(i) for row in cost for i in np.argsort(row, kind="stable")[:count] if np.isfinite(row[i])}
 
 
 def prior_risk(u: Floats) -> Floats:
@@ -165,7 +192,13 @@ def prior_risk(u: Floats) -> Floats:
 
 
 def run_race(
-    views: Sequence[View], scores: xr.Dataset, runner: TrialRunner, trials: TrialFolder, rules: RaceRules
+    views: Sequence[View],
+    scores: xr.Dataset,
+    runner: TrialRunner,
+    trials: TrialFolder,
+    rules: RaceRules,
+    over: Callable[[], bool] = lambda: False,
+    after_round: Callable[[Raced], None] = lambda _: None,
 ) -> Raced:
     """Race the views on the shortlist, and reuse trials in the folder.
 
@@ -179,22 +212,23 @@ def run_race(
         Finished trials, to which those of the race are added.
     rules
         Shortlist, largest number of trials, and the end of the race.
+    over
+        Returns whether time is over; asked after every trial.
+    after_round
+        Receives the state after every round.
 
     See Also
     --------
     standings : the state after some trials
     """
-    numbers = shortlist(scores, rules.shortlist)
+    numbers = shortlist(scores, rules.shortlist, rules.each)
     if not numbers:
         say("race: the map predicts that no view can make any measurement")
-        return Raced(np.empty(0, np.int64), {}, np.empty((len(trials.measurements), 0, 0)), False)
+        return Raced(np.empty(0, np.int64), {}, np.empty((len(trials.measurements), 0, 0)), False, rules.margin)
     by_number = {view.number: view for view in views}
     counts = dict.fromkeys(numbers, 0)
     predicted = scores.sel(view=numbers)
     began = last = time.monotonic()
-
-    def over() -> bool:
-        return rules.seconds is not None and time.monotonic() - began > rules.seconds
 
     def measure(wanted: dict[int, int]) -> None:
         nonlocal last
@@ -204,13 +238,17 @@ def run_race(
             for trial in _first_trials(count)
             if trial not in trials.known(number)
         ]
-        for done, (job, outcome) in enumerate(runner.run(runner.in_order(jobs)), 1):
-            trials.add(job.view.number, job.trial, outcome)
-            if time.monotonic() - last > _SAY_EVERY_S:
-                last = time.monotonic()
-                say_progress(f"race: {done} of {len(jobs)} trials of this round")
-            if over() and done < len(jobs):
-                break
+        done = 0
+        # the most promising views come first, so that they have trials when time is over
+        for first in range(0, len(jobs), _AT_ONCE):
+            for job, outcome in runner.run(runner.in_order(jobs[first : first + _AT_ONCE])):
+                trials.add(job.view.number, job.trial, outcome)
+                done += 1
+                if time.monotonic() - last > _SAY_EVERY_S:
+                    last = time.monotonic()
+                    say_progress(f"race: {done} of {len(jobs)} trials of this round")
+                if over() and done < len(jobs):
+                    return
 
     wanted = dict.fromkeys(numbers, FIRST)
     while True:
@@ -219,9 +257,10 @@ def run_race(
             counts[number] = sum(trial in trials.known(number) for trial in _first_trials(wanted[number]))
         raced = standings(predicted, numbers, trials, counts, rules)
         wanted = _next_round(raced, counts, rules)
-        _say_state(raced, counts, rules, time.monotonic() - began)
+        _say_state(raced, counts, time.monotonic() - began)
         if raced.decided or not wanted or over():
             return raced
+        after_round(raced)
 
 
 def standings(
@@ -240,7 +279,7 @@ def standings(
     counts
         Number of trials that are used, by number of a view.
     rules
-        Margin and confidence of the decision.
+        Margin and loss of the decision.
 
     See Also
     --------
@@ -257,15 +296,18 @@ def standings(
     u = scores["predicted_uncertainty"].sel(measurement=names).transpose("measurement", "view").values
     chance = scores["chance"].sel(measurement=names).transpose("measurement", "view").values
     tolerances = scores["tolerance"].sel(measurement=names).values
-    found, samples = {}, []
-    for m, name in enumerate(names):
-        mean, covariance = posterior(errors[m], prior_risk(u[m]), chance[m])
-        samples.append(sampled(mean, covariance, seed=m))
-        found[name] = judge(samples[-1], rules.margin)
+    prior = np.array([prior_risk(row) for row in u])
+    samples = joint_samples(errors, prior, np.nan_to_num(chance))
+    found = {name: judge(samples[m], rules.margin) for m, name in enumerate(names)}
     possible = possible_measurements(u, errors)
-    found[ALL] = judge(combined_risk(np.array(samples)[possible], tolerances[possible]), rules.margin)
-    decided = all(one.confidence >= rules.confidence for one in found.values())
-    return Raced(np.array(numbers), found, errors, decided)
+    found[ALL] = judge(combined_risk(samples[possible], tolerances[possible]), rules.margin)
+    decided = all(found[name].loss <= rules.loss for name in asked(found, rules))
+    return Raced(np.array(numbers), found, errors, decided, rules.margin)
+
+
+def asked(found: Iterable[str], rules: RaceRules) -> list[str]:
+    """Return the names of the choices that the race has to make."""
+    return list(found) if rules.each else [ALL]
 
 
 def possible_measurements(u: Floats, errors: Floats) -> NDArray[np.bool_]:
@@ -297,10 +339,11 @@ def _first_trials(count: int) -> list[Trial]:
 def _next_round(raced: Raced, counts: dict[int, int], rules: RaceRules) -> dict[int, int]:
     """Return the number of trials after the next round, for the views that get more."""
     wanted = {}
-    for one in raced.standings.values():
-        if one.confidence >= rules.confidence:
+    for name in asked(raced.standings, rules):
+        one = raced.standings[name]
+        if one.loss <= rules.loss:
             continue
-        rivals = [int(v) for v in np.argsort(-one.chance, kind="stable") if one.chance[v] > _LEAST_CHANCE]
+        rivals = [int(v) for v in np.argsort(-one.gain, kind="stable") if one.gain[v] > _LEAST_GAIN]
         for place in [one.leader, *rivals[:_CHALLENGERS]]:
             number = int(raced.views[place])
             if counts[number] < rules.most:
@@ -308,15 +351,18 @@ def _next_round(raced: Raced, counts: dict[int, int], rules: RaceRules) -> dict[
     return wanted
 
 
-def _say_state(raced: Raced, counts: dict[int, int], rules: RaceRules, seconds: float) -> None:
-    open_ones = [name for name, one in raced.standings.items() if one.confidence < rules.confidence]
+def _say_state(raced: Raced, counts: dict[int, int], seconds: float) -> None:
     best = raced.standings[ALL]
-    state = f"{len(open_ones)} of {len(raced.standings)} choices open" if open_ones else "all choices made"
-    left = "" if rules.seconds is None else f", {max(0.0, rules.seconds - seconds):.0f} s left"
     say_progress(
-        f"race: {sum(counts.values())} trials of {len(counts)} views; leads: view {raced.leader(ALL)} "
-        f"({100 * best.confidence:.0f} % sure to be the best or within {100 * rules.margin:.0f} %); {state}{left}"
+        f"race: {sum(counts.values())} trials of {len(counts)} views in {seconds:.0f} s; view {raced.leader(ALL)} "
+        f"leads, {in_words(best, raced.margin)}"
     )
+
+
+def in_words(one: Standing, margin: float) -> str:
+    """Return how good a choice is, like ``expected within 4 % of the best (90 % sure to be within 10 %)``."""
+    loss = "expected to be the best" if one.loss < 0.005 else f"expected within {100 * one.loss:.0f} % of the best"
+    return f"{loss} ({100 * one.confidence:.0f} % sure to be within {100 * margin:.0f} %)"
 
 
 def with_race(scores: xr.Dataset, raced: Raced) -> xr.Dataset:

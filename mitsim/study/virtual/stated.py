@@ -8,21 +8,25 @@ measurement -> ``statement.json``.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from characterisation.files.atomic_io import json_values
-from characterisation.statements.budget import INTERACTION, budget
+from characterisation.statements.budget import budget
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import common_losses, losses
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
 from mitsim.running.text_table import aligned
+from mitsim.running.time_limit import TimeLimit
 from mitsim.running.version import __version__
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.preset import Sensor
-from mitsim.study import StatementTable
+from mitsim.study import StatementTable, Study
 from mitsim.study.exposures.planned import with_exposure
 from mitsim.study.virtual.drawn_decoder import decoder_is_drawn
 from mitsim.study.virtual.drawn_numbers import drawn_numbers, related, seeds, statement_trials
@@ -30,11 +34,21 @@ from mitsim.study.virtual.influences import influences
 from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.race import Job, complete
 from mitsim.study.virtual.trials import TrialFolder
-from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, Unknowns
+from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, SET_DAYS, STATEMENT_DAYS, Trial, Unknowns
 from mitsim.views import View
 
 if TYPE_CHECKING:
     from mitsim.study.session import Session
+
+
+#: trials after which a statement asks whether it is settled, or time is over
+BATCH = 40
+
+#: fewest trials of a statement with which views are compared
+LEAST_COMPARED = 20
+
+#: largest number of trials of a statement within a time limit, if the study names none
+MOST_WITHIN_A_LIMIT = 4000
 
 
 @dataclass(frozen=True)
@@ -49,11 +63,31 @@ class StatedView:
     planned: PlannedExposure | None
 
 
-def state_view(session: Session, view: View, table: StatementTable | None = None) -> StatedView:
+def state_view(
+    session: Session,
+    view: View,
+    table: StatementTable | None = None,
+    limit: TimeLimit | None = None,
+    after_batch: Callable[[StatedView], None] | None = None,
+) -> StatedView:
     """State every measurement from one view at its exposures, and reuse trials in the folder of the session.
 
-    Draws of the race are not used: they selected the view, and are biased in its favour. ``table`` replaces the
-    study's number of trials.
+    Draws of the race are not used: they selected the view, and are biased in its favour. Trials end when every
+    measurement is settled (JCGM 101:2008, 7.9), when they have the number of the study, or when time is over.
+
+    Parameters
+    ----------
+    session
+        Of the study, with a folder.
+    view
+        The view.
+    table
+        Replaces the study's number of trials, which are then made whether or not fewer would settle the statement.
+    limit
+        Time of the statement. Within it, a study that names no number of trials may make
+        :data:`MOST_WITHIN_A_LIMIT`.
+    after_batch
+        Receives the statement, without a budget, after every :data:`BATCH` trials but the last.
     """
     study, runner, trials, planned = session.study, session.runner, session.trials, session.exposures(view)
     if planned is not None:
@@ -63,20 +97,76 @@ def state_view(session: Session, view: View, table: StatementTable | None = None
             runner.exposed_as(planned),
             TrialFolder.of(session.folder / "planned_trials", digest, study.task),
         )
-    table = table or study.file.statement
-    made = statement_trials(table.trials)
-    complete(trials, runner, [Job(view, trial) for trial in made], f"state view {view.number}")
+    limit = TimeLimit() if limit is None else limit
+    label = f"state view {view.number}"
+    made = list[Trial]()
+    for count in batches(table or study.file.statement, table is None, limit):
+        wanted = statement_trials(count)
+        complete(trials, runner, [Job(view, trial) for trial in wanted], label, limit.over)
+        made = [trial for trial in wanted if trial in trials.known(view.number)]
+        so_far = StatedView(view, _statements(study, trials, view, made), planned)
+        if limit.over() or (table is None and count > BATCH and _settled(so_far.statements)):
+            break
+        if after_batch is not None:
+            after_batch(so_far)
     groups = budget_groups(session.unknowns, session.source, study.sensor)
     numbers = drawn_numbers(study, session.unknowns, session.source, made, groups)
-    shared = seeds(made, groups)
-    errors = trials.errors_of_parts(view.number, made)
+    return StatedView(view, _statements(study, trials, view, made, (numbers, seeds(made, groups))), planned)
+
+
+def compared(session: Session, view: int, other: int) -> float | None:
+    """Return the ratio of root mean square errors of two views: the geometric mean over the measurements, as the race.
+
+    With tolerances for all measurements, it is the ratio of the largest errors relative to the tolerance. It is None if
+    a view lacks trials of a statement, or a value.
+    """
+    figures, task = [], session.study.task
+    for number in (view, other):
+        made = [trial for trial in session.trials.known(number) if STATEMENT_DAYS <= trial.day < SET_DAYS]
+        if len(made) < LEAST_COMPARED:
+            return None
+        stated = _statements(session.study, session.trials, session.study.view(number), made)
+        figures.append(np.array([one.root_mean_square for one in stated]))
+    sizes = np.array([one.tolerance_size or math.nan for one in task.measurements.values()])
+    first, second = (each / sizes if np.isfinite(sizes).all() else each for each in figures)
+    if not (np.isfinite(first) & np.isfinite(second) & (first > 0) & (second > 0)).all():
+        return None
+    if np.isfinite(sizes).all():
+        return float(first.max() / second.max())
+    return float(np.exp(np.log(first / second).mean()))
+
+
+def batches(table: StatementTable, by_settled: bool, limit: TimeLimit) -> list[int]:
+    """Return the numbers of trials at which a statement may end: with ``by_settled`` several, else that of the table.
+
+    A limit replaces the largest number of a table that names none.
+    """
+    most = table.trials
+    if by_settled and limit.end is not None and "trials" not in table.model_fields_set:
+        most = MOST_WITHIN_A_LIMIT
+    return [*range(BATCH, most, BATCH), most] if by_settled else [most]
+
+
+def _statements(
+    study: Study,
+    trials: TrialFolder,
+    view: View,
+    made: list[Trial],
+    drawn: tuple[Mapping[str, ArrayLike], Mapping[str, ArrayLike]] | None = None,
+) -> list[Statement]:
+    """Return the statement of every measurement from finished trials; with ``drawn`` numbers and seeds, its budget."""
+    days, common, errors = [trial.day for trial in made], related(made), trials.errors_of_parts(view.number, made)
     out = []
     for m, (name, asked) in enumerate(study.task.measurements.items()):
-        lines = budget(errors[m], numbers, shared)
-        limit = tolerance_of(study.task, name)
-        stated = statement(name, asked.unit, errors[m], limit, lines, shared[INTERACTION], related(made))
+        lines = budget(errors[m], *drawn) if drawn is not None else ()
+        stated = statement(name, asked.unit, errors[m], tolerance_of(study.task, name), lines, days, common)
         out.append(replace(stated, losses=losses(trials.reasons(view.number, made, name))))
-    return StatedView(view, out, planned)
+    return out
+
+
+def _settled(stated: Sequence[Statement]) -> bool:
+    """Return whether all statements are settled but those without values."""
+    return all(one.settled or not math.isfinite(one.standard_uncertainty) for one in stated)
 
 
 def budget_groups(unknowns: Unknowns, source: str, sensor: Sensor) -> list[str]:

@@ -1,0 +1,74 @@
+"""Share the time of a run between its steps before the start, and correct the shares by what the steps take.
+
+Signal chain: time of the whole command, number of views -> seconds of screening, race, statement and report -> limits
+of the steps, each from the time that is left when it starts.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+from mitsim.running.time_limit import TimeLimit
+
+#: expected time of screening [s] for each view; largest share of the whole that is planned for it
+SCREENING_S, _SCREENING_SHARE = 0.2, 0.3
+
+#: share of the whole for pictures and report, with its bounds [s]
+_REPORT_SHARE, _REPORT_S = 0.15, (5.0, 40.0)
+
+#: processor time of clouds and page without pictures [s]; largest factor of a busy machine, and share of what is left
+_PAGE_S, _BUSIEST, _PAGE_SHARE = 6.0, 6.0, 0.4
+
+#: share of the rest for the race; the statement gets what the race leaves
+_RACE_SHARE = 0.45
+
+
+@dataclass(frozen=True)
+class TimePlan:
+    """Planned seconds of the steps of a run."""
+
+    screening: float
+    race: float
+    statement: float
+    report: float
+
+    @property
+    def total(self) -> float:
+        """Return the planned time of all steps [s]."""
+        return self.screening + self.race + self.statement + self.report
+
+    def in_words(self) -> str:
+        """Return the plan in one line, like ``about 2 min: 20 s screening, ...``."""
+        steps = [
+            (self.screening, "screening"),
+            (self.race, "comparing views"),
+            (self.statement, "statement"),
+            (self.report, "pictures and report"),
+        ]
+        return f"about {_in_words(self.total)}: " + ", ".join(f"{_in_words(seconds)} {name}" for seconds, name in steps)
+
+    def race_limit(self, limit: TimeLimit) -> TimeLimit:
+        """Return the limit of the race, which starts now."""
+        return limit.part(_RACE_SHARE, self.page(limit))
+
+    def statement_limit(self, limit: TimeLimit) -> TimeLimit:
+        """Return the limit of the statement, which starts now."""
+        return limit.part(1.0, max(self.page(limit), min(self.report, 0.2 * limit.left)))
+
+    def page(self, limit: TimeLimit) -> float:
+        """Return the time [s] that clouds and page will take, on a machine as busy as it has been so far."""
+        busy = min(max(limit.elapsed / max(time.process_time(), 0.1), 0.5), _BUSIEST)
+        return min(busy * _PAGE_S, _PAGE_SHARE * limit.left)
+
+
+def time_plan(seconds: float, views: int) -> TimePlan:
+    """Return the plan of a command of ``seconds`` with a number of candidate ``views``."""
+    report = min(max(_REPORT_SHARE * seconds, _REPORT_S[0]), _REPORT_S[1], seconds / 2)
+    screening = min(SCREENING_S * views, _SCREENING_SHARE * seconds)
+    rest = max(0.0, seconds - report - screening)
+    return TimePlan(screening, _RACE_SHARE * rest, (1 - _RACE_SHARE) * rest, report)
+
+
+def _in_words(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.2g} min"

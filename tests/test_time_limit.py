@@ -1,0 +1,50 @@
+"""Limits of time, a first Ctrl-C, and the plan of a run; nothing waits."""
+
+import os
+import signal
+import time
+
+import pytest
+
+from mitsim.running.time_limit import TimeLimit, ending_in_order, stopped_by_user
+from mitsim.study.time_plan import time_plan
+
+
+def test_a_part_of_the_time_that_is_left_ends_before_the_whole():
+    whole = TimeLimit(100.0, time.monotonic() - 40.0)
+    part = whole.part(0.5, reserve=20.0)
+    assert whole.left == pytest.approx(60.0, abs=1.0) and part.left == pytest.approx(20.0, abs=1.0)
+    assert not whole.over() and not part.over()
+    late = TimeLimit(1.0, time.monotonic() - 2.0)
+    assert late.over() and late.part(0.5, reserve=20.0).over()
+    assert not TimeLimit().part(0.5).over() and TimeLimit().left == float("inf")
+
+
+def test_the_first_ctrl_c_ends_every_limit_and_the_second_the_command():
+    limit = TimeLimit()
+    with ending_in_order():
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.01)
+        assert stopped_by_user() and limit.over() and limit.part().over()
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.1)
+    assert not stopped_by_user() and not limit.over()
+
+
+@pytest.mark.parametrize("seconds", [6.0, 30.0, 120.0, 600.0, 36000.0])
+@pytest.mark.parametrize("views", [1, 102, 5000])
+def test_a_plan_shares_out_all_of_the_time(seconds, views):
+    plan = time_plan(seconds, views)
+    steps = (plan.screening, plan.race, plan.statement, plan.report)
+    assert min(steps) > 0 and sum(steps) == pytest.approx(seconds)
+    words = plan.in_words()
+    assert words.startswith("about ") and all(
+        name in words for name in ("screening", "comparing views", "statement", "report")
+    )
+
+
+def test_the_statement_gets_the_time_that_the_race_leaves():
+    plan = time_plan(120.0, 102)
+    limit = TimeLimit(120.0, time.monotonic() - 30.0)
+    assert plan.race_limit(limit).left < plan.statement_limit(limit).left < limit.left
