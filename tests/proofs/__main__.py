@@ -271,16 +271,14 @@ def seeds(
     Example: python -m tests.proofs seeds scenes/two_pillars/study.toml --view 99 -o runs/seeds
     """
     start(variant)
-    from mitsim.study import read_study
+    from mitsim.study import open_study
     from tests.proofs.seeds import seeds_table, statements_of_seeds
 
     workers = requested_workers(None, processes)
-    read = read_study(study, "", mapped=False)
-    by_number = {one.number: one for one in read.views}
-    if view not in by_number:
-        raise InputError("--view", "", view, f"0 to {max(by_number)}")
+    opened = open_study(study, mapped=False)
+    stated_view = opened.view(view, "--view")
     check_folder(output)
-    stated = statements_of_seeds(read, by_number[view], range(1, seeds + 1), trials, output, workers)
+    stated = statements_of_seeds(opened, stated_view, range(1, seeds + 1), trials, output, workers)
     print(seeds_table(stated), end="")
 
 

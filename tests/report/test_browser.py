@@ -24,7 +24,7 @@ def test_page_parses_into_what_was_written(report, browser):
     assert len(images) == 2 * len(CHECKED)
     for image in images:
         assert decode_png(base64.b64decode(image), "left").shape == (24, 32)
-    assert "</html>" in dom and dom.count("<section") == 12
+    assert "</html>" in dom and dom.count("<section") == 13
 
 
 @pytest.mark.parametrize(("scheme", "paper"), [("light", 253), ("dark", 22)])

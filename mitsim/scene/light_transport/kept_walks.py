@@ -109,7 +109,17 @@ class Tracer:
         return dr.gather(mi.Int32, self.drawn, self.bsdfs.place(surface, valid), valid)
 
     def kept(self, surface: Any, material: Any, toward_camera: Any, toward_projector: Any) -> list[Any]:
-        """Return material and local directions of a surface as a path keeps them."""
+        """Return material and local directions of a surface as a path keeps them.
+
+        Parameters
+        ----------
+        surface
+            Interaction of each lane.
+        material
+            Number of its drawn finish, -1 for none.
+        toward_camera, toward_projector
+            Unit vectors in the surface's shading frame.
+        """
         directions = [mi.Vector3f(toward_camera), mi.Vector3f(toward_projector)]
         if any(self.tracing.turned):
             turned = dr.gather(mi.Bool, self.turned, mi.UInt32(dr.maximum(material, 0)), material >= 0)
