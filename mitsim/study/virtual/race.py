@@ -40,7 +40,7 @@ _LEAST_GAIN = 0.001
 #: number of views beside the leader that get a batch in a round, for each choice that is open
 _CHALLENGERS = 4
 
-#: number of trials after which a round can end for lack of time; within them, trials share the light of a finish
+#: number of trials after which the state of a round is told; within them, trials share the light paths of a view
 _AT_ONCE = 16
 
 #: time between lines of progress [s]
@@ -215,7 +215,7 @@ def run_race(
     over
         Returns whether time is over; asked after every trial.
     after_round
-        Receives the state after every round.
+        Receives the state after every round, and within long rounds.
 
     See Also
     --------
@@ -230,6 +230,11 @@ def run_race(
     predicted = scores.sel(view=numbers)
     began = last = time.monotonic()
 
+    def state(wanted: dict[int, int]) -> Raced:
+        for number in wanted:
+            counts[number] = sum(trial in trials.known(number) for trial in _first_trials(wanted[number]))
+        return standings(predicted, numbers, trials, counts, rules)
+
     def measure(wanted: dict[int, int]) -> None:
         nonlocal last
         jobs = [
@@ -241,6 +246,8 @@ def run_race(
         done = 0
         # the most promising views come first, so that they have trials when time is over
         for first in range(0, len(jobs), _AT_ONCE):
+            if first:
+                after_round(state(wanted))
             for job, outcome in runner.run(runner.in_order(jobs[first : first + _AT_ONCE])):
                 trials.add(job.view.number, job.trial, outcome)
                 done += 1
@@ -253,12 +260,13 @@ def run_race(
     wanted = dict.fromkeys(numbers, FIRST)
     while True:
         measure(wanted)
-        for number in wanted:
-            counts[number] = sum(trial in trials.known(number) for trial in _first_trials(wanted[number]))
-        raced = standings(predicted, numbers, trials, counts, rules)
+        raced = state(wanted)
         wanted = _next_round(raced, counts, rules)
-        _say_state(raced, counts, time.monotonic() - began)
-        if raced.decided or not wanted or over():
+        ended = raced.decided or not wanted or over()
+        if ended or time.monotonic() - last > _SAY_EVERY_S:
+            last = time.monotonic()
+            _say_state(raced, counts, last - began)
+        if ended:
             return raced
         after_round(raced)
 
@@ -360,8 +368,10 @@ def _say_state(raced: Raced, counts: dict[int, int], seconds: float) -> None:
 
 
 def in_words(one: Standing, margin: float) -> str:
-    """Return how good a choice is, like ``expected within 4 % of the best (90 % sure to be within 10 %)``."""
-    loss = "expected to be the best" if one.loss < 0.005 else f"expected within {100 * one.loss:.0f} % of the best"
+    """Return how good a choice is, like ``its error expected 4 % above the least (90 % sure to be within 10 %)``."""
+    loss = (
+        "expected to be the best" if one.loss < 0.005 else f"its error expected {100 * one.loss:.0f} % above the least"
+    )
     return f"{loss} ({100 * one.confidence:.0f} % sure to be within {100 * margin:.0f} %)"
 
 
