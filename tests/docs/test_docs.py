@@ -48,10 +48,11 @@ from tests.proofs.laboratory.cases import LaboratoryFile
 from tests.proofs.part_cases import PartCasesFile
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PROOFS = ROOT / "tests" / "proofs" / "README.md"
+PAGES = [ROOT / "README.md", PROOFS, *sorted((ROOT / "docs").rglob("*.md"))]
 FORMAT_PAGES = sorted((ROOT / "docs" / "reference" / "formats").glob("*.md"))
 #: text of all pages of formats; a marker stands once among them
-FORMATS = "\n\n".join(page.read_text(encoding="utf-8") for page in FORMAT_PAGES)
+FORMATS = "\n\n".join(page.read_text(encoding="utf-8") for page in [*FORMAT_PAGES, PROOFS])
 COMMANDS = typer.main.get_command(app).commands
 
 
