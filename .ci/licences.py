@@ -165,10 +165,12 @@ PAGE = """# Licences
 
 The packages that mitsim and its extras install, with their dependencies, without the tools of the tests and vendors'
 SDKs that `pip` does not install (NxLib). The tests compare every installed package with this list, and reject licences
-that are neither permissive nor weak copyleft (MPL-2.0, LGPL-2.1) of dynamically linked libraries that users can replace.
+that are neither permissive nor weak copyleft (MPL-2.0, LGPL-2.1) of dynamically linked libraries that users can
+replace.
 
-Licences are SPDX names, from the metadata of each package, or from the source that `.ci/licences.py` records. The wheels
-of NumPy, SciPy and OpenCV also contain libgfortran, whose GCC runtime exception allows distribution with any software.
+Licences are SPDX names, from the metadata of each package, or from the source that `.ci/licences.py` records. The
+wheels of NumPy, SciPy and OpenCV also contain libgfortran, whose GCC runtime exception allows distribution with any
+software.
 
 """
 

@@ -11,12 +11,12 @@ import pytest
 import characterisation
 import mitsim
 
-ROOT = Path(__file__).resolve().parents[2]
-PAGE = (ROOT / "docs" / "reference" / "interface.md").read_text(encoding="utf-8")
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "docs" / "site"))
 
-sys.path.insert(0, str(ROOT / "docs" / "site"))
-
+from interface_pages import PAGE as PATH
 from interface_pages import members, tables
+
+PAGE = PATH.read_text(encoding="utf-8")
 
 
 def listed(heading: str) -> set[str]:
