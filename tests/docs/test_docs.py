@@ -436,8 +436,9 @@ def test_documented_keys_of_a_run_hold_what_the_report_reads():
     assert set(RunDocument.model_fields) <= first_column("columns: run.json")
 
 
-def test_architecture_names_code_that_exists():
-    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+@by_page
+def test_pages_name_code_that_exists(page):
+    text = " ".join(page.read_text(encoding="utf-8").split())
     for path, name in re.findall(r"`((?:mitsim|characterisation)/[\w/]+\.py)(?:: ([\w.]+))?`", text):
         source = (ROOT / path).read_text(encoding="utf-8")
         last = name.rpartition(".")[2]
