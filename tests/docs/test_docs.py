@@ -39,7 +39,6 @@ from mitsim.sensor.rig_covariance import CovarianceFile
 from mitsim.sensor.sensor_file import ImagerTable, ProjectorTable, SensorFile
 from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.study import StudyFile
-from mitsim.study.choice_document import ChoiceDocument
 from mitsim.study.many_captures import ManyFile
 from mitsim.study.run_folder import RunDocument
 from mitsim.study.scoring import pose_columns
@@ -78,9 +77,7 @@ TOML_MODELS = {
 JSON_MODELS = {
     "capture": CaptureDocument,
     "stage_calibration": StageCalibrationFile,
-    "run": RunDocument,
     "statement": StatementDocument,
-    "choice": ChoiceDocument,
 }
 
 by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
