@@ -24,8 +24,8 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError, nearest
+from mitsim.sensor.calibration_eyes import size_of, vector
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
-from mitsim.sensor.calibration_programs import vector
 from mitsim.sensor.calibration_qualifiers import (
     baseline_note,
     lens_model,
@@ -136,15 +136,14 @@ def _sized(table: dict[str, Any], size: tuple[int, int] | None) -> dict[str, Any
     return table | {"cameras": sized}
 
 
-def has_pair(path: Path) -> bool:
-    """Return whether a calibration file has matrices of two cameras, and the pose of the second.
+def has_pair(tree: CalibrationTree) -> bool:
+    """Return whether calibration files have matrices of two cameras, and the pose of the second.
 
     Raises
     ------
     InputError
-        If the file cannot be read.
+        If the files contradict one another.
     """
-    tree = read_tree([path])
     return all(any(tree.find(key) for key in USUAL_NAMES[what][1]) for what in ("matrix", "rotation", "translation"))
 
 
@@ -206,6 +205,8 @@ class _Values:
         keys = self.calibration_table.keys.get(name, EyeKeys())
         given = getattr(keys, what)
         names = (given,) if given else USUAL_NAMES[what][place]
+        if keys.matrix and (what == "matrix" or not given):
+            names = (*(f"+{what} of {each}" for each in (keys.matrix, keys.matrix.rpartition(".")[0])), *names)
         if keys.file and what in ("matrix", "distortion", "size"):
             # a file of one eye uses the names of a single camera
             names = tuple(f"{keys.file}:{key}" for key in ((given,) if given else names + USUAL_NAMES[what][0]))
@@ -215,9 +216,9 @@ class _Values:
             names = tuple(key for key in names if key not in USUAL_NAMES[what][1])
         for key in names:
             found = self.tree.find(key)
-            if found is not None:
-                name_in_file = key.rpartition(":")[2].removeprefix("+")
-                return replace(found, value=_numbers(found.value, found.file, name_in_file, shapes))
+            if found is not None and (key == given or what == "size" or not isinstance(found.value, dict)):
+                value = size_of(found.value) if what == "size" and isinstance(found.value, dict) else found.value
+                return replace(found, value=_numbers(value, found.file, found.name, shapes))
         if needed or given:
             self.missing.append((name, what, names))
         return None
@@ -243,7 +244,7 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
     The sensor file's ``own`` keys may be missing in the calibration.
     """
     calibration_table, file = values.calibration_table, ", ".join(dict.fromkeys(map(str, values.tree.files)))
-    matrix = values.find(name, place, "matrix", ((3, 3),), needed="focal_px" not in own)
+    matrix = values.find(name, place, "matrix", ((3, 3), (9,)), needed="focal_px" not in own)
     table = {} if matrix is None else matrix.table
     values.tables.append(table)
     found = values.find(name, place, "distortion", ((0,), (4,), (5,), (8,), (12,), (14,)), needed=False)
@@ -258,7 +259,10 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
     size = _size(values, name, place, table)
     out: dict[str, Any] = {"model": model, "distortion": distortion.tolist()}
     if matrix is not None:
-        K = _checked_matrix(matrix.value, name, file)
+        K, by_columns = _by_rows(matrix.value)
+        K = _checked_matrix(K, name, file)
+        if by_columns:
+            values.notes.append(f"calibration {matrix.file.name}: {name}: its matrix is written by columns")
         read_out = read_out_of(table, matrix.file)
         if read_out is not None:
             width, height = own.get("width"), own.get("height")
@@ -272,11 +276,18 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
     return out | (_pose(values, name, place, own) if place > 0 else {})
 
 
+def _by_rows(K: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+    """Return K (3, 3) by rows, of nine numbers too, and whether it is written by columns, as Open3D does."""
+    K = K.reshape(3, 3)
+    by_columns = bool((K[:, 2] == (0, 0, 1)).all() and K[2, :2].all())
+    return (K.T if by_columns else K), by_columns
+
+
 def _checked_matrix(K: NDArray[np.float64], name: str, file: str) -> NDArray[np.float64]:
     if abs(K[0, 1]) > 1e-9 and K[0, 0] > 0:
         hint = "calibrate without skew: est_alpha = 0 in MATLAB's toolbox"
         raise InputError(file, f"matrix of {name}", f"a skew of {K[0, 1]:.3g} px", "fx 0 cx, 0 fy cy, 0 0 1", hint)
-    if K[0, 0] <= 0 or K[1, 1] <= 0 or abs(K[2, 2] - 1) > 1e-9:
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs([K[1, 0], *(K[2] - [0, 0, 1])]).max() > 1e-9:
         raise InputError(file, f"matrix of {name}", np.round(K, 3).tolist(), "fx 0 cx, 0 fy cy, 0 0 1")
     return K
 
@@ -346,6 +357,14 @@ def _numbers(value: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], ..
         if vector and values.ndim and values.size == 0 and (0,) in shapes:
             return np.empty(0)
         allowed = " or ".join(" x ".join(map(str, shape)) for shape in shapes) + " finite numbers"
-        shown = f"an array of {' x '.join(map(str, values.shape))}" if values.ndim else "something else"
-        raise InputError(file, key, shown, allowed)
+        raise InputError(file, key, _shown(value, values), allowed)
     return found
+
+
+def _shown(value: Any, values: NDArray[np.float64]) -> str:
+    """Return a value that cannot be used, for a message: few numbers as they are, the size of many."""
+    if isinstance(value, dict):
+        return f"a map of {', '.join(list(value)[:6])}"
+    if values.ndim and values.size <= 16 and not np.isfinite(values).all():
+        return str(values.tolist())
+    return f"an array of {' x '.join(map(str, values.shape))}" if values.ndim else "something else"
