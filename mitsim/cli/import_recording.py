@@ -89,7 +89,9 @@ def import_(
     ] = None,
     unit: Annotated[
         str | None,
-        typer.Option(help="Unit of a cloud: um, mm, cm or m; default: m if the median distance is below 20, else mm."),
+        typer.Option(
+            help="Unit of a cloud: um, mm, cm, m, inch or foot; default: m if the median distance is below 20, else mm."
+        ),
     ] = None,
     axes: Annotated[
         str | None,

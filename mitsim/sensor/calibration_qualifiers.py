@@ -43,6 +43,9 @@ UNITS_MM = {
     for word in words.split()
 }
 
+#: units of length that an option may name [mm]
+LENGTHS_MM = {word: UNITS_MM[word] for word in ("um", "mm", "cm", "m", "inch", "foot")}
+
 #: names under which files state their unit of length
 _UNIT_NAMES = ("unit", "units", "length_unit", "world_units", "WorldUnits", "translation_unit", "baseline_unit")
 

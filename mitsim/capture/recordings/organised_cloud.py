@@ -35,15 +35,12 @@ from mitsim.capture.recordings.pcd import decode_pcd
 from mitsim.capture.recordings.pinhole_fit import LEAST_POINTS, PINHOLE_RMS_PX, fit_pinhole, grid_of, off_the_rays
 from mitsim.capture.recordings.ply import decode_ply
 from mitsim.capture.recordings.zdf import HDF5_MAGIC, read_zdf
-from mitsim.sensor.calibration_qualifiers import UNITS_MM, check_camera
+from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, check_camera
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import Transform
 
 Points = NDArray[np.float32]
 Axes = Literal["opencv", "opengl"]
-
-#: units of length of clouds [mm]
-CLOUD_UNITS_MM = {word: UNITS_MM[word] for word in ("um", "mm", "cm", "m")}
 
 #: median distance of the points, in the file's numbers, below which the unit is metres. All sensors here measure
 #: between 20 mm and 20 m
@@ -155,8 +152,8 @@ def read_organised_cloud(
         The camera of the grid, see :mod:`mitsim.capture.recordings.calibration_file`; by default a pinhole is fitted.
         With a rectification, the grid may also be that of the rectified left image, at full or reduced size.
     unit
-        ``um``, ``mm``, ``cm`` or ``m``; by default metres if the median distance is under :data:`METRES_UNDER`, else
-        millimetres.
+        One of :data:`~mitsim.sensor.calibration_qualifiers.LENGTHS_MM`; by default metres if the median distance is
+        under :data:`METRES_UNDER`, else millimetres.
     axes
         ``opencv``: x right, y down, z forward; ``opengl``: y up and z backward, which is converted.
     link
@@ -241,8 +238,8 @@ def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = Non
     path
         The file, for messages.
     unit
-        One of :data:`CLOUD_UNITS_MM`; by default metres if the median distance is under :data:`METRES_UNDER`, else
-        millimetres.
+        One of :data:`~mitsim.sensor.calibration_qualifiers.LENGTHS_MM`; by default metres if the median distance is
+        under :data:`METRES_UNDER`, else millimetres.
     hint
         What to do if the points are too far away.
 
@@ -262,10 +259,10 @@ def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = Non
         raise InputError(path, "", "no points", "a cloud with x, y and z")
     distance = float(np.median(np.linalg.norm(seen.astype(float), axis=-1)))
     unit = unit or ("m" if distance < METRES_UNDER else "mm")
-    farthest = float(np.abs(seen).max()) * CLOUD_UNITS_MM[unit]
+    farthest = float(np.abs(seen).max()) * LENGTHS_MM[unit]
     if farthest > FARTHEST_MM:
         raise InputError(path, "x, y, z", f"{farthest:.3g} mm", f"up to {FARTHEST_MM:g} mm", hint)
-    points *= CLOUD_UNITS_MM[unit]
+    points *= LENGTHS_MM[unit]
     return unit, distance
 
 

@@ -25,12 +25,13 @@ from mitsim.capture.recordings.depth_image import read_depth_image
 from mitsim.capture.recordings.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
 from mitsim.capture.recordings.ensenso import ensenso_originals, image_sets, read_ensenso
 from mitsim.capture.recordings.image_folder import read_image_folder, size_of_images
-from mitsim.capture.recordings.organised_cloud import CLOUD_UNITS_MM, Axes, StoredCloud, read_organised_cloud
+from mitsim.capture.recordings.organised_cloud import Axes, StoredCloud, read_organised_cloud
 from mitsim.capture.recordings.pose_file import read_pose
 from mitsim.capture.recordings.recording_files import BAG_MAGIC, MCAP_MAGIC, SQLITE_MAGIC, frame_of, plain_name
 from mitsim.capture.recordings.robi import is_robi, read_robi
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
 from mitsim.capture.recordings.zdf import HDF5_MAGIC
+from mitsim.sensor.calibration_qualifiers import LENGTHS_MM
 from mitsim.sensor.preset import load_sensor, named_sensor
 
 AXES: tuple[Axes, ...] = ("opencv", "opengl")
@@ -189,8 +190,8 @@ def _organised(cloud: Path | StoredCloud, options: ReadOptions) -> Capture:
     axes = next((known for known in AXES if known == (options.axes or AXES[0])), None)
     if axes is None:
         raise InputError("--axes", "", repr(options.axes), " | ".join(AXES))
-    if options.unit is not None and options.unit not in CLOUD_UNITS_MM:
-        raise InputError("--unit", "", repr(options.unit), " | ".join(CLOUD_UNITS_MM))
+    if options.unit is not None and options.unit not in LENGTHS_MM:
+        raise InputError("--unit", "", repr(options.unit), " | ".join(LENGTHS_MM))
     return read_organised_cloud(
         cloud,
         calibration=options.cameras,
