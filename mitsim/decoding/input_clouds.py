@@ -21,7 +21,7 @@ from mitsim.capture.recordings.recognise import KINDS, ReadOptions, kind_of, rea
 from mitsim.decoding.cloud import Settings, decoder_settings
 from mitsim.decoding.coded_images import decoded_once
 from mitsim.decoding.kept_clouds import kept_cloud
-from mitsim.decoding.plain_clouds import is_array_or_text, plain_cloud, read_plain_cloud
+from mitsim.decoding.plain_clouds import is_array_or_text, is_map_of_depths, plain_cloud, read_plain_cloud
 from mitsim.running.progress import say
 from mitsim.sensor.matcher import MatcherSettings
 
@@ -97,7 +97,7 @@ def read_cloud(
     """
     if path.is_file() and _is_mitsim_ply(path):
         return InputCloud(path, cloud_files.read_cloud(path), None)
-    if is_array_or_text(path):
+    if is_array_or_text(path) and not is_map_of_depths(path):
         return _plain(path, *read_plain_cloud(path))
     if (path / "capture.json").exists():
         capture = read_capture(path)
@@ -126,7 +126,7 @@ def read_cloud(
             path,
             "",
             "no such file or folder",
-            "a cloud (.ply, .pcd, .npy, .mat, .xyz), a capture folder, or folders of these",
+            "a cloud (.ply, .pcd, .npy, .npz, .mat, .xyz), a capture folder, or folders of these",
         )
     settings, imager = decoder_settings(capture, sensor)
     chosen = (settings, imager, topic, frame, sensor)

@@ -110,7 +110,7 @@ def test_what_a_kind_does_not_heed_is_refused(tmp_path):
         read_recording(path, ReadOptions(scale_mm=2.0))
     with pytest.raises(InputError, match="did you mean 'ply'"):
         read_recording(path, ReadOptions(), "pyl")
-    for wrong, told in (({"axes": "z-up"}, "--axes"), ({"unit": "inch"}, "--unit"), ({"range_mm": (5, 4)}, "--range")):
+    for wrong, told in (({"axes": "z-up"}, "--axes"), ({"unit": "furlong"}, "--unit"), ({"range_mm": (5, 4)}, "--range")):
         with pytest.raises(InputError, match=told):
             read_recording(path, ReadOptions(**wrong))
 

@@ -19,7 +19,7 @@ from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import read_grey
-from mitsim.capture.recordings.array_file import NPY_MAGIC, numbers_of_npy
+from mitsim.capture.recordings.array_file import NPY_MAGIC, map_in
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.organised_cloud import FARTHEST_MM, METRES_UNDER
 from mitsim.sensor.camera import Rig
@@ -36,6 +36,7 @@ def read_depth_image(
     invalid: int | None = None,
     camera: str | None = None,
     sensor: str | None = None,
+    frame: int | None = None,
 ) -> Capture:
     """Read one depth image.
 
@@ -54,6 +55,8 @@ def read_depth_image(
         Name of the camera in the calibration; by default the first.
     sensor
         Name of the sensor; by default that of the calibration, or ``depth-camera``.
+    frame
+        Number of one of several images in a file of NumPy, from 0.
 
     Raises
     ------
@@ -61,7 +64,7 @@ def read_depth_image(
         If the image or the calibration cannot be read, the image has 8 bits, or its size differs from the camera's.
     """
     path = Path(path)
-    image = _levels(path)
+    image = _levels(path, frame)
     if image.dtype == np.uint8:
         hint = "an 8-bit picture has lost its depths: save the device's 16 bits"
         raise InputError(path, "depth", "8 bits", "16 bits", hint)
@@ -82,13 +85,12 @@ def read_depth_image(
     return depth_capture(depth, read, path, settings, camera=camera, sensor=sensor)
 
 
-def _levels(path: Path) -> NDArray[Any]:
-    """Return the numbers (H, W) of an image file or an ``.npy``; integers of ``.npy`` of any size as floating point."""
+def _levels(path: Path, frame: int | None) -> NDArray[Any]:
+    """Return the numbers (H, W) of an image or a file of NumPy; integers of any size as floating point."""
     data = read_bounded(path, "a depth image")
-    if not data.startswith(NPY_MAGIC):
+    if not data.startswith(NPY_MAGIC) and path.suffix.lower() != ".npz":
         return read_grey(path)
-    values = numbers_of_npy(data, path)
-    values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
+    values = map_in(data, path, frame)
     if values.ndim != 2 or not all(1 <= side <= LONGEST_SIDE_PX for side in values.shape):
         raise InputError(path, "shape", " x ".join(map(str, values.shape)), "depths of rows x columns")
     if values.dtype.kind == "f" or values.dtype in (np.uint8, np.uint16):

@@ -27,7 +27,7 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.capture.recordings.array_file import NPY_MAGIC, numbers_of_npy
+from mitsim.capture.recordings.array_file import NPY_MAGIC, map_in
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.nxlib_calibration import sensor_from_rectified
 from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of
@@ -94,7 +94,7 @@ def read_stored_cloud(path: Path) -> StoredCloud:
         return StoredCloud(path, read.points, size, found)
     if data.startswith(HDF5_MAGIC) or path.suffix.lower() == ".zdf":
         return _of_zdf(path)
-    if data.startswith(NPY_MAGIC):
+    if data.startswith(NPY_MAGIC) or path.suffix.lower() == ".npz":
         return _of_npy(path, data)
     if path.suffix.lower() == ".ply" and b"FIELDS" not in data[:4096]:
         raise InputError(path, "", "a file without the header of a PLY", "a PLY file, whose first line is ply")
@@ -123,12 +123,12 @@ def _of_zdf(path: Path) -> StoredCloud:
 
 
 def _of_npy(path: Path, data: bytes) -> StoredCloud:
-    values = numbers_of_npy(data, path)
-    if values.ndim != 3 or values.shape[2] < 3 or min(values.shape[:2]) < 2:
+    values = map_in(data, path)
+    if values.ndim != 3 or min(values.shape[:2]) < 2:
         found = f"{values.dtype} of {' x '.join(map(str, values.shape))}"
         raise InputError(path, "shape", found, "points of rows x columns x 3, or depths of rows x columns")
     with np.errstate(over="ignore"):
-        points = values[..., :3].astype(np.float32)
+        points = values.astype(np.float32)
     return StoredCloud(path, points, (values.shape[1], values.shape[0]), {})
 
 

@@ -20,7 +20,7 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError, MissingEnvironmentError, nearest
 from mitsim.capture.capture import Capture
 from mitsim.capture.grey_image import channel_of
-from mitsim.capture.recordings.array_file import NPY_MAGIC, numbers_of_npy
+from mitsim.capture.recordings.array_file import NPY_MAGIC, map_in
 from mitsim.capture.recordings.depth_image import read_depth_image
 from mitsim.capture.recordings.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
 from mitsim.capture.recordings.ensenso import ensenso_originals, image_sets, read_ensenso
@@ -167,6 +167,7 @@ def _read_depth(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, by
         invalid=options.invalid,
         camera=options.camera,
         sensor=options.named,
+        frame=frame_of(options.frame, path),
     )
     return capture, _originals([path, *_file_of(source)])
 
@@ -179,10 +180,8 @@ def _read_cloud(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, by
 
 def _read_array(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
     """Read an array of rows x columns as depths, and one of rows x columns x 3 as points."""
-    shape = numbers_of_npy(read_bounded(path), path).shape
-    if len(shape) == 2 or (len(shape) == 3 and shape[2] == 1):
-        return _read_depth(path, options)
-    return _read_cloud(path, options)
+    is_depth = map_in(read_bounded(path), path, frame_of(options.frame, path)).ndim == 2
+    return _read_depth(path, options) if is_depth else _read_cloud(path, options)
 
 
 def _organised(cloud: Path | StoredCloud, options: ReadOptions) -> Capture:
@@ -305,7 +304,7 @@ KINDS: dict[str, Kind] = {
     "ply": Kind("a PLY cloud", _read_cloud, _OF_CLOUDS),
     "pcd": Kind("a PCD cloud", _read_cloud, _OF_CLOUDS),
     "zdf": Kind("a cloud of Zivid", _read_cloud, _OF_CLOUDS),
-    "npy": Kind("a NumPy array", _read_array, _OF_CLOUDS | {"scale_mm", "invalid"}),
+    "npy": Kind("a NumPy array", _read_array, _OF_CLOUDS | {"scale_mm", "invalid", "frame"}),
 }
 
 
@@ -324,6 +323,8 @@ def kind_of(path: str | Path, options: ReadOptions | None = None) -> str:
         raise InputError(path, "", "no such file or folder", "a recording")
     with path.open("rb") as stream:
         begin = stream.read(64)
+    if path.suffix.lower() == ".npz":
+        return "npy"
     if begin.startswith(MCAP_MAGIC):
         return _kind_of_mcap(path)
     for mark, kind in (
