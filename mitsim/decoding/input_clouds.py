@@ -8,7 +8,7 @@ capture if there is one.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from characterisation import cloud_files
@@ -16,8 +16,9 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
-from mitsim.capture.recordings.organised_cloud import read_organised_cloud, read_stored_cloud
-from mitsim.capture.recordings.recognise import KINDS, ReadOptions, kind_of, read_recording, unorganised_cloud
+from mitsim.capture.recordings.any_recording import KINDS, ReadOptions, read_recording
+from mitsim.capture.recordings.organised_cloud import NoGridError, read_organised_cloud, read_stored_cloud
+from mitsim.capture.recordings.recognise import kind_of
 from mitsim.decoding.cloud import Settings, decoder_settings
 from mitsim.decoding.coded_images import decoded_once
 from mitsim.decoding.kept_clouds import kept_cloud
@@ -112,13 +113,12 @@ def read_cloud(
                 raise
             return _plain(path, *plain_cloud(stored.points, path))
     elif path.exists():
-        options = ReadOptions(topic=topic, frame=frame, sensor=sensor)
-        if "sensor" not in KINDS[kind_of(path, options)].options:
-            options = replace(options, sensor=None)
-        plain = unorganised_cloud(path, options)
-        if plain is not None:
-            return _plain(path, *plain_cloud(plain, path))
-        capture = read_recording(path, options).capture
+        kind = kind_of(path, sensor=sensor)
+        used = sensor if "sensor" in KINDS[kind].options else None
+        try:
+            capture = read_recording(path, ReadOptions(topic=topic, frame=frame, sensor=used), kind).capture
+        except NoGridError as error:
+            return _plain(path, *plain_cloud(error.points, path))
         for warning in capture.settings.get("warnings", []):
             say(f"warning: {warning}")
     else:

@@ -10,9 +10,10 @@ import pytest
 from cloud_files_of_others import pinhole_cloud, ply
 
 from characterisation.files.errors import InputError
+from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 from mitsim.capture.recordings.calibration_file import read_calibration
 from mitsim.capture.recordings.pinhole_fit import fit_pinhole, grid_of
-from mitsim.capture.recordings.recognise import ReadOptions, kind_of, read_recording
+from mitsim.capture.recordings.recognise import kind_of
 from mitsim.decoding.input_clouds import read_cloud
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.png import encode_png

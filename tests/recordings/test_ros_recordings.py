@@ -20,7 +20,9 @@ from ros_bags import (
 )
 
 from characterisation.files.errors import InputError
-from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+from mitsim.capture.recordings import any_recording, ros_bag
+from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
+from mitsim.decoding import input_clouds
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.decoding.input_clouds import read_cloud
 
@@ -164,6 +166,18 @@ def test_a_cloud_without_a_grid_is_measured_and_not_imported(tmp_path):
     found = read_cloud(path).cloud
     assert found.valid.sum() == (depth_mm() > 0).sum()
     assert np.nanmean(found.points[..., 2]) == pytest.approx(np.nanmean(points_m()[..., 2]) * 1000, abs=1e-3)
+
+
+@pytest.mark.parametrize("organised", [False, True])
+def test_a_bag_to_measure_is_recognised_and_opened_once(tmp_path, monkeypatch, organised):
+    points = points_m() if organised else points_m()[depth_mm() > 0][None]
+    path = bag(tmp_path, [("/points", cloud(ROS2, points))])
+    calls = []
+    for module, name in ((input_clouds, "kind_of"), (any_recording, "kind_of"), (ros_bag, "open_bag")):
+        real = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *a, name=name, real=real, **k: calls.append(name) or real(*a, **k))
+    assert (read_cloud(path).cloud.grid.height > 1) == organised
+    assert calls == ["kind_of", "open_bag"]
 
 
 def pair(store, second=1.0, baseline_m=0.05):

@@ -73,7 +73,7 @@ def arrays_of_npz(data: bytes, where: str | Path) -> dict[str, NDArray[Any]]:
     return out
 
 
-def map_in(data: bytes, where: str | Path, frame: int | None = None) -> NDArray[Any]:
+def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
     """Return the points (rows, columns, 3), or else the depths (rows, columns), of an ``.npy`` or ``.npz`` file.
 
     Parameters

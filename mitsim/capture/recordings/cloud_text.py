@@ -24,6 +24,9 @@ _LARGEST = 256 * 1024**2
 _SPACES = bytes.maketrans(b",;\t", b"   ")
 _MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"\xef\xbb\xbf": "utf-8-sig"}
 
+#: a name of a column: x, y or z, which a word may precede, and a unit may follow
+_NAME = re.compile(r"(?:points?|pos(?:ition)?|coord(?:inate)?)?[_.:]?([xyz])(?:_?(?:mm|m|cm|um))?")
+
 #: lines from which separators and decimal mark are found
 _SAMPLE = 200
 
@@ -68,8 +71,8 @@ def points_of_text(data: bytes, path: Path) -> NDArray[np.float64]:
     if not names:
         return table[:, :3]
     if len(names) != columns or not set("xyz") <= set(names):
-        found = f"the names {', '.join(names)[:80]} of {columns} columns"
-        raise InputError(path, "", found, "names of all columns, among them x, y and z")
+        shown = f"the names {', '.join(names)[:80]} of {columns} columns"
+        raise InputError(path, "", shown, "names of all columns, among them x, y and z")
     return table[:, [names.index(axis) for axis in "xyz"]]
 
 
@@ -80,32 +83,27 @@ def _is_comment(line: bytes) -> bool:
 
 def _names(line: bytes) -> list[str]:
     """Return the names of columns in small letters, without units; none if the line does not name x, y or z."""
-    words = re.split(
-        r"[,;\t ]+", re.sub(r"[\[(][^\])]*[\])]", "", line.decode("ascii", "replace")).strip("#/ \t").lower()
-    )
-    names = [
-        re.sub(r"^(?:points?|pos(?:ition)?|coord(?:inate)?)?[_.:]?([xyz])(?:_?(?:mm|m|cm|um))?$", r"\1", each)
-        for each in words
-    ]
+    without_units = re.sub(r"[\[(][^\])]*[\])]", "", line.decode("ascii", "replace"))
+    words = re.split(r"[,;\t ]+", without_units.strip("#/ \t").lower())
+    names = [found[1] if (found := _NAME.fullmatch(each)) else each for each in words]
     return names if len(set("xyz") & set(names)) >= 2 else []
 
 
 def _with_points(rows: list[bytes]) -> list[bytes]:
     """Return rows with decimal points and with ``nan`` in empty fields, whatever the separators."""
     sample = rows[:_SAMPLE]
-    fields = [re.split(rb"[;\t ]+", row.strip(b";\t ")) for row in sample]
-    has_comma = any(b"," in row for row in sample)
-    if (
-        has_comma
-        and not any(b"." in row for row in sample)
-        and all(len(each) >= 3 and all(re.fullmatch(rb"[^,]+(?:,[^,]+)?", one) for one in each) for each in fields)
-    ):
+    if _has_decimal_commas(sample):
         rows = [row.replace(b",", b".") for row in rows]
-        has_comma = False
-    mark = next(
-        (each for each in ((b";", b",") if has_comma else (b";", b"\t")) if any(each in row for row in sample)), None
-    )
+    mark = next((each for each in (b";", b",", b"\t") if any(each in row for row in rows[:_SAMPLE])), None)
     if mark is None or not any(mark + mark in row or row.startswith(mark) or row.endswith(mark) for row in rows):
         return rows
     count = max(row.rstrip(mark).count(mark) for row in sample)
     return [mark.join(one.strip() or b"nan" for one in (row.split(mark) + [b""] * count)[: count + 1]) for row in rows]
+
+
+def _has_decimal_commas(rows: list[bytes]) -> bool:
+    """Return whether each field between other separators has at most one comma, inside it, and no row has a point."""
+    if not any(b"," in row for row in rows) or any(b"." in row for row in rows):
+        return False
+    fields = [re.split(rb"[;\t ]+", row.strip(b";\t ")) for row in rows]
+    return all(len(each) >= 3 and all(re.fullmatch(rb"[^,]+(?:,[^,]+)?", one) for one in each) for each in fields)

@@ -73,6 +73,12 @@ class StoredCloud:
     grey: NDArray[np.uint8] | None = None
 
 
+class NoGridError(InputError):
+    """A cloud that is not organised, where an organised one is needed; ``points`` (n, 3) as in the file."""
+
+    points: Points
+
+
 def read_stored_cloud(path: Path) -> StoredCloud:
     """Read a PLY, PCD, ZDF or NumPy file of another program; what its bytes are counts, not its suffix.
 
@@ -84,7 +90,10 @@ def read_stored_cloud(path: Path) -> StoredCloud:
     InputError
         If the file is damaged, of none of these formats, or was written by mitsim.
     """
-    data = read_bounded(path, "a PLY, PCD, ZDF or NumPy file")
+    expected = "a PLY, PCD, ZDF or NumPy file"
+    if path.suffix.lower() == ".zdf" or read_bounded(path, expected, first=len(HDF5_MAGIC)) == HDF5_MAGIC:
+        return _of_zdf(path)
+    data = read_bounded(path, expected)
     if data.startswith(b"ply"):
         read = decode_ply(data, path)
         if any(line.startswith("comment mitsim ") for line in read.lines):
@@ -92,8 +101,6 @@ def read_stored_cloud(path: Path) -> StoredCloud:
         size = read.size or grid_of(read.points)
         found = {} if read.size or size is None else {"grid_from": "the points"}
         return StoredCloud(path, read.points, size, found)
-    if data.startswith(HDF5_MAGIC) or path.suffix.lower() == ".zdf":
-        return _of_zdf(path)
     if data.startswith(NPY_MAGIC) or path.suffix.lower() == ".npz":
         return _of_npy(path, data)
     if path.suffix.lower() == ".ply" and b"FIELDS" not in data[:4096]:
@@ -221,7 +228,9 @@ def _on_grid(
     if size is None:
         of_pcd = stored.points.ndim == 3
         field, found = ("HEIGHT", "1: a cloud") if of_pcd else ("", f"{count} points")
-        raise InputError(stored.path, field, f"{found} without a grid", "an organised cloud", hint)
+        error = NoGridError(stored.path, field, f"{found} without a grid", "an organised cloud", hint)
+        error.points = stored.points.reshape(-1, 3)
+        raise error
     if size[0] * size[1] != count:
         allowed = f"{size[0]} x {size[1]}, one for each pixel"
         raise InputError(stored.path, "", f"{count} points", allowed, hint)
