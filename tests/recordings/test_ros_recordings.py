@@ -96,6 +96,28 @@ def test_every_encoding_of_a_depth_is_the_same_depth(tmp_path, made, tolerance):
     assert np.nanmax(np.abs(found - seen(depth_mm()))) < tolerance
 
 
+@pytest.mark.parametrize(
+    ("name", "encoding", "is_depth"),
+    [
+        ("/camera/aligned_depth_to_color/image_raw", "16UC1", True),
+        ("/camera/depth/image", "mono16", True),
+        ("/camera/rgb/image_mono", "mono16", False),
+        ("/camera/snr/image", "32FC1", False),
+        ("/camera/confidence/image", "16UC1", False),
+    ],
+)
+def test_an_image_of_16_bits_is_a_depth_by_its_topic_too(tmp_path, name, encoding, is_depth):
+    """Before, grey images of 16 bits and maps of the signal-to-noise ratio were depths."""
+    values = METRES if encoding == "32FC1" else depth_mm()
+    space = name.rpartition("/")[0]
+    path = bag(tmp_path, [(f"{space}/camera_info", info(ROS2)), (name, image(ROS2, values, encoding))])
+    if is_depth:
+        assert np.array_equal(depth_of(path), seen(depth_mm()), equal_nan=True)
+    else:
+        with pytest.raises(InputError, match=f"{name} .*Image, {encoding}"):
+            depth_of(path)
+
+
 def test_a_bag_of_the_viewer_of_realsense_has_its_own_unit(tmp_path):
     sensor = "/device_0/sensor_0"
     unit = typed(ROS1, "std_msgs/msg/Float32", data=0.0001)
