@@ -29,7 +29,7 @@ from mitsim.sensor.mat_structure import read_mat
 _MOST_NUMBERS = 1_000_000_000
 
 #: suffixes of clouds in arrays and text
-ARRAYS, TEXTS = (".npy", ".npz", ".mat"), (".xyz", ".txt", ".asc", ".pts", ".csv")
+ARRAYS, TEXTS = (".npy", ".npz", ".mat"), (".xyz", ".xyzn", ".xyzi", ".xyzrgb", ".txt", ".asc", ".pts", ".csv")
 
 
 def is_array_or_text(path: Path) -> bool:

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError, nearest
-from mitsim.sensor.calibration_eyes import size_of, vector
+from mitsim.sensor.calibration_eyes import size_of
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
 from mitsim.sensor.calibration_qualifiers import (
     baseline_note,
@@ -295,15 +295,15 @@ def _checked_matrix(K: NDArray[np.float64], name: str, file: str) -> NDArray[np.
 def _size(values: _Values, name: str, place: int, table: dict[str, Any]) -> tuple[int, int] | None:
     """Return the image size (width, height) [px] of an eye that the files state; None without one.
 
-    ``table`` has the matrix of the eye; an ``image_width`` and ``image_height`` beside the matrix come first.
+    ``table`` has the matrix of the eye; a width and height beside the matrix come first.
     """
     size = values.find(name, place, "size", ((2,),), needed=False)
     if size is not None:
         return int(size.value[0]), int(size.value[1])
-    beside = [vector(table.get(key), 1) for key in ("image_width", "image_height")]
+    beside = size_of(table)
     own_file = values.calibration_table.keys.get(name, EyeKeys()).file
-    if beside[0] is not None and beside[1] is not None and (place < 2 or own_file or table is not values.tables[0]):
-        return int(beside[0][0]), int(beside[1][0])
+    if beside is not None and (place < 2 or own_file or table is not values.tables[0]):
+        return int(beside[0]), int(beside[1])
     if place == 2 and not own_file:
         return None
     sides = [values.tree.find(f"{own_file}:{key}" if own_file else key) for key in ("image_width", "image_height")]

@@ -81,6 +81,12 @@ def test_one_camera_in_the_words_of_many_programs(tmp_path, name, ending):
     assert list(read.notes) == (by_columns if name in ("nine numbers by columns", "transposed") else [])
 
 
+def test_the_size_beside_a_matrix_suffices(tmp_path):
+    """As in the files of Open3D, without any image."""
+    read = read_calibration(saved(tmp_path / "a.json", FILES["nine numbers by columns"]))
+    assert (read.rig.reference.width, read.rig.reference.height) == SIZE
+
+
 PAIRS = {
     "left and right": {
         "right": {"camera_matrix": K2.tolist(), "dist_coeffs": D},
