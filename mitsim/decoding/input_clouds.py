@@ -30,7 +30,7 @@ from mitsim.sensor.matcher import MatcherSettings
 _SUFFIXES = (".ply", ".pcd", ".zdf")
 
 #: text that identifies a cloud file of ``mitsim decode``, and the length of the header in which it stands [bytes]
-_MARK, _HEAD = b"\ncomment mitsim ", 4096
+_MARK, _HEAD = b"\ncomment mitsim ", 1 << 20
 
 
 @dataclass(frozen=True)
@@ -145,6 +145,7 @@ def margin_of(settings: Settings) -> int:
 
 
 def _is_mitsim_ply(path: Path) -> bool:
+    """Return whether a file is a cloud of ``mitsim decode``: one that ``mitsim export`` wrote states no grid."""
     with path.open("rb") as file:
         head = file.read(_HEAD)
-    return head.startswith(b"ply\n") and _MARK in head
+    return head.startswith(b"ply\n") and b'"grid"' in head.partition(_MARK)[2].partition(b"\n")[0]

@@ -102,6 +102,7 @@ TEXTS = {
     "tabs, decimal commas, empty fields": text("\t", "X\tY\tZ\n", mark=",", missing=""),
     "numbered rows": text(",", "index,x,y,z\n", "{n}{s}{x}{s}{y}{s}{z}"),
     "columns in another order": text(",", "z,x,y\n", "{z}{s}{x}{s}{y}"),
+    "a first row of empty fields": "x;y;z\n;;\n" + text(";", mark=",", missing=""),
     "names in quotes": text(",", '"x","y","z"\n'),
     "names with units": text(";", "x [mm]; y [mm]; z [mm]\n"),
     "names in a comment": text(" ", "//X Y Z Intensity\n", "{x}{s}{y}{s}{z}{s}7"),
@@ -188,6 +189,16 @@ def test_a_ply_with_capital_names_and_a_space_in_its_first_line(tmp_path):
     (tmp_path / "a.ply").write_bytes(ply(plane(2.0), "XYZ").replace(b"ply\n", b"ply \n", 1))
     cloud = read_cloud(tmp_path / "a.ply").cloud
     assert cloud.points[cloud.valid][:, 2] == pytest.approx(602.0)
+
+
+def test_a_cloud_that_was_exported_is_measured(tmp_path):
+    """Its header names mitsim, too, but states no grid."""
+    pytest.importorskip("pypcd4")
+    decoded(tmp_path / "a.ply", plane(2.0))
+    for name in ("b.ply", "b.pcd"):
+        assert mitsim_here("export", "cloud", tmp_path / "a.ply", "-o", tmp_path / name).returncode == 0
+        cloud = read_cloud(tmp_path / name).cloud
+        np.testing.assert_allclose(cloud.points[cloud.valid], plane(2.0)[np.isfinite(plane()[..., 0])], rtol=1e-6)
 
 
 def test_a_reference_with_a_grid_may_lie_anywhere(tmp_path):

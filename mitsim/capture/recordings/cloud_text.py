@@ -105,5 +105,6 @@ def _has_decimal_commas(rows: list[bytes]) -> bool:
     """Return whether each field between other separators has at most one comma, inside it, and no row has a point."""
     if not any(b"," in row for row in rows) or any(b"." in row for row in rows):
         return False
-    fields = [re.split(rb"[;\t ]+", row.strip(b";\t ")) for row in rows]
-    return all(len(each) >= 3 and all(re.fullmatch(rb"[^,]+(?:,[^,]+)?", one) for one in each) for each in fields)
+    fields = [[one for one in re.split(rb"[;\t ]+", row) if one] for row in rows]
+    inside = all(re.fullmatch(rb"[^,]+(?:,[^,]+)?", one) for each in fields for one in each)
+    return inside and max(map(len, fields)) >= 3

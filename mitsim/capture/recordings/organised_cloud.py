@@ -96,7 +96,7 @@ def read_stored_cloud(path: Path) -> StoredCloud:
     data = read_bounded(path, expected)
     if data.startswith(b"ply"):
         read = decode_ply(data, path)
-        if any(line.startswith("comment mitsim ") for line in read.lines):
+        if any(line.startswith("comment mitsim ") and '"grid"' in line for line in read.lines):
             raise InputError(path, "", "a cloud written by mitsim", "a cloud of another program", "it needs no import")
         size = read.size or grid_of(read.points)
         found = {} if read.size or size is None else {"grid_from": "the points"}
