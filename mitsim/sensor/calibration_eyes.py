@@ -309,6 +309,6 @@ def vector(value: Any, size: int | None = None) -> NDArray[np.float64] | None:
         return None
     try:
         numbers = np.asarray(value, float).reshape(-1)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         return None
     return numbers if np.isfinite(numbers).all() and (size is None or len(numbers) == size) else None

@@ -144,7 +144,7 @@ def _is_optics(name: str, value: Any) -> bool:
         return alone is not None and bool(alone.any())
     try:
         numbers = np.asarray(value, float)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         return False
     if not numbers.size or not np.isfinite(numbers).all():
         return False
@@ -179,5 +179,5 @@ def _spelt(name: str, table: dict[str, Any]) -> str:
 def _same(one: Any, other: Any) -> bool:
     try:
         return bool(np.array_equal(np.asarray(one, float), np.asarray(other, float)))
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         return bool(one == other)

@@ -349,7 +349,7 @@ def _numbers(value: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], ..
     """Convert a matrix or lists to an array of one of several shapes; row and column vectors are equivalent."""
     try:
         values = np.asarray(value, float)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         values = np.array(math.nan)
     vector = len(shapes[0]) == 1
     found = values.reshape(-1) if vector and values.ndim and values.size == max(values.shape) else values

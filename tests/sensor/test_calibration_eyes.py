@@ -173,6 +173,7 @@ def test_a_map_named_in_a_sensor_file(tmp_path):
         ({"fx": float("nan")}, r"fx, fy, ppx, ppy: found \[\[nan"),
         ({"fx": "600,5"}, r"fx, fy, ppx, ppy: found \[\[nan"),
         ({"coeffs": [0.1] * 6}, "coeffs: found an array of 6"),
+        ({"fx": 10**400}, r"fx, fy, ppx, ppy: found \[\[nan"),
     ],
 )
 def test_what_no_model_of_opencv_describes_is_refused(tmp_path, more, message):
