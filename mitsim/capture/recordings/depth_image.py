@@ -18,7 +18,7 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.capture.grey_image import read_grey
+from mitsim.capture.grey_image import read_depths
 from mitsim.capture.recordings.array_file import NPY_MAGIC, map_in
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.organised_cloud import FARTHEST_MM, METRES_UNDER
@@ -50,7 +50,7 @@ def read_depth_image(
         Depth of one level [mm]; by default 1, or 1000 for floating point with a median under
         :data:`~mitsim.capture.recordings.organised_cloud.METRES_UNDER`.
     invalid
-        Level of missing depths; by default 0.
+        Level of missing depths, beside 0 and the largest one of 16 bits.
     camera
         Name of the camera in the calibration; by default the first.
     sensor
@@ -80,7 +80,15 @@ def read_depth_image(
         raise InputError(path, "", f"an image with only the level {invalid}", "an image with some depths")
     with np.errstate(over="ignore"):
         depth = image.astype(np.float32) * np.float32(scale_mm)
-    depth[(image == invalid) | ~np.isfinite(depth)] = np.nan
+    depth[(image == invalid) | (image == 0) | ~np.isfinite(depth)] = np.nan
+    full = np.iinfo(np.uint16).max
+    if image.dtype == np.uint16 and (image == full).any():
+        depth[image == full] = np.nan
+        if invalid != full:
+            share = 100 * float(np.mean(image == full))
+            settings["warnings"] = [f"{share:.2g} % of the pixels have the level {full}, the largest: left out"]
+        if np.isnan(depth).all():
+            raise InputError(path, "", f"an image with only the level {full}", "an image with some depths")
     read = read_calibration(calibration, (image.shape[1], image.shape[0]))
     return depth_capture(depth, read, path, settings, camera=camera, sensor=sensor)
 
@@ -89,7 +97,7 @@ def _levels(path: Path, frame: int | None) -> NDArray[Any]:
     """Return the numbers (H, W) of an image or a file of NumPy; integers of any size as floating point."""
     data = read_bounded(path, "a depth image")
     if not data.startswith(NPY_MAGIC) and path.suffix.lower() != ".npz":
-        return read_grey(path)
+        return read_depths(path)
     values = map_in(data, path, frame)
     if values.ndim != 2 or not all(1 <= side <= LONGEST_SIDE_PX for side in values.shape):
         raise InputError(path, "shape", " x ".join(map(str, values.shape)), "depths of rows x columns")

@@ -40,6 +40,8 @@ _MARKS = {
     b"\x89PNG": "depth",
     b"II*\x00": "depth",
     b"MM\x00*": "depth",
+    b"P5": "depth",
+    b"Pf\n": "depth",
 }
 
 #: kinds by the suffix of a file whose first bytes are unknown
@@ -49,6 +51,11 @@ _SUFFIXES = {
     ".ply": "ply",
     ".mcap": "depthai",
     ".png": "depth",
+    ".pgm": "depth",
+    ".pfm": "depth",
+    ".bmp": "depth",
+    ".jpg": "depth",
+    ".jpeg": "depth",
     ".bag": "ros",
     ".db3": "ros",
     ".zdf": "zdf",
@@ -58,8 +65,11 @@ _SUFFIXES = {
 #: suffixes of recordings that are one file
 _RECORDED_ALONE = frozenset({".zip", ".enscam", ".ply", ".pcd", ".mcap", ".bag", ".db3", ".zdf"})
 
-#: formats that their makers have not published: what they are, what is read instead, and how to save it
-_UNPUBLISHED = {
+#: files that are not read: what they are, what is read instead, and how to make it
+_NOT_READ = {
+    ".exr": ("an EXR image", "depths as a TIFF of floating point, a 16-bit PNG or an .npy", "convert it"),
+    ".raw": ("bytes without their size", "a 16-bit PNG, or an .npy: np.fromfile(...).reshape(rows, columns)", ""),
+    ".bin": ("bytes without their size", "a 16-bit PNG, or an .npy: np.fromfile(...).reshape(rows, columns)", ""),
     ".praw": (
         "a .praw of PhoXi Control, whose format Photoneo has not published",
         "a cloud that PhoXi Control saves as organised PLY",
@@ -106,8 +116,8 @@ def kind_of(path: str | Path, *, sensor: str | None = None, calibration: str | N
         return "pcd"
     if path.suffix.lower() in _SUFFIXES:
         return _SUFFIXES[path.suffix.lower()]  # damaged; its reader reports the error
-    if path.suffix.lower() in _UNPUBLISHED:
-        raise InputError(path, "", *_UNPUBLISHED[path.suffix.lower()])
+    if path.suffix.lower() in _NOT_READ:
+        raise InputError(path, "", *_NOT_READ[path.suffix.lower()])
     raise InputError(path, "", "a file of an unknown kind", "; ".join(NAMES.values()), "say which with --as")
 
 
