@@ -122,9 +122,21 @@ def half_stripe(coordinate: ProjectorCoordinate) -> float:
 def meeting(eye: Camera, projector: Camera, rays: Floats, coordinates: dict[Axis, Floats]) -> tuple[Floats, Floats]:
     """Return the distance (n,) [mm] along rays at which they meet their light, and the miss distance [projector px].
 
-    ``rays`` (n, 3): directions from the camera, in the sensor frame. The miss has a sign: across the epipolar line, to
-    one side or the other. With one axis the light is the plane of a column or row, which a lens bends slightly; rays
-    cannot miss it.
+    The miss has a sign: across the epipolar line, to one side or the other. With one axis the light is the plane of a
+    column or row, which a lens bends slightly; rays cannot miss it.
+
+    Parameters
+    ----------
+    eye, projector
+        Camera and projector of a rig.
+    rays
+        (n, 3) directions from the camera, in the sensor frame.
+    coordinates
+        (n,) columns, rows or both [projector px].
+
+    See Also
+    --------
+    meet_light_planes : of one axis
     """
     start = eye.centre - projector.centre
     if len(coordinates) == 2:
