@@ -11,14 +11,12 @@ of the two cameras. Values that qualify these numbers are those of :mod:`mitsim.
 
 from __future__ import annotations
 
-import math
 import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
@@ -26,6 +24,7 @@ from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError, nearest
 from mitsim.sensor.calibration_eyes import size_of
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
+from mitsim.sensor.calibration_numbers import by_rows, checked_matrix, numbers_of
 from mitsim.sensor.calibration_qualifiers import (
     baseline_note,
     lens_model,
@@ -218,7 +217,7 @@ class _Values:
             found = self.tree.find(key)
             if found is not None and (key == given or what == "size" or not isinstance(found.value, dict)):
                 value = size_of(found.value) if what == "size" and isinstance(found.value, dict) else found.value
-                return replace(found, value=_numbers(value, found.file, found.name, shapes))
+                return replace(found, value=numbers_of(value, found.file, found.name, shapes))
         if needed or given:
             self.missing.append((name, what, names))
         return None
@@ -259,8 +258,8 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
     size = _size(values, name, place, table)
     out: dict[str, Any] = {"model": model, "distortion": distortion.tolist()}
     if matrix is not None:
-        K, by_columns = _by_rows(matrix.value)
-        K = _checked_matrix(K, name, file)
+        K, by_columns = by_rows(matrix.value)
+        K = checked_matrix(K, name, file)
         if by_columns:
             values.notes.append(f"calibration {matrix.file.name}: {name}: its matrix is written by columns")
         read_out = read_out_of(table, matrix.file)
@@ -274,22 +273,6 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
     if size is not None:
         out |= {"width": size[0], "height": size[1]}
     return out | (_pose(values, name, place, own) if place > 0 else {})
-
-
-def _by_rows(K: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
-    """Return K (3, 3) by rows, of nine numbers too, and whether it is written by columns, as Open3D does."""
-    K = K.reshape(3, 3)
-    by_columns = bool((K[:, 2] == (0, 0, 1)).all() and K[2, :2].all())
-    return (K.T if by_columns else K), by_columns
-
-
-def _checked_matrix(K: NDArray[np.float64], name: str, file: str) -> NDArray[np.float64]:
-    if abs(K[0, 1]) > 1e-9 and K[0, 0] > 0:
-        hint = "calibrate without skew: est_alpha = 0 in MATLAB's toolbox"
-        raise InputError(file, f"matrix of {name}", f"a skew of {K[0, 1]:.3g} px", "fx 0 cx, 0 fy cy, 0 0 1", hint)
-    if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs([K[1, 0], *(K[2] - [0, 0, 1])]).max() > 1e-9:
-        raise InputError(file, f"matrix of {name}", np.round(K, 3).tolist(), "fx 0 cx, 0 fy cy, 0 0 1")
-    return K
 
 
 def _size(values: _Values, name: str, place: int, table: dict[str, Any]) -> tuple[int, int] | None:
@@ -309,7 +292,7 @@ def _size(values: _Values, name: str, place: int, table: dict[str, Any]) -> tupl
     sides = [values.tree.find(f"{own_file}:{key}" if own_file else key) for key in ("image_width", "image_height")]
     if sides[0] is None or sides[1] is None:
         return None
-    width, height = (_numbers([each.value], each.file, "image_width", ((1,),)) for each in sides if each)
+    width, height = (numbers_of([each.value], each.file, "image_width", ((1,),)) for each in sides if each)
     return int(width[0]), int(height[0])
 
 
@@ -343,28 +326,3 @@ def _pose(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[s
         turn = Rotation.from_matrix(R.T)
         angles = turn.as_euler("xyz", degrees=True).tolist()
     return {"rotation_deg": angles, "position_mm": (-turn.apply(T)).tolist()}
-
-
-def _numbers(value: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
-    """Convert a matrix or lists to an array of one of several shapes; row and column vectors are equivalent."""
-    try:
-        values = np.asarray(value, float)
-    except (ValueError, TypeError, OverflowError):
-        values = np.array(math.nan)
-    vector = len(shapes[0]) == 1
-    found = values.reshape(-1) if vector and values.ndim and values.size == max(values.shape) else values
-    if found.shape not in shapes or not np.isfinite(found).all():
-        if vector and values.ndim and values.size == 0 and (0,) in shapes:
-            return np.empty(0)
-        allowed = " or ".join(" x ".join(map(str, shape)) for shape in shapes) + " finite numbers"
-        raise InputError(file, key, _shown(value, values), allowed)
-    return found
-
-
-def _shown(value: Any, values: NDArray[np.float64]) -> str:
-    """Return a value that cannot be used, for a message: few numbers as they are, the size of many."""
-    if isinstance(value, dict):
-        return f"a map of {', '.join(list(value)[:6])}"
-    if values.ndim and values.size <= 16 and not np.isfinite(values).all():
-        return str(values.tolist())
-    return f"an array of {' x '.join(map(str, values.shape))}" if values.ndim else "something else"
