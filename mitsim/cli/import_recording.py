@@ -89,7 +89,9 @@ def import_(
     ] = None,
     unit: Annotated[
         str | None,
-        typer.Option(help="Unit of a cloud: um, mm, cm or m; default: m if the median distance is below 20, else mm."),
+        typer.Option(
+            help="Unit of a cloud: um, mm, cm, m, inch or foot; default: m if the median distance is below 20, else mm."
+        ),
     ] = None,
     axes: Annotated[
         str | None,
@@ -112,7 +114,8 @@ def import_(
     Example: mitsim import recording.zip -o captures/real
     """
     from mitsim.capture.folder import is_written, write_capture
-    from mitsim.capture.recordings.recognise import KINDS, ReadOptions, read_recording
+    from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
+    from mitsim.capture.recordings.recognise import NAMES
     from mitsim.capture.recordings.recording_files import plain_name
     from mitsim.decoding.checks.sanity import with_warnings
     from mitsim.running.progress import say
@@ -140,7 +143,7 @@ def import_(
     imported = read_recording(path, options, kind)
     capture = with_warnings(imported.capture)
     folder = output or Path(plain_name(path.resolve().stem) + "_capture")
-    say(f"{path}: {KINDS[imported.kind].name}, of {capture.sensor}, {capture.technology}, {capture.source}")
+    say(f"{path}: {NAMES[imported.kind]}, of {capture.sensor}, {capture.technology}, {capture.source}")
     for name in SETTINGS_TO_CHECK:
         if name in capture.settings:
             say(f"  {name}: {capture.settings[name]}")

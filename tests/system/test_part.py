@@ -303,7 +303,9 @@ def test_normals_in_the_files_are_those_of_the_surface(plate):
     assert np.abs(normals - places * [1, 1, 0] / 15).max() < 1e-6
 
 
-@pytest.mark.parametrize(("units", "length_mm"), [(None, 1), ("mm", 1), ("inch", 25.4), ("m", 1000)])
+@pytest.mark.parametrize(
+    ("units", "length_mm"), [(None, 1), ("mm", 1), ("cm", 10), ("inch", 25.4), ("foot", 304.8), ("m", 1000)]
+)
 def test_units_are_turned_into_mm(tmp_path, units, length_mm):
     plate_with_pillar().apply_scale(1 / length_mm).export(tmp_path / "plate.stl")
     mesh = read_mesh(tmp_path / "plate.stl", units)
@@ -313,7 +315,7 @@ def test_units_are_turned_into_mm(tmp_path, units, length_mm):
 
 def test_a_part_in_metres_is_noticed(tmp_path):
     plate_with_pillar().apply_scale(0.001).export(tmp_path / "plate.stl")
-    with pytest.raises(InputError, match="give --units m"):
+    with pytest.raises(InputError, match="give --units if the file has another unit"):
         read_mesh(tmp_path / "plate.stl")
 
 
@@ -397,7 +399,7 @@ def test_whatever_a_file_holds_is_a_mesh_or_a_message(suffix, head, data):
     [
         ({"path": "plat.stl"}, "did you mean 'plate.stl'"),
         ({"path": "plate.dxf"}, "'.dxf'"),
-        ({"units": "cm"}, "mm, m, inch"),
+        ({"units": "furlong"}, "um, mm, cm, m, inch, foot"),
         ({"finishing": ("aluminum", "ground", 0.8)}, "did you mean 'aluminium'"),
         ({"finishing": ("aluminium", "grund", 0.8)}, "did you mean 'ground'"),
         ({"finishing": ("aluminium", "ground", 80)}, "0.005 to 10 um"),
