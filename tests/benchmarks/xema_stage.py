@@ -18,6 +18,7 @@ import argparse
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,6 +31,10 @@ from mitsim.sensor.preset import Sensor, load_sensor
 
 Floats = NDArray[np.float64]
 CELL, PATCH = 240, 40
+#: a part with this share of points has no reason of loss
+COMPLETE = 0.995
+#: noise is predicted for parts with more than this share of points
+LIT = 0.5
 #: rows and columns of the top of the stage that have neither holes nor screws, in the bright image
 TOP = ((slice(390, 440), slice(680, 860)), (slice(670, 725), slice(680, 860)))
 #: period [px], number of steps, contrast of the finest fringes with all blur: of the preset
@@ -72,7 +77,7 @@ def plane_of(sensor: Sensor, corners: Floats) -> tuple[Floats, Floats, float]:
     camera, projector = sensor.rig.reference, sensor.rig.projector
     w, h = projector.width - 0.5, projector.height - 0.5
     code = np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]])
-    best = None
+    best: tuple[Floats, float] | None = None
     for order in ([0, 1, 2, 3], [1, 0, 3, 2], [3, 2, 1, 0], [2, 3, 0, 1]):
         a = camera.rays(corners)
         a = camera.sensor_from_camera.rotation @ a.T
@@ -84,11 +89,11 @@ def plane_of(sensor: Sensor, corners: Floats) -> tuple[Floats, Floats, float]:
             places.append((first + second) / 2)
             gaps.append(np.linalg.norm(first - second))
         if best is None or max(gaps) < best[1]:
-            best = np.array(places), max(gaps)
+            best = np.array(places), float(max(gaps))
     assert best is not None
     middle = best[0].mean(axis=0)
     normal = np.linalg.svd(best[0] - middle)[2][2]
-    return middle, normal, float(best[1])
+    return middle, normal, best[1]
 
 
 def predicted(sensor: Sensor, white: Floats) -> dict[str, object]:
@@ -113,24 +118,18 @@ def predicted(sensor: Sensor, white: Floats) -> dict[str, object]:
     across = np.abs(np.gradient(u[..., 0], axis=1))
     photon = PERIOD / (2 * np.pi) * np.sqrt(2 / STEPS * variance) / (mean * contrast + 1e-9) / np.abs(du)
     texture = spread * across * np.abs(gradient) / np.abs(du)
-    good = lit & ~low & ~top_level
-    table = []
-    for row in range(0, white.shape[0], CELL):
-        for column in range(0, white.shape[1], CELL):
-            table.append(
-                _row(
-                    f"{row} {column}",
-                    (slice(row, row + CELL), slice(column, column + CELL)),
-                    good,
-                    lit,
-                    low,
-                    top_level,
-                    photon,
-                    texture,
-                )
-            )
-    top = [_row(f"top {k}", each, good, lit, low, top_level, photon, texture) for k, each in enumerate(TOP)]
-    shares = {"F": good.mean(), "LOW_MODULATION": (~lit | low).mean(), "SATURATED": (lit & top_level).mean()}
+    maps = {
+        "F": lit & ~low & ~top_level,
+        "LOW_MODULATION": ~lit | low,
+        "SATURATED": lit & top_level,
+        "photon": photon,
+        "texture": texture,
+    }
+    corners = [(row, column) for row in range(0, white.shape[0], CELL) for column in range(0, white.shape[1], CELL)]
+    names = [f"{row} {column}" for row, column in corners]
+    table = [part_of(name, cell(name), maps) for name in names]
+    top = [part_of(f"top {k}", each, maps) for k, each in enumerate(TOP)]
+    shares = {key: maps[key].mean() for key in ("F", "LOW_MODULATION", "SATURATED")}
     tilt = np.degrees(np.arccos(abs(normal[2])))
     return {
         "plane_mm": round(float(point[2]), 1),
@@ -151,19 +150,17 @@ def _finest_contrast(sensor: Sensor) -> float:
     return float((1 - black) / (1 + black) * 2 * sensor.pattern.contrast * np.exp(-2 * np.pi**2 * spread / PERIOD**2))
 
 
-def _row(name, where, good, lit, low, saturated, photon, texture) -> dict[str, object]:  # type: ignore[no-untyped-def]
+def part_of(name: str, where: tuple[slice, slice], maps: dict[str, NDArray[Any]]) -> dict[str, object]:
     """Return the predictions of one part of the image."""
-    kept = good[where]
-    reason = {"LOW_MODULATION": (~lit | low)[where].mean(), "SATURATED": (lit & saturated)[where].mean()}
+    kept = maps["F"][where]
+    reason = {key: maps[key][where].mean() for key in ("LOW_MODULATION", "SATURATED")}
     out: dict[str, object] = {"where": name, "F": round(float(kept.mean()), 4)}
-    out["reason"] = max(reason, key=lambda key: reason[key]) if kept.mean() < 0.995 else "none"
-    if kept.mean() > 0.5:
-        photons, moved = np.median(photon[where][kept]), np.sqrt(np.mean(texture[where][kept] ** 2))
-        out |= {
-            "photon_mm": round(float(photons), 4),
-            "texture_mm": round(float(moved), 4),
-            "sigma_mm": round(float(np.hypot(photons, moved)), 4),
-        }
+    out["reason"] = max(reason, key=lambda key: reason[key]) if kept.mean() < COMPLETE else "none"
+    if kept.mean() > LIT:
+        photons = float(np.median(maps["photon"][where][kept]))
+        moved = float(np.sqrt(np.mean(maps["texture"][where][kept] ** 2)))
+        sigma = float(np.hypot(photons, moved))
+        out |= {"photon_mm": round(photons, 4), "texture_mm": round(moved, 4), "sigma_mm": round(sigma, 4)}
     return out
 
 
@@ -225,32 +222,38 @@ def written(found: dict[str, object]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def compare(capture_folder: str, predictions: dict[str, object]) -> None:
+def compare(capture_folder: str, predictions: dict[str, Any]) -> None:
     """Print measured figures beside the predicted ones."""
     sensor = load_sensor("xema")
     cloud = capture_cloud(read_capture(capture_folder), sensor.settings, None)
-    status, valid = cloud.status, cloud.valid
-    said = predictions["all"]
-    print(f"| all pixels | predicted | measured |\n|---|---|---|\n| F | {said['F']:.3f} | {valid.mean():.3f} |")  # type: ignore[index]
-    for reason in REASONS:
-        print(f"| {reason} | {said.get(reason, 0):.3f} | {(status == Status[reason]).mean():.3f} |")  # type: ignore[attr-defined]
-    p = cloud.points[valid].astype(float)
-    print(f"| distance, median [mm] | {predictions['plane_mm']} | {np.median(p[:, 2]):.1f} |")
+    status, valid, said = cloud.status, cloud.valid, predictions["all"]
+    unlit = np.isin(status, (Status.NO_SURFACE, Status.LOW_MODULATION)).mean()
     low, rest = form(cloud)
-    print(f"| form of the plate, range of a cubic surface [mm] | {predictions['form_mm']['median']} | {low:.3f} |")  # type: ignore[index]
-    print(f"| the same points about it, standard deviation [mm] | | {rest:.3f} |")
+    rows = [
+        ("F", f"{said['F']:.4f}", f"{valid.mean():.4f}"),
+        ("too little light: low modulation, no surface", f"{said['LOW_MODULATION']:.4f}", f"{unlit:.4f}"),
+        ("saturated", f"{said['SATURATED']:.4f}", f"{(status == Status.SATURATED).mean():.4f}"),
+        ("phases inconsistent", "0", f"{(status == Status.PHASE_INCONSISTENT).mean():.4f}"),
+        ("form of the plate, range of a cubic surface [mm]", f"{predictions['form_mm']['median']}", f"{low:.2f}"),
+        ("standard deviation of the plate about it [mm]", "", f"{rest:.3f}"),
+    ]
+    print("| all pixels | predicted | measured |\n|---|---|---|")
+    for row in rows:
+        print(f"| {' | '.join(row)} |")
     print("\n| part | F | measured | reason | measured | sigma [mm] | measured |\n|---|---|---|---|---|---|---|")
-    for row in [*predictions["cells"], *predictions["top"]]:  # type: ignore[misc]
-        if row["where"].startswith("top"):
-            where = TOP[int(row["where"][-1])]
-        else:
-            first, second = (int(part) for part in row["where"].split())
-            where = (slice(first, first + CELL), slice(second, second + CELL))
+    for part in [*predictions["cells"], *predictions["top"]]:
+        where = TOP[int(part["where"][-1])] if part["where"].startswith("top") else cell(part["where"])
         lost = {reason: (status[where] == Status[reason]).mean() for reason in REASONS}
-        why = max(lost, key=lambda key: lost[key]) if valid[where].mean() < 0.995 else "none"
-        print(
-            f"| {row['where']} | {row['F']:.3f} | {valid[where].mean():.3f} | {row['reason']} | {why} | {row.get('sigma_mm', float('nan')):.3f} | {measured_noise(cloud, where):.3f} |"
-        )
+        why = max(lost, key=lambda key: lost[key]) if valid[where].mean() < COMPLETE else "none"
+        sigma, found = part.get("sigma_mm", np.nan), measured_noise(cloud, where)
+        cells = (part["where"], f"{part['F']:.3f}", f"{valid[where].mean():.3f}", part["reason"], why)
+        print(f"| {' | '.join(cells)} | {sigma:.3f} | {found:.3f} |")
+
+
+def cell(name: str) -> tuple[slice, slice]:
+    """Return the rows and columns of a cell by its first row and column."""
+    row, column = (int(part) for part in name.split())
+    return slice(row, row + CELL), slice(column, column + CELL)
 
 
 def main(arguments: list[str]) -> None:
