@@ -5,8 +5,8 @@ import sys
 
 import numpy as np
 import pytest
-import yaml
 import trimesh
+import yaml
 
 from characterisation.files.errors import MissingEnvironmentError
 from mitsim.capture.recordings.pcd import decode_pcd
