@@ -147,7 +147,7 @@ class GrayCodePhaseShift(Document):
         stripe = self.period_px / 2 if self.complementary else self.period_px
         inverse: Literal["each", "none"] = "each" if self.inverse else "none"
         gray = GrayImages(show="gray", axis=self.axis, stripe_px=stripe, inverse=inverse)
-        images = [*_plain(self.white_black), gray, _fringes(self, self.period_px, self.steps)]
+        images: list[Group] = [*_plain(self.white_black), gray, _fringes(self, self.period_px, self.steps)]
         return _sequence(images, self.mean, self.contrast)
 
 
