@@ -51,8 +51,8 @@ def mesh_facts(vertices: Floats, triangles: NDArray[np.int64], merge: float, tex
         (n, 3) [mm], and (m, 3) indices of vertices.
     merge
         Vertices in one cell of a grid of this spacing [mm] are merged.
-    texture, smooth
-        Whether the vertices have u, v and normals.
+    texture
+        Whether the vertices have u and v.
     """
     _, first, inverse = np.unique(np.round(vertices / merge), axis=0, return_index=True, return_inverse=True)
     vertices, triangles = vertices[first], inverse.reshape(-1)[triangles]
