@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.checked_files import LARGEST_FILE, read_bounded
 from characterisation.files.errors import InputError
-from mitsim.sensor.png import LONGEST_SIDE_PX, PNG_SIGNATURE, decode_png, png_chunks
+from mitsim.sensor.png import LONGEST_SIDE_PX, PNG_SIGNATURE, check_png, decode_png
 
 #: suffixes of the image files that are read
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
@@ -119,7 +119,7 @@ def _decoded(data: bytes, where: str | Path, channel: int | None) -> NDArray[Any
     """Return the numbers (H, W) of an image: its only channel, or the one that is asked for."""
     is_png = data.startswith(PNG_SIGNATURE)
     if is_png:
-        png_chunks(data, where)  # OpenCV would decode the undamaged part of a damaged PNG
+        check_png(data, where)  # OpenCV would decode the undamaged part of a damaged PNG
     image = None
     with suppress(cv2.error):  # reported below, as where OpenCV returns None
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None

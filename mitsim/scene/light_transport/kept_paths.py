@@ -41,9 +41,6 @@ from mitsim.scene.light_transport.projector_light import ProjectedLight
 
 Floats = NDArray[np.float32]
 
-#: index of the factor 1 among the factors of a path, for surfaces whose BSDF is part of the weight
-_ONE = 0
-
 
 @dataclass(frozen=True)
 class Candidates:
