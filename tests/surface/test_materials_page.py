@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from figures_of_surfaces import alpha_of_half_width, short_wave_height
+from figures_of_surfaces import alpha_of_half_width, half_width, short_wave_height
 from scipy.optimize import brentq
 
 from mitsim.scene.surface.diffraction import coherent_share, lobe_alpha
 from mitsim.scene.surface.energy import directional_albedo, energy_factors
 from mitsim.scene.surface.machined import MachinedFace, machined
-from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, half_width
+from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN
 from mitsim.scene.surface.processes import PROCESSES
 from mitsim.scene.surface.roughness import (
     ALPHA_LARGEST,
