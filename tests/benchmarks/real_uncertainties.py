@@ -30,7 +30,7 @@ from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.recordings.ensenso import read_ensenso
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
-from mitsim.decoding.plate import Plate, image_on_grid, plate_dots, plate_scale
+from mitsim.decoding.plate import Plate, PlateDots, image_on_grid, plate_dots, plate_scale
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.drift import Drift, drift_modes
 from mitsim.sensor.preset import load_sensor
@@ -92,7 +92,7 @@ def plate_cells(
     where = Roi(*(window or (0, 0, cloud.grid.width, cloud.grid.height)))
     dots = plate_dots(name, Plate(where, PITCH), cloud, image_on_grid(capture, cloud.grid))
     scale, scatter, _ = plate_scale(dots, PITCH)
-    parts = contributions(capture, preset, dots.centres)
+    parts, (axes, shear) = contributions(capture, preset, dots.centres), axes_of(dots)
     total = PITCH * float(np.sqrt(scatter**2 + sum(part**2 for part in parts.values())))
     pitch = scale * PITCH
     low, high = pitch - 1.96 * total, pitch + 1.96 * total
@@ -100,12 +100,24 @@ def plate_cells(
         "plate": name,
         "pitch [mm]": f"{pitch:.3f}",
         "error": f"{1e3 * (scale - 1):+.2f} per mille",
+        "along the axes [per mille]": f"{1e3 * axes[0]:+.2f}, {1e3 * axes[1]:+.2f}",
+        "shear [mrad]": f"{1e3 * shear:+.2f}",
         "dots [ppm]": f"{1e6 * scatter:.0f}",
         **{f"{key} [ppm]": f"{1e6 * part:.0f}" for key, part in parts.items()},
         "u [mm]": f"{total:.3f}",
         "95 % interval": f"{low:.3f} to {high:.3f}",
         "verdict": "holds" if low <= PITCH <= high else "misses",
     }
+
+
+def axes_of(dots: PlateDots) -> tuple[Floats, float]:
+    """Return the scales of a plate along its two rows of dots, relative to the print, and the shear [rad] between them."""
+    found = dots.centres - dots.centres.mean(axis=0)
+    plane = found @ np.linalg.svd(found, full_matrices=False)[2][:2].T
+    printed = (dots.indices - dots.indices.mean(axis=0)) * PITCH
+    along = np.linalg.lstsq(printed, plane, rcond=None)[0]
+    scale = np.linalg.norm(along, axis=1)
+    return scale - 1, float(along[0] @ along[1] / np.prod(scale))
 
 
 def contributions(capture: Capture, preset: str, dots: Floats) -> dict[str, float]:
