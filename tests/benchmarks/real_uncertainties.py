@@ -111,7 +111,7 @@ def plate_cells(
 
 
 def axes_of(dots: PlateDots) -> tuple[Floats, float]:
-    """Return the scales of a plate along its two rows of dots, relative to the print, and the shear [rad] between them."""
+    """Return the scales along the two rows of a plate's dots, relative to the print, and the rows' shear [rad]."""
     found = dots.centres - dots.centres.mean(axis=0)
     plane = found @ np.linalg.svd(found, full_matrices=False)[2][:2].T
     printed = (dots.indices - dots.indices.mean(axis=0)) * PITCH
