@@ -1,6 +1,7 @@
 """Stated uncertainties against real recordings: pitch of plates of dots, and noise that does not average out.
 
 python tests/benchmarks/real_uncertainties.py FOLDER_OF_RECORDINGS
+python tests/benchmarks/real_uncertainties.py --twin RECORDED_CAPTURE SIMULATED_CAPTURE
 
 Plates: rigs are drawn from the covariance of the preset's calibration and the default drift, about the rig of the
 recording; ideal dots go through the drawn rig and come back through the recorded one, as the decoder works. Their pitch
@@ -8,7 +9,8 @@ is the statement, with the scatter of the dots; the print of the plate is not in
 
 Planes: the mean of a square cell of n pixels scatters by sigma sqrt(A / n), and less the mean of its four neighbours by
 sqrt(5 / 4) as much; the difference knows nothing of a bend, and nothing of what neighbours share. Sigma and A are those
-of the map that comes with the preset, and once more with the sigma of the recording itself.
+of the map that comes with the preset, and once more with the sigma of the recording itself. With ``--twin``, the same of
+a recorded capture and its twin by ``mitsim compare``, decoded by the settings of the recording.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from characterisation.maps.shipped import map_path
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
+from mitsim.capture.folder import read_capture
 from mitsim.capture.recordings.ensenso import read_ensenso
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.decoding.plate import Plate, PlateDots, image_on_grid, plate_dots, plate_scale
@@ -51,6 +54,8 @@ PLATES = (
 )
 #: side of a cell [px]; degree of the smooth surface that the sheet may have
 CELLS, DEGREE = (10, 20, 40), 3
+#: part of the sheet that the twin shows, too
+TWIN_WINDOW = Roi(400, 290, 480, 300)
 
 
 def main(data: Path) -> None:
@@ -74,6 +79,16 @@ def main(data: Path) -> None:
     settings, imager = decoder_settings(sheet)
     cloud = capture_cloud(sheet, settings, imager=imager)
     plane_rows("N35-604, sheet", cloud, baseline(sheet.rig), Roi(360, 270, 560, 340), "ensenso-n35")
+
+
+def twins(recorded: Path, simulated: Path) -> None:
+    """Print the rows of a recorded sheet and of its twin, in a window that both fill."""
+    np.seterr(all="ignore")
+    real = read_capture(recorded)
+    settings, imager = decoder_settings(real)
+    for name, capture in (("recorded", real), ("its twin", read_capture(simulated))):
+        cloud = capture_cloud(capture, settings, imager=imager)
+        plane_rows(name, cloud, baseline(capture.rig), TWIN_WINDOW, "ensenso-n35")
 
 
 def baseline(rig: Rig) -> Floats:
@@ -203,4 +218,7 @@ def plane_rows(name: str, cloud: PointCloud, across: Floats, window: Roi, preset
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    if sys.argv[1] == "--twin":
+        twins(Path(sys.argv[2]), Path(sys.argv[3]))
+    else:
+        main(Path(sys.argv[1]))
