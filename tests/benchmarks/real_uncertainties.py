@@ -9,8 +9,8 @@ is the statement, with the scatter of the dots; the print of the plate is not in
 
 Planes: the mean of a square cell of n pixels scatters by sigma sqrt(A / n), and less the mean of its four neighbours by
 sqrt(5 / 4) as much; the difference knows nothing of a bend, and nothing of what neighbours share. Sigma and A are those
-of the map that comes with the preset, and once more with the sigma of the recording itself. With ``--twin``, the same of
-a recorded capture and its twin by ``mitsim compare``, decoded by the settings of the recording.
+of the map that comes with the preset, and once more with the sigma of the recording itself. With ``--twin``, the same
+of a recorded capture and its twin by ``mitsim compare``, decoded by the settings of the recording.
 """
 
 from __future__ import annotations
