@@ -54,6 +54,10 @@ PLATES = (
 )
 #: side of a cell [px]; degree of the smooth surface that the sheet may have
 CELLS, DEGREE = (10, 20, 40), 3
+PLANE_HEADS = (
+    "| plane | cell [px] | cells | scatter [mm] | from the preset's map "
+    "| from the map's A and the recording's sigma |\n| --- | --- | --- | --- | --- | --- |"
+)
 #: part of the sheet that the twin shows, too
 TWIN_WINDOW = Roi(400, 290, 480, 300)
 
@@ -70,11 +74,7 @@ def main(data: Path) -> None:
     print("| " + " | ".join(heads) + " |\n" + "| --- " * len(heads) + "|")
     for cells in plates:
         print("| " + " | ".join(cells.get(head, "-") for head in heads) + " |")
-    print(
-        "\n| plane | cell [px] | cells | scatter [mm] | from the preset's map "
-        "| from the map's A and the recording's sigma |"
-    )
-    print("| --- | --- | --- | --- | --- | --- |")
+    print(f"\n{PLANE_HEADS}")
     sheet = read_ensenso(data / "ensenso" / "colorized_point_cloud" / "stereo.zip")
     settings, imager = decoder_settings(sheet)
     cloud = capture_cloud(sheet, settings, imager=imager)
@@ -86,6 +86,7 @@ def twins(recorded: Path, simulated: Path) -> None:
     np.seterr(all="ignore")
     real = read_capture(recorded)
     settings, imager = decoder_settings(real)
+    print(PLANE_HEADS)
     for name, capture in (("recorded", real), ("its twin", read_capture(simulated))):
         cloud = capture_cloud(capture, settings, imager=imager)
         plane_rows(name, cloud, baseline(capture.rig), TWIN_WINDOW, "ensenso-n35")
