@@ -55,11 +55,11 @@ def is_colour(path: Path) -> bool:
     return False
 
 
-def read_grey(path: Path, *, green: bool = False, channel: int | None = None) -> Image:
+def read_grey(path: Path, *, channel: int | None = None) -> Image:
     """Read a grey image (H, W), uint8 or uint16.
 
-    A colour image is read only if its colour channels are equal, or if one is selected. ``channel`` selects it by
-    number (:data:`CHANNELS`); ``green`` selects the green channel.
+    A colour image is read only if its colour channels are equal, or if ``channel`` selects one by its number
+    (:data:`CHANNELS`).
 
     Raises
     ------
@@ -69,10 +69,10 @@ def read_grey(path: Path, *, green: bool = False, channel: int | None = None) ->
     data = read_bounded(path)
     if not data:
         raise InputError(path, "size", "0 bytes", f"1 to {LARGEST_FILE} bytes")
-    return decode_grey(data, path, green=green, channel=channel)
+    return decode_grey(data, path, channel=channel)
 
 
-def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel: int | None = None) -> Image:
+def decode_grey(data: bytes, where: str | Path, *, channel: int | None = None) -> Image:
     """Read a grey image from the bytes of a file, as :func:`read_grey` does.
 
     Parameters
@@ -81,8 +81,6 @@ def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel:
         Content of the file.
     where
         Name of the file in messages.
-    green
-        Whether to take the green channel of a colour image.
     channel
         Number of the channel to take of a colour image (:data:`CHANNELS`).
 
@@ -105,8 +103,6 @@ def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel:
         raise InputError(where, "", "a file that is not an image, or is damaged", f"one of {', '.join(SUFFIXES)}")
     if image.ndim == 3:
         colours = image[..., :3] if image.shape[2] >= 3 else image[..., :1]
-        if green:
-            channel = CHANNELS["green"]
         if channel is not None and image.shape[2] >= 3:
             return np.ascontiguousarray(_checked(image[..., channel], where))
         if (colours != colours[..., :1]).any():

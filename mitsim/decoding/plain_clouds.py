@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
-from mitsim.capture.recordings.array_file import numbers_of_npy
+from mitsim.capture.npy import numbers_of_npy
 from mitsim.capture.recordings.number_text import number_words
 from mitsim.capture.recordings.organised_cloud import scale_to_mm
 from mitsim.sensor.mat_structure import read_mat

@@ -107,7 +107,7 @@ def size_of_images(folder: Path) -> tuple[int, int] | None:
         for path in sorted(folder.glob(pattern), key=counted):
             if path.suffix.lower() in SUFFIXES and path.is_file():
                 with suppress(InputError):
-                    image = read_grey(path, green=True)
+                    image = read_grey(path, channel=CHANNELS["green"])
                     return image.shape[1], image.shape[0]
     return None
 

@@ -27,7 +27,7 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.capture.recordings.array_file import NPY_MAGIC, numbers_of_npy
+from mitsim.capture.npy import NPY_MAGIC, numbers_of_npy
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.nxlib_calibration import sensor_from_rectified
 from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of

@@ -20,7 +20,7 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError, MissingEnvironmentError, nearest
 from mitsim.capture.capture import Capture
 from mitsim.capture.grey_image import channel_of
-from mitsim.capture.recordings.array_file import NPY_MAGIC, numbers_of_npy
+from mitsim.capture.npy import NPY_MAGIC, numbers_of_npy
 from mitsim.capture.recordings.depth_image import read_depth_image
 from mitsim.capture.recordings.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
 from mitsim.capture.recordings.ensenso import ensenso_originals, image_sets, read_ensenso
