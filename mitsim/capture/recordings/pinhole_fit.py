@@ -22,8 +22,6 @@ from characterisation.pinhole_grid import LEAST_POINTS, PINHOLE_RMS_PX, pinhole_
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.png import LONGEST_SIDE_PX
 
-__all__ = ["LEAST_POINTS", "PINHOLE_RMS_PX", "fit_pinhole", "grid_of", "off_the_rays"]
-
 #: largest tangential coefficient that is fitted; those of lenses are under 1e-3, and a turn by 0.17 deg has as much
 _TANGENTIAL = 1e-3
 
@@ -131,7 +129,6 @@ def grid_of(points: NDArray[np.floating]) -> tuple[int, int] | None:
         if best is None or max(off) < best[0]:
             best = max(off), (width, count // width)
     return best[1] if best is not None and best[0] <= _LOOSE_PX else None
-
 
 #: largest rms residual [px] of the simple lens by which a grid is recognised; a wrong width has tens of pixels or more
 _LOOSE_PX = 1.0
