@@ -130,6 +130,7 @@ def grid_of(points: NDArray[np.floating]) -> tuple[int, int] | None:
             best = max(off), (width, count // width)
     return best[1] if best is not None and best[0] <= _LOOSE_PX else None
 
+
 #: largest rms residual [px] of the simple lens by which a grid is recognised; a wrong width has tens of pixels or more
 _LOOSE_PX = 1.0
 
