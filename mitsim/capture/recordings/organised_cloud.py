@@ -30,8 +30,7 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.npy import NPY_MAGIC, numbers_of_npy
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
-from mitsim.capture.recordings.nxlib_calibration import sensor_from_rectified
-from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of
+from mitsim.capture.recordings.nxlib_calibration import NxLibTree, link_of, sensor_from_rectified
 from mitsim.capture.recordings.pcd import decode_pcd
 from mitsim.capture.recordings.pinhole_fit import fit_pinhole, grid_of, off_the_rays
 from mitsim.capture.recordings.ply import decode_ply
