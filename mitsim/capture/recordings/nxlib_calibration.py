@@ -14,9 +14,9 @@ The sensor frame is that of the raw left camera. The files do not state the foll
 - The right camera follows from the rectifying rotations and the baseline B: its centre is rotation_left^T (B, 0, 0).
 - ``Link`` is the pose of the camera: it takes coordinates of its target, a workspace or another camera, to those of the
   *rectified* left camera, by a rotation about an axis and a translation [mm]. The manufacturer's manual (*Common Tree
-  Elements*) says that links go "from Target to object". NxLib's own point maps are in the target's frame. In the recording ``locate_pattern`` of
-  ensenso/ros_driver, the vendor's own pose of a dot pattern is reproduced within 0.05 mm from there; from the raw left
-  frame the error is 52 mm.
+  Elements*) says that links go "from Target to object". NxLib's own point maps are in the target's frame. In the
+  recording ``locate_pattern`` of ensenso/ros_driver, the vendor's own pose of a dot pattern is reproduced within
+  0.05 mm from there; from the raw left frame the error is 52 mm.
 """
 
 from __future__ import annotations
