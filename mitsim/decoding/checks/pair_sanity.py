@@ -16,7 +16,7 @@ from scipy.ndimage import map_coordinates
 
 from mitsim.decoding.checks.rig_sanity import COARSE, half_stripe
 from mitsim.decoding.checks.row_texture import rectified, textured_row_error, uniform_light_mean
-from mitsim.decoding.checks.texture_matches import COMPARED_ROWS, LEAST_BLOCKS, texture_matches
+from mitsim.decoding.checks.texture_matches import LEAST_PAIRS, texture_matches
 from mitsim.decoding.coded_images import CodedImages
 from mitsim.decoding.matching.stereo import StereoGeometry
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
@@ -100,26 +100,27 @@ def _texture_contradiction(
     "" if the texture agrees, or does not suffice.
     """
     pixels = texture_matches(textures, columns)
-    if len(pixels[0]) < LEAST_BLOCKS:
+    if len(pixels[0]) < LEAST_PAIRS:
         return "", False
-    step = max(1.0, textures[0].shape[0] / COMPARED_ROWS)  # rows are compared to a fraction of this
     found, other = (_row_errors(*order, rig, geometry) for order in (pixels, pixels[::-1]))
-    if found.fits(step):
+    if found.fits:
         return "", False
-    return f"{found}, by the texture of the surface", other.fits(step)
+    return f"{found}, by the texture of the surface", other.fits
 
 
 @dataclass(frozen=True)
 class _RowErrors:
-    """Row error [px] of matched texture: its ``median`` and ``spread``; share that lies ``behind`` the cameras."""
+    """Row error [px] of matched texture: its ``median`` and rms, ``spread``; share that lies ``behind`` the cameras."""
 
     median: float
     spread: float
     behind: float
 
-    def fits(self, step: float) -> bool:
-        """Return whether the calibration explains the matches, whose rows are accurate to a share of ``step`` [px]."""
-        return self.behind <= 0.5 and self.spread <= _LARGEST_SPREAD * step + 0.5 * min(abs(self.median), _MOVED)
+    @property
+    def fits(self) -> bool:
+        """Return whether the calibration, or that of a rig that has moved since, explains the matches."""
+        varying = np.sqrt(max(self.spread**2 - self.median**2, 0.0))
+        return self.behind <= 0.5 and abs(self.median) <= _MOVED and varying <= _LARGEST_SPREAD + 0.5 * abs(self.median)
 
     def __str__(self) -> str:
         if self.behind > 0.5:
