@@ -25,6 +25,7 @@ from mitsim.capture.devices.depthai_camera import (
     pixels,
     stereo_pipeline,
 )
+from mitsim.capture.devices.depthai_matching import grey_frame, match_on_device
 from mitsim.capture.devices.depthai_settings import SIZES, DepthaiSettings, configuration, configure
 from mitsim.capture.devices.device_error import DeviceError
 from mitsim.capture.devices.maker_captures import depthai_capture, depthai_rig
@@ -55,16 +56,11 @@ def test_every_filter_is_off_and_recorded():
     assert json.loads(json.dumps(told)) == told
 
 
-def grey_frame(image, number):
-    frame = dai.ImgFrame()
-    frame.setCvFrame(image, dai.ImgFrame.Type.GRAY8)
-    frame.setSequenceNum(number)
-    return frame
-
-
-def test_a_grey_image_comes_out_of_a_frame_unchanged(rng):
+def test_a_grey_image_goes_through_a_frame_unchanged(rng):
     image = rng.integers(0, 256, (48, 64), np.uint8)
-    assert np.array_equal(pixels(grey_frame(image, 7)), image)
+    frame = grey_frame(image, dai.CameraBoardSocket.CAM_C, dai, number=7)
+    assert np.array_equal(pixels(frame), image)
+    assert (frame.getInstanceNum(), frame.getSequenceNum()) == (2, 7)
 
 
 def test_raw_disparities_become_pixels_and_zero_is_missing(rng):
@@ -86,7 +82,7 @@ def test_a_coloured_frame_is_refused():
 
 
 def test_what_a_frame_says_of_itself_is_kept():
-    frame = grey_frame(np.zeros((4, 4), np.uint8), 12)
+    frame = grey_frame(np.zeros((4, 4), np.uint8), dai.CameraBoardSocket.CAM_B, dai, number=12)
     told = frame_settings(frame)
     assert told["sequence_number"] == 12
     assert told["exposure_s"] == 0.0
@@ -96,7 +92,7 @@ def test_what_a_frame_says_of_itself_is_kept():
 def queue_of(numbers):
     queue = dai.MessageQueue("test", 30, False)
     for number in numbers:
-        queue.send(grey_frame(np.full((2, 2), number % 256, np.uint8), number))
+        queue.send(grey_frame(np.full((2, 2), number % 256, np.uint8), dai.CameraBoardSocket.CAM_B, dai, number))
     return queue
 
 
@@ -198,6 +194,8 @@ def test_without_a_device_it_is_told(monkeypatch):
     monkeypatch.setenv("DEPTHAI_SEARCH_TIMEOUT", "200")  # ms; by default it looks for ten seconds
     with pytest.raises(DeviceError, match=r"no such camera.*None is connected.*udev"):
         open_depthai(DepthaiSettings())
+    with pytest.raises(DeviceError, match="no such camera"):
+        match_on_device(np.zeros((8, 8), np.uint8), np.zeros((8, 8), np.uint8), DepthaiSettings())
 
 
 def test_without_the_package_it_is_told_how_to_get_it(monkeypatch):
@@ -395,3 +393,30 @@ def test_a_camera_without_a_projector_is_told():
         DepthaiCamera(DepthaiSettings(), "", FakePackage(laser=False))
     with DepthaiCamera(DepthaiSettings(dot_projector=0, warm_up_frames=0), "", FakePackage(laser=False)) as camera:
         camera.take()
+
+
+@pytest.mark.parametrize("rectified", [True, False])
+def test_a_rendered_pair_is_sent_to_the_devices_matcher_and_its_disparity_comes_back(rng, rectified):
+    fake, pair_sent = FakePackage(), rng.integers(0, 256, (2, 800, 1280), np.uint8)
+    disparity = match_on_device(*pair_sent, DepthaiSettings(subpixel_bits=5), "1844301", rectified, fake)
+    assert fake.last("stereo.setRectification") == (not rectified,)
+    assert fake.last("stereo.setInputResolution") == (1280, 800)
+    assert fake.last("stereo.setRectificationUseSpecTranslation") == (False,)
+    for side, image, socket in zip(("left", "right"), pair_sent, ("CAM_B", "CAM_C"), strict=True):
+        (frame,) = fake.last(f"stereo.{side}.createInputQueue.send")
+        np.testing.assert_array_equal(frame.getCvFrame(), image)
+        assert frame.getInstanceNum() == getattr(dai.CameraBoardSocket, socket).value
+    assert (disparity == 1 / 32).all()  # the first frame that the fake gives, of 1/32 px
+    assert fake.last("pipeline.stop") == fake.last("device.close") == ()
+
+
+def test_a_matcher_that_fails_leaves_the_device_closed(monkeypatch):
+    fake = FakePackage()
+
+    def failing(self, timeout):
+        raise RuntimeError("X_LINK_ERROR")
+
+    monkeypatch.setattr(FakeQueue, "get", failing)
+    with pytest.raises(DeviceError, match="match"):
+        match_on_device(*np.zeros((2, 8, 8), np.uint8), DepthaiSettings(), package=fake)
+    assert fake.last("device.close") == ()

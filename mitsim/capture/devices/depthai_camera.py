@@ -190,11 +190,16 @@ def stereo_pipeline(pipeline: Any, settings: DepthaiSettings, dai: Any) -> Any:
         )
     preset = getattr(dai.node.StereoDepth.PresetMode, settings.preset)
     stereo = pipeline.create(dai.node.StereoDepth).build(*outputs, presetMode=preset)
+    configure_matcher(stereo, settings, dai)
+    return stereo
+
+
+def configure_matcher(stereo: Any, settings: DepthaiSettings, dai: Any) -> None:
+    """Apply the settings to a ``StereoDepth`` node; neither rectification nor depth may use design values."""
     configure(stereo.initialConfig, settings, dai)
     stereo.setDisparityToDepthUseSpecTranslation(False)
     stereo.setRectificationUseSpecTranslation(False)
     stereo.setDepthAlignmentUseSpecTranslation(False)
-    return stereo
 
 
 def pixels(frame: Any) -> Image:

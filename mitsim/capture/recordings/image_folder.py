@@ -165,7 +165,16 @@ def _stack(files: list[Path], camera: Camera, bits: int | None, channel: int) ->
 def advice(found: list[Path], camera: str, count: int, ambient_image: bool) -> str:
     """Return advice on images of a camera that are not ``count``: by their names, else on the pattern.
 
-    ``ambient_image``: whether the last of these is without the projector.
+    Parameters
+    ----------
+    found
+        Files of the images.
+    camera
+        ``left`` or ``right``.
+    count
+        Number of images that the pattern needs.
+    ambient_image
+        Whether the last of these is without the projector.
     """
     matches = [re.search(r"(\d+)(?=\D*$)", path.name) for path in found]
     numbers = sorted({int(match.group(1)) for match in matches if match})
