@@ -170,7 +170,7 @@ def advice(found: list[Path], camera: str, count: int, ambient_image: bool) -> s
     found
         Files of the images.
     camera
-        ``left`` or ``right``.
+        Name of the camera, as in the sensor file.
     count
         Number of images that the pattern needs.
     ambient_image
