@@ -24,7 +24,7 @@ from characterisation.scores.joining import (
     rigid_derivatives,
 )
 from characterisation.scores.view_sets import FeatureInformation, ViewSet, fewest_views
-from characterisation.tasks.evaluation import InputQuantity, measurement_model
+from characterisation.tasks.measurement_model import InputQuantity, measurement_model
 from characterisation.tasks.prediction import ExpectedInput, joint_quadratic_form
 from characterisation.tasks.task_file import Task
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from characterisation.features.pose_fit import Pose
 from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.deviations import Size, deviations, fold_of, form_basis
-from characterisation.tasks.evaluation import measurement_model
+from characterisation.tasks.measurement_model import measurement_model
 from characterisation.tasks.task_file import Task
 
 Array = NDArray[np.float64]

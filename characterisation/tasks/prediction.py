@@ -2,7 +2,7 @@
 
 Signal chain: expected points of each shape, part frame -> expected fit of every input quantity of a measurement:
 surfaces, figures in a face, forms, the pose of the part (:mod:`characterisation.tasks.covariance`) -> the measurement
-as a function of these, propagated as for real fits (:func:`characterisation.tasks.evaluation.evaluate`) -> u and the
+as a function of these, propagated as for real fits (:func:`characterisation.tasks.measurement_model.evaluate`) -> u and the
 contribution of each.
 
 All fits are small changes about the nominal geometry in the part frame, so those of several views can be joined.
@@ -26,7 +26,7 @@ from characterisation.features.pose_fit import PoseFit, pose_jacobian
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Cone, Cylinder, Plane
 from characterisation.tasks.covariance import ExpectedFit, ExpectedPoints, expected_fit, expected_sums, solved, usable
-from characterisation.tasks.evaluation import InputQuantity, evaluate, measurement_model
+from characterisation.tasks.measurement_model import InputQuantity, evaluate, measurement_model
 from characterisation.tasks.task_file import Task
 
 Floats = NDArray[np.float64]

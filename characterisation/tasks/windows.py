@@ -2,7 +2,7 @@
 
 Signal chain: window [px] -> its points -> robust fit along the view rays, seen from the origin of the grid
 (:mod:`characterisation.features.fits`) -> value and standard uncertainty, propagated from the covariance of the fit
-(:func:`characterisation.tasks.evaluation.evaluate`).
+(:func:`characterisation.tasks.measurement_model.evaluate`).
 
 A window should contain one feature and little else. If fewer than :data:`LEAST_SHARE` of its points lie on the fitted
 surface, the result has no value and states this reason.
@@ -36,7 +36,7 @@ from characterisation.tasks.definitions import (
     point_distance,
     point_plane_distance,
 )
-from characterisation.tasks.evaluation import evaluate
+from characterisation.tasks.measurement_model import evaluate
 from characterisation.tasks.places_in_frame import PLACE_QUANTITIES, place_functions
 from characterisation.tasks.result import Result, failed
 

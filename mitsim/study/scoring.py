@@ -23,7 +23,7 @@ from characterisation.scores.joining import pose_covariance
 from characterisation.scores.task_sets import SetJoining, choose_set
 from characterisation.scores.view_score import write_scores
 from characterisation.scores.view_sets import ViewSet
-from characterisation.tasks.evaluation import InputQuantity
+from characterisation.tasks.measurement_model import InputQuantity
 from mitsim.maps.campaign.run import write_netcdf
 from mitsim.running.progress import say
 from mitsim.scene.ray_casting.triangles import triangles

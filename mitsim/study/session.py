@@ -19,7 +19,7 @@ import xarray as xr
 from characterisation.files.errors import InputError
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.statements.statement import Statements
-from characterisation.tasks.evaluation import InputQuantity
+from characterisation.tasks.measurement_model import InputQuantity
 from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.scores.view_score import rank_views, score_views, view_statistics
 from characterisation.tasks.covariance import LEAST_CHANCE, ExpectedPoints
-from characterisation.tasks.evaluation import InputQuantity
+from characterisation.tasks.measurement_model import InputQuantity
 from characterisation.tasks.prediction import (
     ExpectedInput,
     ExpectedMeasurement,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from characterisation.files.errors import InputError
-from characterisation.tasks.evaluation import measurement_model
+from characterisation.tasks.measurement_model import measurement_model
 from characterisation.tasks.task_reading import read_task
 from mitsim.scene.authoring.part21 import Enumeration, Reference, Typed, read_step_text
 from mitsim.scene.authoring.part_folder import read_part, write_part

@@ -7,7 +7,7 @@ from characterisation.features.fits import fit_cylinder, fit_plane
 from characterisation.features.form import Form, fit_form, form_modes, zone
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Cylinder, Plane, tangents
-from characterisation.tasks.evaluation import evaluate
+from characterisation.tasks.measurement_model import evaluate
 
 EYE = np.zeros(3)
 TILT = np.deg2rad(35)

@@ -11,8 +11,8 @@ from characterisation.features.form import fit_form, zone
 from characterisation.features.pose_fit import Pose
 from characterisation.files.documents import validate
 from characterisation.tasks.deviations import form_size
-from characterisation.tasks.evaluation import measurement_model
 from characterisation.tasks.folded import folded_value
+from characterisation.tasks.measurement_model import measurement_model
 from characterisation.tasks.task_file import Task
 
 FEATURES = """

@@ -21,7 +21,7 @@ from characterisation.scores.joining import (
 )
 from characterisation.scores.task_sets import SetJoining, choose_set
 from characterisation.tasks.covariance import ExpectedFit
-from characterisation.tasks.evaluation import InputQuantity
+from characterisation.tasks.measurement_model import InputQuantity
 from characterisation.tasks.prediction import ExpectedInput, expected_measurement, joint_quadratic_form
 from characterisation.tasks.task_file import Task
 

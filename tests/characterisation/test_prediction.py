@@ -12,7 +12,7 @@ from characterisation.features.pose_fit import fit_pose
 from characterisation.features.robust_fit import FitError
 from characterisation.features.surfaces import Surface
 from characterisation.tasks.covariance import ExpectedPoints
-from characterisation.tasks.evaluation import evaluate, measurement_model
+from characterisation.tasks.measurement_model import evaluate, measurement_model
 from characterisation.tasks.prediction import (
     ExpectedInput,
     expected_inputs,

@@ -20,7 +20,8 @@ from characterisation.tasks.definitions import (
     plane_axis_angle,
     radius,
 )
-from characterisation.tasks.evaluation import evaluate, measure
+from characterisation.tasks.evaluation import measure
+from characterisation.tasks.measurement_model import evaluate
 from characterisation.tasks.task_file import Feature
 from characterisation.tasks.task_reading import check_features, read_task
 from mitsim.sensor.transforms import Transform

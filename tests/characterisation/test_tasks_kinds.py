@@ -13,7 +13,7 @@ from characterisation.features.surfaces import Cone
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.tasks.definitions import DEFINITIONS
-from characterisation.tasks.evaluation import measurement_model
+from characterisation.tasks.measurement_model import measurement_model
 from characterisation.tasks.task_file import KEYS, Task
 from characterisation.tasks.task_reading import check_features, read_task
 

@@ -26,7 +26,8 @@ from characterisation.tasks.definitions import (
     pose_position,
     pose_rotation,
 )
-from characterisation.tasks.evaluation import evaluate, measure, measurement_model
+from characterisation.tasks.evaluation import measure
+from characterisation.tasks.measurement_model import evaluate, measurement_model
 from characterisation.tasks.places import intersection
 from characterisation.tasks.task_file import Task
 from characterisation.tasks.zones import datum_motion, least_width, parallelism, perpendicularity, position

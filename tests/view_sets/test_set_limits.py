@@ -8,7 +8,7 @@ from two_balls import TASK
 
 from characterisation.features.fitted import with_covariance
 from characterisation.tasks.covariance import ExpectedFit
-from characterisation.tasks.evaluation import InputQuantity
+from characterisation.tasks.measurement_model import InputQuantity
 from characterisation.tasks.prediction import ExpectedInput
 from characterisation.tasks.task_file import Task
 from mitsim.study import SetTable

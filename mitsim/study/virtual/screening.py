@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.maps.performance_map import PerformanceMap
-from characterisation.tasks.evaluation import InputQuantity
+from characterisation.tasks.measurement_model import InputQuantity
 from mitsim.maps.prediction import Effect, Predictor
 from mitsim.maps.prediction.interreflections import InterreflectionEffect
 from mitsim.maps.prediction.shared_errors import SharedErrors, independent_fields

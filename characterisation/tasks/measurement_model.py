@@ -1,0 +1,178 @@
+"""Express a measurement of a task as a function of fits, and propagate their covariances to its value.
+
+Signal chain: task, measurement -> the fits that it is a function of, its input quantities in the sense of JCGM
+100:2008, 4.1.2 -> its value and what they deviate from nominal -> standard uncertainty from the covariances of the fits.
+
+Features with a common parent are correlated: two circles in one face move with it. A measurement is therefore always a
+function of the *fitted* features. Derived features have no covariances of their own. In every step of the propagation,
+intersections and middle planes are computed again, and figures are carried along with their plane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import block_diag
+
+from characterisation.features.pose_fit import Pose
+from characterisation.tasks.definitions import DEFINITIONS
+from characterisation.tasks.deviations import deviations, fold_of
+from characterisation.tasks.places import intersection, mid_plane
+from characterisation.tasks.task_file import Feature, Measurement, Task
+
+Array = NDArray[np.float64]
+
+#: no place, and the origin of a frame
+NOWHERE, ORIGIN = np.empty((0, 3)), np.zeros(3)
+
+
+class Estimate(Protocol):
+    """Any fit: it has a covariance (p, p), and can be changed by p parameters."""
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (p, p) of the parameters."""
+
+    def moved(self, parameters: Array) -> Any:
+        """Change the estimate by the parameters (p,)."""
+
+
+@dataclass(frozen=True)
+class InputQuantity:
+    """Input quantity of a measurement: the fit or the form of one feature, or the pose from several."""
+
+    kind: Literal["feature", "form", "pose"]
+    features: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class MeasurementModel:
+    """A measurement as a function of its input quantities.
+
+    ``value`` takes a fit for each of ``inputs``, in their order, and returns mm or rad. The fit is a
+    :data:`~characterisation.features.fitted.Fit` for a feature, a :class:`~characterisation.features.form.Form`, or a
+    :class:`~characterisation.features.pose_fit.Pose`. ``deviations`` takes the same, and returns what they deviate from
+    nominal (k, m) [mm or rad], in the part frame: None for values that do not fold
+    (:mod:`characterisation.tasks.deviations`).
+    """
+
+    inputs: tuple[InputQuantity, ...]
+    value: Callable[..., float]
+    deviations: Callable[..., Array] | None = None
+
+
+def measurement_model(task: Task, measurement: str, sensor_from_part: ArrayLike | None = None) -> MeasurementModel:
+    """Return a measurement of a task as a function of its fits.
+
+    ``sensor_from_part`` (4, 4) takes the nominal geometry to the frame of the fits; by default, they are in the part
+    frame.
+    """
+    asked = task.measurements[measurement]
+    definition = DEFINITIONS[asked.kind]
+    motion = np.eye(4) if sensor_from_part is None else np.asarray(sensor_from_part, float)
+    places = [np.array(task.features[name].point_mm or (0.0, 0.0, 0.0)) for name in asked.features]
+    point = np.mean(places, axis=0) if asked.point_mm is None else np.array(asked.point_mm)
+    if definition.of == "form":
+        form_of = _deviations(asked, motion, [None])
+        return MeasurementModel((InputQuantity("form", asked.features),), definition.value, form_of)
+    if definition.of == "pose":
+        value = partial(definition.value, sensor_from_part=motion, point=point)
+        pose_of = _deviations(asked, motion, [Pose(motion, motion[:3, :3] @ point + motion[:3, 3])], point=point)
+        return MeasurementModel((InputQuantity("pose", asked.features),), value, pose_of)
+    extra: dict[str, Any] = {}
+    outline = np.array(task.features[asked.features[0]].outline_mm or (), float).reshape(-1, 3)
+    outline = outline @ motion[:3, :3].T + motion[:3, 3]
+    nominal = [task.nominal(name, motion) for name in asked.features]
+    if "nominal" in definition.needs:
+        extra["nominal"] = nominal
+    if "outline" in definition.needs:
+        extra["outline"] = outline
+    fitted = task.fitted_for(measurement)
+
+    def features_of(fits: Sequence[Any]) -> list[Any]:
+        by_name = dict(zip(fitted, fits, strict=True))
+        return [_resolved(task.features[name], name, by_name) for name in asked.features]
+
+    def value_of_fits(*fits: Any) -> float:
+        return definition.value(*features_of(fits), **extra)
+
+    of_features = _deviations(asked, motion, nominal, outline)
+    return MeasurementModel(
+        tuple(InputQuantity("feature", (name,)) for name in fitted),
+        value_of_fits,
+        None if of_features is None else lambda *fits: of_features(*features_of(fits)),
+    )
+
+
+def _deviations(
+    asked: Measurement, motion: Array, nominal: Sequence[Any], outline: Array = NOWHERE, point: Array = ORIGIN
+) -> Callable[..., Array] | None:
+    """Return the deviations from nominal, in the part frame, as a function of the measured features, form or pose."""
+    if fold_of(asked) is None:
+        return None
+
+    def from_nominal(*measured: Any) -> Array:
+        found = deviations(asked, outline, nominal, point).of
+        rows = found(measured, nominal)
+        if nominal[0] is not None:
+            rows = rows - found(nominal, nominal)
+        return rows @ motion[:3, :3] if rows.shape[1] == 3 else rows
+
+    return from_nominal
+
+
+def _resolved(feature: Feature, name: str, fits: Mapping[str, Any]) -> Any:
+    """Return a feature from the fits: itself, carried along with its plane, or derived from its parents."""
+    if feature.kind == "intersection":
+        return intersection([fits[parent] for parent in feature.of or ()])
+    if feature.kind == "mid_plane":
+        return mid_plane(*[fits[parent] for parent in feature.of or ()])
+    if feature.shaped:
+        return fits[name]
+    (plane,) = feature.of or ("",)
+    return fits[name].on_moved_plane(fits[plane])
+
+
+def evaluate(
+    value: Callable[..., float], fits: Sequence[Estimate], covariance: ArrayLike | None = None
+) -> tuple[float, float]:
+    """Return the value of a measurement function of fits, and its standard uncertainty, both in mm or rad.
+
+    u^2 is the second moment of f about f(x) over the points x +- L_k. The L_k are the columns of a square root of the
+    joint covariance of the fits. In full, u^2 = sum_k ((f(x + L_k) - f)^2 + (f(x - L_k) - f)^2) / 2. For a linear f
+    this is the law of propagation of uncertainty (JCGM 100:2008, 5.1.2 and, correlated, 5.2.2).
+
+    An angle between nominally parallel directions is not linear: it is the length of a small vector, and a central
+    difference would give 0. The second moment gives the root mean square of the vector's error where the value is 0.
+    Where the value is well above its noise, it gives the error of the component along the vector, which is smaller by
+    at most sqrt(2).
+
+    ``covariance`` (P, P) is that of all parameters of all fits in their order, for correlated fits. By default, the
+    fits are independent.
+    """
+    best = value(*fits)
+    blocks = [np.asarray(fit.covariance, float) for fit in fits]
+    if covariance is None:
+        root = block_diag(*[_square_root(block) for block in blocks])
+    else:
+        root = _square_root(np.asarray(covariance, float))
+    ends = np.cumsum([len(block) for block in blocks])
+    moment = 0.0
+    for column in root.T:
+        steps = np.split(column, ends[:-1])
+        for sign in (1.0, -1.0):
+            moved = [fit.moved(sign * step) if step.any() else fit for fit, step in zip(fits, steps, strict=True)]
+            moment += 0.5 * (value(*moved) - best) ** 2
+    return best, float(np.sqrt(moment))
+
+
+def _square_root(covariance: Array) -> Array:
+    """Return L (p, p) with L L^T equal to the covariance."""
+    variances, axes = np.linalg.eigh(covariance)
+    root: Array = axes * np.sqrt(np.maximum(variances, 0.0))
+    return root
