@@ -1,7 +1,7 @@
 """Express a measurement of a task as a function of fits, and propagate their covariances to its value.
 
 Signal chain: task, measurement -> the fits that it is a function of, its input quantities in the sense of JCGM
-100:2008, 4.1.2 -> its value and what they deviate from nominal -> standard uncertainty from the covariances of the fits.
+100:2008, 4.1.2 -> its value and what they deviate from nominal -> standard uncertainty from the fits' covariances.
 
 Features with a common parent are correlated: two circles in one face move with it. A measurement is therefore always a
 function of the *fitted* features. Derived features have no covariances of their own. In every step of the propagation,

@@ -2,8 +2,8 @@
 
 Signal chain: expected points of each shape, part frame -> expected fit of every input quantity of a measurement:
 surfaces, figures in a face, forms, the pose of the part (:mod:`characterisation.tasks.covariance`) -> the measurement
-as a function of these, propagated as for real fits (:func:`characterisation.tasks.measurement_model.evaluate`) -> u and the
-contribution of each.
+as a function of these, propagated as for real fits (:func:`characterisation.tasks.measurement_model.evaluate`) -> u and
+the contribution of each.
 
 All fits are small changes about the nominal geometry in the part frame, so those of several views can be joined.
 """
