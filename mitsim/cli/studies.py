@@ -73,6 +73,7 @@ def run(
     from mitsim.report.page import write_report
     from mitsim.running.progress import say
     from mitsim.study import open_study, report_lays, with_plan
+    from mitsim.study.remedies.entries import remedies_in_words
     from mitsim.study.run import run_within
     from mitsim.study.run_folder import read_run
 
@@ -91,7 +92,7 @@ def run(
         say(f"after {limit.elapsed:.0f} s; not done: {'; '.join(about.lacks)}. The same command goes on")
     if stopped:
         raise KeyboardInterrupt  # exit code 130
-    _tell_statement(stated, output, about.view_sets)
+    _tell_statement(stated, output, about.view_sets, remedies_in_words(about.remedies))
 
 
 def choose(
@@ -275,9 +276,12 @@ def exposures(
         raise typer.Exit(1)
 
 
-def _tell_statement(stated: Sequence[Statement], output: Path, sets: Sequence[ViewSetEntry] = ()) -> None:
-    """Print the statements, and the result of the sets; exit with code 1 if a tolerance does not fit or a set exceeds
-    a limit.
+def _tell_statement(
+    stated: Sequence[Statement], output: Path, sets: Sequence[ViewSetEntry] = (), remedies: Sequence[str] = ()
+) -> None:
+    """Print the statements, the result of the sets, and what would make the rest fit.
+
+    Exit with code 1 if a tolerance does not fit or a set exceeds a limit.
     """
     from characterisation.statements.verdict_words import fits_all, result_in_words
     from mitsim.report.set_words import with_sets
@@ -290,6 +294,8 @@ def _tell_statement(stated: Sequence[Statement], output: Path, sets: Sequence[Vi
     print(statement_table(stated))
     result = with_sets(result_in_words(judged(stated)), fits_all(judged(stated)), sets)
     say(f"statement: {output / 'statement.json'}\n{result.words}")
+    if remedies:
+        say("\n".join(["what would make it fit:", *(f"- {line}" for line in remedies)]))
     if not result.good:
         raise typer.Exit(1)
 

@@ -24,6 +24,7 @@ from mitsim.report.set_words import with_sets
 from mitsim.report.style import Picture, as_svg
 from mitsim.running.numbers import NONE, count, or_nan, with_degree_signs
 from mitsim.study.choice_document import ChoiceDocument, SensorEntry, judged
+from mitsim.study.remedies.entries import remedies_in_words
 from mitsim.study.run_folder import Run
 from mitsim.study.scene_geometry import SceneGeometry
 from mitsim.study.statement_file import StatedMeasurement
@@ -38,7 +39,7 @@ class FirstScreen:
     """Content of the first screen: the result in ``words``, its ``tone``, rows and picture.
 
     The picture shows ``poses`` (label, part_from_sensor) and ``verdicts`` by feature. ``trials`` is the largest number
-    of virtual measurements behind a row.
+    of virtual measurements behind a row. ``remedies`` say what would make the other measurements fit.
     """
 
     words: str
@@ -48,6 +49,7 @@ class FirstScreen:
     poses: list[tuple[str, ArrayLike]]
     verdicts: dict[str, str]
     trials: int = 0
+    remedies: tuple[str, ...] = ()
 
     @property
     def short_words(self) -> str:
@@ -121,6 +123,7 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
         poses,
         verdicts,
         max((one.trials for one in document.measurements.values()), default=0),
+        tuple(with_degree_signs(line[:1].upper() + line[1:]) for line in remedies_in_words(run.about.remedies)),
     )
 
 

@@ -61,7 +61,8 @@ class CalibrationUnknowns(Document):
 
     ``covariance`` is a file written by ``mitsim calibrate``, relative to the file that names it. By default it is the
     preset's own, or a virtual calibration of the sensor. The drift since that calibration is added, by the terms of
-    :class:`mitsim.sensor.drift.Drift`; the baseline's expansion follows from ``temperature``.
+    :class:`mitsim.sensor.drift.Drift`; the baseline's expansion follows from ``temperature``. ``scale`` multiplies the
+    errors of both: 0.5 is a calibration that is twice as accurate.
     """
 
     covariance: str | None = None
@@ -70,6 +71,7 @@ class CalibrationUnknowns(Document):
     roll_mrad: NotNegative = Drift.roll_mrad
     focal_relative: NotNegative = Drift.focal_relative
     path_offset_mm: NotNegative = Drift.path_offset_mm
+    scale: Annotated[float, Field(ge=0, le=10)] = 1.0
 
     def drift(self) -> Drift:
         """Return the drift since the calibration."""

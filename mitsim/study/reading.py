@@ -136,7 +136,10 @@ def open_study(
     check_exposure(sensor)
     task = read_task(folder / file.task)
     scene = load_scene(
-        folder / file.scene, sensor.wavelength_nm, {name: str(value) for name, value in file.parameters.items()}
+        folder / file.scene,
+        sensor.wavelength_nm,
+        {name: str(value) for name, value in file.parameters.items()},
+        sprayed=file.sprayed,
     )
     check_features(task, folder / file.task, scene.names)
     file = _with_limits(path, file, task)

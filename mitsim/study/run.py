@@ -37,6 +37,8 @@ from mitsim.running.progress import say, track
 from mitsim.running.time_limit import TimeLimit, stopped_by_user
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
+from mitsim.study.remedies.changes import Shortfall
+from mitsim.study.remedies.confirm import find_remedies, remedies_document
 from mitsim.study.run_files import digests_of
 from mitsim.study.run_record import draw_clouds, own_files, run_record, runners_up
 from mitsim.study.scoring import score_study, write_raced
@@ -129,7 +131,7 @@ def run_within(
         Writes the report of the folder. Called for the first answer after :data:`FIRST_ANSWER_S`, and as it improves.
     """
     whole = None if limit.end is None else limit.end - limit.began
-    plan = time_plan(whole or 0.0, len(study.views))
+    plan = time_plan(whole or 0.0, len(study.views), _seeks_remedies(study))
     if whole is not None:
         say(plan.in_words())
     session, clock = Session(study, folder, workers), _Clock()
@@ -171,6 +173,10 @@ def run_within(
         shown = _show(twin, shown, folder, {} if stated is None else {leaders[0]: stated.planned}, pictured)
         residuals += [_residual(twin, number) for number in shown[:1] if not pictured.over()]
     clock.lap("pictures")
+    twin = None  # its memory is for the changed studies
+    after = limit.part(1.0, plan.page(limit)) if whole is not None else TimeLimit(60 * study.file.remedies.minutes)
+    remedies = None if stated is None or limit.over() else _remedies(session, stated, scores, raced, search, after)
+    clock.lap("remedies")
     about = run_record(study, performance_map, raced, shown, largest_residual(residuals))
     reported = leaders[:1] or _best(scores)[:1]
     about["faces_in_sight"] = {
@@ -180,6 +186,7 @@ def run_within(
         if name in study.task.shapes
     }
     about["view_sets"] = [] if chosen is None else [_set_record(study, chosen, tried)]
+    about["remedies"] = remedies
     about["seconds"] = clock.steps
     about["runners_up"] = runners_up(session, raced)
     about["lacks"] = lacking(study, raced, stated, limit)
@@ -285,6 +292,22 @@ def _confirm(session: Session, chosen: ViewSet | None, search: Search) -> list[T
         f"{set_table(table, best)}"
     )
     return tried
+
+
+def _seeks_remedies(study: Study) -> bool:
+    """Return whether a run looks for changes that make measurements fit: the study allows it, and has tolerances."""
+    tolerances = (one.tolerance for one in study.task.measurements.values())
+    return study.file.remedies.minutes > 0 and any(one is not None for one in tolerances)
+
+
+def _remedies(
+    session: Session, stated: StatedView, scores: xr.Dataset, raced: Raced, search: Search, limit: TimeLimit
+) -> dict[str, Any] | None:
+    """Return the changes with which the measurements fit that do not, as JSON values; None if all fit."""
+    now = Shortfall(session, stated, scores, raced, search, session.folder / "remedies")
+    if not now.missed or not _seeks_remedies(session.study):
+        return None
+    return remedies_document(find_remedies(now, session.study.file.remedies.trials, limit), now)
 
 
 def _best(scores: xr.Dataset) -> list[int]:

@@ -23,6 +23,7 @@ from characterisation.tasks.task_reading import check_task
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.scene.surface.lay import LayLeftOut
+from mitsim.study.remedies.entries import RemediesEntry
 from mitsim.study.run_files import AGAIN, TASK, check_own
 from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement
 
@@ -190,6 +191,7 @@ class RunDocument(PartialDocument):
     faces_in_sight: dict[str, float] = Field(default_factory=dict)
     measurements: dict[str, MeasurementEntry]
     view_sets: list[ViewSetEntry] = Field(default_factory=list)
+    remedies: RemediesEntry | None = None
     seconds: dict[str, float] = Field(default_factory=dict)
     python: str = ""
     machine: str = ""

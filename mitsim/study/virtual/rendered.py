@@ -257,7 +257,8 @@ class RenderedMeasurements:
         if self._own_scene is None or not self._own_scene.changeable:
             file, scene = self.study.file, self.study.scene
             parameters = {name: str(value) for name, value in file.parameters.items()}
-            self._own_scene = load_scene(scene.where, self.study.sensor.wavelength_nm, parameters, deviation)
+            wavelength_nm = self.study.sensor.wavelength_nm
+            self._own_scene = load_scene(scene.where, wavelength_nm, parameters, deviation, file.sprayed)
         return self._own_scene.deviated(deviation) if self._own_scene.changeable else self._own_scene
 
     def _view_light(self, view: View) -> _ViewLight:

@@ -32,7 +32,7 @@ from mitsim.study.virtual.drawn_decoder import decoder_is_drawn
 from mitsim.study.virtual.drawn_numbers import drawn_numbers, related, seeds, statement_trials
 from mitsim.study.virtual.influences import influences
 from mitsim.study.virtual.mapped import MappedMeasurements
-from mitsim.study.virtual.race import Job, complete
+from mitsim.study.virtual.race import Job, TrialRunner, complete
 from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, SET_DAYS, STATEMENT_DAYS, Trial, Unknowns
 from mitsim.views import View
@@ -89,14 +89,7 @@ def state_view(
     after_batch
         Receives the statement, without a budget, after every :data:`BATCH` trials but the last.
     """
-    study, runner, trials, planned = session.study, session.runner, session.trials, session.exposures(view)
-    if planned is not None:
-        assert not isinstance(runner, MappedMeasurements)  # exposures() rejects a map
-        digest = with_exposure(session.digest, planned)
-        runner, trials = (
-            runner.exposed_as(planned),
-            TrialFolder.of(session.folder / "planned_trials", digest, study.task),
-        )
+    study, (runner, trials, planned) = session.study, source_of_trials(session, view)
     limit = TimeLimit() if limit is None else limit
     label = f"state view {view.number}"
     made = list[Trial]()
@@ -112,6 +105,20 @@ def state_view(
     groups = budget_groups(session.unknowns, session.source, study.sensor)
     numbers = drawn_numbers(study, session.unknowns, session.source, made, groups)
     return StatedView(view, _statements(study, trials, view, made, (numbers, seeds(made, groups))), planned)
+
+
+def source_of_trials(session: Session, view: View) -> tuple[TrialRunner, TrialFolder, PlannedExposure | None]:
+    """Return what makes the trials of a statement of a view, where they are kept, and their planned exposures."""
+    runner, planned = session.runner, session.exposures(view)
+    if planned is None:
+        return runner, session.trials, None
+    assert not isinstance(runner, MappedMeasurements)  # exposures() rejects a map
+    digest = with_exposure(session.digest, planned)
+    return (
+        runner.exposed_as(planned),
+        TrialFolder.of(session.folder / "planned_trials", digest, session.study.task),
+        planned,
+    )
 
 
 def compared(session: Session, view: int, other: int) -> float | None:

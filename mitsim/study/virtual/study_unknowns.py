@@ -6,6 +6,7 @@ Signal chain: study -> covariance of the calibration with the drift since then, 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,7 +74,14 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
 
 
 def calibration_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: Path) -> RigCovariance:
-    """Return the covariance of a sensor's calibration, with the drift since then."""
+    """Return the covariance of a sensor's calibration, with the drift since then, both scaled as the table says."""
+    known = _unscaled_covariance(sensor, table, folder)
+    if table.scale == 1:
+        return known
+    return replace(known, covariance=table.scale**2 * known.covariance, source=f"{known.source}; times {table.scale:g}")
+
+
+def _unscaled_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: Path) -> RigCovariance:
     if table.covariance is not None:
         return with_drift(read_rig_covariance(folder / table.covariance, sensor.rig), sensor.rig, table.drift())
     if sensor.name in presets():
