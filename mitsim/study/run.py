@@ -38,7 +38,7 @@ from mitsim.running.time_limit import TimeLimit, stopped_by_user
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
 from mitsim.study.remedies.changes import Shortfall
-from mitsim.study.remedies.confirm import find_remedies, remedies_document
+from mitsim.study.remedies.confirm import all_changes, find_remedies, remedies_document
 from mitsim.study.run_files import digests_of
 from mitsim.study.run_record import draw_clouds, own_files, run_record, runners_up
 from mitsim.study.scoring import score_study, write_raced
@@ -307,7 +307,8 @@ def _remedies(
     now = Shortfall(session, stated, scores, raced, search, session.folder / "remedies")
     if not now.missed or not _seeks_remedies(session.study):
         return None
-    return remedies_document(find_remedies(now, session.study.file.remedies.trials, limit), now)
+    trials = session.study.file.remedies.trials
+    return remedies_document(find_remedies(now.missed, all_changes(now, limit), trials, limit))
 
 
 def _best(scores: xr.Dataset) -> list[int]:

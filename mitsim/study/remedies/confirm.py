@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -54,11 +54,11 @@ class TriedChange:
 class Remedies:
     """What was tried for the measurements that do not fit.
 
-    ``missed`` are their names, ``failed`` the changes that are impossible with the reason. ``untried`` are the words
-    of changes for which time did not suffice.
+    ``missed`` are their statements by name, ``failed`` the changes that are impossible with the reason. ``untried`` are
+    the words of changes for which time did not suffice.
     """
 
-    missed: list[str]
+    missed: dict[str, Statement]
     tried: list[TriedChange] = field(default_factory=list)
     failed: list[tuple[Change, str]] = field(default_factory=list)
     untried: list[str] = field(default_factory=list)
@@ -70,24 +70,26 @@ class Remedies:
         return [name for name in self.missed if name not in solved]
 
 
-def find_remedies(now: Shortfall, trials: int, limit: TimeLimit) -> Remedies:
+def find_remedies(
+    missed: dict[str, Statement], proposed: Iterable[Change], trials: int, limit: TimeLimit | None = None
+) -> Remedies:
     """Try changes until every missed measurement fits with one, no change is left, or time is over.
 
     Parameters
     ----------
-    now
-        Statement, scores and race of a study.
+    missed
+        Statements of the measurements that do not fit, by name.
+    proposed
+        Changes, the least effort first; each is asked for only when those before it do not suffice.
     trials
         Virtual measurements of a change; a quarter of them can exclude it, and four times as many may decide it.
     limit
-        Time.
+        Time; none by default.
     """
-    found = Remedies(list(now.missed))
-    for change in _all_changes(now, limit):
+    found, limit = Remedies(missed), limit or TimeLimit()
+    for change in proposed:
         wanted = [name for name in change.expected if name in found.open]
         if not wanted:
-            if not found.open:
-                break
             continue
         if limit.over():
             found.untried.append(change.words)
@@ -102,19 +104,22 @@ def find_remedies(now: Shortfall, trials: int, limit: TimeLimit) -> Remedies:
             change.release()
             gc.collect()
         seconds = time.monotonic() - began
-        tried = TriedChange(change, {name: stated[name] for name in found.missed if name in stated}, seconds)
+        tried = TriedChange(change, {name: stated[name] for name in missed if name in stated}, seconds)
         if tried.trials < _FEWEST:
             found.untried.append(change.words)
             continue
         found.tried.append(tried)
-        fits = ", ".join(name for name in tried.fits) or "no measurement"
+        fits = ", ".join(name for name in wanted if name in tried.fits) or "no measurement"
         say(f"remedies: {change.words}: {fits} of {len(wanted)} fits, by {tried.trials} trials in {seconds:.0f} s")
-    if limit.over() and found.open and all(one.change.kind != "sensor" for one in found.tried):
+        if not found.open:
+            break
+    if limit.over() and found.open and not any(one.change.kind == "sensor" for one in found.tried):
         found.untried.append("with another sensor")
     return found
 
 
-def _all_changes(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
+def all_changes(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
+    """Yield the changes of a study that may help, the least effort first; other sensors come last."""
     yield from changes(now)
     yield from other_sensors(now, limit)
 
@@ -133,7 +138,7 @@ def _stated(change: Change, wanted: list[str], trials: int, limit: TimeLimit) ->
     return stated
 
 
-def remedies_document(found: Remedies, now: Shortfall) -> dict[str, Any]:
+def remedies_document(found: Remedies) -> dict[str, Any]:
     """Return the changes that were tried as JSON values; see docs/reference/formats/run-folder.md."""
     return {
         "measurements": {
@@ -143,7 +148,7 @@ def remedies_document(found: Remedies, now: Shortfall) -> dict[str, Any]:
                 "needed": None if one.decided is None else json_values(one.decided.needed),
                 "fits_by": next((i for i, tried in enumerate(found.tried) if name in tried.fits), None),
             }
-            for name, one in now.missed.items()
+            for name, one in found.missed.items()
         },
         "tried": [_entry(one) for one in found.tried],
         "impossible": [{"words": one.words, "reason": why} for one, why in found.failed],
