@@ -17,6 +17,7 @@ from characterisation.files.documents import Document
 from mitsim.sensor.drift import Drift
 
 NotNegative = Annotated[float, Field(ge=0)]
+Thickness = Annotated[float, Field(ge=0, le=1000)]
 Percent = Annotated[float, Field(ge=0, le=100)]
 _OverZero = Annotated[float, Field(gt=0, le=1000)]
 
@@ -245,6 +246,17 @@ class DecoderUnknowns(Document):
         return self
 
 
+class CoatUnknowns(Document):
+    """Coat of the faces that are sprayed for the measurement: those in ``matt_white``.
+
+    ``thickness_um``: range of the mean thickness on a part. ``spread``: standard deviation of the thickness over the
+    part, relative to its mean. The thickness 0 is a part that is white itself.
+    """
+
+    thickness_um: Annotated[tuple[Thickness, Thickness], AfterValidator(_in_order)] = (5.0, 20.0)
+    spread: Scale = 0.3
+
+
 class UnknownsTable(Document):
     """All groups of unknowns."""
 
@@ -256,6 +268,7 @@ class UnknownsTable(Document):
     pose: PoseUnknowns = PoseUnknowns()
     unit: UnitUnknowns = UnitUnknowns()
     decoder: DecoderUnknowns = DecoderUnknowns()
+    coat: CoatUnknowns = CoatUnknowns()
 
 
 def unknowns_of(*tables: UnknownsTable) -> UnknownsTable:

@@ -53,7 +53,7 @@ def form_deviation(
     seed
         Selects the form; each face has its own field.
     """
-    out = points.copy()
+    out = points
     for name, size in sizes.items():
         index = scene.names.index(name)
         here = (surfaces.shape == index) & np.isfinite(points[..., 2])
@@ -62,10 +62,26 @@ def form_deviation(
         place = world_from_sensor.points(points[here].astype(float))
         extent = float(np.linalg.norm(np.ptp(bounds_of(scene.shapes[index]), axis=0)))
         height = size * random_field(place, extent, np.random.default_rng([seed, zlib.crc32(name.encode())]))
-        rows, columns = np.nonzero(here)
-        rays = grid.rays_at(columns, rows)
-        cosine = np.maximum(np.abs((surfaces.normal[here] * rays).sum(axis=-1)), _GRAZING)
-        out[here] -= (rays * (height / cosine)[:, None]).astype(np.float32)  # outward means toward the sensor
+        out = along_rays(out, here, height, surfaces, grid)
+    return out
+
+
+def along_rays(
+    points: NDArray[np.float32],
+    here: NDArray[np.bool_],
+    height: NDArray[np.floating],
+    surfaces: Surfaces,
+    grid: ViewGrid,
+) -> NDArray[np.float32]:
+    """Return points (H, W, 3) of which those at pixels ``here`` lie ``height`` (n,) [mm] farther out along the normal.
+
+    They move along their rays, toward the sensor.
+    """
+    out = points.copy()
+    rows, columns = np.nonzero(here)
+    rays = grid.rays_at(columns, rows)
+    cosine = np.maximum(np.abs((surfaces.normal[here] * rays).sum(axis=-1)), _GRAZING)
+    out[here] -= (rays * (height / cosine)[:, None]).astype(np.float32)
     return out
 
 

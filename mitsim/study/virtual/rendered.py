@@ -48,6 +48,7 @@ from mitsim.sensor.pattern import DotPattern, another_mask
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, Study
+from mitsim.study.virtual.coat import coated, coated_shapes
 from mitsim.study.virtual.drawn_decoder import drawn_decoder
 from mitsim.study.virtual.drawn_finish import finish_deviation
 from mitsim.study.virtual.form import form_deviation
@@ -130,6 +131,7 @@ class RenderedMeasurements:
         self._own_scene: Scene | None = None
         self._views: dict[int, _ViewLight] = {}
         self._has_form = any(unknowns.table.form.features.values())
+        self._has_coat = bool(coated_shapes(study.scene, unknowns.table.coat))
 
     def exposed_as(self, planned: PlannedExposure | None) -> RenderedMeasurements:
         """Return the same measurements with other exposures than the sensor's own; prepared data is shared."""
@@ -169,8 +171,12 @@ class RenderedMeasurements:
         lit = self.lit(view, drawn)
         capture = self.exposed(lit, self.planned, drawn.seed)
         labels = self.predictor.quick_labels(self.study.scene, lit.assumed)
-        surfaces = self.predictor.surfaces(self.study.scene, lit.assumed) if self._has_form and drawn.form else None
+        surfaces = self.predictor.surfaces(self.study.scene, lit.assumed) if self._moves_faces(drawn) else None
         return _Captured(capture, drawn, lit.assumed, surfaces, labels)
+
+    def _moves_faces(self, drawn: DrawnValues) -> bool:
+        """Return whether the faces of a draw lie off their nominal places, by form or coat."""
+        return bool((self._has_form and drawn.form) or (self._has_coat and drawn.coat))
 
     def lit(self, view: View, drawn: DrawnValues) -> TracedLight:
         """Trace the light of one draw in a view, which all of its exposures share."""
@@ -239,9 +245,12 @@ class RenderedMeasurements:
         scene, cloud = self.study.scene, self.unlabelled_cloud(captured.capture, captured.drawn.decoder)
         points = displaced(cloud, captured.drawn, captured.assumed, scene.centre)
         if captured.surfaces is not None:
-            form = self.unknowns.table.form.features
+            form = self.unknowns.table.form.features if captured.drawn.form else {}
             seed = captured.drawn.form
             points = form_deviation(points, captured.surfaces, scene, form, captured.assumed, cloud.grid, seed)
+            if captured.drawn.coat:
+                coat, seed = self.unknowns.table.coat, captured.drawn.coat
+                points = coated(points, captured.surfaces, scene, coat, captured.assumed, cloud.grid, seed)
         return replace(cloud, points=points, feature=captured.labels, feature_names=scene.names)
 
     def _scene(self, finish: int) -> tuple[Scene, list[Floats]]:

@@ -192,7 +192,9 @@ def budget_groups(unknowns: Unknowns, source: str, sensor: Sensor) -> list[str]:
 def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
     """Return the statement as JSON values; see docs/reference/formats/statement.md."""
     study, unknowns, view = session.study, session.unknowns, stated.view
-    declared = influences(unknowns.table, session.source, study.file.measure.light_path_depth)
+    declared = influences(
+        unknowns.table, session.source, study.file.measure.light_path_depth, "coat" in unknowns.varied
+    )
     exposed = {} if stated.planned is None else {"exposure": asdict(stated.planned)}
     return exposed | {
         "schema_version": 1,

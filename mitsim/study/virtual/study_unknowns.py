@@ -20,6 +20,7 @@ from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance
 from mitsim.sensor.unknowns import CalibrationUnknowns
 from mitsim.study import Study
 from mitsim.study.calibration.virtual_calibration import calibrate
+from mitsim.study.virtual.coat import coated_shapes
 from mitsim.study.virtual.world import GROUPS, Unknowns
 
 #: linear expansion near 20 C [1/K], by the metal of a finish (CRC Handbook of Chemistry and Physics; steel: unalloyed)
@@ -61,6 +62,8 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
             field = f"unknowns.finish.measured.{name}"
             raise InputError(study.path, field, "no bsdf of the scene", ", ".join(finishes), nearest(name, finishes))
     folder = study.path.parent
+    if not coated_shapes(study.scene, table.coat):
+        varied = tuple(group for group in varied if group != "coat")
     return Unknowns(
         table,
         sensor.rig,
