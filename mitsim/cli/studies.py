@@ -286,6 +286,7 @@ def _tell_statement(
     from characterisation.statements.verdict_words import fits_all, result_in_words
     from mitsim.report.set_words import with_sets
     from mitsim.running.progress import say
+    from mitsim.study.statement_file import read_statement
     from mitsim.study.virtual.stated import judged, statement_table
 
     if not stated:
@@ -294,6 +295,9 @@ def _tell_statement(
     print(statement_table(stated))
     result = with_sets(result_in_words(judged(stated)), fits_all(judged(stated)), sets)
     say(f"statement: {output / 'statement.json'}\n{result.words}")
+    document = read_statement(output / "statement.json")
+    for doubt in document.doubts() if document else ():
+        say(f"warning: {doubt}")
     if remedies:
         say("\n".join(["what would make it fit:", *(f"- {line}" for line in remedies)]))
     if not result.good:

@@ -39,7 +39,8 @@ class FirstScreen:
     """Content of the first screen: the result in ``words``, its ``tone``, rows and picture.
 
     The picture shows ``poses`` (label, part_from_sensor) and ``verdicts`` by feature. ``trials`` is the largest number
-    of virtual measurements behind a row. ``remedies`` say what would make the other measurements fit.
+    of virtual measurements behind a row. ``remedies`` say what would make the other measurements fit,
+    ``doubts`` why to check the statement.
     """
 
     words: str
@@ -50,6 +51,7 @@ class FirstScreen:
     verdicts: dict[str, str]
     trials: int = 0
     remedies: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
     @property
     def short_words(self) -> str:
@@ -124,6 +126,7 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
         verdicts,
         max((one.trials for one in document.measurements.values()), default=0),
         tuple(with_degree_signs(line[:1].upper() + line[1:]) for line in remedies_in_words(run.about.remedies)),
+        tuple(document.doubts()),
     )
 
 

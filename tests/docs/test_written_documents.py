@@ -39,8 +39,9 @@ def test_keys_of_a_statement(stated):
         sensor=SimpleNamespace(name="ensenso-n10"),
         performance_map=None,
         file=SimpleNamespace(seed=1, measure=SimpleNamespace(light_path_depth=2)),
+        task=SimpleNamespace(measurements={"radius": SimpleNamespace(unit="deg")}),
     )
-    view = SimpleNamespace(number=3, world_from_sensor=Transform.from_matrix(np.eye(4)))
+    view = SimpleNamespace(number=3, standoff=500.0, world_from_sensor=Transform.from_matrix(np.eye(4)))
     unknowns = SimpleNamespace(table=UnknownsTable(), calibration=SimpleNamespace(source="a calibration"), varied=())
     session = SimpleNamespace(study=study, unknowns=unknowns, source="render")
     written = statement_document(session, StatedView(view, [stated], PlannedExposure((1e-3,))))

@@ -28,6 +28,7 @@ from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.preset import Sensor
 from mitsim.study import StatementTable, Study
 from mitsim.study.exposures.planned import with_exposure
+from mitsim.study.maker_accuracy import maker_sigma
 from mitsim.study.virtual.drawn_decoder import decoder_is_drawn
 from mitsim.study.virtual.drawn_numbers import drawn_numbers, related, seeds, statement_trials
 from mitsim.study.virtual.influences import influences
@@ -209,7 +210,11 @@ def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
         "coverage_probability": 0.95,
         "calibration": unknowns.calibration.source,
         "unknowns": unknowns.table.model_dump(mode="json"),
-        "measurements": {one.measurement: _measurement(one) for one in stated.statements},
+        "measurements": {
+            one.measurement: _measurement(one)
+            | {"maker_sigma": maker_sigma(study.sensor, study.task.measurements[one.measurement], view.standoff)}
+            for one in stated.statements
+        },
         "influences": [asdict(one) for one in declared],
     }
 
