@@ -173,7 +173,9 @@ def open_study(
     if chosen_map is not None and mapped:
         view_distances = [view.standoff for view in candidates.views]
         depths = (min(view_distances) - radius, max(view_distances) + radius)
-        wanted = NeededFinishes(sensor, scene.where, seen_finishes(scene), depths)
+        rendered = file.measure.by != "map" and chosen_map.data.attrs.get("source") in (None, "", "simulated")
+        measured = frozenset(task.shapes)
+        wanted = NeededFinishes(sensor, scene.where, seen_finishes(scene), depths, measured, rendered)
         chosen_map = map_with_finishes(chosen_map, wanted, ask)
     return Study(path, file, scene, task, sensor, candidates, campaign, chosen_map)
 

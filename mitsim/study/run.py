@@ -43,7 +43,7 @@ from mitsim.study.run_files import digests_of
 from mitsim.study.run_record import draw_clouds, own_files, run_record, runners_up
 from mitsim.study.scoring import score_study, write_raced
 from mitsim.study.session import Session
-from mitsim.study.time_plan import time_plan
+from mitsim.study.time_plan import TimePlan, time_plan
 from mitsim.study.view_sets.confirmed_set import (
     Search,
     TriedSet,
@@ -162,6 +162,12 @@ def run_within(
     if stated is not None:
         write_json(folder / "statement.json", statement_document(session, stated))
     clock.lap("state")
+    remedies = None
+    if stated is not None and not limit.over():
+        twin = None  # its memory is for the changed studies
+        remedies = _remedies(session, stated, scores, raced, search, _time_of_remedies(study, plan, limit))
+        twin = session.renderer
+    clock.lap("remedies")
     tried = [] if limit.over() else _confirm(session, chosen, search)
     chosen = tried[-1].chosen if tried else chosen
     clock.lap("confirm")
@@ -173,10 +179,6 @@ def run_within(
         shown = _show(twin, shown, folder, {} if stated is None else {leaders[0]: stated.planned}, pictured)
         residuals += [_residual(twin, number) for number in shown[:1] if not pictured.over()]
     clock.lap("pictures")
-    twin = None  # its memory is for the changed studies
-    after = limit.part(1.0, plan.page(limit)) if whole is not None else TimeLimit(60 * study.file.remedies.minutes)
-    remedies = None if stated is None or limit.over() else _remedies(session, stated, scores, raced, search, after)
-    clock.lap("remedies")
     about = run_record(study, performance_map, raced, shown, largest_residual(residuals))
     reported = leaders[:1] or _best(scores)[:1]
     about["faces_in_sight"] = {
@@ -298,6 +300,11 @@ def _seeks_remedies(study: Study) -> bool:
     """Return whether a run looks for changes that make measurements fit: the study allows it, and has tolerances."""
     tolerances = (one.tolerance for one in study.task.measurements.values())
     return study.file.remedies.minutes > 0 and any(one is not None for one in tolerances)
+
+
+def _time_of_remedies(study: Study, plan: TimePlan, limit: TimeLimit) -> TimeLimit:
+    """Return the limit of the search for changes: that of the study, or what pictures and report leave of a limit."""
+    return TimeLimit(60 * study.file.remedies.minutes) if limit.end is None else plan.remedies_limit(limit)
 
 
 def _remedies(

@@ -59,7 +59,15 @@ class TimePlan:
 
     def statement_limit(self, limit: TimeLimit) -> TimeLimit:
         """Return the limit of the statement, which starts now."""
-        return limit.part(1.0 - self._remedies_share, max(self.page(limit), min(self.report, 0.2 * limit.left)))
+        return limit.part(1.0 - self._remedies_share, self._pictures(limit))
+
+    def remedies_limit(self, limit: TimeLimit) -> TimeLimit:
+        """Return the limit of the remedies, which start now."""
+        return limit.part(1.0, self._pictures(limit))
+
+    def _pictures(self, limit: TimeLimit) -> float:
+        """Return the time [s] that is kept for pictures and report."""
+        return max(self.page(limit), min(self.report, 0.2 * limit.left))
 
     @property
     def _remedies_share(self) -> float:
