@@ -15,7 +15,7 @@ from characterisation.statements.decision import demand, plus_minus
 from characterisation.statements.statement import Statement, statement
 from characterisation.tasks.decision_table import Decision
 from mitsim.running.time_limit import TimeLimit
-from mitsim.study.remedies.bounds import Effect, can_fit, least_shares, least_uncertainty
+from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
 from mitsim.study.remedies.changes import Change, changed_file
 from mitsim.study.remedies.confirm import Remedies, find_remedies, remedies_document
 from mitsim.study.remedies.entries import RemediesEntry, remedies_in_words
@@ -54,6 +54,15 @@ def test_an_uncertain_line_of_the_budget_counts_with_its_high_end() -> None:
     u2 = one.standard_uncertainty**2
     unsure = replace(one, budget=(BudgetLine("calibration", 0.2 * u2, 0.0, 0.96 * u2, 0.2, (0.0, 0.96), False),))
     assert least_uncertainty(unsure, Effect({"calibration": 0.0})) == pytest.approx(0.2 * one.standard_uncertainty)
+
+
+def test_a_line_that_stays_counts_with_its_low_end_however_wide_the_others_are() -> None:
+    one = stated("radius", 0.5)
+    u2 = one.standard_uncertainty**2
+    lines = [BudgetLine("calibration", 0.8 * u2, 0.49 * u2, u2, 0.8, (0.49, 1.0))]
+    lines += [BudgetLine(name, 0.1 * u2, 0.0, 0.6 * u2, 0.1, (0.0, 0.6), False) for name in ("noise", "light")]
+    wide = replace(one, budget=tuple(lines))
+    assert least_uncertainty(wide, EXPOSURE) == pytest.approx(0.7 * one.standard_uncertainty)
 
 
 @pytest.mark.parametrize("rule", ["iso_14253_1", "simple_acceptance"])

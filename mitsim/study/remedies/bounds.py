@@ -4,8 +4,8 @@ Signal chain: statement with the budget of a measurement -> variance that is lef
 its groups -> least standard uncertainty after the change -> whether the tolerance can be reached at all. A change whose
 bound misses the tolerance needs no virtual measurement.
 
-The bound is generous: a group counts with the high end of its 95 % interval, and a change that acts on the bias may
-remove all of it. Without a budget, nothing is excluded.
+The bound is generous: a group that a change removes counts with the high end of its 95 % interval, a group that stays
+with the low end, and a change that acts on the bias may remove all of it. Without a budget, nothing is excluded.
 """
 
 from __future__ import annotations
@@ -45,8 +45,10 @@ def least_uncertainty(stated: Statement, effect: Effect) -> float:
     """Return the least standard uncertainty of a measurement after a change, in its unit; 0 without a budget."""
     if not stated.budget:
         return 0.0
-    removed = sum(line.high * (1 - effect.left.get(line.group, 1.0) ** 2) for line in stated.budget)
-    return math.sqrt(max(stated.standard_uncertainty**2 - removed, 0.0))
+    left = {line.group: effect.left.get(line.group, 1.0) ** 2 for line in stated.budget}
+    removed = sum(line.high * (1 - left[line.group]) for line in stated.budget)
+    remains = sum(line.low * left[line.group] for line in stated.budget)
+    return math.sqrt(max(stated.standard_uncertainty**2 - removed, remains, 0.0))
 
 
 def can_fit(stated: Statement, uncertainty: float, unbiased: bool) -> bool:
