@@ -108,7 +108,7 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     results = [_judged(name, one) for name, one in document.measurements.items()]
     view_scores = run.scores.sel(view=document.view)
     asked = {
-        name: (run.about.measurements[name].features, one.verdict)
+        name: (run.about.measurements[name].faces, one.verdict)
         for name, one in document.measurements.items()
         if name in run.about.measurements
     }

@@ -235,9 +235,9 @@ def _table(run: Run, name: str) -> dict[str, Any]:
             | _expected(run, name, view)
             | {
                 "rank": rank,
-                "points": [count(round(float(points.sel(feature=feature)))) for feature in entry.features],
+                "points": [count(round(float(points.sel(feature=feature)))) for feature in entry.faces],
                 "checked": view in run.checked,
             }
         )
     tolerance = math.isfinite(float(run.scores["tolerance"].sel(measurement=name)))
-    return {"name": name, "features": entry.features, "tolerance": tolerance, "rows": rows}
+    return {"name": name, "features": entry.faces, "tolerance": tolerance, "rows": rows}

@@ -94,13 +94,22 @@ _PATCHES = Schema(
 
 
 class MeasurementEntry(PartialDocument):
-    """Entry of a measurement in ``run.json``; ``kind`` and ``tolerance`` as in the task."""
+    """Entry of a measurement in ``run.json``; ``kind`` and ``tolerance`` as in the task.
+
+    ``shapes`` are the faces whose points decide it, which are not the ``features`` of an edge or a rim.
+    """
 
     nominal: float
     unit: str
     features: list[str]
     kind: str = ""
     tolerance: float | tuple[float, float] | None = None
+    shapes: list[str] = Field(default_factory=list)
+
+    @property
+    def faces(self) -> list[str]:
+        """Return the faces whose points decide the measurement; files of older versions name its features alone."""
+        return self.shapes or self.features
 
 
 class ResidualEntry(PartialDocument):
@@ -312,9 +321,9 @@ def read_run(folder: str | Path) -> Run:
             raise InputError(folder / name, "measurement", ", ".join(found), allowed)
     seen = {str(feature) for feature in scores["feature"].values}
     for name, entry in about.measurements.items():
-        if absent := sorted(set(entry.features) - seen):
+        if absent := sorted(set(entry.faces) - seen):
             allowed = "features of scores.nc"
-            raise InputError(folder / "run.json", f"measurements.{name}.features", absent[0], allowed)
+            raise InputError(folder / "run.json", f"measurements.{name}.shapes", absent[0], allowed)
     named = [("checks.nc", "view", checks["view"].values.tolist())]
     named += [("run.json", f"view_sets[{i}].views", chosen.views) for i, chosen in enumerate(about.view_sets)]
     for name, key, views in named:

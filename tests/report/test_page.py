@@ -149,7 +149,7 @@ def test_what_would_make_a_measurement_fit_stands_below_the_result(run_folder, t
     }
     (folder / "run.json").write_text(json.dumps(about))
     page = plain(written(folder))
-    line = "Sprayed <white>, radius (u 0.020 mm, before 0.25 mm) fits (40 virtual measurements)"
+    line = "Sprayed <white>: radius (u 0.020 mm, before 0.25 mm) fits (40 virtual measurements)"
     assert (
         page.index('id="result"')
         < page.index("What would make it fit?")
@@ -157,6 +157,21 @@ def test_what_would_make_a_measurement_fit_stands_below_the_result(run_folder, t
         < page.index('id="verdicts"')
     )
     assert "<white>" not in written(folder)  # names are text
+
+
+def test_a_measurement_of_edges_is_told_by_its_edges_and_counted_on_its_faces(run_folder, tmp_path, written):
+    folder = tmp_path / "run"
+    shutil.copytree(run_folder, folder)
+    about = json.loads((folder / "run.json").read_text())
+    name, entry = next(iter(about["measurements"].items()))
+    entry["shapes"], entry["features"] = entry["features"], ["left_edge", "right_edge"]
+    (folder / "run.json").write_text(json.dumps(about))
+    page = plain(re.sub("<wbr>", "", written(folder)))
+    assert "left_edge" in page and f"Points on<br>{entry['shapes'][0]}" in page
+    entry["shapes"] = ["no_face"]
+    (folder / "run.json").write_text(json.dumps(about))
+    with pytest.raises(InputError, match="no_face"):
+        written(folder)
 
 
 def test_a_statement_far_below_the_accuracy_of_the_maker_says_so(run_folder, tmp_path, written):

@@ -119,8 +119,8 @@ def test_the_least_effort_is_tried_first_and_no_change_for_a_measurement_that_fi
     document = RemediesEntry.model_validate(remedies_document(found))
     assert {name: one.fits_by for name, one in document.measurements.items()} == {"a": 0, "b": 1}
     first, second = remedies_in_words(document)
-    assert first == "with view, a (u 0.020 mm, before 0.80 mm) fits (40 virtual measurements)"
-    assert second == "with sensor, b (u 0.020 mm, before 0.80 mm) fits (40 virtual measurements)"
+    assert first == "with view: a (u 0.020 mm, before 0.80 mm) fits (40 virtual measurements)"
+    assert second == "with sensor: b (u 0.020 mm, before 0.80 mm) fits (40 virtual measurements)"
 
 
 def test_a_quarter_of_the_trials_excludes_a_hopeless_change_and_more_decide_a_good_one() -> None:

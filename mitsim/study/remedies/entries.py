@@ -63,7 +63,7 @@ def remedies_in_words(found: RemediesEntry | None) -> list[str]:
         if names:
             changed = [_changed(name, found.measurements[name], tried.measurements[name]) for name in names]
             verb = "fits" if len(names) == 1 else "fit"
-            lines.append(f"{tried.words}, {listed(changed)} {verb} ({tried.trials} virtual measurements)")
+            lines.append(f"{tried.words}: {listed(changed)} {verb} ({tried.trials} virtual measurements)")
     lines += [_unsolved(found, name) for name, one in found.measurements.items() if one.fits_by is None]
     if found.untried and any(one.fits_by is None for one in found.measurements.values()):
         lines.append(f"not tried for lack of time: {'; '.join(found.untried)}")
