@@ -163,7 +163,7 @@ def test_a_measurement_of_edges_is_told_by_its_edges_and_counted_on_its_faces(ru
     folder = tmp_path / "run"
     shutil.copytree(run_folder, folder)
     about = json.loads((folder / "run.json").read_text())
-    name, entry = next(iter(about["measurements"].items()))
+    _, entry = next(iter(about["measurements"].items()))
     entry["shapes"], entry["features"] = entry["features"], ["left_edge", "right_edge"]
     (folder / "run.json").write_text(json.dumps(about))
     page = plain(re.sub("<wbr>", "", written(folder)))

@@ -26,6 +26,8 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
 from characterisation.tasks.evaluation import measure
 from characterisation.tasks.folded import folded_values
+from characterisation.tasks.result import Result
+from characterisation.tasks.task_file import Task
 from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import one_ahead
 from mitsim.maps.prediction import CharacterisedScene, Predictor
@@ -36,7 +38,7 @@ from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.calibration.accuracy import measured_points
 from mitsim.study.virtual.beyond_map import beyond_map
 from mitsim.study.virtual.coat import coated, coated_shapes
-from mitsim.study.virtual.form import form_deviation
+from mitsim.study.virtual.form import form_deviation, measured_with_form
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import displaced
 from mitsim.study.virtual.screening import screen
@@ -106,14 +108,19 @@ class MappedMeasurements:
         scene, assumed = self.study.scene, drawn.assumed.inverse() @ job.view.world_from_sensor
         cloud = replace(cloud, points=moved_by_calibration(cloud, self.study.sensor, drawn))
         points = displaced(cloud, drawn, assumed, scene.centre)
-        if surfaces is not None:
-            table = self.unknowns.table
-            form = table.form.features if drawn.form else {}
-            points = form_deviation(points, surfaces, scene, form, assumed, cloud.grid, drawn.form)
-            if drawn.coat:
-                points = coated(points, surfaces, scene, table.coat, assumed, cloud.grid, drawn.coat)
-        labelled = replace(cloud, points=points, feature=labels, feature_names=scene.names)
-        found = measure(labelled, self.study.task, assumed.inverse().matrix(), MINIMUM_POINTS, False)
+        table = self.unknowns.table
+
+        def evaluate(task: Task, with_form: bool) -> dict[str, Result]:
+            moved = points
+            if surfaces is not None:
+                form = table.form.features if drawn.form and with_form else {}
+                moved = form_deviation(moved, surfaces, scene, form, assumed, cloud.grid, drawn.form)
+                if drawn.coat:
+                    moved = coated(moved, surfaces, scene, table.coat, assumed, cloud.grid, drawn.coat)
+            labelled = replace(cloud, points=moved, feature=labels, feature_names=scene.names)
+            return measure(labelled, task, assumed.inverse().matrix(), MINIMUM_POINTS, False)
+
+        found = measured_with_form(self.study.task, evaluate, bool(self._has_form and drawn.form))
         return self._with_beyond(Outcome.of(found), job.view, drawn)
 
     def _moves_faces(self, drawn: DrawnValues) -> bool:

@@ -29,6 +29,8 @@ from numpy.typing import NDArray
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.evaluation import measure
+from characterisation.tasks.result import Result
+from characterisation.tasks.task_file import Task
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.exposing import LightOnImagers
 from mitsim.capture.simulated.kept_light import KeptLight, can_be_kept, keep_light
@@ -51,7 +53,7 @@ from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.virtual.coat import coated, coated_shapes
 from mitsim.study.virtual.drawn_decoder import drawn_decoder
 from mitsim.study.virtual.drawn_finish import finish_deviation
-from mitsim.study.virtual.form import form_deviation
+from mitsim.study.virtual.form import form_deviation, measured_with_form
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.trials import Outcome
 from mitsim.study.virtual.world import DrawnValues, Trial, Unknowns
@@ -164,8 +166,15 @@ class RenderedMeasurements:
         return self._cloud(captured), captured.assumed
 
     def _finish(self, captured: _Captured, job: Job) -> Outcome:
-        cloud, part_from_world = self._cloud(captured), captured.assumed.inverse().matrix()
-        return Outcome.of(measure(cloud, self.study.task, part_from_world, MINIMUM_POINTS, False))
+        part_from_world = captured.assumed.inverse().matrix()
+        decoded = self.unlabelled_cloud(captured.capture, captured.drawn.decoder)
+
+        def evaluate(task: Task, with_form: bool) -> dict[str, Result]:
+            cloud = self._labelled(captured, decoded, with_form)
+            return measure(cloud, task, part_from_world, MINIMUM_POINTS, False)
+
+        deviates = bool(self._has_form and captured.drawn.form)
+        return Outcome.of(measured_with_form(self.study.task, evaluate, deviates))
 
     def _captured(self, view: View, drawn: DrawnValues) -> _Captured:
         lit = self.lit(view, drawn)
@@ -242,15 +251,17 @@ class RenderedMeasurements:
         return capture_cloud(capture, settings, self.geometry, imager=sensor.imager)
 
     def _cloud(self, captured: _Captured) -> PointCloud:
-        scene, cloud = self.study.scene, self.unlabelled_cloud(captured.capture, captured.drawn.decoder)
-        points = displaced(cloud, captured.drawn, captured.assumed, scene.centre)
+        return self._labelled(captured, self.unlabelled_cloud(captured.capture, captured.drawn.decoder), True)
+
+    def _labelled(self, captured: _Captured, cloud: PointCloud, with_form: bool) -> PointCloud:
+        """Return a decoded cloud with the errors of path, temperature, coat and, if asked for, form of the part."""
+        scene, table, drawn, pose = self.study.scene, self.unknowns.table, captured.drawn, captured.assumed
+        points = displaced(cloud, drawn, pose, scene.centre)
         if captured.surfaces is not None:
-            form = self.unknowns.table.form.features if captured.drawn.form else {}
-            seed = captured.drawn.form
-            points = form_deviation(points, captured.surfaces, scene, form, captured.assumed, cloud.grid, seed)
-            if captured.drawn.coat:
-                coat, seed = self.unknowns.table.coat, captured.drawn.coat
-                points = coated(points, captured.surfaces, scene, coat, captured.assumed, cloud.grid, seed)
+            form = table.form.features if drawn.form and with_form else {}
+            points = form_deviation(points, captured.surfaces, scene, form, pose, cloud.grid, drawn.form)
+            if drawn.coat:
+                points = coated(points, captured.surfaces, scene, table.coat, pose, cloud.grid, drawn.coat)
         return replace(cloud, points=points, feature=captured.labels, feature_names=scene.names)
 
     def _scene(self, finish: int) -> tuple[Scene, list[Floats]]:

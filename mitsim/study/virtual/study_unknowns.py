@@ -17,10 +17,11 @@ from mitsim.sensor.drift import Drift, with_drift
 from mitsim.sensor.preset import Sensor, presets
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance
-from mitsim.sensor.unknowns import CalibrationUnknowns
+from mitsim.sensor.unknowns import CalibrationUnknowns, FormUnknowns
 from mitsim.study import Study
 from mitsim.study.calibration.virtual_calibration import calibrate
 from mitsim.study.virtual.coat import coated_shapes
+from mitsim.study.virtual.form import drawn_form
 from mitsim.study.virtual.world import GROUPS, Unknowns
 
 #: linear expansion near 20 C [1/K], by the metal of a finish (CRC Handbook of Chemistry and Physics; steel: unalloyed)
@@ -56,6 +57,7 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
         if name not in study.task.shapes:
             allowed = ", ".join(study.task.shapes)
             raise InputError(study.path, f"unknowns.form.features.{name}", "no shape of the task", allowed)
+    table = table.model_copy(update={"form": FormUnknowns(features=drawn_form(study.task, table.form.features))})
     finishes = sorted({shape.bsdf().id() for shape in study.scene.shapes})
     for name in table.finish.measured:
         if name not in finishes:
