@@ -27,6 +27,9 @@ from mitsim.study.remedies.sensors import other_sensors
 #: first trials of a change, and those of the next steps while a verdict is open, over the trials of the study's table
 _STEPS = (0.25, 1.0, 4.0)
 
+#: share of the time that is left for screening other sensors
+_SCREENING_SHARE = 0.4
+
 #: fewest trials whose verdict counts
 _FEWEST = 8
 
@@ -86,8 +89,9 @@ def find_remedies(
     limit
         Time; none by default.
     """
-    found, limit = Remedies(missed), limit or TimeLimit()
+    found, limit, kinds = Remedies(missed), limit or TimeLimit(), set[str]()
     for change in proposed:
+        kinds.add(change.kind)
         wanted = [name for name in change.expected if name in found.open]
         if not wanted:
             continue
@@ -113,7 +117,7 @@ def find_remedies(
         say(f"remedies: {change.words}: {fits} of {len(wanted)} fits, by {tried.trials} trials in {seconds:.0f} s")
         if not found.open:
             break
-    if limit.over() and found.open and not any(one.change.kind == "sensor" for one in found.tried):
+    if limit.over() and found.open and "sensor" not in kinds:
         found.untried.append("with another sensor")
     return found
 
@@ -121,7 +125,7 @@ def find_remedies(
 def all_changes(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
     """Yield the changes of a study that may help, the least effort first; other sensors come last."""
     yield from changes(now)
-    yield from other_sensors(now, limit)
+    yield from other_sensors(now, limit.part(_SCREENING_SHARE))
 
 
 def _stated(change: Change, wanted: list[str], trials: int, limit: TimeLimit) -> dict[str, Statement]:

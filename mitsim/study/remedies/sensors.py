@@ -18,7 +18,7 @@ from characterisation.files.errors import InputError
 from characterisation.maps.shipped import shipped_maps
 from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit
-from mitsim.sensor.preset import presets
+from mitsim.sensor.preset import named_sensor, presets
 from mitsim.study import Study
 from mitsim.study.choose.candidates import Excluded, open_candidate
 from mitsim.study.remedies.bounds import can_fit
@@ -40,7 +40,8 @@ def other_sensors(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
     names, stated = list(now.missed), now.stated.view.number
     own = _risks(now.scores, names)[:, now.scores["view"].values.tolist().index(stated)]
     found = list[tuple[int, float, Change]]()
-    for name in presets():
+    # fringes first: time may not suffice for all
+    for name in sorted(presets(), key=lambda one: named_sensor(one)[1] != "structured_light"):
         if name == now.study.sensor.name or name not in shipped_maps():
             continue
         if limit.over():
