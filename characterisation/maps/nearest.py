@@ -73,6 +73,13 @@ def standing_for(
     """Return a map of the nearest sample alone, under the name and the optical properties of another surface.
 
     A surface with a lay is treated as round.
+
+    Parameters
+    ----------
+    performance_map, nearest
+        The map, and its nearest sample.
+    finish, roughness, light
+        Name, Ra [um] and optical properties of the other surface.
     """
     data = performance_map.data.isel(sample=[nearest.sample])
     data = data.drop_vars([name for name in data.variables if "lay" in data[name].dims or str(name).startswith("lay")])

@@ -61,8 +61,10 @@ def run(
     """Run a study: screen all views, compare the best by virtual measurements, state the uncertainty, write a report.
 
     Screening predicts uncertainties from the performance map of the sensor. A virtual measurement renders, decodes and
-    measures the part once, with random values of all unknown effects. Exit code 1 if a measurement with a
-    tolerance does not fit it, or the set of views that the study asks for exceeds an uncertainty limit.
+    measures the part once, with random values of all unknown effects. For measurements that do not fit their
+    tolerance, the last lines name the cheapest changes with which they do (spray, exposure, view, sensor and others).
+    Exit code 1 if a measurement with a tolerance does not fit it, or the set of views that the study asks for exceeds
+    an uncertainty limit.
 
     Example: mitsim run scenes/two_pillars/study.toml -o runs/two_pillars
     """

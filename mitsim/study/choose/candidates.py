@@ -91,7 +91,17 @@ def _each(sensors: Sequence[str]) -> list[str]:
 
 
 def open_candidate(path: Path, file: StudyFile, given: str, ask: Ask | None) -> CandidateSensor | Excluded:
-    """Open a study for one sensor, given as in :func:`read_candidates`; say why if that is impossible."""
+    """Open a study for one sensor; say why if that is impossible.
+
+    Parameters
+    ----------
+    path, file
+        Path of the study file, and its content.
+    given
+        The sensor, as in :func:`read_candidates`.
+    ask
+        Answers whether finishes that its map lacks may be characterised now; None if nobody can answer.
+    """
     sensor, _, map_name = given.partition("=")
     own = sensor.endswith(".toml")
     if not own and sensor not in presets():

@@ -23,9 +23,20 @@ from mitsim.views import View
 
 
 def state_mean(session: Session, view: View, captures: int, count: int, limit: TimeLimit) -> list[Statement]:
-    """State the mean of ``captures`` captures of a day for every measurement, from up to ``count`` days.
+    """State the mean of several captures of a day for every measurement.
 
     Captures without a value are left out of the mean of their day. Days that time does not suffice for are not used.
+
+    Parameters
+    ----------
+    session, view
+        Of the study, and the view at its exposures.
+    captures
+        Number of captures of a day.
+    count
+        Largest number of days.
+    limit
+        Time.
     """
     study, (runner, trials, _) = session.study, source_of_trials(session, view)
     days = list(dict.fromkeys(trial.day for trial in statement_trials(2 * count)))[:count]

@@ -122,9 +122,18 @@ def along_rays(
     surfaces: Surfaces,
     grid: ViewGrid,
 ) -> NDArray[np.float32]:
-    """Return points (H, W, 3) of which those at pixels ``here`` lie ``height`` (n,) [mm] farther out along the normal.
+    """Return points of which some lie farther out along the normal of their face; they move along their rays.
 
-    They move along their rays, toward the sensor.
+    Parameters
+    ----------
+    points
+        (H, W, 3) points [mm], sensor frame. They are not changed.
+    here
+        (H, W) pixels whose points move.
+    height
+        (n,) heights of these points [mm], toward the sensor.
+    surfaces, grid
+        Normal that each pixel meets, sensor frame, and the view rays of the pixels.
     """
     out = points.copy()
     rows, columns = np.nonzero(here)

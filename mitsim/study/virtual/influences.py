@@ -32,8 +32,16 @@ _OTHER_PARTS = "not in the map; drawn with the size found on other parts, see ef
 def influences(table: UnknownsTable, source: str, depth: int, sprayed: bool = False) -> list[Influence]:
     """Return the influences of a statement.
 
-    ``source`` is ``render`` or ``map``; ``depth`` is the number of surfaces on a light path; ``sprayed``: whether a
-    face of the part has a coat.
+    Parameters
+    ----------
+    table
+        Sizes of the unknowns.
+    source
+        ``render`` or ``map``.
+    depth
+        Number of surfaces on a light path.
+    sprayed
+        Whether a face of the part has a coat.
     """
     rendered = source == "render"
     form, pose, temperature, light = table.form.features, table.pose, table.temperature, table.light
