@@ -27,6 +27,9 @@ from mitsim.study.remedies.sensors import other_sensors
 #: first trials of a change, and those of the next steps while a verdict is open, over the trials of the study's table
 _STEPS = (0.25, 1.0, 4.0)
 
+#: share of the time that is left which one change may take, so that later ones have a chance
+_CHANGE_SHARE = 0.5
+
 #: share of the time that is left for screening other sensors
 _SCREENING_SHARE = 0.4
 
@@ -100,7 +103,7 @@ def find_remedies(
             continue
         began = time.monotonic()
         try:
-            stated = _stated(change, wanted, trials, limit)
+            stated = _stated(change, wanted, trials, limit.part(_CHANGE_SHARE))
         except InputError as error:
             found.failed.append((change, str(error)))
             continue
