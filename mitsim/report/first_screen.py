@@ -125,7 +125,7 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
         poses,
         verdicts,
         max((one.trials for one in document.measurements.values()), default=0),
-        tuple(with_degree_signs(line[:1].upper() + line[1:]) for line in remedies_in_words(run.about.remedies)),
+        tuple(with_degree_signs(line) for line in remedies_in_words(run.about.remedies)),
         tuple(document.doubts()),
     )
 

@@ -149,7 +149,7 @@ def test_what_would_make_a_measurement_fit_stands_below_the_result(run_folder, t
     }
     (folder / "run.json").write_text(json.dumps(about))
     page = plain(written(folder))
-    line = "Sprayed <white>: radius (u 0.020 mm, before 0.25 mm) fits (40 virtual measurements)"
+    line = "sprayed <white>: radius (u 0.020 mm, before 0.25 mm) fits (40 virtual measurements)"
     assert (
         page.index('id="result"')
         < page.index("What would make it fit?")

@@ -153,7 +153,7 @@ def test_the_nearest_of_insufficient_changes_is_named() -> None:
     lines = remedies_in_words(
         RemediesEntry.model_validate(remedies_document(find_remedies(missed("a"), [far.change, near.change], 40)))
     )
-    assert lines == ["a: none of 2 changes tried suffices; nearest with spray, u 0.40 mm, 0.12 mm needed"]
+    assert lines == ["a (u 0.40 mm, 0.12 mm needed): none of 2 changes tried suffices; nearest is with spray"]
     nothing = RemediesEntry.model_validate(remedies_document(Remedies(missed("a"))))
     assert remedies_in_words(nothing) == ["a: by its budget, no single change that mitsim knows suffices"]
 

@@ -64,7 +64,12 @@ def remedies_in_words(found: RemediesEntry | None) -> list[str]:
             changed = [_changed(name, found.measurements[name], tried.measurements[name]) for name in names]
             verb = "fits" if len(names) == 1 else "fit"
             lines.append(f"{tried.words}: {listed(changed)} {verb} ({tried.trials} virtual measurements)")
-    lines += [_unsolved(found, name) for name, one in found.measurements.items() if one.fits_by is None]
+    unsolved: dict[str, list[str]] = {}
+    for name, one in found.measurements.items():
+        if one.fits_by is None:
+            told, why = _unsolved(found, name)
+            unsolved.setdefault(why, []).append(told)
+    lines += [f"{listed(told)}: {why}" for why, told in unsolved.items()]
     if found.untried and any(one.fits_by is None for one in found.measurements.values()):
         lines.append(f"not tried for lack of time: {'; '.join(found.untried)}")
     return lines
@@ -82,19 +87,18 @@ def _changed(name: str, before: MissedEntry, after: ChangedMeasurement) -> str:
     return f"{name} (u {u}, before {_plain(before.standard_uncertainty, before.unit)})"
 
 
-def _unsolved(found: RemediesEntry, name: str) -> str:
-    """Return the change that comes nearest to making a measurement fit."""
+def _unsolved(found: RemediesEntry, name: str) -> tuple[str, str]:
+    """Return a measurement with the nearest uncertainty that was reached, and why no change makes it fit."""
     one = found.measurements[name]
     rows = [(or_nan(tried.measurements[name].demand), tried) for tried in found.tried if name in tried.measurements]
     rows = [row for row in rows if math.isfinite(row[0])]
     if not rows:
-        why = "not tried" if found.untried else "by its budget, no single change that mitsim knows suffices"
-        return f"{name}: {why}"
+        return name, "not tried" if found.untried else "by its budget, no single change that mitsim knows suffices"
     _, best = min(rows, key=lambda row: row[0])
     after = best.measurements[name]
-    reached = f"u {_plain(after.standard_uncertainty, one.unit)}, {_plain(one.needed, one.unit)} needed"
+    told = f"{name} (u {_plain(after.standard_uncertainty, one.unit)}, {_plain(one.needed, one.unit)} needed)"
     if after.verdict == "not decided":
-        return f"{name} may fit {best.words}: {reached}, not decided by {best.trials} virtual measurements"
+        return told, f"perhaps {best.words}, not decided by {best.trials} virtual measurements"
     count = len(rows)
     tried = "the one change tried does not suffice" if count == 1 else f"none of {count} changes tried suffices"
-    return f"{name}: {tried}; nearest {best.words}, {reached}"
+    return told, f"{tried}; nearest is {best.words}"
