@@ -1,8 +1,8 @@
 """Propose changes of a study that could make a measurement fit its tolerance, the least effort first.
 
 Signal chain: statement of a view, scores and race of all views -> candidates: the bias subtracted, another view, nearer
-to the features, planned exposures, repeated captures, no room light, a fresh calibration, steady temperatures, two
-views, a matt white spray, a better calibration, a known decoder -> bound of each (:mod:`mitsim.study.remedies.bounds`)
+to the features, a matt white spray, planned exposures, repeated captures, no room light, a fresh calibration, several
+views, steady temperatures, a better calibration, a known decoder -> bound of each (:mod:`mitsim.study.remedies.bounds`)
 -> those with which some measurement can fit. Other sensors: :mod:`mitsim.study.remedies.sensors`.
 
 Apart from views and repeated captures, a change consists of ``keys`` of the study's TOML file. A user who adds them
@@ -48,6 +48,9 @@ SCREENING_FACTOR = math.exp(PRIOR_OWN)
 
 #: numbers of captures whose mean is proposed, and shares of the errors of calibration and temperature
 _CAPTURES, _SHARES = (4, 16), (1 / 2, 1 / 4, 1 / 8)
+
+#: number of other views that are tried
+_MOST_OTHER_VIEWS = 2
 
 #: largest ratio of standoffs at which a nearer one is worth a try
 _NEARER = 0.9
@@ -144,12 +147,12 @@ def changes(now: Shortfall) -> Iterator[Change]:
         _bias,
         _views,
         _nearer,
+        _spray,
         _exposure,
         _repeats,
         _room,
         _fresh_calibration,
         _several_views,
-        _spray,
         _temperature,
         _better_calibration,
         _decoder,
@@ -222,7 +225,7 @@ def _bias(now: Shortfall) -> Iterator[Change]:
 
 
 def _views(now: Shortfall) -> Iterator[Change]:
-    """Yield the best other view of each measurement, by the race or else by the map."""
+    """Yield best other views of single measurements, by the race or by the map, those of most measurements first."""
     stated, found = now.stated.view.number, dict[int, dict[str, float]]()
     risk = screening_risk(now.scores)
     numbers = now.scores["view"].values.tolist()
@@ -241,7 +244,7 @@ def _views(now: Shortfall) -> Iterator[Change]:
             u = ratio * one.standard_uncertainty / SCREENING_FACTOR
             if number != stated and ratio < 1 and can_fit(one, u, unbiased=True):
                 found.setdefault(number, {})[name] = u
-    for number, expected in found.items():
+    for number, expected in sorted(found.items(), key=lambda row: -len(row[1]))[:_MOST_OTHER_VIEWS]:
 
         def state(count: int, limit: TimeLimit, view: int = number) -> list[Statement]:
             return now.session.state(now.study.view(view), StatementTable(trials=count), limit).statements
