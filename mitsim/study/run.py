@@ -37,7 +37,7 @@ from mitsim.running.progress import say, track
 from mitsim.running.time_limit import TimeLimit, stopped_by_user
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
-from mitsim.study.remedies.changes import Shortfall
+from mitsim.study.remedies.change import Shortfall
 from mitsim.study.remedies.confirm import all_changes, find_remedies, remedies_document
 from mitsim.study.run_files import digests_of
 from mitsim.study.run_record import draw_clouds, own_files, run_record, runners_up

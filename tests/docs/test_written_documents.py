@@ -20,7 +20,7 @@ from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.study.exposures.exposure_plan import ExposurePlan
 from mitsim.study.exposures.exposure_sweep import ExposureResult, FeatureResult
 from mitsim.study.exposures.planned import plan_document, write_plan_csv
-from mitsim.study.remedies.changes import Change
+from mitsim.study.remedies.change import Change
 from mitsim.study.remedies.confirm import find_remedies, remedies_document
 from mitsim.study.remedies.entries import RemediesEntry
 from mitsim.study.virtual.stated import StatedView, statement_document

@@ -16,7 +16,7 @@ from characterisation.statements.statement import Statement, statement
 from characterisation.tasks.decision_table import Decision
 from mitsim.running.time_limit import TimeLimit
 from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
-from mitsim.study.remedies.changes import Change, changed_file
+from mitsim.study.remedies.change import Change, changed_file
 from mitsim.study.remedies.confirm import Remedies, find_remedies, remedies_document
 from mitsim.study.remedies.entries import RemediesEntry, remedies_in_words
 from mitsim.study.tables import StudyFile

@@ -21,7 +21,8 @@ from characterisation.files.errors import InputError
 from characterisation.statements.statement import Statement
 from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit
-from mitsim.study.remedies.changes import MISSED, Change, Shortfall, changes
+from mitsim.study.remedies.change import MISSED, Change, Shortfall
+from mitsim.study.remedies.changes import changes
 from mitsim.study.remedies.sensors import other_sensors
 
 #: first trials of a change, and those of the next steps while a verdict is open, over the trials of the study's table

@@ -22,7 +22,7 @@ from mitsim.sensor.preset import named_sensor, presets
 from mitsim.study import Study
 from mitsim.study.choose.candidates import Excluded, open_candidate
 from mitsim.study.remedies.bounds import can_fit
-from mitsim.study.remedies.changes import SCREENING_FACTOR, Change, ChangedStudy, Shortfall
+from mitsim.study.remedies.change import SCREENING_FACTOR, Change, ChangedStudy, Shortfall
 from mitsim.study.session import Session
 from mitsim.views import View
 from mitsim.views.view_scores import screening_risk
