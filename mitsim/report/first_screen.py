@@ -16,6 +16,8 @@ import xarray as xr
 from markupsafe import Markup
 from numpy.typing import ArrayLike
 
+from characterisation.plots.statements import GROUPS
+from characterisation.statements.budget import largest_line
 from characterisation.statements.verdict_words import OFTEN, Judged, fits_all, losses_in_words, result_in_words
 from mitsim.report.first_rows import ResultRow, RowValues, measured_words
 from mitsim.report.placement_figure import face_verdicts, placement_figure
@@ -182,7 +184,7 @@ def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[ResultRow]:
 
 def _run_row(run: Run, view_scores: xr.Dataset, name: str, one: StatedMeasurement) -> ResultRow:
     """Return the row of a measurement of a run; ``view_scores`` are the scores of the stated view."""
-    entry, decision = run.about.measurements.get(name), one.decision
+    entry, decision, largest = run.about.measurements.get(name), one.decision, largest_line(one.budget)
     limit = feature = ""
     points = None
     if entry is not None:
@@ -201,6 +203,7 @@ def _run_row(run: Run, view_scores: xr.Dataset, name: str, one: StatedMeasuremen
         **({} if decision is None else _same_names(decision, ("rule", *_DECIDED))),
         limited=f"{limit} on {feature}" if limit and feature else limit,
         points=points if limit else None,
+        source="" if largest is None else f"mostly {GROUPS.get(largest.group, ('', largest.group))[1]}",
     ).texts()
 
 

@@ -215,7 +215,8 @@ def lacking(study: Study, raced: Raced, stated: StatedView | None, limit: TimeLi
         return out
     if len(raced.views) and not raced.decided:
         out.append(
-            f"views compared by {raced.trials} trials: the best is {in_words(raced.standings[ALL], raced.margin)}"
+            f"views compared by {raced.trials} trials: view {raced.leader(ALL)} leads, "
+            f"{in_words(raced.standings[ALL], raced.margin)}"
         )
     if len(raced.views) and stated is None:
         out.append("no statement of uncertainty")

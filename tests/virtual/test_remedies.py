@@ -131,6 +131,10 @@ def test_a_quarter_of_the_trials_excludes_a_hopeless_change_and_more_decide_a_go
     near = Fake("view", ("a",), a=0.11)  # 0.128 is needed: the interval of the demand of 40 trials contains 1
     find_remedies(missed("a"), [near.change], 40)
     assert near.asked == [10, 40, 160]
+    missing = Fake("view", ("a",), a=0.14)  # open after ten trials, but a third above the demand of a fit
+    assert stated("a", 0.14, count=10).verdict == "not decided"
+    find_remedies(missed("a"), [missing.change], 40)
+    assert missing.asked == [10]
 
 
 def test_an_impossible_change_is_reported_and_the_next_one_tried() -> None:
@@ -154,6 +158,11 @@ def test_the_nearest_of_insufficient_changes_is_named() -> None:
         RemediesEntry.model_validate(remedies_document(find_remedies(missed("a"), [far.change, near.change], 40)))
     )
     assert lines == ["a (u 0.40 mm, 0.12 mm needed): none of 2 changes tried suffices; nearest is with spray"]
+    worse, worst = Fake("view", ("a",), a=0.9), Fake("spray", ("a",), a=1.4)
+    lines = remedies_in_words(
+        RemediesEntry.model_validate(remedies_document(find_remedies(missed("a"), [worse.change, worst.change], 40)))
+    )
+    assert lines == ["a (u 0.80 mm, 0.12 mm needed): none of 2 changes tried helps"]
     nothing = RemediesEntry.model_validate(remedies_document(Remedies(missed("a"))))
     assert remedies_in_words(nothing) == ["a: by its budget, no single change that mitsim knows suffices"]
 

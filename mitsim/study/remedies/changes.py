@@ -126,9 +126,11 @@ def _views(now: Shortfall) -> Iterator[Change]:
             best = int(np.argmin(screened))
             ratios[numbers[best]] = float(screened[best] / screened[numbers.index(stated)])
         if name in now.raced.standings and stated in now.raced.views:
-            standing = now.raced.standings[name]
-            own = float(standing.risk[int(np.flatnonzero(now.raced.views == stated)[0])])
-            ratios[now.raced.leader(name)] = float(standing.risk[standing.leader]) / own
+            risks = dict(zip(now.raced.views.tolist(), now.raced.standings[name].risk.tolist(), strict=True))
+            # the trials of the race tell more of a view than the map
+            ratios = {view: risks.get(view, risks[stated] * ratio) / risks[stated] for view, ratio in ratios.items()}
+            leader = now.raced.leader(name)
+            ratios[leader] = risks[leader] / risks[stated]
         for number, ratio in ratios.items():
             u = ratio * one.standard_uncertainty / SCREENING_FACTOR
             if number != stated and ratio < 1 and can_fit(one, u, unbiased=True):

@@ -1,8 +1,8 @@
 """Find the cheapest change with which each missed measurement fits, by virtual measurements of every change tried.
 
 Signal chain: changes in the order of their effort (:mod:`mitsim.study.remedies.changes`) -> virtual measurements of the
-first change that can help a measurement that no earlier one helps, few at first and more while its verdict is open ->
-next change, until every measurement fits or time is over -> :class:`Remedies`.
+first change that can help a measurement that no earlier one helps, few at first and more while it may still fit -> next
+change, until every measurement fits or time is over -> :class:`Remedies`.
 
 A change is confirmed if the decision rule gives the verdict *fits* from its virtual measurements alone. Their draws are
 those of the statement, so that only the change makes the difference.
@@ -21,7 +21,7 @@ from characterisation.files.errors import InputError
 from characterisation.statements.statement import Statement
 from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit
-from mitsim.study.remedies.change import MISSED, Change, Shortfall
+from mitsim.study.remedies.change import Change, Shortfall
 from mitsim.study.remedies.changes import changes
 from mitsim.study.remedies.sensors import other_sensors
 
@@ -133,17 +133,25 @@ def all_changes(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
 
 
 def _stated(change: Change, wanted: list[str], trials: int, limit: TimeLimit) -> dict[str, Statement]:
-    """Return the statements under a change, from more trials while a wanted verdict is open and can become good."""
+    """Return the statements under a change, from more trials while a wanted verdict is open and may become good."""
     stated: dict[str, Statement] = {}
     for share in _STEPS:
         stated = {one.measurement: one for one in change.state(max(_FEWEST, round(share * trials)), limit)}
         asked = [stated[name] for name in wanted]
-        if limit.over() or all(one.verdict in MISSED for one in asked):
-            break
-        hopeful = [one for one in asked if one.verdict == "not decided" and one.decided and one.decided.demand <= 1]
-        if share >= 1 and not hopeful:
+        if limit.over() or not any(_deserves_more(one, share < 1) for one in asked):
             break
     return stated
+
+
+def _deserves_more(one: Statement, first: bool) -> bool:
+    """Return whether a verdict deserves more trials: one that may become *fits*, or does so by the first few alone.
+
+    After the first few, one standard deviation of the logarithm of the demand may be missing, later nothing.
+    """
+    if one.decided is None or one.verdict != "not decided":
+        return one.verdict == "fits" and first
+    demand, low = one.decided.demand, one.decided.demand_interval[0]
+    return demand <= 1 or (first and demand * low <= 1)
 
 
 def remedies_document(found: Remedies) -> dict[str, Any]:
@@ -154,6 +162,7 @@ def remedies_document(found: Remedies) -> dict[str, Any]:
                 "unit": one.unit,
                 "standard_uncertainty": json_values(one.standard_uncertainty),
                 "needed": None if one.decided is None else json_values(one.decided.needed),
+                "demand": None if one.decided is None else json_values(one.decided.demand),
                 "fits_by": next((i for i, tried in enumerate(found.tried) if name in tried.fits), None),
             }
             for name, one in found.missed.items()

@@ -21,6 +21,7 @@ class MissedEntry(PartialDocument):
     unit: str
     standard_uncertainty: float | None
     needed: float | None
+    demand: float | None = None
     fits_by: int | None = None
 
 
@@ -94,11 +95,13 @@ def _unsolved(found: RemediesEntry, name: str) -> tuple[str, str]:
     rows = [row for row in rows if math.isfinite(row[0])]
     if not rows:
         return name, "not tried" if found.untried else "by its budget, no single change that mitsim knows suffices"
-    _, best = min(rows, key=lambda row: row[0])
-    after = best.measurements[name]
-    told = f"{name} (u {_plain(after.standard_uncertainty, one.unit)}, {_plain(one.needed, one.unit)} needed)"
-    if after.verdict == "not decided":
+    demand, best = min(rows, key=lambda row: row[0])
+    helps = one.demand is None or demand < one.demand
+    nearest = best.measurements[name].standard_uncertainty if helps else one.standard_uncertainty
+    told = f"{name} (u {_plain(nearest, one.unit)}, {_plain(one.needed, one.unit)} needed)"
+    if best.measurements[name].verdict == "not decided" and demand <= 1:
         return told, f"perhaps {best.words}, not decided by {best.trials} virtual measurements"
-    count = len(rows)
-    tried = "the one change tried does not suffice" if count == 1 else f"none of {count} changes tried suffices"
-    return told, f"{tried}; nearest is {best.words}"
+    if len(rows) == 1:
+        return told, f"the one change tried, {best.words}, does not {'suffice' if helps else 'help'}"
+    none = f"none of {len(rows)} changes tried"
+    return told, f"{none} suffices; nearest is {best.words}" if helps else f"{none} helps"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from characterisation.files.atomic_io import json_values
-from characterisation.statements.budget import budget
+from characterisation.statements.budget import budget, largest_line
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import common_losses, losses
 from characterisation.statements.statement import Statement, statement
@@ -273,11 +273,8 @@ def _largest(one: Statement) -> str:
     """Return the largest line of the budget; none where the trials are too few to tell which."""
     if not one.budget:
         return ""
-    largest = one.budget[0]
-    others = max((line.high for line in one.budget[1:]), default=0.0)
-    if not largest.settled or (largest.low < others and largest.share < 0.5):
-        return "too few trials"
-    return f"{largest.group} ({100 * largest.share:.0f} %)"
+    largest = largest_line(one.budget)
+    return "too few trials" if largest is None else f"{largest.group} ({100 * largest.share:.0f} %)"
 
 
 def _measurement(one: Statement) -> dict[str, Any]:
