@@ -3,6 +3,7 @@
 import html
 import json
 import re
+import shutil
 
 import pytest
 
@@ -136,3 +137,19 @@ def test_values_that_are_missing_are_told_of_a_comparison_without_tolerances(tmp
     first = of_choice(read_choice(folder), None)
     assert first.tone == "warn" and "no value in up to 29 % of the virtual measurements" in first.words
     assert not first.tolerances
+
+
+def test_a_row_names_the_largest_line_of_the_budget_only_if_the_trials_tell_it(run_folder, tmp_path):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    path = folder / "statement.json"
+
+    def source(**changed):
+        document = json.loads(path.read_text())
+        document["measurements"][MEASUREMENTS[0]]["budget"][0] |= changed
+        path.write_text(json.dumps(document))
+        return of_run(read_run(folder), read_scene_geometry(folder)).rows[0].source
+
+    assert source(settled=False) == ""
+    assert source(settled=True) == "mostly calibration and drift"
+    assert source(share=0.45, low=0.02) == ""  # under half, and the next line may be as large
+    assert source(low=0.1) == "mostly calibration and drift"
