@@ -97,7 +97,7 @@ def run(
         say(f"after {limit.elapsed:.0f} s; not done: {'; '.join(about.lacks)}. The same command goes on")
     if stopped:
         raise KeyboardInterrupt  # exit code 130
-    _tell_statement(stated, output, require_fit, about.view_sets, remedies_in_words(about.remedies))
+    _tell_statement(stated, output, require_fit, about.leader, about.view_sets, remedies_in_words(about.remedies))
 
 
 def choose(
@@ -287,6 +287,7 @@ def _tell_statement(
     stated: Sequence[Statement],
     output: Path,
     require_fit: bool,
+    leader: int | None = None,
     sets: Sequence[ViewSetEntry] = (),
     remedies: Sequence[str] = (),
 ) -> None:
@@ -301,7 +302,9 @@ def _tell_statement(
     from mitsim.study.virtual.stated import judged, statement_table
 
     if not stated:
-        say(with_sets("no view can make every measurement: there is no statement", False, sets).words)
+        leads = f"view {leader} leads, but time did not suffice for a statement of uncertainty"
+        none = "no view can make every measurement: there is no statement"
+        say(with_sets(none if leader is None else leads, False, sets).words)
         raise typer.Exit(1)
     print(statement_table(stated))
     result = with_sets(result_in_words(judged(stated)), fits_all(judged(stated)), sets)

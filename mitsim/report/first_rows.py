@@ -116,7 +116,7 @@ class RowValues:
             share=NONE if self.share is None else _share(self.share),
             share_interval="" if limit is None else _interval(self.demand_interval, limit),
             share_limit="" if limit is None else percent(limit),
-            accepted=accepted_words(self.accepted, self.unit, size),
+            accepted=accepted_words(self.accepted, self.unit, size) if self.rule else NONE,
             false_accept=percent(self.false_accept),
             without_value=percent(self.without_value),
             limited=self.limited,

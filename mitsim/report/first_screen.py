@@ -105,8 +105,7 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     """Return the first screen of the report of a run."""
     document = run.statement
     if document is None:
-        words = with_sets("No view can make the measurements", False, run.about.view_sets).words
-        return FirstScreen(words, "bad", [], None, [], {})
+        return _without_statement(run, geometry)
     results = [_judged(name, one) for name, one in document.measurements.items()]
     view_scores = run.scores.sel(view=document.view)
     asked = {
@@ -117,19 +116,58 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", view_scores["world_from_sensor"].values)]
     verdicts = face_verdicts(asked)
     result = with_sets(result_in_words(results), fits_all(results), run.about.view_sets)
-    best = f"the best of {count(run.scores.sizes['view'])} views for all measurements together"
-    pose = pose_words(pose_of_view(run, document.view))
     return FirstScreen(
         with_degree_signs(result.words[:1].upper() + result.words[1:]),
         tone_of(results) if result.good else "bad",
         [_run_row(run, view_scores, name, one) for name, one in document.measurements.items()],
-        _picture(geometry, poses, verdicts, f"{run.about.sensor} in view {document.view}, {best}: {pose}"),
+        _picture(geometry, poses, verdicts, _caption(run, document.view)),
         poses,
         verdicts,
         max((one.trials for one in document.measurements.values()), default=0),
         tuple(with_degree_signs(line) for line in remedies_in_words(run.about.remedies)),
         tuple(document.doubts()),
     )
+
+
+def _without_statement(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
+    """Return the first screen of a run that states no uncertainty: its leading view so far, or that there is none."""
+    about, leader = run.about, run.about.leader
+    if leader is None:
+        words = with_sets("No view can make the measurements", False, about.view_sets).words
+        return FirstScreen(words, "bad", [], None, [], {})
+    scores = run.scores.sel(view=leader)
+    poses: list[tuple[str, ArrayLike]] = [(f"view {leader}", scores["world_from_sensor"].values)]
+    rows = [
+        RowValues(
+            name=name,
+            about=measured_words(one.kind, one.features),
+            unit=one.unit,
+            verdict="no tolerance" if one.tolerance is None else "not decided",
+            nominal=one.nominal,
+            tolerance=one.tolerance,
+            bias=None,
+            uncertainty=float(scores["measured_risk"].sel(measurement=name)),
+            without_value=math.nan,
+        ).texts()
+        for name, one in about.measurements.items()
+    ]
+    verdicts = face_verdicts({name: (one.faces, "not decided") for name, one in about.measurements.items()})
+    made = f"{about.race_trials} virtual measurement{'' if about.race_trials == 1 else 's'}"
+    return FirstScreen(
+        f"View {leader} leads so far, by {made}; no uncertainty is stated yet",
+        "warn",
+        rows,
+        _picture(geometry, poses, verdicts, _caption(run, leader)),
+        poses,
+        verdicts,
+        about.race_trials,
+        doubts=(f"Standard uncertainties are expected by the performance map and {made}, and include the bias",),
+    )
+
+
+def _caption(run: Run, view: int) -> str:
+    best = f"the best of {count(run.scores.sizes['view'])} views for all measurements together"
+    return f"{run.about.sensor} in view {view}, {best}: {pose_words(pose_of_view(run, view))}"
 
 
 def of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None) -> FirstScreen:

@@ -207,6 +207,11 @@ class RunDocument(PartialDocument):
     cores: int | None = None
     files: dict[str, str] = Field(default_factory=dict)
 
+    @property
+    def leader(self) -> int | None:
+        """Return the number of the best view for all measurements together; None if no view was raced."""
+        return self.leaders.get("all measurements")
+
 
 @dataclass(frozen=True)
 class Run:

@@ -153,3 +153,19 @@ def test_a_row_names_the_largest_line_of_the_budget_only_if_the_trials_tell_it(r
     assert source(settled=True) == "mostly calibration and drift"
     assert source(share=0.45, low=0.02) == ""  # under half, and the next line may be as large
     assert source(low=0.1) == "mostly calibration and drift"
+
+
+def test_a_run_without_a_statement_shows_the_leading_view_so_far(run_folder, tmp_path):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    about = json.loads((folder / "run.json").read_text())
+    view = about["leaders"]["all measurements"]
+    (folder / "statement.json").unlink()
+    first = of_run(read_run(folder), read_scene_geometry(folder))
+    assert first.tone == "warn" and first.words.startswith(f"View {view} leads so far, by ")
+    assert f"view {view}" in first.picture.caption and len(first.rows) == len(MEASUREMENTS)
+    with without_pictures():
+        page = write_report(folder).read_text()
+    assert "No view can make the measurements" not in page
+    (folder / "run.json").write_text(json.dumps(about | {"leaders": {}}))
+    with without_pictures():
+        assert "No view can make the measurements" in write_report(folder).read_text()

@@ -187,13 +187,6 @@ def test_a_statement_far_below_the_accuracy_of_the_maker_says_so(run_folder, tmp
     assert "below a tenth of the accuracy that the maker" in plain(written(folder))
 
 
-def test_a_run_without_a_statement_says_so(run_folder, tmp_path, written):
-    folder = tmp_path / "run"
-    shutil.copytree(run_folder, folder)
-    (folder / "statement.json").unlink()
-    assert "there is no statement" in written(folder)
-
-
 @pytest.mark.parametrize("damage", ["[]", "{", '{"schema_version": 2}', '{"schema_version": 1, "view": "x"}'])
 def test_a_damaged_statement_is_named(run_folder, tmp_path, damage):
     folder = tmp_path / "run"
