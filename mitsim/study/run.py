@@ -61,6 +61,9 @@ from mitsim.study.virtual.stated import StatedView, statement_document
 #: number of best views per measurement whose predicted clouds are written to the run folder
 SHOWN = 3
 
+#: time of the render noise of a view, in pictures of it
+_RESIDUAL_PICTURES = 8
+
 #: time after which a run writes its first report [s], and at least that between later ones
 FIRST_ANSWER_S = 50.0
 
@@ -176,8 +179,10 @@ def run_within(
     draw_clouds(session, performance_map, drawn)
     shown = leaders[: study.file.check.views] if twin is not None else []
     if twin is not None:
+        began = time.monotonic()
         shown = _show(twin, shown, folder, {} if stated is None else {leaders[0]: stated.planned}, pictured)
-        residuals += [_residual(twin, number) for number in shown[:1] if not pictured.over()]
+        each = (time.monotonic() - began) / max(1, len(shown))
+        residuals += [_residual(twin, number) for number in shown[:1] if pictured.left > _RESIDUAL_PICTURES * each]
     clock.lap("pictures")
     about = run_record(study, performance_map, raced, shown, largest_residual(residuals))
     reported = leaders[:1] or _best(scores)[:1]
@@ -336,7 +341,7 @@ def _map(study: Study, twin: RenderedMeasurements | None, folder: Path) -> Perfo
 
 
 def _residual(renderer: RenderedMeasurements, number: int) -> RenderResidual:
-    """Return the render noise of a view without kept light paths, which trials have; takes three trials' time."""
+    """Return the render noise of a view without kept light paths, which trials have."""
     study = renderer.study
     pose, camera = study.view(number).world_from_sensor, next(iter(study.sensor.rig.cameras))
     found = render_residual(renderer.simulated, study.scene, pose, camera, renderer.rendering, seed=study.file.seed)
