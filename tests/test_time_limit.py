@@ -34,11 +34,13 @@ def test_the_first_ctrl_c_ends_every_limit_and_the_second_the_command():
 
 @pytest.mark.parametrize("seconds", [6.0, 30.0, 120.0, 600.0, 36000.0])
 @pytest.mark.parametrize("views", [1, 102, 5000])
-def test_a_plan_shares_out_all_of_the_time(seconds, views):
-    plan = time_plan(seconds, views)
+@pytest.mark.parametrize("remedies", [False, True])
+def test_a_plan_shares_out_all_of_the_time(seconds, views, remedies):
+    plan = time_plan(seconds, views, remedies)
     steps = (plan.screening, plan.race, plan.statement, plan.report)
-    assert min(steps) > 0 and sum(steps) == pytest.approx(seconds)
+    assert min(steps) > 0 and sum(steps) + plan.remedies == pytest.approx(seconds)
     words = plan.in_words()
+    assert (plan.remedies > 0) == remedies == ("changes that would fit" in words)
     assert words.startswith("about ") and all(
         name in words for name in ("screening", "comparing views", "statement", "report")
     )
@@ -48,3 +50,10 @@ def test_the_statement_gets_the_time_that_the_race_leaves():
     plan = time_plan(120.0, 102)
     limit = TimeLimit(120.0, time.monotonic() - 30.0)
     assert plan.race_limit(limit).left < plan.statement_limit(limit).left < limit.left
+
+
+def test_the_remedies_get_what_the_statement_leaves_but_for_pictures_and_report():
+    with_them, without = time_plan(600.0, 102, True), time_plan(600.0, 102)
+    limit = TimeLimit(600.0, time.monotonic() - 300.0)
+    assert with_them.statement_limit(limit).left < without.statement_limit(limit).left
+    assert with_them.statement_limit(limit).left < with_them.remedies_limit(limit).left < limit.left

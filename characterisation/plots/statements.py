@@ -22,6 +22,7 @@ GROUPS = {
     "calibration": ("#0072b2", "calibration and drift"),
     "finish": ("#e69f00", "finish of the part"),
     "form": ("#f0e442", "form of the part"),
+    "coat": ("#6a51a3", "coat of the part"),
     "light": ("#cc79a7", "room light, power, exposure"),
     "temperature": ("#d55e00", "temperature"),
     "unit": ("#999999", "fixed pattern and dots of the unit"),

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,6 +71,42 @@ class BudgetLine:
     share_interval: tuple[float, float]
     settled: bool = True
     source: str = ""
+
+
+class SizedLine(Protocol):
+    """Size of a line of a budget, as in :class:`BudgetLine`."""
+
+    @property
+    def low(self) -> float:
+        """Return the low end of the interval of the variance."""
+
+    @property
+    def high(self) -> float:
+        """Return its high end."""
+
+    @property
+    def share(self) -> float:
+        """Return the share in the whole variance."""
+
+    @property
+    def settled(self) -> bool:
+        """Return whether the trials tell the share."""
+
+
+_Line = TypeVar("_Line", bound=SizedLine)
+
+
+def largest_line(lines: Sequence[_Line]) -> _Line | None:
+    """Return the largest line of a budget; None without lines, or if the trials are too few to tell which it is.
+
+    ``lines`` are sorted, the largest first.
+    """
+    if not lines:
+        return None
+    largest = lines[0]
+    others = max((line.high for line in lines[1:]), default=0.0)
+    told = largest.settled and (largest.low >= others or largest.share >= 0.5)
+    return largest if told else None
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """The command line: every stage of the pipeline as a command, in the order in which ``--help`` lists them.
 
 Data goes to files or stdout; messages and progress go to stderr. Exit codes: 0 success, 1 a check failed, 2 wrong usage
-or input, 3 the machine lacks something, 130 interrupted. Commands import heavy packages only when they run, so that
-``--help`` is fast.
+or input, 3 the machine lacks something, 70 a bug, with its traceback, 130 interrupted. Commands import heavy packages
+only when they run, so that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import os
 import signal
 import sys
 import threading
+import traceback
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
@@ -145,8 +146,8 @@ _OF_THE_USER = frozenset(
 )
 
 
-#: exit code of an interrupted command
-_STOPPED = 130
+#: exit codes of an interrupted command, and of a bug: EX_SOFTWARE of sysexits.h, since Python's own is that of a check
+_STOPPED, _BUG = 130, 70
 
 
 def main() -> None:
@@ -155,7 +156,10 @@ def main() -> None:
 
 
 def run_application(app: typer.Typer) -> None:
-    """Run commands; errors that users can correct end with a message and an exit code, not a traceback."""
+    """Run commands; errors that users can correct end with a message and an exit code, not a traceback.
+
+    A bug ends with its traceback, and with an exit code that differs from that of a failed check.
+    """
     _prepare_streams()
     _stop_as_by_hand()
     code = 0
@@ -182,7 +186,9 @@ def run_application(app: typer.Typer) -> None:
         elif error.errno in _OF_THE_USER and error.filename is not None:
             code = _end(2, f"{error.filename}: found {error.strerror}; allowed: a path that can be read and written")
         else:
-            raise
+            code = _bug()
+    except Exception:
+        code = _bug()
     sys.exit(_flushed(code))
 
 
@@ -191,6 +197,13 @@ def _end(code: int, text: str) -> int:
     with suppress(OSError, ValueError):
         print(f"mitsim: {printable(text)}", file=sys.stderr, flush=True)
     return code
+
+
+def _bug() -> int:
+    """Print the traceback of the exception at hand, and return the exit code."""
+    with suppress(OSError, ValueError):
+        traceback.print_exc()
+    return _BUG
 
 
 def printable(text: str) -> str:

@@ -37,6 +37,9 @@ PlanExposures = Annotated[
         "of the study. Views are screened and compared with the sensor's own exposure.",
     ),
 ]
+RequireFit = Annotated[
+    bool, typer.Option("--require-fit", help="End with exit code 1 unless every tolerance and limit is kept.")
+]
 ViewNumber = Annotated[int, typer.Option(min=0, help="Number of the view in scores.csv and poses/.")]
 
 
@@ -52,6 +55,7 @@ def run(
         ),
     ] = None,
     plan: PlanExposures = False,
+    require_fit: RequireFit = False,
     scheduler: Scheduler = None,
     processes: Processes = 1,
     overwrite: Overwrite = False,
@@ -61,8 +65,9 @@ def run(
     """Run a study: screen all views, compare the best by virtual measurements, state the uncertainty, write a report.
 
     Screening predicts uncertainties from the performance map of the sensor. A virtual measurement renders, decodes and
-    measures the part once, with random values of all unknown effects. Exit code 1 if a measurement with a
-    tolerance does not fit it, or the set of views that the study asks for exceeds an uncertainty limit.
+    measures the part once, with random values of all unknown effects. For measurements that do not fit their
+    tolerance, the last lines name the cheapest changes with which they do (spray, exposure, view, sensor and others).
+    Exit code 1 if no view can make every measurement.
 
     Example: mitsim run scenes/two_pillars/study.toml -o runs/two_pillars
     """
@@ -73,6 +78,7 @@ def run(
     from mitsim.report.page import write_report
     from mitsim.running.progress import say
     from mitsim.study import open_study, report_lays, with_plan
+    from mitsim.study.remedies.entries import remedies_in_words
     from mitsim.study.run import run_within
     from mitsim.study.run_folder import read_run
 
@@ -91,7 +97,7 @@ def run(
         say(f"after {limit.elapsed:.0f} s; not done: {'; '.join(about.lacks)}. The same command goes on")
     if stopped:
         raise KeyboardInterrupt  # exit code 130
-    _tell_statement(stated, output, about.view_sets)
+    _tell_statement(stated, output, require_fit, about.leader, about.view_sets, remedies_in_words(about.remedies))
 
 
 def choose(
@@ -105,6 +111,7 @@ def choose(
     ] = "all",
     minutes: Annotated[float, typer.Option(min=0.1, help="Total time, shared among the sensors [min].")] = 10.0,
     plan: PlanExposures = False,
+    require_fit: RequireFit = False,
     scheduler: Scheduler = None,
     processes: Processes = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print choice.json in place of the table.")] = False,
@@ -114,7 +121,7 @@ def choose(
 ) -> None:
     """Choose a sensor for a study: screen all sensors, and compare the promising ones by virtual measurements.
 
-    Finished work is kept: run the same command again to continue. Exit code 1 if no sensor fits every tolerance.
+    Finished work is kept: run the same command again to continue. Exit code 1 if no sensor has a statement.
 
     Example: mitsim study choose scenes/two_pillars/tolerances.toml --sensors all -o runs/choice
     """
@@ -165,7 +172,8 @@ def choose(
     say(f"page: {output / 'choice.html'}\n{known.words}")
     if stopped:
         raise KeyboardInterrupt  # exit code 130
-    if not any(one.status == "stated" and fits_all(judged(one)) for one in known.sensors):
+    stated = [one for one in known.sensors if one.status == "stated"]
+    if not stated or (require_fit and not any(fits_all(judged(one)) for one in stated)):
         raise typer.Exit(1)
 
 
@@ -182,6 +190,7 @@ def state(
         ),
     ] = None,
     plan: PlanExposures = False,
+    require_fit: RequireFit = False,
     scheduler: Scheduler = None,
     processes: Processes = 1,
     yes: Yes = False,
@@ -189,8 +198,7 @@ def state(
 ) -> None:
     """State the uncertainty of every measurement from one view of a study, with a budget of its sources.
 
-    The first Ctrl-C ends it with the statement so far, and the same command goes on from there. Exit code 1 if a
-    measurement with a tolerance does not fit it.
+    The first Ctrl-C ends it with the statement so far, and the same command goes on from there.
 
     Example: mitsim study state scenes/two_pillars/study.toml --view 12 -o runs/view_12
     """
@@ -214,7 +222,7 @@ def state(
     write_json(output / "statement.json", statement_document(session, stated))
     if stopped:
         raise KeyboardInterrupt  # exit code 130
-    _tell_statement(stated.statements, output)
+    _tell_statement(stated.statements, output, require_fit)
 
 
 def exposures(
@@ -275,22 +283,38 @@ def exposures(
         raise typer.Exit(1)
 
 
-def _tell_statement(stated: Sequence[Statement], output: Path, sets: Sequence[ViewSetEntry] = ()) -> None:
-    """Print the statements, and the result of the sets; exit with code 1 if a tolerance does not fit or a set exceeds
-    a limit.
+def _tell_statement(
+    stated: Sequence[Statement],
+    output: Path,
+    require_fit: bool,
+    leader: int | None = None,
+    sets: Sequence[ViewSetEntry] = (),
+    remedies: Sequence[str] = (),
+) -> None:
+    """Print the statements, the result of the sets, and what would make the rest fit.
+
+    Exit with code 1 without a statement; with ``require_fit`` also if a tolerance or a limit of a set is not kept.
     """
     from characterisation.statements.verdict_words import fits_all, result_in_words
     from mitsim.report.set_words import with_sets
     from mitsim.running.progress import say
+    from mitsim.study.statement_file import read_statement
     from mitsim.study.virtual.stated import judged, statement_table
 
     if not stated:
-        say(with_sets("no view can make every measurement: there is no statement", False, sets).words)
+        leads = f"view {leader} leads, but time did not suffice for a statement of uncertainty"
+        none = "no view can make every measurement: there is no statement"
+        say(with_sets(none if leader is None else leads, False, sets).words)
         raise typer.Exit(1)
     print(statement_table(stated))
     result = with_sets(result_in_words(judged(stated)), fits_all(judged(stated)), sets)
     say(f"statement: {output / 'statement.json'}\n{result.words}")
-    if not result.good:
+    document = read_statement(output / "statement.json")
+    for doubt in document.doubts() if document else ():
+        say(f"warning: {doubt}")
+    if remedies:
+        say("\n".join(["what would make it fit:", *(f"- {line}" for line in remedies)]))
+    if require_fit and not result.good:
         raise typer.Exit(1)
 
 

@@ -41,8 +41,8 @@ class ResultRow:
     """One measurement in the short table, as texts; ``colour`` of its verdict.
 
     ``about`` says what is measured. ``share`` of the tolerance with its ``share_interval`` and the largest
-    ``share_limit`` that fits. ``limited`` says what limits the view, ``points`` how many it expects there. Texts are
-    empty where nothing is known; values without a number are a dash.
+    ``share_limit`` that fits. ``limited`` says what limits the view, ``points`` how many it expects there; ``source``
+    is the largest line of the budget. Texts are empty where nothing is known; values without a number are a dash.
     """
 
     name: str
@@ -60,6 +60,7 @@ class ResultRow:
     without_value: str
     limited: str
     points: str
+    source: str
     verdict: str
     colour: str
 
@@ -70,7 +71,7 @@ class RowValues:
 
     ``tolerance`` as in the task, or half the interval that conforms. ``share`` of the tolerance that the uncertainty
     takes; ``demand`` of the ``rule`` with its interval; ``accepted`` lowest and highest reading. ``limited`` is what
-    limits the view, with the expected ``points`` on that feature.
+    limits the view, with the expected ``points`` on that feature; ``source`` the largest line of the budget.
     """
 
     name: str
@@ -91,6 +92,7 @@ class RowValues:
     false_accept: float | None = None
     limited: str = ""
     points: float | None = None
+    source: str = ""
 
     @property
     def share_limit(self) -> float | None:
@@ -114,11 +116,12 @@ class RowValues:
             share=NONE if self.share is None else _share(self.share),
             share_interval="" if limit is None else _interval(self.demand_interval, limit),
             share_limit="" if limit is None else percent(limit),
-            accepted=accepted_words(self.accepted, self.unit, size),
+            accepted=accepted_words(self.accepted, self.unit, size) if self.rule else NONE,
             false_accept=percent(self.false_accept),
             without_value=percent(self.without_value),
             limited=self.limited,
             points="" if self.points is None or not math.isfinite(self.points) else count(round(self.points)),
+            source=self.source,
             verdict=self.verdict,
             colour=VERDICTS.get(self.verdict, "#9a9fa8"),
         )

@@ -16,6 +16,8 @@ import xarray as xr
 from markupsafe import Markup
 from numpy.typing import ArrayLike
 
+from characterisation.plots.statements import GROUPS
+from characterisation.statements.budget import largest_line
 from characterisation.statements.verdict_words import OFTEN, Judged, fits_all, losses_in_words, result_in_words
 from mitsim.report.first_rows import ResultRow, RowValues, measured_words
 from mitsim.report.placement_figure import face_verdicts, placement_figure
@@ -24,6 +26,7 @@ from mitsim.report.set_words import with_sets
 from mitsim.report.style import Picture, as_svg
 from mitsim.running.numbers import NONE, count, or_nan, with_degree_signs
 from mitsim.study.choice_document import ChoiceDocument, SensorEntry, judged
+from mitsim.study.remedies.entries import remedies_in_words
 from mitsim.study.run_folder import Run
 from mitsim.study.scene_geometry import SceneGeometry
 from mitsim.study.statement_file import StatedMeasurement
@@ -38,7 +41,8 @@ class FirstScreen:
     """Content of the first screen: the result in ``words``, its ``tone``, rows and picture.
 
     The picture shows ``poses`` (label, part_from_sensor) and ``verdicts`` by feature. ``trials`` is the largest number
-    of virtual measurements behind a row.
+    of virtual measurements behind a row. ``remedies`` say what would make the other measurements fit,
+    ``doubts`` why to check the statement.
     """
 
     words: str
@@ -48,6 +52,8 @@ class FirstScreen:
     poses: list[tuple[str, ArrayLike]]
     verdicts: dict[str, str]
     trials: int = 0
+    remedies: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
     @property
     def short_words(self) -> str:
@@ -99,29 +105,69 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
     """Return the first screen of the report of a run."""
     document = run.statement
     if document is None:
-        words = with_sets("No view can make the measurements", False, run.about.view_sets).words
-        return FirstScreen(words, "bad", [], None, [], {})
+        return _without_statement(run, geometry)
     results = [_judged(name, one) for name, one in document.measurements.items()]
     view_scores = run.scores.sel(view=document.view)
     asked = {
-        name: (run.about.measurements[name].features, one.verdict)
+        name: (run.about.measurements[name].faces, one.verdict)
         for name, one in document.measurements.items()
         if name in run.about.measurements
     }
     poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", view_scores["world_from_sensor"].values)]
     verdicts = face_verdicts(asked)
     result = with_sets(result_in_words(results), fits_all(results), run.about.view_sets)
-    best = f"the best of {count(run.scores.sizes['view'])} views for all measurements together"
-    pose = pose_words(pose_of_view(run, document.view))
     return FirstScreen(
         with_degree_signs(result.words[:1].upper() + result.words[1:]),
         tone_of(results) if result.good else "bad",
         [_run_row(run, view_scores, name, one) for name, one in document.measurements.items()],
-        _picture(geometry, poses, verdicts, f"{run.about.sensor} in view {document.view}, {best}: {pose}"),
+        _picture(geometry, poses, verdicts, _caption(run, document.view)),
         poses,
         verdicts,
         max((one.trials for one in document.measurements.values()), default=0),
+        tuple(with_degree_signs(line) for line in remedies_in_words(run.about.remedies)),
+        tuple(document.doubts()),
     )
+
+
+def _without_statement(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
+    """Return the first screen of a run that states no uncertainty: its leading view so far, or that there is none."""
+    about, leader = run.about, run.about.leader
+    if leader is None:
+        words = with_sets("No view can make the measurements", False, about.view_sets).words
+        return FirstScreen(words, "bad", [], None, [], {})
+    scores = run.scores.sel(view=leader)
+    poses: list[tuple[str, ArrayLike]] = [(f"view {leader}", scores["world_from_sensor"].values)]
+    rows = [
+        RowValues(
+            name=name,
+            about=measured_words(one.kind, one.features),
+            unit=one.unit,
+            verdict="no tolerance" if one.tolerance is None else "not decided",
+            nominal=one.nominal,
+            tolerance=one.tolerance,
+            bias=None,
+            uncertainty=float(scores["measured_risk"].sel(measurement=name)),
+            without_value=math.nan,
+        ).texts()
+        for name, one in about.measurements.items()
+    ]
+    verdicts = face_verdicts({name: (one.faces, "not decided") for name, one in about.measurements.items()})
+    made = f"{about.race_trials} virtual measurement{'' if about.race_trials == 1 else 's'}"
+    return FirstScreen(
+        f"View {leader} leads so far, by {made}; no uncertainty is stated yet",
+        "warn",
+        rows,
+        _picture(geometry, poses, verdicts, _caption(run, leader)),
+        poses,
+        verdicts,
+        about.race_trials,
+        doubts=(f"Standard uncertainties are expected by the performance map and {made}, and include the bias",),
+    )
+
+
+def _caption(run: Run, view: int) -> str:
+    best = f"the best of {count(run.scores.sizes['view'])} views for all measurements together"
+    return f"{run.about.sensor} in view {view}, {best}: {pose_words(pose_of_view(run, view))}"
 
 
 def of_choice(choice: ChoiceDocument, geometry: SceneGeometry | None) -> FirstScreen:
@@ -176,7 +222,7 @@ def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[ResultRow]:
 
 def _run_row(run: Run, view_scores: xr.Dataset, name: str, one: StatedMeasurement) -> ResultRow:
     """Return the row of a measurement of a run; ``view_scores`` are the scores of the stated view."""
-    entry, decision = run.about.measurements.get(name), one.decision
+    entry, decision, largest = run.about.measurements.get(name), one.decision, largest_line(one.budget)
     limit = feature = ""
     points = None
     if entry is not None:
@@ -195,6 +241,7 @@ def _run_row(run: Run, view_scores: xr.Dataset, name: str, one: StatedMeasuremen
         **({} if decision is None else _same_names(decision, ("rule", *_DECIDED))),
         limited=f"{limit} on {feature}" if limit and feature else limit,
         points=points if limit else None,
+        source="" if largest is None else f"mostly {GROUPS.get(largest.group, ('', largest.group))[1]}",
     ).texts()
 
 

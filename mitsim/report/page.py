@@ -77,6 +77,7 @@ def page_content(run: Run) -> dict[str, Any]:
     """Return everything that the template shows, in its order."""
     scores, about, map_data = run.scores, run.about, run.performance_map.data
     agreements = {name: agreement(scores, run.checks, name) for name in run.measurements}
+    best = about.leader if run.statement is None else run.statement.view
     return {
         "part": Path(about.scene).stem,
         "about": about,
@@ -88,7 +89,7 @@ def page_content(run: Run) -> dict[str, Any]:
         "minimum_points": count(int(scores.attrs.get("minimum_points", 100))),
         "first": of_run(run, read_scene_geometry(run.folder)),
         "statement": None if run.statement is None else statement_section(run.statement),
-        "stated_pose": None if run.statement is None else pose_texts(pose_of_view(run, run.statement.view)),
+        "stated_pose": None if best is None else pose_texts(pose_of_view(run, best)),
         "race_confidence": percent(about.confidence.get(ALL, 0.0)),
         "race_margin": percent(about.race_margin),
         "race_loss": percent(about.losses[ALL]) if ALL in about.losses else "",
@@ -235,9 +236,9 @@ def _table(run: Run, name: str) -> dict[str, Any]:
             | _expected(run, name, view)
             | {
                 "rank": rank,
-                "points": [count(round(float(points.sel(feature=feature)))) for feature in entry.features],
+                "points": [count(round(float(points.sel(feature=feature)))) for feature in entry.faces],
                 "checked": view in run.checked,
             }
         )
     tolerance = math.isfinite(float(run.scores["tolerance"].sel(measurement=name)))
-    return {"name": name, "features": entry.features, "tolerance": tolerance, "rows": rows}
+    return {"name": name, "features": entry.faces, "tolerance": tolerance, "rows": rows}

@@ -101,7 +101,7 @@ def _measurement(run: Run, name: str) -> dict[str, Any]:
         "unit": entry.unit,
         "nominal": entry.nominal,
         "tolerance": _numbers(here["tolerance"].values),
-        "features": [known.index(feature) for feature in entry.features if feature in known],
+        "features": [known.index(feature) for feature in entry.faces if feature in known],
         "able": here["uncertainty_possible"].values.astype(int).tolist(),
         "possible": here["possible"].values.astype(int).tolist(),
         "limit": here["limit"].values.astype(str).tolist(),

@@ -139,6 +139,7 @@ def load_scene(
     wavelength_nm: float,
     parameters: dict[str, str] | None = None,
     deviation: Deviation | Callable[[str], Deviation] = NOMINAL,
+    sprayed: bool = False,
 ) -> Scene:
     """Load a scene XML for a sensor of one wavelength [nm].
 
@@ -150,6 +151,8 @@ def load_scene(
         Values for the ``<default>`` elements of the XML, as by Mitsuba's option ``-D name=value``.
     deviation
         Deviation of all finishes from their best estimates, or a function from the id of a BSDF to its deviation.
+    sprayed
+        Whether every finish is under a matt white spray.
 
     Raises
     ------
@@ -165,7 +168,7 @@ def load_scene(
     parameters = parameters or {}
     _check_xml(path, parameters)
     _prepare()
-    with loading(wavelength_nm, str(path), path.parent, deviation) as state:
+    with loading(wavelength_nm, str(path), path.parent, deviation, sprayed) as state:
         try:
             scene = backend.mi.load_file(str(path), parallel=False, optimize=False, **parameters)
         except Exception as error:  # Mitsuba raises plain RuntimeErrors for errors in the file

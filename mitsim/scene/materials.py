@@ -72,6 +72,7 @@ class Loading:
     - ``where``: the scene's file, for messages.
     - ``folder`` to which the file names of materials are relative.
     - ``deviation`` of a finish from its best estimate, by the id of its BSDF.
+    - ``sprayed``: whether every finish is under a matt white spray.
     - ``finishes`` loaded so far, by the id of the BSDF.
     - ``fault``: first error of the author. It is kept here because Mitsuba replaces our exceptions by its own.
     """
@@ -80,6 +81,7 @@ class Loading:
     where: str = "scene"
     folder: Path = field(default_factory=Path)
     deviation: Callable[[str], Deviation] = lambda _: NOMINAL
+    sprayed: bool = False
     finishes: dict[str, Finish] = field(default_factory=dict)
     fault: InputError | None = None
 
@@ -99,6 +101,7 @@ def loading(
     where: str,
     folder: str | Path = ".",
     deviation: Deviation | Callable[[str], Deviation] = NOMINAL,
+    sprayed: bool = False,
 ) -> Iterator[Loading]:
     """Make BSDFs for one wavelength [nm] inside this block; yield the state, which collects the finishes.
 
@@ -110,11 +113,13 @@ def loading(
         As in :class:`Loading`.
     deviation
         Of all finishes, or a function from the id of a BSDF to its deviation.
+    sprayed
+        As in :class:`Loading`.
     """
     global _current
     with _lock:
         deviation_of = deviation if callable(deviation) else lambda _: deviation
-        before, _current = _current, Loading(wavelength_nm, where, Path(folder), deviation_of)
+        before, _current = _current, Loading(wavelength_nm, where, Path(folder), deviation_of, sprayed)
         try:
             yield _current
         finally:
@@ -211,6 +216,8 @@ def _make_bsdf(props: Any, finish_of: Callable[[Deviation], Finish]) -> Any:
     from mitsim.scene.backend import mi
 
     asked = props.id()
+    if _current.sprayed:
+        finish_of = partial(_white_finish, USUAL_REFLECTANCE["matt_white"], _current.wavelength_nm)
 
     def deviated(deviation: Callable[[str], Deviation]) -> Finish:
         return finish_of(deviation(asked))

@@ -30,7 +30,7 @@ from mitsim.sensor.opencv_calibration import with_calibration
 from mitsim.sensor.pattern import DotPattern, dot_frames
 from mitsim.sensor.projector import Projector
 from mitsim.sensor.projector_images import ImageFolder, ProjectorImages, allowed_images, checked_images, read_images
-from mitsim.sensor.published_lengths import PublishedLengths
+from mitsim.sensor.published_lengths import PublishedAccuracy, PublishedLengths
 from mitsim.sensor.published_noise import PublishedNoise
 from mitsim.sensor.rig_parameters import moved
 from mitsim.sensor.sensor_file import (
@@ -81,6 +81,7 @@ class Sensor:
     demodulation: TimeOfFlightSettings | None = None
     published_noise: tuple[PublishedNoise, ...] = field(default=(), repr=False)
     published_lengths: PublishedLengths | None = field(default=None, repr=False)
+    published_accuracy: PublishedAccuracy | None = field(default=None, repr=False)
     images: dict[str, str | list[str]] | None = None
     unknowns: UnknownsTable = field(default=UnknownsTable(), repr=False)
     room: RoomTable | None = field(default=None, repr=False)
@@ -380,6 +381,7 @@ def _assemble(path: Path, table: SensorFile, missing: frozenset[str], notes: tup
         demodulation=table.demodulation,
         published_noise=tuple(table.published_noise),
         published_lengths=table.published_lengths,
+        published_accuracy=table.published_accuracy,
         images=table.images,
         unknowns=_unknowns(path, table),
         room=table.room,

@@ -1,4 +1,4 @@
-"""Published error of lengths of a sensor over distance, by its manufacturer."""
+"""Published accuracy of a sensor, by its manufacturer: error of lengths over distance, or one figure."""
 
 from __future__ import annotations
 
@@ -11,6 +11,16 @@ from scipy.stats import norm
 from characterisation.files.documents import Document
 
 Positive = Annotated[float, Field(gt=0)]
+
+
+class PublishedAccuracy(Document):
+    """Accuracy of points or lengths that the maker states as one figure.
+
+    ``source`` and what exactly it states; ``sigma_mm``: one standard deviation.
+    """
+
+    source: str = Field(min_length=1, max_length=200)
+    sigma_mm: Positive
 
 
 class PublishedLengths(Document):

@@ -31,7 +31,7 @@ from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.opencv_calibration import CalibrationTable
 from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
 from mitsim.sensor.projector_images import ImageFolder
-from mitsim.sensor.published_lengths import PublishedLengths
+from mitsim.sensor.published_lengths import PublishedAccuracy, PublishedLengths
 from mitsim.sensor.published_noise import PublishedNoise
 from mitsim.sensor.transforms import Transform
 from mitsim.sensor.unknowns import UnknownsTable
@@ -219,6 +219,7 @@ class SensorFile(Document):
     demodulation: TimeOfFlightSettings | None = None
     published_noise: list[PublishedNoise] = Field(default=[], max_length=20)
     published_lengths: PublishedLengths | None = None
+    published_accuracy: PublishedAccuracy | None = None
     images: dict[str, str | Annotated[list[str], Field(min_length=1, max_length=1000)]] | None = None
     unknowns: UnknownsTable = UnknownsTable()
 

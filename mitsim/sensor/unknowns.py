@@ -18,6 +18,7 @@ from mitsim.sensor.drift import Drift
 from mitsim.sensor.matcher import ContrastWindow, OddSum, odd
 
 NotNegative = Annotated[float, Field(ge=0)]
+Thickness = Annotated[float, Field(ge=0, le=1000)]
 Percent = Annotated[float, Field(ge=0, le=100)]
 _OverZero = Annotated[float, Field(gt=0, le=1000)]
 
@@ -48,7 +49,8 @@ class CalibrationUnknowns(Document):
 
     ``covariance`` is a file written by ``mitsim calibrate``, relative to the file that names it. By default it is the
     preset's own, or a virtual calibration of the sensor. The drift since that calibration is added, by the terms of
-    :class:`mitsim.sensor.drift.Drift`; the baseline's expansion follows from ``temperature``.
+    :class:`mitsim.sensor.drift.Drift`; the baseline's expansion follows from ``temperature``. ``scale`` multiplies the
+    errors of both: 0.5 is a calibration that is twice as accurate.
     """
 
     covariance: str | None = None
@@ -57,6 +59,7 @@ class CalibrationUnknowns(Document):
     roll_mrad: NotNegative = Drift.roll_mrad
     focal_relative: NotNegative = Drift.focal_relative
     path_offset_mm: NotNegative = Drift.path_offset_mm
+    scale: Annotated[float, Field(ge=0, le=10)] = 1.0
 
     def drift(self) -> Drift:
         """Return the drift since the calibration."""
@@ -230,6 +233,17 @@ class DecoderUnknowns(Document):
         return self
 
 
+class CoatUnknowns(Document):
+    """Coat of the faces that are sprayed for the measurement: those in ``matt_white``.
+
+    ``thickness_um``: range of the mean thickness on a part. ``spread``: standard deviation of the thickness over the
+    part, relative to its mean. The thickness 0 is a part that is white itself.
+    """
+
+    thickness_um: Annotated[tuple[Thickness, Thickness], AfterValidator(_in_order)] = (5.0, 20.0)
+    spread: Scale = 0.3
+
+
 class UnknownsTable(Document):
     """All groups of unknowns."""
 
@@ -241,6 +255,7 @@ class UnknownsTable(Document):
     pose: PoseUnknowns = PoseUnknowns()
     unit: UnitUnknowns = UnitUnknowns()
     decoder: DecoderUnknowns = DecoderUnknowns()
+    coat: CoatUnknowns = CoatUnknowns()
 
 
 def unknowns_of(*tables: UnknownsTable) -> UnknownsTable:

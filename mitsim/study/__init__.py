@@ -13,6 +13,7 @@ from mitsim.study.reading import with_plan as with_plan
 from mitsim.study.tables import CharacterisationTable as CharacterisationTable
 from mitsim.study.tables import ExposureTable as ExposureTable
 from mitsim.study.tables import RaceTable as RaceTable
+from mitsim.study.tables import RemediesTable as RemediesTable
 from mitsim.study.tables import SetTable as SetTable
 from mitsim.study.tables import StatementTable as StatementTable
 from mitsim.study.tables import StudyFile as StudyFile

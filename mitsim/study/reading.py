@@ -137,7 +137,10 @@ def open_study(
     check_exposure(sensor)
     task = read_task(folder / file.task)
     scene = load_scene(
-        folder / file.scene, sensor.wavelength_nm, {name: str(value) for name, value in file.parameters.items()}
+        folder / file.scene,
+        sensor.wavelength_nm,
+        {name: str(value) for name, value in file.parameters.items()},
+        sprayed=file.sprayed,
     )
     check_features(task, folder / file.task, scene.names)
     file = _with_limits(path, file, task)
@@ -171,7 +174,9 @@ def open_study(
     if chosen_map is not None and mapped:
         view_distances = [view.standoff for view in candidates.views]
         depths = (min(view_distances) - radius, max(view_distances) + radius)
-        wanted = NeededFinishes(sensor, scene.where, seen_finishes(scene), depths)
+        rendered = file.measure.by != "map" and chosen_map.data.attrs.get("source") in (None, "", "simulated")
+        measured = frozenset(task.shapes)
+        wanted = NeededFinishes(sensor, scene.where, seen_finishes(scene), depths, measured, rendered)
         chosen_map = map_with_finishes(chosen_map, wanted, ask)
     return Study(path, file, scene, task, sensor, candidates, campaign, chosen_map)
 

@@ -37,11 +37,13 @@ from mitsim.running.progress import say, track
 from mitsim.running.time_limit import TimeLimit, stopped_by_user
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
+from mitsim.study.remedies.change import Shortfall
+from mitsim.study.remedies.confirm import all_changes, find_remedies, remedies_document
 from mitsim.study.run_files import digests_of
 from mitsim.study.run_record import draw_clouds, own_files, run_record, runners_up
 from mitsim.study.scoring import score_study, write_raced
 from mitsim.study.session import Session
-from mitsim.study.time_plan import time_plan
+from mitsim.study.time_plan import TimePlan, time_plan
 from mitsim.study.view_sets.confirmed_set import (
     Search,
     TriedSet,
@@ -58,6 +60,9 @@ from mitsim.study.virtual.stated import StatedView, statement_document
 
 #: number of best views per measurement whose predicted clouds are written to the run folder
 SHOWN = 3
+
+#: time of the render noise of a view, in pictures of it
+_RESIDUAL_PICTURES = 8
 
 #: time after which a run writes its first report [s], and at least that between later ones
 FIRST_ANSWER_S = 50.0
@@ -129,7 +134,7 @@ def run_within(
         Writes the report of the folder. Called for the first answer after :data:`FIRST_ANSWER_S`, and as it improves.
     """
     whole = None if limit.end is None else limit.end - limit.began
-    plan = time_plan(whole or 0.0, len(study.views))
+    plan = time_plan(whole or 0.0, len(study.views), _seeks_remedies(study))
     if whole is not None:
         say(plan.in_words())
     session, clock = Session(study, folder, workers), _Clock()
@@ -160,6 +165,12 @@ def run_within(
     if stated is not None:
         write_json(folder / "statement.json", statement_document(session, stated))
     clock.lap("state")
+    remedies = None
+    if stated is not None and not limit.over():
+        twin = None  # its memory is for the changed studies
+        remedies = _remedies(session, stated, scores, raced, search, _time_of_remedies(study, plan, limit))
+        twin = session.renderer
+    clock.lap("remedies")
     tried = [] if limit.over() else _confirm(session, chosen, search)
     chosen = tried[-1].chosen if tried else chosen
     clock.lap("confirm")
@@ -168,8 +179,10 @@ def run_within(
     draw_clouds(session, performance_map, drawn)
     shown = leaders[: study.file.check.views] if twin is not None else []
     if twin is not None:
+        began = time.monotonic()
         shown = _show(twin, shown, folder, {} if stated is None else {leaders[0]: stated.planned}, pictured)
-        residuals += [_residual(twin, number) for number in shown[:1] if not pictured.over()]
+        each = (time.monotonic() - began) / max(1, len(shown))
+        residuals += [_residual(twin, number) for number in shown[:1] if pictured.left > _RESIDUAL_PICTURES * each]
     clock.lap("pictures")
     about = run_record(study, performance_map, raced, shown, largest_residual(residuals))
     reported = leaders[:1] or _best(scores)[:1]
@@ -180,6 +193,7 @@ def run_within(
         if name in study.task.shapes
     }
     about["view_sets"] = [] if chosen is None else [_set_record(study, chosen, tried)]
+    about["remedies"] = remedies
     about["seconds"] = clock.steps
     about["runners_up"] = runners_up(session, raced)
     about["lacks"] = lacking(study, raced, stated, limit)
@@ -206,7 +220,8 @@ def lacking(study: Study, raced: Raced, stated: StatedView | None, limit: TimeLi
         return out
     if len(raced.views) and not raced.decided:
         out.append(
-            f"views compared by {raced.trials} trials: the best is {in_words(raced.standings[ALL], raced.margin)}"
+            f"views compared by {raced.trials} trials: view {raced.leader(ALL)} leads, "
+            f"{in_words(raced.standings[ALL], raced.margin)}"
         )
     if len(raced.views) and stated is None:
         out.append("no statement of uncertainty")
@@ -287,6 +302,28 @@ def _confirm(session: Session, chosen: ViewSet | None, search: Search) -> list[T
     return tried
 
 
+def _seeks_remedies(study: Study) -> bool:
+    """Return whether a run looks for changes that make measurements fit: the study allows it, and has tolerances."""
+    tolerances = (one.tolerance for one in study.task.measurements.values())
+    return study.file.remedies.minutes > 0 and any(one is not None for one in tolerances)
+
+
+def _time_of_remedies(study: Study, plan: TimePlan, limit: TimeLimit) -> TimeLimit:
+    """Return the limit of the search for changes: that of the study, or what pictures and report leave of a limit."""
+    return TimeLimit(60 * study.file.remedies.minutes) if limit.end is None else plan.remedies_limit(limit)
+
+
+def _remedies(
+    session: Session, stated: StatedView, scores: xr.Dataset, raced: Raced, search: Search, limit: TimeLimit
+) -> dict[str, Any] | None:
+    """Return the changes with which the measurements fit that do not, as JSON values; None if all fit."""
+    now = Shortfall(session, stated, scores, raced, search, session.folder / "remedies")
+    if not now.missed or not _seeks_remedies(session.study):
+        return None
+    trials = session.study.file.remedies.trials
+    return remedies_document(find_remedies(now.missed, all_changes(now, limit), trials, limit))
+
+
 def _best(scores: xr.Dataset) -> list[int]:
     """Return the numbers of the best views of every measurement, by predicted risk and by V_m."""
     ranks = np.concatenate([scores["uncertainty_rank"].values, scores["rank"].values])
@@ -304,7 +341,7 @@ def _map(study: Study, twin: RenderedMeasurements | None, folder: Path) -> Perfo
 
 
 def _residual(renderer: RenderedMeasurements, number: int) -> RenderResidual:
-    """Return the render noise of a view without kept light paths, which trials have; takes three trials' time."""
+    """Return the render noise of a view without kept light paths, which trials have."""
     study = renderer.study
     pose, camera = study.view(number).world_from_sensor, next(iter(study.sensor.rig.cameras))
     found = render_residual(renderer.simulated, study.scene, pose, camera, renderer.rendering, seed=study.file.seed)

@@ -23,6 +23,7 @@ from characterisation.tasks.task_reading import check_task
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
 from mitsim.scene.surface.lay import LayLeftOut
+from mitsim.study.remedies.entries import RemediesEntry
 from mitsim.study.run_files import AGAIN, TASK, check_own
 from mitsim.study.statement_file import PartialDocument, StatementDocument, read_statement
 
@@ -93,13 +94,22 @@ _PATCHES = Schema(
 
 
 class MeasurementEntry(PartialDocument):
-    """Entry of a measurement in ``run.json``; ``kind`` and ``tolerance`` as in the task."""
+    """Entry of a measurement in ``run.json``; ``kind`` and ``tolerance`` as in the task.
+
+    ``shapes`` are the faces whose points decide it, which are not the ``features`` of an edge or a rim.
+    """
 
     nominal: float
     unit: str
     features: list[str]
     kind: str = ""
     tolerance: float | tuple[float, float] | None = None
+    shapes: list[str] = Field(default_factory=list)
+
+    @property
+    def faces(self) -> list[str]:
+        """Return the faces whose points decide the measurement; files of older versions name its features alone."""
+        return self.shapes or self.features
 
 
 class ResidualEntry(PartialDocument):
@@ -190,11 +200,17 @@ class RunDocument(PartialDocument):
     faces_in_sight: dict[str, float] = Field(default_factory=dict)
     measurements: dict[str, MeasurementEntry]
     view_sets: list[ViewSetEntry] = Field(default_factory=list)
+    remedies: RemediesEntry | None = None
     seconds: dict[str, float] = Field(default_factory=dict)
     python: str = ""
     machine: str = ""
     cores: int | None = None
     files: dict[str, str] = Field(default_factory=dict)
+
+    @property
+    def leader(self) -> int | None:
+        """Return the number of the best view for all measurements together; None if no view was raced."""
+        return self.leaders.get("all measurements")
 
 
 @dataclass(frozen=True)
@@ -310,9 +326,9 @@ def read_run(folder: str | Path) -> Run:
             raise InputError(folder / name, "measurement", ", ".join(found), allowed)
     seen = {str(feature) for feature in scores["feature"].values}
     for name, entry in about.measurements.items():
-        if absent := sorted(set(entry.features) - seen):
+        if absent := sorted(set(entry.faces) - seen):
             allowed = "features of scores.nc"
-            raise InputError(folder / "run.json", f"measurements.{name}.features", absent[0], allowed)
+            raise InputError(folder / "run.json", f"measurements.{name}.shapes", absent[0], allowed)
     named = [("checks.nc", "view", checks["view"].values.tolist())]
     named += [("run.json", f"view_sets[{i}].views", chosen.views) for i, chosen in enumerate(about.view_sets)]
     for name, key, views in named:

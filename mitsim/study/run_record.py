@@ -143,6 +143,7 @@ def run_record(
         "lay": {name: left_out for name, left_out in lays.items() if left_out is not None},
         "measurements": {
             name: {key: getattr(one, key) for key in ("kind", "nominal", "unit", "features", "tolerance")}
+            | {"shapes": list(study.task.shapes_for(name))}
             for name, one in study.task.measurements.items()
         },
         "seconds": {},

@@ -27,7 +27,7 @@ from characterisation.tasks.measurement_model import InputQuantity
 from mitsim.maps.campaign.run import write_netcdf
 from mitsim.running.progress import say
 from mitsim.scene.ray_casting.triangles import triangles
-from mitsim.study import Study
+from mitsim.study import SetTable, Study
 from mitsim.study.run_files import TASK
 from mitsim.study.scene_geometry import write_scene_geometry
 from mitsim.study.screened_errors import stated_shares
@@ -48,7 +48,7 @@ def score_study(
     """
     study, folder = session.study, session.folder
     scores, inputs = session.screen(performance_map)
-    shares = np.ones(len(study.task.measurements)) if study.file.set is None else stated_shares(study.task)
+    shares = stated_shares(study.task)
     search = partial(set_within, study, inputs, shares)
     chosen = _chosen_set(study, search)
     write_scores(folder / "scores.csv", scores, pose_columns(scores), order="uncertainty_rank")
@@ -79,7 +79,11 @@ def write_inputs(session: Session) -> None:
 
 
 def set_within(
-    study: Study, inputs: list[dict[InputQuantity, Any]], shares: NDArray[np.float64], limits: dict[str, float]
+    study: Study,
+    inputs: list[dict[InputQuantity, Any]],
+    shares: NDArray[np.float64],
+    limits: dict[str, float],
+    table: SetTable | None = None,
 ) -> ViewSet:
     """Return the fewest views that keep the limits according to the map.
 
@@ -93,9 +97,10 @@ def set_within(
         (measurements,) of the task: stated over predicted standard uncertainty, from :func:`stated_shares`.
     limits
         Stated standard uncertainties by measurement, in its unit; so is the uncertainty of the set.
+    table
+        How the views are joined, and how long to search; by default as the study says.
     """
-    table = study.file.set
-    assert table is not None
+    table = table or study.file.set or SetTable()
     joining = SetJoining(
         pose_covariance(*table.pose_known), np.asarray(study.scene.centre, float), table.joining == "best_fit"
     )

@@ -11,6 +11,7 @@ from pydantic import Field
 from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import Document, validate
 from characterisation.statements.statement import ANY_PART
+from mitsim.study.maker_accuracy import below_the_maker
 
 
 class PartialDocument(Document, extra="ignore"):
@@ -75,6 +76,7 @@ class StatedMeasurement(PartialDocument):
     verdict: str
     losses: list[LossEntry] = Field(default_factory=list)
     errors_of: str = ANY_PART
+    maker_sigma: float | None = None
 
     @property
     def expanded_uncertainty(self) -> float | None:
@@ -119,6 +121,12 @@ class StatementDocument(PartialDocument):
     measurements: dict[str, StatedMeasurement]
     influences: list[InfluenceEntry]
     exposure: ExposureEntry | None = None
+    sensor: str = ""
+
+    def doubts(self) -> list[str]:
+        """Return a sentence on measurements that are stated far below the accuracy of the maker, if there are any."""
+        rows = [(name, one.standard_uncertainty, one.maker_sigma) for name, one in self.measurements.items()]
+        return below_the_maker(rows, [one.name for one in self.influences if not one.included], self.sensor)
 
 
 def read_statement(path: Path) -> StatementDocument | None:

@@ -105,6 +105,17 @@ class ExposureTable(Document):
         return self
 
 
+class RemediesTable(Document):
+    """Search for changes that would make measurements fit their tolerances, after the statement.
+
+    ``trials`` virtual measurements confirm a change: a quarter of them may exclude it, and four times as many may
+    decide it. The search ends after ``minutes``, or in time for ``--minutes`` of the run; with 0 there is none.
+    """
+
+    trials: int = Field(default=40, ge=8, le=100_000)
+    minutes: Annotated[float, Field(ge=0, le=100_000)] = 5.0
+
+
 class SetTable(Document):
     """The fewest views that together keep limits of uncertainty.
 
@@ -152,6 +163,7 @@ class StudyFile(Document):
 
     scene: str
     parameters: dict[str, str | float] = Field(default_factory=dict)
+    sprayed: bool = False
     task: str
     sensor: str
     seed: Annotated[int, Field(ge=0)] = 1
@@ -164,4 +176,5 @@ class StudyFile(Document):
     statement: StatementTable = StatementTable()
     exposure: ExposureTable | None = None
     set: SetTable | None = None
+    remedies: RemediesTable = RemediesTable()
     check: CheckTable = CheckTable()

@@ -23,6 +23,9 @@ _PAGE_S, _BUSIEST, _PAGE_SHARE = 6.0, 6.0, 0.4
 #: share of the rest for the race; the statement gets what the race leaves
 _RACE_SHARE = 0.45
 
+#: share of the time after the race for changes that would make measurements fit; the rest is that of the statement
+_REMEDIES_SHARE = 0.6
+
 
 @dataclass(frozen=True)
 class TimePlan:
@@ -32,11 +35,12 @@ class TimePlan:
     race: float
     statement: float
     report: float
+    remedies: float = 0.0
 
     @property
     def total(self) -> float:
         """Return the planned time of all steps [s]."""
-        return self.screening + self.race + self.statement + self.report
+        return self.screening + self.race + self.statement + self.remedies + self.report
 
     def in_words(self) -> str:
         """Return the plan in one line, like ``about 2 min: 20 s screening, ...``."""
@@ -44,6 +48,7 @@ class TimePlan:
             (self.screening, "screening"),
             (self.race, "comparing views"),
             (self.statement, "statement"),
+            *([(self.remedies, "changes that would fit")] if self.remedies else []),
             (self.report, "pictures and report"),
         ]
         return f"about {_in_words(self.total)}: " + ", ".join(f"{_in_words(seconds)} {name}" for seconds, name in steps)
@@ -54,7 +59,21 @@ class TimePlan:
 
     def statement_limit(self, limit: TimeLimit) -> TimeLimit:
         """Return the limit of the statement, which starts now."""
-        return limit.part(1.0, max(self.page(limit), min(self.report, 0.2 * limit.left)))
+        return limit.part(1.0 - self._remedies_share, self._pictures(limit))
+
+    def remedies_limit(self, limit: TimeLimit) -> TimeLimit:
+        """Return the limit of the remedies, which start now."""
+        return limit.part(1.0, self._pictures(limit))
+
+    def _pictures(self, limit: TimeLimit) -> float:
+        """Return the time [s] that is kept for pictures and report."""
+        return max(self.page(limit), min(self.report, 0.2 * limit.left))
+
+    @property
+    def _remedies_share(self) -> float:
+        """Return the share of the remedies in the time of statement and remedies."""
+        both = self.statement + self.remedies
+        return self.remedies / both if both > 0 else 0.0
 
     def page(self, limit: TimeLimit) -> float:
         """Return the time [s] that clouds and page will take, on a machine as busy as it has been so far."""
@@ -62,12 +81,14 @@ class TimePlan:
         return min(busy * _PAGE_S, _PAGE_SHARE * limit.left)
 
 
-def time_plan(seconds: float, views: int) -> TimePlan:
-    """Return the plan of a command of ``seconds`` with a number of candidate ``views``."""
+def time_plan(seconds: float, views: int, remedies: bool = False) -> TimePlan:
+    """Return the plan of a command of ``seconds`` with a number of candidate ``views``, with or without remedies."""
     report = min(max(_REPORT_SHARE * seconds, _REPORT_S[0]), _REPORT_S[1], seconds / 2)
     screening = min(SCREENING_S * views, _SCREENING_SHARE * seconds)
     rest = max(0.0, seconds - report - screening)
-    return TimePlan(screening, _RACE_SHARE * rest, (1 - _RACE_SHARE) * rest, report)
+    race, after = _RACE_SHARE * rest, (1 - _RACE_SHARE) * rest
+    share = _REMEDIES_SHARE if remedies else 0.0
+    return TimePlan(screening, race, (1 - share) * after, report, share * after)
 
 
 def _in_words(seconds: float) -> str:

@@ -12,7 +12,7 @@ HERE = Path(__file__).resolve().parent
 STUDY = ms.StudyFile(
     scene="sprayed_pillars.xml",
     task="task_with_tolerances.toml",
-    sensor="ensenso-n10",
+    sensor="zivid-2-m70",
     seed=1,
     views={"subdivisions": 2, "rolls_deg": [0, 90], "lowest_elevation_deg": 20},
 )

@@ -15,6 +15,7 @@ from shell import mitsim_here
 
 from characterisation.files.errors import InputError
 from characterisation.maps.lay import mirror_direction, tangent_at
+from characterisation.maps.nearest import nearest_sample
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.shipped import shipped_maps
 from mitsim.cli.options import asking
@@ -72,6 +73,52 @@ def test_what_is_not_known_is_refused_where_nobody_can_be_asked(shipped, n10, qu
             map_with_finishes(shipped, wanted_of(n10, finish_of(**bsdf)), ask)
         assert "about" in caught.value.hint
     assert not quick
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "sample"),
+    [
+        (MILLED, "aluminium/ground Ra 0.37"),
+        ({"type": "gloss_paint"}, "matt_white"),
+        ({"type": "machined_metal", "process": "ground", "Ra": 0.8}, "aluminium/ground Ra 0.74"),
+        (
+            {"type": "machined_metal", "metal": "carbon_steel", "process": "polished", "Ra": 0.05},
+            "aluminium/ground Ra 0.09",
+        ),
+        ({"type": "matt_white", "reflectance": 0.6}, "matt_white"),
+    ],
+    ids=["milled", "paint", "too rough", "polished", "grey"],
+)
+def test_for_screening_the_optically_nearest_sample_stands_in_and_is_named(shipped, n10, quick, bsdf, sample, capsys):
+    finish = finish_of(**bsdf)
+    joined = map_with_finishes(shipped, replace(wanted_of(n10, finish), screening=True))
+    assert not quick
+    said = capsys.readouterr().err
+    assert f"optically nearest sample, {sample}" in said and "F may be off by" in said and "--yes" in said
+    name, _, roughness = sample.partition(" Ra ")
+    known = shipped.query(name, float(roughness or "nan"), [504.0], AHEAD)
+    found = joined.query(finish.name, finish.roughness, [504.0], AHEAD, finish.light)
+    assert (found.fraction[0], found.sigma[0]) == (known.fraction[0], known.sigma[0])
+
+
+def test_a_face_that_is_not_measured_needs_no_finish_of_the_map_and_no_question(shipped, n10, quick, capsys):
+    milled = finish_of(**MILLED)
+    wanted = NeededFinishes(
+        n10, "part.xml", {"seat": finish_of(type="matt_white"), "side": milled}, (480.0, 620.0), frozenset({"seat"})
+    )
+    joined = map_with_finishes(shipped, wanted)
+    assert not quick and not capsys.readouterr().err
+    assert np.isfinite(joined.query(milled.name, 1.6, [504.0], AHEAD, milled.light).sigma).all()
+    with pytest.raises(InputError, match="--yes"):
+        map_with_finishes(shipped, replace(wanted, measured=frozenset({"seat", "side"})))
+
+
+def test_the_nearest_sample_of_an_optical_neighbour_is_at_a_small_distance_and_of_a_mirror_at_a_large_one(shipped):
+    near, far = (
+        nearest_sample(shipped, finish_of(type="machined_metal", process="ground", Ra=one).light) for one in (0.8, 0.02)
+    )
+    assert near.distance < 0.2 and far.distance > 1
+    assert 0 < near.sigma_error < 0.1 < far.sigma_error and near.fraction_error < far.fraction_error <= 1
 
 
 def test_it_is_characterised_once_and_kept(shipped, n10, quick, monkeypatch):
@@ -267,7 +314,7 @@ def test_scripts_without_yes_end_with_a_message(command, scenes, tmp_path, monke
         for line in study.splitlines()
         if not line.startswith(("parameters", "campaign"))
     ]
-    (tmp_path / "study.toml").write_text("\n".join(lines))
+    (tmp_path / "study.toml").write_text("\n".join([*lines, "[measure]", 'by = "map"']))
     arguments = {
         "map predict": [str(scene), "--map", "ensenso-n10", "--position", "0", "-300", "400", "-D", "plane_Ra=3.2"],
         "study state": [str(tmp_path / "study.toml"), "--view", "1"],

@@ -76,12 +76,20 @@ def test_at_a_terminal_the_user_is_asked_and_may_refuse(command, study, tmp_path
     """`run` in a process of its own, as a user starts it; the others in this one, with the streams of a terminal."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("COLUMNS", "500")
+    study.write_text(DRAWN)
     started = at_a_terminal if command == "run" else here_at_a_terminal
     told, code = started([*command.split(), str(study), *COMMANDS[command], "-o", str(tmp_path / "out")], "n\n")
     assert re.search(QUESTION, " ".join(told.split())), told
     assert "[y/N]" in told
     assert code == 2
     assert "--yes" in told and "Traceback" not in told
+
+
+def test_a_rendered_study_goes_on_with_the_nearest_sample(study, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    done = mitsim_here("study", "score", study, "-o", tmp_path / "out")
+    assert "optically nearest sample, aluminium/ground Ra 0.74 um" in done.stderr and "--yes" in done.stderr
+    assert (tmp_path / "out/scores.csv").exists() and not (tmp_path / "cache").exists()
 
 
 def test_exposures_of_a_view_need_no_map(study, tmp_path, monkeypatch):

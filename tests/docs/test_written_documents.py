@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_docs import FORMATS, JSON_MODELS, first_column
+from test_docs import FORMATS, JSON_MODELS, first_column, table_rows
 
 from characterisation.statements.budget import BudgetLine
 from characterisation.statements.decision import plus_minus
@@ -20,6 +20,9 @@ from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.study.exposures.exposure_plan import ExposurePlan
 from mitsim.study.exposures.exposure_sweep import ExposureResult, FeatureResult
 from mitsim.study.exposures.planned import plan_document, write_plan_csv
+from mitsim.study.remedies.change import Change
+from mitsim.study.remedies.confirm import find_remedies, remedies_document
+from mitsim.study.remedies.entries import RemediesEntry
 from mitsim.study.virtual.stated import StatedView, statement_document
 
 
@@ -36,9 +39,10 @@ def test_keys_of_a_statement(stated):
         sensor=SimpleNamespace(name="ensenso-n10"),
         performance_map=None,
         file=SimpleNamespace(seed=1, measure=SimpleNamespace(light_path_depth=2)),
+        task=SimpleNamespace(measurements={"radius": SimpleNamespace(unit="deg")}),
     )
-    view = SimpleNamespace(number=3, world_from_sensor=Transform.from_matrix(np.eye(4)))
-    unknowns = SimpleNamespace(table=UnknownsTable(), calibration=SimpleNamespace(source="a calibration"))
+    view = SimpleNamespace(number=3, standoff=500.0, world_from_sensor=Transform.from_matrix(np.eye(4)))
+    unknowns = SimpleNamespace(table=UnknownsTable(), calibration=SimpleNamespace(source="a calibration"), varied=())
     session = SimpleNamespace(study=study, unknowns=unknowns, source="render")
     written = statement_document(session, StatedView(view, [stated], PlannedExposure((1e-3,))))
     assert first_column("columns: statement.json") == set(written)
@@ -86,3 +90,18 @@ def test_channels_of_a_true_image(tmp_path):
 def test_baud_rates_are_those_of_the_controllers():
     row = next(line for line in FORMATS.splitlines() if line.startswith("| `baud` |"))
     assert all(f"{rate} ({kind})" in row for kind, rate in BAUD.items())
+
+
+def test_keys_of_remedies(stated):
+    change = Change("spray", "sprayed matt white", {"sprayed": True}, (3,), {"radius": 0.1}, lambda *_: [stated])
+    found = find_remedies({"radius": stated}, [change], 40)
+    written = remedies_document(found)
+    assert first_column("columns: run.json remedies") == set(written)
+    assert first_column("columns: run.json remedies tried") == set(written["tried"][0])
+    for marker, entry in (
+        ("columns: run.json remedies", written["measurements"]["radius"]),
+        ("columns: run.json remedies tried", written["tried"][0]["measurements"]["radius"]),
+    ):
+        row = next(cells for cells in table_rows(marker) if cells[0] == "`measurements`")
+        assert all(f"`{key}`" in row[2] for key in entry)
+    RemediesEntry.model_validate(written)

@@ -3,6 +3,7 @@
 import html
 import json
 import re
+import shutil
 
 import pytest
 
@@ -136,3 +137,35 @@ def test_values_that_are_missing_are_told_of_a_comparison_without_tolerances(tmp
     first = of_choice(read_choice(folder), None)
     assert first.tone == "warn" and "no value in up to 29 % of the virtual measurements" in first.words
     assert not first.tolerances
+
+
+def test_a_row_names_the_largest_line_of_the_budget_only_if_the_trials_tell_it(run_folder, tmp_path):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    path = folder / "statement.json"
+
+    def source(**changed):
+        document = json.loads(path.read_text())
+        document["measurements"][MEASUREMENTS[0]]["budget"][0] |= changed
+        path.write_text(json.dumps(document))
+        return of_run(read_run(folder), read_scene_geometry(folder)).rows[0].source
+
+    assert source(settled=False) == ""
+    assert source(settled=True) == "mostly calibration and drift"
+    assert source(share=0.45, low=0.02) == ""  # under half, and the next line may be as large
+    assert source(low=0.1) == "mostly calibration and drift"
+
+
+def test_a_run_without_a_statement_shows_the_leading_view_so_far(run_folder, tmp_path):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    about = json.loads((folder / "run.json").read_text())
+    view = about["leaders"]["all measurements"]
+    (folder / "statement.json").unlink()
+    first = of_run(read_run(folder), read_scene_geometry(folder))
+    assert first.tone == "warn" and first.words.startswith(f"View {view} leads so far, by ")
+    assert f"view {view}" in first.picture.caption and len(first.rows) == len(MEASUREMENTS)
+    with without_pictures():
+        page = write_report(folder).read_text()
+    assert "No view can make the measurements" not in page
+    (folder / "run.json").write_text(json.dumps(about | {"leaders": {}}))
+    with without_pictures():
+        assert "No view can make the measurements" in write_report(folder).read_text()

@@ -138,11 +138,53 @@ def test_the_statement_is_told_first_with_its_budget_and_what_it_leaves_out(text
     assert re.search(r">dirt</th><td[^>]*>no</td>", section) and re.search(r">noise</th><td[^>]*>yes</td>", section)
 
 
-def test_a_run_without_a_statement_says_so(run_folder, tmp_path, written):
+def test_what_would_make_a_measurement_fit_stands_below_the_result(run_folder, tmp_path, written):
     folder = tmp_path / "run"
     shutil.copytree(run_folder, folder)
-    (folder / "statement.json").unlink()
-    assert "there is no statement" in written(folder)
+    about = json.loads((folder / "run.json").read_text())
+    after = {"bias": 0.0, "standard_uncertainty": 0.02, "demand": 0.8, "verdict": "fits"}
+    about["remedies"] = {
+        "measurements": {"radius": {"unit": "mm", "standard_uncertainty": 0.25, "needed": 0.03, "fits_by": 0}},
+        "tried": [{"change": "spray", "words": "sprayed <white>", "trials": 40, "measurements": {"radius": after}}],
+    }
+    (folder / "run.json").write_text(json.dumps(about))
+    page = plain(written(folder))
+    line = "sprayed <white>: radius (u 0.020 mm, before 0.25 mm) fits (40 virtual measurements)"
+    assert (
+        page.index('id="result"')
+        < page.index("What would make it fit?")
+        < page.index(line)
+        < page.index('id="verdicts"')
+    )
+    assert "<white>" not in written(folder)  # names are text
+
+
+def test_a_measurement_of_edges_is_told_by_its_edges_and_counted_on_its_faces(run_folder, tmp_path, written):
+    folder = tmp_path / "run"
+    shutil.copytree(run_folder, folder)
+    about = json.loads((folder / "run.json").read_text())
+    _, entry = next(iter(about["measurements"].items()))
+    entry["shapes"], entry["features"] = entry["features"], ["left_edge", "right_edge"]
+    (folder / "run.json").write_text(json.dumps(about))
+    page = plain(re.sub("<wbr>", "", written(folder)))
+    assert "left_edge" in page and f"Points on<br>{entry['shapes'][0]}" in page
+    entry["shapes"] = ["no_face"]
+    (folder / "run.json").write_text(json.dumps(about))
+    with pytest.raises(InputError, match="no_face"):
+        written(folder)
+
+
+def test_a_statement_far_below_the_accuracy_of_the_maker_says_so(run_folder, tmp_path, written):
+    folder = tmp_path / "run"
+    shutil.copytree(run_folder, folder)
+    document = json.loads((folder / "statement.json").read_text())
+    name = next(name for name, one in document["measurements"].items() if one["unit"] == "mm")
+    document["measurements"][name]["maker_sigma"] = 11 * document["measurements"][name]["standard_uncertainty"]
+    (folder / "statement.json").write_text(json.dumps(document))
+    about = json.loads((folder / "run.json").read_text())
+    about["files"] = {}
+    (folder / "run.json").write_text(json.dumps(about))
+    assert "below a tenth of the accuracy that the maker" in plain(written(folder))
 
 
 @pytest.mark.parametrize("damage", ["[]", "{", '{"schema_version": 2}', '{"schema_version": 1, "view": "x"}'])

@@ -271,3 +271,13 @@ def test_a_rendering_that_shows_nothing_of_the_part_says_so(tmp_path):
     assert "shows the part" in decoded.stderr
     seen = mitsim("render", scene, "--position", 0, -400, 300, *view, "-o", tmp_path / "seen")
     assert "warning: no pixel" not in seen.stderr
+
+
+def test_a_bug_shows_its_traceback_and_differs_from_a_failed_check(monkeypatch):
+    def broken(*_, **__):
+        raise RuntimeError("a bug of ours")
+
+    monkeypatch.setattr("mitsim.study.open_study", broken)
+    done = mitsim_here("study", "score", "study.toml", "-o", "out", code=None)
+    assert done.returncode == 70
+    assert "Traceback" in done.stderr and "RuntimeError: a bug of ours" in done.stderr

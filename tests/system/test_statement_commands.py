@@ -40,7 +40,7 @@ def stated(tmp_path_factory):
     (folder / "task.toml").write_text(
         task[:place] + task[place:].replace("nominal = 20.0", "nominal = 20.0\ntolerance = 1e-6", 1)
     )
-    done = mitsim_here("study", "state", folder / "study.toml", "--view", 1, "-o", folder / "out")
+    done = mitsim_here("study", "state", folder / "study.toml", "--view", 1, "-o", folder / "out", "--require-fit")
     return folder, done
 
 
@@ -69,7 +69,7 @@ def test_a_second_start_goes_on_and_ends_in_the_same_bytes(stated):
     trials.write_bytes(b"".join(whole.splitlines(keepends=True)[:3]) + b'{"day": 10485')  # as a kill leaves it
     statement.unlink()
     again = mitsim_here("study", "state", folder / "study.toml", "--view", 1, "-o", folder / "out")
-    assert again.returncode == 1
+    assert again.returncode == 0  # an answer, though no fit
     assert statement.read_bytes() == before
     assert sorted(trials.read_bytes().splitlines()) == sorted(whole.splitlines())
 

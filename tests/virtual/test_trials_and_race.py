@@ -66,9 +66,9 @@ def scores_of(u, chance=None, tolerance=(np.nan, np.nan)):
 RULES = RaceRules(shortlist=5, most=200, margin=0.1, loss=0.02, each=True)
 
 
-def race(maker, scores, folder, rules=RULES, over=lambda: False):
+def race(maker, scores, folder, rules=RULES, over=lambda: False, after_round=lambda _: None):
     views = [View(number) for number in range(scores.sizes["view"])]
-    return run_race(views, scores, maker, TrialFolder(folder, "digest", NAMES), rules, over)
+    return run_race(views, scores, maker, TrialFolder(folder, "digest", NAMES), rules, over, after_round)
 
 
 SPREADS = [[3.0, 1.0, 2.0, 4.0, 2.5, 9.0], [0.2, 0.5, 0.1, 0.3, 0.4, 9.0]]
@@ -106,6 +106,14 @@ def test_time_that_is_over_ends_a_race_undecided(tmp_path):
     maker = KnownMaker(np.ones((2, 6)))
     raced = race(maker, scores_of(np.ones((2, 6))), tmp_path, over=lambda: maker.made >= 3)
     assert not raced.decided and raced.trials == 3
+
+
+def test_the_first_round_tells_its_state_while_it_lasts(tmp_path, monkeypatch):
+    monkeypatch.setattr("mitsim.study.virtual.race._SAY_EVERY_S", -1.0)
+    scores, states = scores_of(np.array(SPREADS) * 1.3), []
+    raced = race(KnownMaker(SPREADS), scores, tmp_path / "told", after_round=states.append)
+    assert [one.trials for one in states[:5]] == [1, 2, 3, 4, 5]
+    np.testing.assert_array_equal(raced.errors, race(KnownMaker(SPREADS), scores, tmp_path / "quiet").errors)
 
 
 def test_only_the_view_for_all_measurements_is_asked_for_by_default(tmp_path):

@@ -45,6 +45,7 @@ def told(world):
         "noise": world.seed,
         "beyond_map": world.beyond,
         "decoder": world.decoder,
+        "coat": world.coat,
     }
 
 

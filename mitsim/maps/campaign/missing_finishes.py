@@ -1,12 +1,17 @@
-"""Complete a map for the finishes of a scene: characterise missing finishes now, if that is allowed.
+"""Complete a map for the finishes of a scene: characterise missing finishes now, or let the nearest sample stand in.
 
 Signal chain: map of a sensor, scene -> finishes missing in the map -> those in the cache are read -> the user is asked
 about the others, with the expected time -> a quick campaign for each (:mod:`mitsim.maps.campaign.one_finish`) at the
 map's distances around the views -> one map.
+
+A study whose virtual measurements are rendered needs the map for screening alone. Then, without an answer, the
+optically nearest sample of the map stands in for a missing finish (:mod:`characterisation.maps.nearest`). It always
+does for faces that are not measured.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -16,6 +21,7 @@ import numpy as np
 from characterisation.files.errors import InputError
 from characterisation.maps.joined import with_samples
 from characterisation.maps.light import Light
+from characterisation.maps.nearest import Nearest, nearest_sample, standing_for
 from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.samples import Samples
 from mitsim.capture.simulated.simulate import SimulatedSensor
@@ -33,12 +39,18 @@ Ask = Callable[[str], bool]
 
 @dataclass(frozen=True)
 class NeededFinishes:
-    """Finishes needed from a map, by shape name, for a ``sensor``, an interval of |V| [mm] and a scene."""
+    """Finishes needed from a map, by shape name, for a ``sensor``, an interval of |V| [mm] and a scene.
+
+    ``measured`` are the shapes whose finish matters; None for all. ``screening``: whether the map serves for screening
+    alone, so that the nearest sample may stand in.
+    """
 
     sensor: Sensor
     scene: str
     finishes: dict[str, Finish]
     between: tuple[float, float]
+    measured: frozenset[str] | None = None
+    screening: bool = False
 
 
 def unknown_finishes(known: Samples, finishes: dict[str, Finish]) -> dict[str, Finish]:
@@ -79,11 +91,39 @@ def map_with_finishes(
     Raises
     ------
     InputError
-        If a finish is missing and may not be characterised, or the map was not simulated.
+        If a finish is missing and may not be characterised, or the map was not simulated. Not if the map serves for
+        screening alone.
     """
-    missing = unknown_finishes(performance_map.known, needed.finishes)
-    if not missing:
-        return performance_map
+    others = {name for name in needed.finishes if needed.measured is not None and name not in needed.measured}
+    measured = {name: one for name, one in needed.finishes.items() if name not in others}
+    missing = unknown_finishes(performance_map.known, measured)
+    completed = _characterised(performance_map, needed, missing, ask) if missing else performance_map
+    unseen = unknown_finishes(completed.known, {name: needed.finishes[name] for name in others})
+    return with_nearest(completed, unseen)[0] if unseen else completed
+
+
+def with_nearest(
+    performance_map: PerformanceMap, missing: dict[str, Finish]
+) -> tuple[PerformanceMap, dict[str, Nearest]]:
+    """Return a map in which the optically nearest sample stands in for each missing finish, and these samples by name.
+
+    A finish of unknown optical properties, or a map without them, has none: it stays missing.
+    """
+    found, maps = dict[str, Nearest](), list[PerformanceMap]()
+    for name, finish in missing.items():
+        nearest = None if finish.light is None else nearest_sample(performance_map, finish.light)
+        if nearest is not None and finish.light is not None:
+            found[name] = nearest
+            maps.append(standing_for(performance_map, nearest, finish.name, finish.roughness, finish.light))
+    if not maps:
+        return performance_map, {}
+    return with_samples(performance_map, maps), found
+
+
+def _characterised(
+    performance_map: PerformanceMap, needed: NeededFinishes, missing: dict[str, Finish], ask: Ask | None
+) -> PerformanceMap:
+    """Return the map with samples of missing finishes, characterised or of the cache; or with their nearest samples."""
     source = str(performance_map.data.attrs.get("source", ""))
     if source not in ("", "simulated"):
         name, finish = next(iter(missing.items()))
@@ -99,8 +139,14 @@ def map_with_finishes(
         names = list(dict.fromkeys(name for name, _ in to_make))
         lacking = ", ".join(_in_words(ones[name].finish) for name in names)
         about = f"about {time_in_words(seconds)}"
-        question = f"{needed.sensor.name}: its map lacks {lacking}; characterise now ({about})?"
+        otherwise = " Without it, the nearest sample serves the screening." if needed.screening else ""
+        question = f"{needed.sensor.name}: its map lacks {lacking}; characterise now ({about})?{otherwise}"
         if ask is None or not ask(question):
+            standing, nearest = with_nearest(performance_map, missing) if needed.screening else (performance_map, {})
+            if len(nearest) == len(missing):
+                for name, one in nearest.items():
+                    say(_standing_in_words(performance_map, needed, missing[name], one, about))
+                return standing
             hint = f"add --yes to characterise it now, in {about}; the result is kept"
             raise _unknown_finish_error(performance_map, needed, names[0], missing[names[0]], hint)
         say(f"{needed.sensor.name}: characterising {lacking} in {about}; kept in {cache_folder()}")
@@ -110,6 +156,18 @@ def map_with_finishes(
     digests = sorted(str(one.data.attrs["finish_digest"]) for one in found)
     joined.data.attrs["characterised_when_asked"] = ", ".join(digests)
     return joined
+
+
+def _standing_in_words(
+    performance_map: PerformanceMap, needed: NeededFinishes, finish: Finish, nearest: Nearest, about: str
+) -> str:
+    name, roughness = performance_map.samples[nearest.sample]
+    sample = name if math.isnan(roughness) else f"{name} Ra {roughness:g} um"
+    return (
+        f"{needed.sensor.name}: its map lacks {_in_words(finish)}. Views are screened with the optically nearest "
+        f"sample, {sample}: F may be off by {nearest.fraction_error:.2f}, sigma by {100 * nearest.sigma_error:.0f} %. "
+        f"Virtual measurements render the finish itself; --yes characterises it, in {about}"
+    )
 
 
 def _characterise(

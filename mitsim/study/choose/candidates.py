@@ -65,7 +65,7 @@ def read_candidates(
     file = read_toml(path, StudyFile)
     candidates, excluded = list[CandidateSensor](), list[Excluded]()
     for given in _each(sensors):
-        opened = _open_candidate(path, file, given, ask)
+        opened = open_candidate(path, file, given, ask)
         if isinstance(opened, Excluded):
             excluded.append(opened)
             continue
@@ -90,7 +90,18 @@ def _each(sensors: Sequence[str]) -> list[str]:
     return out
 
 
-def _open_candidate(path: Path, file: StudyFile, given: str, ask: Ask | None) -> CandidateSensor | Excluded:
+def open_candidate(path: Path, file: StudyFile, given: str, ask: Ask | None) -> CandidateSensor | Excluded:
+    """Open a study for one sensor; say why if that is impossible.
+
+    Parameters
+    ----------
+    path, file
+        Path of the study file, and its content.
+    given
+        The sensor, as in :func:`read_candidates`.
+    ask
+        Answers whether finishes that its map lacks may be characterised now; None if nobody can answer.
+    """
     sensor, _, map_name = given.partition("=")
     own = sensor.endswith(".toml")
     if not own and sensor not in presets():

@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from characterisation.files.atomic_io import json_values, write_text
 from characterisation.scores.view_sets import ViewSet
@@ -49,8 +49,12 @@ _WITHOUT_VALUE = 0.5
 #: part of the digest of a set's trials; raise it when the same clouds are joined differently
 _JOINING_VERSION = 2
 
-#: finds the fewest views that keep limits, by measurement, according to the map
-Search = Callable[[dict[str, float]], ViewSet]
+
+class Search(Protocol):
+    """Finds the fewest views that keep limits, by measurement, according to the map."""
+
+    def __call__(self, limits: dict[str, float], *, table: SetTable | None = None) -> ViewSet:
+        """Return the views; ``table`` replaces the study's own for the joining and the time of the search."""
 
 
 @dataclass(frozen=True)
@@ -149,8 +153,11 @@ def _excess(one: Statement, limit: float) -> float:
     return one.root_mean_square / limit if math.isfinite(one.root_mean_square) else math.inf
 
 
-def state_set(session: Session, chosen: ViewSet) -> list[Statement]:
-    """State every measurement from a set of views together, and reuse trials in the folder of the session."""
+def state_set(session: Session, chosen: ViewSet, over: Callable[[], bool] = lambda: False) -> list[Statement]:
+    """State every measurement from a set of views together, and reuse trials in the folder of the session.
+
+    ``over`` returns whether to stop after the trial at hand.
+    """
     study, renderer, table = session.study, session.renderer, session.study.file.set
     assert table is not None and renderer is not None  # clouds drawn from a map cannot be joined
     what = ["set", list(chosen.views), table.joining, list(table.pose_known), _JOINING_VERSION]
@@ -161,7 +168,9 @@ def state_set(session: Session, chosen: ViewSet) -> list[Statement]:
     missing = [day for day in days if Trial(day) not in trials.known(0)]
     for day, outcome in track(runner.run(missing), "confirm the set", len(missing)):
         trials.add(0, Trial(day), outcome)
-    wanted = [Trial(day) for day in days]
+        if over():
+            break
+    wanted = [trial for trial in map(Trial, days) if trial in trials.known(0)]
     found = trials.errors_of_parts(0, wanted)
     return [
         replace(

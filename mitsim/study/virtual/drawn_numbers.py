@@ -19,6 +19,7 @@ from scipy.special import ndtr
 
 from characterisation.statements.budget import INTERACTION
 from mitsim.study import Study
+from mitsim.study.virtual.coat import coat_numbers
 from mitsim.study.virtual.drawn_decoder import decoder_numbers, drawn_decoder
 from mitsim.study.virtual.drawn_finish import finish_numbers
 from mitsim.study.virtual.mapped import drawn_spread
@@ -120,6 +121,8 @@ def _numbers(study: Study, unknowns: Unknowns, source: str, group: str, trial: T
         sizes = np.repeat([pose.placement_deg, pose.placement_mm, pose.told_deg, pose.told_mm], 3)
         return stream.standard_normal(12)[sizes > 0]
     drawn = unknowns.draw(trial)
+    if group == "coat":
+        return coat_numbers(drawn.coat)
     if group == "decoder":
         return np.array(list(decoder_numbers(drawn_decoder(study.sensor, table.decoder, drawn.decoder)).values()))
     if source == "map":

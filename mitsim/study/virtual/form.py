@@ -6,23 +6,72 @@ along its ray, by the distance that matches the height along the normal.
 The field is a sum of plane waves with random directions and phases. Their wavelengths are between half and twice the
 extent of the face, since form, as opposed to waviness, is the deviation over the whole extent (ISO 1101, ISO 12781-1).
 Each face has its own field.
+
+A face whose flatness or cylindricity has a tolerance deviates by a quarter of it, one sigma, unless the study says
+otherwise: the zone of the drawing then holds 95 % of the deviations. The form itself is measured without that
+deviation, since its statement is about a part at the limit of the tolerance
+(:mod:`characterisation.statements.one_sided`).
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.point_cloud import ViewGrid
+from characterisation.tasks.definitions import DEFINITIONS
+from characterisation.tasks.result import Result
+from characterisation.tasks.task_file import Task
 from mitsim.scene.load import Scene, bounds_of
 from mitsim.scene.ray_casting.raycast import Surfaces
 from mitsim.sensor.transforms import Transform
 
 #: number of plane waves of a field, and the smallest cosine between normal and view ray; it bounds the displacement
 _WAVES, _GRAZING = 24, 0.1
+
+#: width of the zone of a form tolerance, in standard deviations of the form. Assumed
+_ZONE_SIGMAS = 4.0
+
+
+def drawn_form(task: Task, given: Mapping[str, float]) -> dict[str, float]:
+    """Return the form deviation [mm], one sigma, by face: as given, else a quarter of the tolerance of its form."""
+    sizes = dict[str, float]()
+    for name in form_measurements(task):
+        asked = task.measurements[name]
+        if asked.tolerance_size is not None:
+            face = asked.features[0]
+            sizes[face] = min(asked.tolerance_size / _ZONE_SIGMAS, sizes.get(face, np.inf))
+    return sizes | dict(given)
+
+
+def form_measurements(task: Task) -> list[str]:
+    """Return the names of the measurements of form: flatness and cylindricity."""
+    return [name for name, one in task.measurements.items() if DEFINITIONS[one.kind].of == "form"]
+
+
+def measured_with_form(
+    task: Task, evaluate: Callable[[Task, bool], dict[str, Result]], deviates: bool
+) -> dict[str, Result]:
+    """Return all measurements of a cloud; those of form from the cloud without form deviation.
+
+    Parameters
+    ----------
+    task
+        The task.
+    evaluate
+        Measures a task in the cloud with or without form deviation.
+    deviates
+        Whether the cloud has a form deviation at all.
+    """
+    names = form_measurements(task) if deviates else []
+    found = evaluate(task, True)
+    if not names:
+        return found
+    own = task.model_copy(update={"measurements": {name: task.measurements[name] for name in names}})
+    return found | evaluate(own, False)
 
 
 def form_deviation(
@@ -53,7 +102,7 @@ def form_deviation(
     seed
         Selects the form; each face has its own field.
     """
-    out = points.copy()
+    out = points
     for name, size in sizes.items():
         index = scene.names.index(name)
         here = (surfaces.shape == index) & np.isfinite(points[..., 2])
@@ -62,10 +111,35 @@ def form_deviation(
         place = world_from_sensor.points(points[here].astype(float))
         extent = float(np.linalg.norm(np.ptp(bounds_of(scene.shapes[index]), axis=0)))
         height = size * random_field(place, extent, np.random.default_rng([seed, zlib.crc32(name.encode())]))
-        rows, columns = np.nonzero(here)
-        rays = grid.rays_at(columns, rows)
-        cosine = np.maximum(np.abs((surfaces.normal[here] * rays).sum(axis=-1)), _GRAZING)
-        out[here] -= (rays * (height / cosine)[:, None]).astype(np.float32)  # outward means toward the sensor
+        out = along_rays(out, here, height, surfaces, grid)
+    return out
+
+
+def along_rays(
+    points: NDArray[np.float32],
+    here: NDArray[np.bool_],
+    height: NDArray[np.floating],
+    surfaces: Surfaces,
+    grid: ViewGrid,
+) -> NDArray[np.float32]:
+    """Return points of which some lie farther out along the normal of their face; they move along their rays.
+
+    Parameters
+    ----------
+    points
+        (H, W, 3) points [mm], sensor frame. They are not changed.
+    here
+        (H, W) pixels whose points move.
+    height
+        (n,) heights of these points [mm], toward the sensor.
+    surfaces, grid
+        Normal that each pixel meets, sensor frame, and the view rays of the pixels.
+    """
+    out = points.copy()
+    rows, columns = np.nonzero(here)
+    rays = grid.rays_at(columns, rows)
+    cosine = np.maximum(np.abs((surfaces.normal[here] * rays).sum(axis=-1)), _GRAZING)
+    out[here] -= (rays * (height / cosine)[:, None]).astype(np.float32)
     return out
 
 

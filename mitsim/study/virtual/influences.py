@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mitsim.sensor.unknowns import UnknownsTable
+from mitsim.sensor.unknowns import CoatUnknowns, UnknownsTable
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,19 @@ class Influence:
 _OTHER_PARTS = "not in the map; drawn with the size found on other parts, see effects outside the map"
 
 
-def influences(table: UnknownsTable, source: str, depth: int) -> list[Influence]:
+def influences(table: UnknownsTable, source: str, depth: int, sprayed: bool = False) -> list[Influence]:
     """Return the influences of a statement.
 
-    ``source`` is ``render`` or ``map``; ``depth`` is the number of surfaces on a light path.
+    Parameters
+    ----------
+    table
+        Sizes of the unknowns.
+    source
+        ``render`` or ``map``.
+    depth
+        Number of surfaces on a light path.
+    sprayed
+        Whether a face of the part has a coat.
     """
     rendered = source == "render"
     form, pose, temperature, light = table.form.features, table.pose, table.temperature, table.light
@@ -93,8 +102,16 @@ def influences(table: UnknownsTable, source: str, depth: int) -> list[Influence]
             rendered,
         ),
         Influence("vibration, motion during a capture", False, "hold the sensor and the part still", False),
-        Influence("dirt, oil, coatings, marks on the part", False, "clean the part as for the characterisation", False),
+        *([Influence("thickness of the spray on the part", True, _coat_in_words(table.coat))] if sprayed else []),
+        Influence(
+            "dirt, oil, other coats, marks on the part", False, "clean the part as for the characterisation", False
+        ),
         Influence("deformation by clamping", False, "clamp as in use", False),
         Influence("datums and choice of features", False, "the task is assumed to agree with the drawing", False),
     ]
     return listed_influences
+
+
+def _coat_in_words(coat: CoatUnknowns) -> str:
+    low, high = coat.thickness_um
+    return f"drawn: mean thickness {low:g} to {high:g} um, {100 * coat.spread:.0f} % from place to place"

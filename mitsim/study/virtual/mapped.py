@@ -26,6 +26,8 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud
 from characterisation.tasks.evaluation import measure
 from characterisation.tasks.folded import folded_values
+from characterisation.tasks.result import Result
+from characterisation.tasks.task_file import Task
 from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.campaign.acquire import one_ahead
 from mitsim.maps.prediction import CharacterisedScene, Predictor
@@ -35,7 +37,8 @@ from mitsim.sensor.preset import Sensor
 from mitsim.study import MINIMUM_POINTS, Study
 from mitsim.study.calibration.accuracy import measured_points
 from mitsim.study.virtual.beyond_map import beyond_map
-from mitsim.study.virtual.form import form_deviation
+from mitsim.study.virtual.coat import coated, coated_shapes
+from mitsim.study.virtual.form import form_deviation, measured_with_form
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.rendered import displaced
 from mitsim.study.virtual.screening import screen
@@ -72,6 +75,7 @@ class MappedMeasurements:
         self.predictor = Predictor.of_sensor(study.sensor, self.geometry)
         self._characterised: dict[int, CharacterisedScene] = {}
         self._has_form = any(unknowns.table.form.features.values())
+        self._has_coat = bool(coated_shapes(study.scene, unknowns.table.coat))
         self._beyond_sizes = beyond_map().of(study.sensor) if BEYOND in unknowns.varied else None
         self._predicted: dict[int, dict[str, float]] = {}
         self._folded = folded_values(study.task)
@@ -96,7 +100,7 @@ class MappedMeasurements:
         rng = np.random.default_rng(drawn.seed)
         cloud = self.predictor.predict(self._scene(drawn.finish), true, rng, correlated=True)
         labels = self.predictor.quick_labels(self.study.scene, assumed)
-        surfaces = self.predictor.surfaces(self.study.scene, assumed) if self._has_form and drawn.form else None
+        surfaces = self.predictor.surfaces(self.study.scene, assumed) if self._moves_faces(drawn) else None
         return cloud, drawn, labels, surfaces
 
     def _finish(self, drawing: tuple[PointCloud, DrawnValues, NDArray[np.int16], Surfaces | None], job: Job) -> Outcome:
@@ -104,12 +108,24 @@ class MappedMeasurements:
         scene, assumed = self.study.scene, drawn.assumed.inverse() @ job.view.world_from_sensor
         cloud = replace(cloud, points=moved_by_calibration(cloud, self.study.sensor, drawn))
         points = displaced(cloud, drawn, assumed, scene.centre)
-        if surfaces is not None:
-            form = self.unknowns.table.form.features
-            points = form_deviation(points, surfaces, scene, form, assumed, cloud.grid, drawn.form)
-        labelled = replace(cloud, points=points, feature=labels, feature_names=scene.names)
-        found = measure(labelled, self.study.task, assumed.inverse().matrix(), MINIMUM_POINTS, False)
+        table = self.unknowns.table
+
+        def evaluate(task: Task, with_form: bool) -> dict[str, Result]:
+            moved = points
+            if surfaces is not None:
+                form = table.form.features if drawn.form and with_form else {}
+                moved = form_deviation(moved, surfaces, scene, form, assumed, cloud.grid, drawn.form)
+                if drawn.coat:
+                    moved = coated(moved, surfaces, scene, table.coat, assumed, cloud.grid, drawn.coat)
+            labelled = replace(cloud, points=moved, feature=labels, feature_names=scene.names)
+            return measure(labelled, task, assumed.inverse().matrix(), MINIMUM_POINTS, False)
+
+        found = measured_with_form(self.study.task, evaluate, bool(self._has_form and drawn.form))
         return self._with_beyond(Outcome.of(found), job.view, drawn)
+
+    def _moves_faces(self, drawn: DrawnValues) -> bool:
+        """Return whether the faces of a draw lie off their nominal places, by form or coat."""
+        return bool((self._has_form and drawn.form) or (self._has_coat and drawn.coat))
 
     def _predict(self, views: dict[int, View]) -> None:
         """Compute and keep the predicted uncertainties of views."""

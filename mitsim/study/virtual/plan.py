@@ -137,6 +137,8 @@ def trial_digest(study: Study, unknowns: Unknowns, source: str, separate_light: 
         content["deviations"] = {name: one.shape for name, one in folded.items()}
     if named := named_digests(Path(study.scene.where), {name: str(value) for name, value in file.parameters.items()}):
         content["files"] = named
+    if file.sprayed:
+        content["sprayed"] = True
     if separate_light:
         content["apart"] = True
     if source == "map":

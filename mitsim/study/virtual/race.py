@@ -39,10 +39,10 @@ _LEAST_GAIN = 0.001
 #: number of views beside the leader that get a batch in a round, for each choice that is open
 _CHALLENGERS = 4
 
-#: number of trials after which the state of a round is told; within them, trials share the light paths of a view
+#: number of trials of a round that the runner orders at once; within them, trials share the light paths of a view
 _AT_ONCE = 16
 
-#: time between lines of progress [s]
+#: time between lines of progress, and between states within a round [s]
 _SAY_EVERY_S = 10.0
 
 #: name of the objective that combines all measurements
@@ -245,14 +245,13 @@ def run_race(
         done = 0
         # the most promising views come first, so that they have trials when time is over
         for first in range(0, len(jobs), _AT_ONCE):
-            if first:
-                after_round(state(wanted))
             for job, outcome in runner.run(runner.in_order(jobs[first : first + _AT_ONCE])):
                 trials.add(job.view.number, job.trial, outcome)
                 done += 1
                 if time.monotonic() - last > _SAY_EVERY_S:
                     last = time.monotonic()
                     say_progress(f"race: {done} of {len(jobs)} trials of this round")
+                    after_round(state(wanted))
                 if over() and done < len(jobs):
                     return
 
@@ -367,8 +366,8 @@ def _say_state(raced: Raced, counts: dict[int, int], seconds: float) -> None:
 
 
 def in_words(one: Standing, margin: float) -> str:
-    """Return how good a choice is, like ``its error expected 4 % above the least (90 % sure to be within 10 %)``."""
-    loss = (
-        "expected to be the best" if one.loss < 0.005 else f"its error expected {100 * one.loss:.0f} % above the least"
-    )
+    """Return how good a choice is: ``with an error expected 4 % above the least (90 % sure to be within 10 %)``."""
+    loss = "expected to be the best"
+    if one.loss >= 0.005:
+        loss = f"with an error expected {100 * one.loss:.0f} % above the least"
     return f"{loss} ({100 * one.confidence:.0f} % sure to be within {100 * margin:.0f} %)"

@@ -29,6 +29,8 @@ from numpy.typing import NDArray
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.evaluation import measure
+from characterisation.tasks.result import Result
+from characterisation.tasks.task_file import Task
 from mitsim.capture.capture import Capture
 from mitsim.capture.simulated.exposing import LightOnImagers
 from mitsim.capture.simulated.kept_light import KeptLight, can_be_kept, keep_light
@@ -49,9 +51,10 @@ from mitsim.sensor.pattern import DotPattern, another_mask
 from mitsim.sensor.roi import roi_around
 from mitsim.sensor.transforms import Transform
 from mitsim.study import MINIMUM_POINTS, Study
+from mitsim.study.virtual.coat import coated, coated_shapes
 from mitsim.study.virtual.drawn_decoder import drawn_decoder
 from mitsim.study.virtual.drawn_finish import finish_deviation
-from mitsim.study.virtual.form import form_deviation
+from mitsim.study.virtual.form import form_deviation, measured_with_form
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.trials import Outcome
 from mitsim.study.virtual.world import DrawnValues, Trial, Unknowns
@@ -134,6 +137,7 @@ class RenderedMeasurements:
         self._own_scene: Scene | None = None
         self._views: dict[int, _ViewLight] = {}
         self._has_form = any(unknowns.table.form.features.values())
+        self._has_coat = bool(coated_shapes(study.scene, unknowns.table.coat))
 
     def exposed_as(self, planned: PlannedExposure | None) -> RenderedMeasurements:
         """Return the same measurements with other exposures than the sensor's own; prepared data is shared."""
@@ -166,15 +170,26 @@ class RenderedMeasurements:
         return self._cloud(captured), captured.assumed
 
     def _finish(self, captured: _Captured, job: Job) -> Outcome:
-        cloud, part_from_world = self._cloud(captured), captured.assumed.inverse().matrix()
-        return Outcome.of(measure(cloud, self.study.task, part_from_world, MINIMUM_POINTS, False))
+        part_from_world = captured.assumed.inverse().matrix()
+        decoded = self.unlabelled_cloud(captured.capture, captured.drawn.decoder)
+
+        def evaluate(task: Task, with_form: bool) -> dict[str, Result]:
+            cloud = self._labelled(captured, decoded, with_form)
+            return measure(cloud, task, part_from_world, MINIMUM_POINTS, False)
+
+        deviates = bool(self._has_form and captured.drawn.form)
+        return Outcome.of(measured_with_form(self.study.task, evaluate, deviates))
 
     def _captured(self, view: View, drawn: DrawnValues) -> _Captured:
         lit = self.lit(view, drawn)
         capture = self.exposed(lit, self.planned, drawn.seed)
         labels = self.predictor.quick_labels(self.study.scene, lit.assumed)
-        surfaces = self.predictor.surfaces(self.study.scene, lit.assumed) if self._has_form and drawn.form else None
+        surfaces = self.predictor.surfaces(self.study.scene, lit.assumed) if self._moves_faces(drawn) else None
         return _Captured(capture, drawn, lit.assumed, surfaces, labels)
+
+    def _moves_faces(self, drawn: DrawnValues) -> bool:
+        """Return whether the faces of a draw lie off their nominal places, by form or coat."""
+        return bool((self._has_form and drawn.form) or (self._has_coat and drawn.coat))
 
     def lit(self, view: View, drawn: DrawnValues) -> TracedLight:
         """Trace the light of one draw in a view, which all of its exposures share."""
@@ -240,12 +255,17 @@ class RenderedMeasurements:
         return capture_cloud(capture, settings, self.geometry, imager=sensor.imager)
 
     def _cloud(self, captured: _Captured) -> PointCloud:
-        scene, cloud = self.study.scene, self.unlabelled_cloud(captured.capture, captured.drawn.decoder)
-        points = displaced(cloud, captured.drawn, captured.assumed, scene.centre)
+        return self._labelled(captured, self.unlabelled_cloud(captured.capture, captured.drawn.decoder), True)
+
+    def _labelled(self, captured: _Captured, cloud: PointCloud, with_form: bool) -> PointCloud:
+        """Return a decoded cloud with the errors of path, temperature, coat and, if asked for, form of the part."""
+        scene, table, drawn, pose = self.study.scene, self.unknowns.table, captured.drawn, captured.assumed
+        points = displaced(cloud, drawn, pose, scene.centre)
         if captured.surfaces is not None:
-            form = self.unknowns.table.form.features
-            seed = captured.drawn.form
-            points = form_deviation(points, captured.surfaces, scene, form, captured.assumed, cloud.grid, seed)
+            form = table.form.features if drawn.form and with_form else {}
+            points = form_deviation(points, captured.surfaces, scene, form, pose, cloud.grid, drawn.form)
+            if drawn.coat:
+                points = coated(points, captured.surfaces, scene, table.coat, pose, cloud.grid, drawn.coat)
         return replace(cloud, points=points, feature=captured.labels, feature_names=scene.names)
 
     def _scene(self, finish: int) -> tuple[Scene, list[Floats]]:
@@ -261,7 +281,8 @@ class RenderedMeasurements:
         if self._own_scene is None or not self._own_scene.changeable:
             file, scene = self.study.file, self.study.scene
             parameters = {name: str(value) for name, value in file.parameters.items()}
-            self._own_scene = load_scene(scene.where, self.study.sensor.wavelength_nm, parameters, deviation)
+            wavelength_nm = self.study.sensor.wavelength_nm
+            self._own_scene = load_scene(scene.where, wavelength_nm, parameters, deviation, file.sprayed)
         return self._own_scene.deviated(deviation) if self._own_scene.changeable else self._own_scene
 
     def _view_light(self, view: View) -> _ViewLight:

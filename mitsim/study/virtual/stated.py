@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from characterisation.files.atomic_io import json_values
-from characterisation.statements.budget import budget
+from characterisation.statements.budget import budget, largest_line
 from characterisation.statements.decision import tolerance_of
 from characterisation.statements.losses import losses, lost_features
 from characterisation.statements.statement import Statement, statement
@@ -28,11 +28,12 @@ from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.preset import Sensor
 from mitsim.study import StatementTable, Study
 from mitsim.study.exposures.planned import with_exposure
+from mitsim.study.maker_accuracy import maker_sigma
 from mitsim.study.virtual.drawn_decoder import decoder_is_drawn
 from mitsim.study.virtual.drawn_numbers import drawn_numbers, related, seeds, statement_trials
 from mitsim.study.virtual.influences import influences
 from mitsim.study.virtual.mapped import MappedMeasurements
-from mitsim.study.virtual.race import Job, complete
+from mitsim.study.virtual.race import Job, TrialRunner, complete
 from mitsim.study.virtual.trials import TrialFolder
 from mitsim.study.virtual.world import BEYOND, FRESH, GROUPS, SET_DAYS, STATEMENT_DAYS, Trial, Unknowns
 from mitsim.views import View
@@ -89,14 +90,7 @@ def state_view(
     after_batch
         Receives the statement, without a budget, after every :data:`BATCH` trials but the last.
     """
-    study, runner, trials, planned = session.study, session.runner, session.trials, session.exposures(view)
-    if planned is not None:
-        assert not isinstance(runner, MappedMeasurements)  # exposures() rejects a map
-        digest = with_exposure(session.digest, planned)
-        runner, trials = (
-            runner.exposed_as(planned),
-            TrialFolder.of(session.folder / "planned_trials", digest, study.task),
-        )
+    study, (runner, trials, planned) = session.study, source_of_trials(session, view)
     limit = TimeLimit() if limit is None else limit
     label = f"state view {view.number}"
     made = list[Trial]()
@@ -112,6 +106,20 @@ def state_view(
     groups = budget_groups(session.unknowns, session.source, study.sensor)
     numbers = drawn_numbers(study, session.unknowns, session.source, made, groups)
     return StatedView(view, _statements(study, trials, view, made, (numbers, seeds(made, groups))), planned)
+
+
+def source_of_trials(session: Session, view: View) -> tuple[TrialRunner, TrialFolder, PlannedExposure | None]:
+    """Return what makes the trials of a statement of a view, where they are kept, and their planned exposures."""
+    runner, planned = session.runner, session.exposures(view)
+    if planned is None:
+        return runner, session.trials, None
+    assert not isinstance(runner, MappedMeasurements)  # exposures() rejects a map
+    digest = with_exposure(session.digest, planned)
+    return (
+        runner.exposed_as(planned),
+        TrialFolder.of(session.folder / "planned_trials", digest, session.study.task),
+        planned,
+    )
 
 
 def compared(session: Session, view: int, other: int) -> float | None:
@@ -185,7 +193,9 @@ def budget_groups(unknowns: Unknowns, source: str, sensor: Sensor) -> list[str]:
 def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
     """Return the statement as JSON values; see docs/reference/formats/statement.md."""
     study, unknowns, view = session.study, session.unknowns, stated.view
-    declared = influences(unknowns.table, session.source, study.file.measure.light_path_depth)
+    declared = influences(
+        unknowns.table, session.source, study.file.measure.light_path_depth, "coat" in unknowns.varied
+    )
     exposed = {} if stated.planned is None else {"exposure": asdict(stated.planned)}
     return exposed | {
         "schema_version": 1,
@@ -200,7 +210,11 @@ def statement_document(session: Session, stated: StatedView) -> dict[str, Any]:
         "coverage_probability": 0.95,
         "calibration": unknowns.calibration.source,
         "unknowns": unknowns.table.model_dump(mode="json"),
-        "measurements": {one.measurement: _measurement(one) for one in stated.statements},
+        "measurements": {
+            one.measurement: _measurement(one)
+            | {"maker_sigma": maker_sigma(study.sensor, study.task.measurements[one.measurement], view.standoff)}
+            for one in stated.statements
+        },
         "influences": [asdict(one) for one in declared],
     }
 
@@ -259,11 +273,8 @@ def _largest(one: Statement) -> str:
     """Return the largest line of the budget; none where the trials are too few to tell which."""
     if not one.budget:
         return ""
-    largest = one.budget[0]
-    others = max((line.high for line in one.budget[1:]), default=0.0)
-    if not largest.settled or (largest.low < others and largest.share < 0.5):
-        return "too few trials"
-    return f"{largest.group} ({100 * largest.share:.0f} %)"
+    largest = largest_line(one.budget)
+    return "too few trials" if largest is None else f"{largest.group} ({100 * largest.share:.0f} %)"
 
 
 def _measurement(one: Statement) -> dict[str, Any]:

@@ -6,6 +6,7 @@ Signal chain: study -> covariance of the calibration with the drift since then, 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,11 @@ from mitsim.sensor.drift import Drift, with_drift
 from mitsim.sensor.preset import Sensor, presets
 from mitsim.sensor.preset_covariance import preset_covariance
 from mitsim.sensor.rig_covariance import RigCovariance, read_rig_covariance
-from mitsim.sensor.unknowns import CalibrationUnknowns
+from mitsim.sensor.unknowns import CalibrationUnknowns, FormUnknowns
 from mitsim.study import Study
 from mitsim.study.calibration.virtual_calibration import calibrate
+from mitsim.study.virtual.coat import coated_shapes
+from mitsim.study.virtual.form import drawn_form
 from mitsim.study.virtual.world import GROUPS, Unknowns
 
 #: linear expansion near 20 C [1/K], by the metal of a finish (CRC Handbook of Chemistry and Physics; steel: unalloyed)
@@ -54,12 +57,15 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
         if name not in study.task.shapes:
             allowed = ", ".join(study.task.shapes)
             raise InputError(study.path, f"unknowns.form.features.{name}", "no shape of the task", allowed)
+    table = table.model_copy(update={"form": FormUnknowns(features=drawn_form(study.task, table.form.features))})
     finishes = sorted({shape.bsdf().id() for shape in study.scene.shapes})
     for name in table.finish.measured:
         if name not in finishes:
             field = f"unknowns.finish.measured.{name}"
             raise InputError(study.path, field, "no bsdf of the scene", ", ".join(finishes), nearest(name, finishes))
     folder = study.path.parent
+    if not coated_shapes(study.scene, table.coat):
+        varied = tuple(group for group in varied if group != "coat")
     return Unknowns(
         table,
         sensor.rig,
@@ -73,7 +79,14 @@ def study_unknowns(study: Study, varied: tuple[str, ...] = GROUPS) -> Unknowns:
 
 
 def calibration_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: Path) -> RigCovariance:
-    """Return the covariance of a sensor's calibration, with the drift since then."""
+    """Return the covariance of a sensor's calibration, with the drift since then, both scaled as the table says."""
+    known = _unscaled_covariance(sensor, table, folder)
+    if table.scale == 1:
+        return known
+    return replace(known, covariance=table.scale**2 * known.covariance, source=f"{known.source}; times {table.scale:g}")
+
+
+def _unscaled_covariance(sensor: Sensor, table: CalibrationUnknowns, folder: Path) -> RigCovariance:
     if table.covariance is not None:
         return with_drift(read_rig_covariance(folder / table.covariance, sensor.rig), sensor.rig, table.drift())
     if sensor.name in presets():

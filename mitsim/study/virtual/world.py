@@ -35,7 +35,7 @@ BEYOND = "beyond_map"
 FRESH = ("pose", "noise")
 
 #: all groups; the index of a group in this tuple seeds its stream, so that a new one comes last
-GROUPS = ("calibration", "finish", "form", "light", "temperature", "unit", *FRESH, BEYOND, "decoder")
+GROUPS = ("calibration", "finish", "form", "light", "temperature", "unit", *FRESH, BEYOND, "decoder", "coat")
 
 #: groups that all captures of a day share
 COMMON = tuple(group for group in GROUPS if group not in (*FRESH, BEYOND))
@@ -67,11 +67,11 @@ class DrawnValues:
 
     ``rig`` is the sensor's true geometry. ``path`` is offset [mm] and scale [1] of a time-of-flight distance.
     ``finish`` numbers the deviation of the finishes (:mod:`mitsim.study.virtual.drawn_finish`), -1 for the best
-    estimate. ``form``, ``unit`` and ``decoder`` are seeds, 0 for none: the unit's patterns, and
-    :func:`mitsim.study.virtual.drawn_decoder.drawn_decoder`. ``room`` is irradiance [W/mm^2]. ``power`` and
-    ``exposure`` are relative to nominal [1]. ``expansion`` of the part is relative [1]. ``placed`` and ``assumed``
-    (world to world) are the true and the assumed motion of the part from its nominal pose. ``seed`` is that of the
-    capture, ``beyond`` that of effects outside the map, 0 for none.
+    estimate. ``form``, ``unit``, ``decoder`` and ``coat`` are seeds, 0 for none: the unit's patterns,
+    :func:`mitsim.study.virtual.drawn_decoder.drawn_decoder` and :func:`mitsim.study.virtual.coat.drawn_coat`.
+    ``room`` is irradiance [W/mm^2]. ``power`` and ``exposure`` are relative to nominal [1]. ``expansion`` of the part
+    is relative [1]. ``placed`` and ``assumed`` (world to world) are the true and the assumed motion of the part from
+    its nominal pose. ``seed`` is that of the capture, ``beyond`` that of effects outside the map, 0 for none.
     """
 
     rig: Rig
@@ -88,6 +88,7 @@ class DrawnValues:
     seed: int
     beyond: int = 0
     decoder: int = 0
+    coat: int = 0
 
 
 @dataclass(frozen=True)
@@ -134,6 +135,7 @@ class Unknowns:
             seed=_seed(streams["noise"]),
             beyond=_seed(streams[BEYOND]) if BEYOND in self.varied else 0,
             decoder=_seed(streams["decoder"]) if "decoder" in self.varied else 0,
+            coat=_seed(streams["coat"]) if "coat" in self.varied else 0,
         )
 
     def stream(self, group: str, trial: Trial) -> np.random.Generator:

@@ -1,0 +1,156 @@
+"""A change of a study, and the study after it.
+
+Signal chain: stated view whose measurements do not all fit -> keys of a changed study, or another view -> the same
+virtual measurements under the change.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from characterisation.files.errors import InputError
+from characterisation.statements.selection import PRIOR_OWN
+from characterisation.statements.statement import Statement
+from mitsim.running.time_limit import TimeLimit
+from mitsim.study import StatementTable, Study, StudyFile, open_study
+from mitsim.study.remedies.bounds import Effect, can_fit, least_uncertainty
+from mitsim.study.session import Session
+from mitsim.study.view_sets.confirmed_set import Search
+from mitsim.study.virtual.plan import measured_by
+from mitsim.study.virtual.race import Raced
+from mitsim.study.virtual.stated import StatedView
+from mitsim.views import View
+
+#: verdicts that ask for a change; a measurement that is not decided asks for more virtual measurements
+MISSED = ("does not fit", "undecidable")
+
+#: factor by which a ratio of uncertainties from the map may be too large: one standard deviation of its logarithm
+SCREENING_FACTOR = math.exp(PRIOR_OWN)
+
+#: states every measurement under a change, from a number of trials or those within a limit
+Stating = Callable[[int, TimeLimit], list[Statement]]
+
+
+@dataclass(frozen=True)
+class Shortfall:
+    """A stated view whose measurements do not all fit, and what is known of the other views.
+
+    ``folder`` keeps the trials of changed studies. ``search`` finds sets of views by the map.
+    """
+
+    session: Session
+    stated: StatedView
+    scores: xr.Dataset
+    raced: Raced
+    search: Search
+    folder: Path
+
+    @property
+    def study(self) -> Study:
+        """Return the study."""
+        return self.session.study
+
+    @property
+    def missed(self) -> dict[str, Statement]:
+        """Return the statements of the measurements that do not fit, by name."""
+        return {one.measurement: one for one in self.stated.statements if one.verdict in MISSED}
+
+
+@dataclass(frozen=True)
+class Change:
+    """One change of a study.
+
+    Parameters
+    ----------
+    kind
+        ``bias``, ``view``, ``nearer``, ``exposure``, ``repeats``, ``light``, ``calibration``, ``temperature``,
+        ``views``, ``spray``, ``decoder`` or ``sensor``.
+    words
+        The change, to follow "it would fit": ``sprayed matt white``.
+    keys
+        Keys of the study's TOML file that make the change; of the task for ``bias``.
+    views
+        Numbers of the views that measure, of the changed study.
+    expected
+        Least standard uncertainty, in its unit, of each measurement that can fit.
+    state
+        Makes the virtual measurements; raises :class:`InputError` if the change is impossible.
+    captures
+        Number of captures whose mean is taken.
+    """
+
+    kind: str
+    words: str
+    keys: Mapping[str, Any]
+    views: tuple[int, ...]
+    expected: Mapping[str, float]
+    state: Stating
+    captures: int = 1
+    release: Callable[[], None] = field(default=lambda: None)
+
+
+class ChangedStudy:
+    """Virtual measurements of one view of a changed study, prepared at the first use."""
+
+    def __init__(self, now: Shortfall, name: str, study: Callable[[], Study], view: Callable[[Study], View]) -> None:
+        self.now, self.name, self.study, self.view = now, name, study, view
+        self.session: Session | None = None
+
+    def state(self, count: int, limit: TimeLimit) -> list[Statement]:
+        """State every measurement from a number of trials, or those within a limit."""
+        if self.session is None:
+            self.now.session.release()
+            self.session = Session(self.study(), self.now.folder / self.name, self.now.session.workers)
+        view = self.view(self.session.study)
+        return self.session.state(view, StatementTable(trials=count), limit).statements
+
+    def release(self) -> None:
+        """Free the memory of the measurements."""
+        if self.session is not None:
+            self.session.release()
+
+
+def changed_file(file: StudyFile, keys: Mapping[str, Any]) -> StudyFile:
+    """Return a study's file with keys of its tables replaced."""
+
+    def merged(old: dict[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+        both = dict(old)
+        for key, value in new.items():
+            nested = isinstance(value, Mapping) and isinstance(both.get(key), dict)
+            both[key] = merged(both[key], value) if nested else value
+        return both
+
+    return StudyFile.model_validate(merged(file.model_dump(exclude_unset=True), keys))
+
+
+def reopened(study: Study, keys: Mapping[str, Any]) -> Study:
+    """Open a study with keys of its file replaced; its map is kept."""
+    by_map = measured_by(study) == "map"
+    opened = open_study(study.path, changed_file(study.file, keys), mapped=by_map)
+    return opened if by_map else replace(opened, performance_map=study.performance_map)
+
+
+def possible(now: Shortfall, effect: Effect) -> dict[str, float]:
+    """Return the least uncertainty after a change, of the measurements that can fit with it."""
+    least = {name: least_uncertainty(one, effect) for name, one in now.missed.items()}
+    return {name: u for name, u in least.items() if can_fit(now.missed[name], u, effect.unbiased)}
+
+
+def same_direction(study: Study, view: View) -> View:
+    """Return the view of a study with direction and roll of a view of another.
+
+    Raises
+    ------
+    InputError
+        If the study has none.
+    """
+    for one in study.views:
+        if float(one.direction @ view.direction) > 1 - 1e-9 and math.isclose(one.roll_deg, view.roll_deg, abs_tol=1e-6):
+            return one
+    raise InputError(study.path, "views", f"no view in the direction of view {view.number}", "a view there")

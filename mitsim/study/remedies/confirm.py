@@ -1,0 +1,200 @@
+"""Find the cheapest change with which each missed measurement fits, by virtual measurements of every change tried.
+
+Signal chain: changes in the order of their effort (:mod:`mitsim.study.remedies.changes`) -> virtual measurements of the
+first change that can help a measurement that no earlier one helps, few at first and more while it may still fit -> next
+change, until every measurement fits or time is over -> :class:`Remedies`.
+
+A change is confirmed if the decision rule gives the verdict *fits* from its virtual measurements alone. Their draws are
+those of the statement, so that only the change makes the difference.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from characterisation.files.atomic_io import json_values
+from characterisation.files.errors import InputError
+from characterisation.statements.statement import Statement
+from mitsim.running.progress import say
+from mitsim.running.time_limit import TimeLimit
+from mitsim.study.remedies.change import Change, Shortfall
+from mitsim.study.remedies.changes import changes
+from mitsim.study.remedies.sensors import other_sensors
+
+#: first trials of a change, and those of the next steps while a verdict is open, over the trials of the study's table
+_STEPS = (0.25, 1.0, 4.0)
+
+#: share of the time that is left which one change may take, so that later ones have a chance
+_CHANGE_SHARE = 0.5
+
+#: share of the time that is left for screening other sensors
+_SCREENING_SHARE = 0.4
+
+#: fewest trials whose verdict counts
+_FEWEST = 8
+
+
+@dataclass(frozen=True)
+class TriedChange:
+    """A change with its ``stated`` measurements, those that were missed only, and the ``seconds`` that it took."""
+
+    change: Change
+    stated: dict[str, Statement]
+    seconds: float
+
+    @property
+    def trials(self) -> int:
+        """Return the number of virtual measurements."""
+        return max((one.trials for one in self.stated.values()), default=0)
+
+    @property
+    def fits(self) -> list[str]:
+        """Return the measurements that fit."""
+        return [name for name, one in self.stated.items() if one.verdict == "fits"]
+
+
+@dataclass
+class Remedies:
+    """What was tried for the measurements that do not fit.
+
+    ``missed`` are their statements by name, ``failed`` the changes that are impossible with the reason. ``untried`` are
+    the words of changes for which time did not suffice.
+    """
+
+    missed: dict[str, Statement]
+    tried: list[TriedChange] = field(default_factory=list)
+    failed: list[tuple[Change, str]] = field(default_factory=list)
+    untried: list[str] = field(default_factory=list)
+
+    @property
+    def open(self) -> list[str]:
+        """Return the measurements that no change makes fit so far."""
+        solved = {name for one in self.tried for name in one.fits}
+        return [name for name in self.missed if name not in solved]
+
+
+def find_remedies(
+    missed: dict[str, Statement], proposed: Iterable[Change], trials: int, limit: TimeLimit | None = None
+) -> Remedies:
+    """Try changes until every missed measurement fits with one, no change is left, or time is over.
+
+    Parameters
+    ----------
+    missed
+        Statements of the measurements that do not fit, by name.
+    proposed
+        Changes, the least effort first; each is asked for only when those before it do not suffice.
+    trials
+        Virtual measurements of a change; a quarter of them can exclude it, and four times as many may decide it.
+    limit
+        Time; none by default.
+    """
+    found, limit, kinds = Remedies(missed), limit or TimeLimit(), set[str]()
+    for change in proposed:
+        kinds.add(change.kind)
+        wanted = [name for name in change.expected if name in found.open]
+        if not wanted:
+            continue
+        if limit.over():
+            found.untried.append(change.words)
+            continue
+        began = time.monotonic()
+        try:
+            stated = _stated(change, wanted, trials, limit.part(_CHANGE_SHARE))
+        except InputError as error:
+            found.failed.append((change, str(error)))
+            continue
+        finally:
+            change.release()
+            gc.collect()
+        seconds = time.monotonic() - began
+        tried = TriedChange(change, {name: stated[name] for name in missed if name in stated}, seconds)
+        if tried.trials < _FEWEST:
+            found.untried.append(change.words)
+            continue
+        found.tried.append(tried)
+        fits = ", ".join(name for name in wanted if name in tried.fits) or "no measurement"
+        say(f"remedies: {change.words}: {fits} of {len(wanted)} fits, by {tried.trials} trials in {seconds:.0f} s")
+        if not found.open:
+            break
+    if limit.over() and found.open and "sensor" not in kinds:
+        found.untried.append("with another sensor")
+    return found
+
+
+def all_changes(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
+    """Yield the changes of a study that may help, the least effort first; other sensors come last."""
+    yield from changes(now)
+    yield from other_sensors(now, limit.part(_SCREENING_SHARE))
+
+
+def _stated(change: Change, wanted: list[str], trials: int, limit: TimeLimit) -> dict[str, Statement]:
+    """Return the statements under a change, from more trials while a wanted verdict is open and may become good."""
+    stated: dict[str, Statement] = {}
+    for share in _STEPS:
+        stated = {one.measurement: one for one in change.state(max(_FEWEST, round(share * trials)), limit)}
+        asked = [stated[name] for name in wanted]
+        if limit.over() or not any(_deserves_more(one, share < 1) for one in asked):
+            break
+    return stated
+
+
+def _deserves_more(one: Statement, first: bool) -> bool:
+    """Return whether a verdict deserves more trials: one that may become *fits*, or does so by the first few alone.
+
+    After the first few, one standard deviation of the logarithm of the demand may be missing, later nothing.
+    """
+    if one.decided is None or one.verdict != "not decided":
+        return one.verdict == "fits" and first
+    demand, low = one.decided.demand, one.decided.demand_interval[0]
+    return demand <= 1 or (first and demand * low <= 1)
+
+
+def remedies_document(found: Remedies) -> dict[str, Any]:
+    """Return the changes that were tried as JSON values; see docs/reference/formats/run-folder.md."""
+    return {
+        "measurements": {
+            name: {
+                "unit": one.unit,
+                "standard_uncertainty": json_values(one.standard_uncertainty),
+                "needed": None if one.decided is None else json_values(one.decided.needed),
+                "demand": None if one.decided is None else json_values(one.decided.demand),
+                "fits_by": next((i for i, tried in enumerate(found.tried) if name in tried.fits), None),
+            }
+            for name, one in found.missed.items()
+        },
+        "tried": [_entry(one) for one in found.tried],
+        "impossible": [{"words": one.words, "reason": why} for one, why in found.failed],
+        "untried": list(found.untried),
+    }
+
+
+def _entry(tried: TriedChange) -> dict[str, Any]:
+    change = tried.change
+    return {
+        "change": change.kind,
+        "words": change.words,
+        "keys": dict(change.keys),
+        "views": list(change.views),
+        "captures": change.captures,
+        "trials": tried.trials,
+        "seconds": round(tried.seconds, 1),
+        "measurements": {name: _measured(one, change) for name, one in tried.stated.items()},
+    }
+
+
+def _measured(one: Statement, change: Change) -> dict[str, Any]:
+    decided = one.decided
+    return {
+        "expected": json_values(change.expected.get(one.measurement)),
+        "bias": json_values(one.bias),
+        "standard_uncertainty": json_values(one.standard_uncertainty),
+        "without_value": one.without_value,
+        "demand": None if decided is None else json_values(decided.demand),
+        "demand_interval": None if decided is None else json_values(list(decided.demand_interval)),
+        "verdict": one.verdict,
+    }

@@ -1,0 +1,72 @@
+"""State the mean of repeated captures of one part, by virtual measurements of every capture.
+
+Signal chain: days of a statement -> several captures of each day, with the same unknowns but new pose and noise ->
+mean error of each day -> statement of every measurement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from characterisation.statements.decision import tolerance_of
+from characterisation.statements.one_sided import OneSidedErrors
+from characterisation.statements.statement import Statement, statement
+from mitsim.running.time_limit import TimeLimit
+from mitsim.study.session import Session
+from mitsim.study.virtual.drawn_numbers import related, statement_trials
+from mitsim.study.virtual.race import Job, complete
+from mitsim.study.virtual.stated import source_of_trials
+from mitsim.study.virtual.world import Trial
+from mitsim.views import View
+
+
+def state_mean(session: Session, view: View, captures: int, count: int, limit: TimeLimit) -> list[Statement]:
+    """State the mean of several captures of a day for every measurement.
+
+    Captures without a value are left out of the mean of their day. Days that time does not suffice for are not used.
+
+    Parameters
+    ----------
+    session, view
+        Of the study, and the view at its exposures.
+    captures
+        Number of captures of a day.
+    count
+        Largest number of days.
+    limit
+        Time.
+    """
+    study, (runner, trials, _) = session.study, source_of_trials(session, view)
+    days = list(dict.fromkeys(trial.day for trial in statement_trials(2 * count)))[:count]
+    for day in days:
+        jobs = [Job(view, Trial(day, capture)) for capture in range(captures)]
+        complete(trials, runner, jobs, f"capture day {day - days[0] + 1} of {len(days)}", limit.over)
+        if limit.over():
+            break
+    known = trials.known(view.number)
+    whole = [day for day in days if all(Trial(day, capture) in known for capture in range(captures))]
+    rows = [trials.errors_of_parts(view.number, [Trial(day, k) for day in whole]) for k in range(captures)]
+    common = related([Trial(day) for day in whole])
+    return [
+        statement(name, asked.unit, _mean([row[m] for row in rows]), tolerance_of(study.task, name), (), None, common)
+        for m, (name, asked) in enumerate(study.task.measurements.items())
+    ]
+
+
+def _mean(captures: list[np.ndarray | OneSidedErrors]) -> np.ndarray | OneSidedErrors:
+    """Return the mean errors (n,) of days from those of each capture."""
+    first = captures[0]
+    if isinstance(first, OneSidedErrors):
+        vectors = np.array([one.vectors for one in captures if isinstance(one, OneSidedErrors)])
+        return replace(first, vectors=_known_mean(vectors))
+    return _known_mean(np.array(captures))
+
+
+def _known_mean(values: np.ndarray) -> np.ndarray:
+    """Return the mean over the first axis without NaN; NaN where there is no number."""
+    known = np.isfinite(values)
+    count = known.sum(axis=0)
+    total = np.where(known, values, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -1,0 +1,104 @@
+"""Propose other sensors with which a measurement could fit its tolerance.
+
+Signal chain: presets with a map -> the study with each -> screening of the directions that were best for the first
+sensor -> uncertainty of each missed measurement relative to the first sensor's -> the sensors with which most can fit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from characterisation.files.errors import InputError
+from characterisation.maps.shipped import shipped_maps
+from mitsim.running.progress import say
+from mitsim.running.time_limit import TimeLimit
+from mitsim.sensor.preset import named_sensor, presets
+from mitsim.study import Study
+from mitsim.study.choose.candidates import Excluded, open_candidate
+from mitsim.study.remedies.bounds import can_fit
+from mitsim.study.remedies.change import SCREENING_FACTOR, Change, ChangedStudy, Shortfall
+from mitsim.study.session import Session
+from mitsim.views import View
+from mitsim.views.view_scores import screening_risk
+
+Floats = NDArray[np.float64]
+
+#: directions in which another sensor is screened, and sensors that are proposed
+_DIRECTIONS, _MOST = 6, 2
+
+
+def other_sensors(now: Shortfall, limit: TimeLimit) -> Iterator[Change]:
+    """Yield the most promising other sensors, the one with which most measurements can fit first."""
+    if now.session.source == "map":
+        return
+    names, stated = list(now.missed), now.stated.view.number
+    own = _risks(now.scores, names)[:, now.scores["view"].values.tolist().index(stated)]
+    found = list[tuple[int, float, Change]]()
+    # fringes first: time may not suffice for all
+    for name in sorted(presets(), key=lambda one: named_sensor(one)[1] != "structured_light"):
+        if name == now.study.sensor.name or name not in shipped_maps():
+            continue
+        if limit.over():
+            break
+        study = _opened(now, name)
+        if study is None or not (some := _in_best_directions(now, study)).views:
+            continue
+        say(f"remedies: screening {name}, {len(some.views)} views")
+        scores, _ = Session(some).screen()
+        risks = _risks(scores, names)
+        least = risks.min(axis=1)
+        expected = {}
+        for one, risk, before in zip(now.missed.values(), least, own, strict=True):
+            ratio = float(risk / before)  # 0 where the map sees no way for the first sensor
+            u = ratio * one.standard_uncertainty / SCREENING_FACTOR
+            if math.isfinite(risk) and can_fit(one, u, unbiased=True):
+                expected[one.measurement] = u
+        if expected:
+            able = np.isfinite(least)
+            best = int(np.argmin((risks[able] / least[able, None]).max(axis=0)))
+            view = study.view(int(scores["view"].values[best]))
+            found.append((-len(expected), float(least[able].sum()), _with_sensor(now, name, study, view, expected)))
+    for _, _, change in sorted(found, key=lambda one: one[:2])[:_MOST]:
+        yield change
+
+
+def _opened(now: Shortfall, name: str) -> Study | None:
+    """Return the study with another sensor; None if that is impossible, such as without its finishes in the map."""
+    try:
+        opened = open_candidate(now.study.path, now.study.file, name, None)
+    except InputError:
+        return None
+    return None if isinstance(opened, Excluded) else opened.study
+
+
+def _with_sensor(now: Shortfall, name: str, study: Study, view: View, expected: dict[str, float]) -> Change:
+    changed = ChangedStudy(now, f"sensor_{name}", lambda: study, lambda one: one.view(view.number))
+    words = f"with {name}, from its view {view.number}"
+    return Change("sensor", words, {"sensor": name}, (view.number,), expected, changed.state, release=changed.release)
+
+
+def _in_best_directions(now: Shortfall, study: Study) -> Study:
+    """Return the study with the views in the stated direction and in those that screening ranks first."""
+    risks = _risks(now.scores, list(now.missed))
+    risks = risks[np.isfinite(risks).any(axis=1)]
+    worst = (risks / risks.min(axis=1, keepdims=True)).max(axis=0) if len(risks) else np.zeros(now.scores.sizes["view"])
+    order = now.scores["view"].values[np.argsort(worst, kind="stable")].tolist()
+    directions = list[Floats]()
+    for number in (now.stated.view.number, *order):
+        direction = now.study.view(int(number)).direction
+        if len(directions) < _DIRECTIONS and all(one @ direction < 1 - 1e-9 for one in directions):
+            directions.append(direction)
+    views = [view for view in study.views if any(one @ view.direction > 1 - 1e-9 for one in directions)]
+    return replace(study, candidates=replace(study.candidates, views=views))
+
+
+def _risks(scores: xr.Dataset, names: list[str]) -> Floats:
+    """Return the screened risk (measurement, view) of measurements, in their units; infinite if the map excludes it."""
+    known = [str(name) for name in scores["measurement"].values]
+    return np.asarray(np.exp(screening_risk(scores)[[known.index(name) for name in names]]))

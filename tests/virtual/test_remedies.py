@@ -1,0 +1,178 @@
+"""Changes that would make measurements fit: bounds by the budget, the order of trials, and their words."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from characterisation.files.errors import InputError
+from characterisation.statements.budget import BudgetLine
+from characterisation.statements.decision import demand, plus_minus
+from characterisation.statements.statement import Statement, statement
+from characterisation.tasks.decision_table import Decision
+from mitsim.running.time_limit import TimeLimit
+from mitsim.study.remedies.bounds import EXPOSURE, Effect, can_fit, least_shares, least_uncertainty
+from mitsim.study.remedies.change import Change, changed_file
+from mitsim.study.remedies.confirm import Remedies, find_remedies, remedies_document
+from mitsim.study.remedies.entries import RemediesEntry, remedies_in_words
+from mitsim.study.tables import StudyFile
+
+#: equally likely errors of a standard normal distribution
+NORMAL = norm.ppf((np.arange(200) + 0.5) / 200)
+
+
+def stated(name: str, u: float, bias: float = 0.0, tolerance: float = 1.0, count: int = 200) -> Statement:
+    """A statement from errors of a normal distribution, in a random order."""
+    errors = bias + u * np.random.default_rng(1).permutation(norm.ppf((np.arange(count) + 0.5) / count))
+    return statement(name, "mm", errors, plus_minus(20.0, tolerance))
+
+
+def with_budget(one: Statement, **shares: float) -> Statement:
+    """The statement with a budget of shares of its variance, exactly known."""
+    lines = [
+        BudgetLine(group, share * one.standard_uncertainty**2, 0.0, share * one.standard_uncertainty**2, share, (0, 1))
+        for group, share in shares.items()
+    ]
+    return replace(one, budget=tuple(lines))
+
+
+def test_a_change_leaves_the_variance_of_the_groups_that_it_does_not_touch() -> None:
+    one = with_budget(stated("radius", 0.5), calibration=0.64, noise=0.3, light=0.06)
+    u = one.standard_uncertainty
+    assert least_uncertainty(one, Effect({"calibration": 0.0})) == pytest.approx(0.6 * u)
+    assert least_uncertainty(one, Effect({"calibration": 0.5})) == pytest.approx(u * math.sqrt(1 - 0.75 * 0.64))
+    assert least_uncertainty(one, Effect({"form": 0.0})) == pytest.approx(u)
+    assert least_uncertainty(replace(one, budget=()), Effect({"form": 0.0})) == 0
+
+
+def test_an_uncertain_line_of_the_budget_counts_with_its_high_end() -> None:
+    one = stated("radius", 0.5)
+    u2 = one.standard_uncertainty**2
+    unsure = replace(one, budget=(BudgetLine("calibration", 0.2 * u2, 0.0, 0.96 * u2, 0.2, (0.0, 0.96), False),))
+    assert least_uncertainty(unsure, Effect({"calibration": 0.0})) == pytest.approx(0.2 * one.standard_uncertainty)
+
+
+def test_a_line_that_stays_counts_with_its_low_end_however_wide_the_others_are() -> None:
+    one = stated("radius", 0.5)
+    u2 = one.standard_uncertainty**2
+    lines = [BudgetLine("calibration", 0.8 * u2, 0.49 * u2, u2, 0.8, (0.49, 1.0))]
+    lines += [BudgetLine(name, 0.1 * u2, 0.0, 0.6 * u2, 0.1, (0.0, 0.6), False) for name in ("noise", "light")]
+    wide = replace(one, budget=tuple(lines))
+    assert least_uncertainty(wide, EXPOSURE) == pytest.approx(0.7 * one.standard_uncertainty)
+
+
+@pytest.mark.parametrize("rule", ["iso_14253_1", "simple_acceptance"])
+@pytest.mark.parametrize("bias", [0.0, 0.06, 0.3])
+@pytest.mark.parametrize("ratio", [0.1, 0.2, 0.35, 0.8])
+def test_the_bound_agrees_with_the_decision_rule_on_scaled_errors(rule: str, bias: float, ratio: float) -> None:
+    tolerance = plus_minus(20.0, 1.0, Decision(rule=rule))
+    errors = bias + 0.4 * NORMAL
+    one = statement("radius", "mm", errors, tolerance)
+    u = ratio * one.standard_uncertainty
+    assert can_fit(one, u, unbiased=False) == (demand(bias + ratio * (errors - bias), tolerance) <= 1)
+    assert can_fit(one, u, unbiased=True) == (demand(ratio * (errors - bias), tolerance) <= 1)
+
+
+def test_only_changes_that_can_give_values_help_a_measurement_without_any() -> None:
+    lost = statement("radius", "mm", np.full(40, math.nan), plus_minus(20.0, 1.0))
+    assert can_fit(lost, 0.0, unbiased=True)
+    assert not can_fit(lost, 0.0, unbiased=False)
+
+
+def test_the_largest_share_of_a_group_that_suffices() -> None:
+    one = with_budget(stated("radius", 0.22), calibration=1.0)  # half of it is below the 0.12 that is needed
+    assert least_shares(one, "calibration", (0.5, 0.25, 0.125)) == 0.5
+    half = with_budget(stated("radius", 0.22), calibration=0.5, noise=0.5)
+    assert least_shares(half, "calibration", (0.5, 0.25, 0.125)) is None
+
+
+class Fake:
+    """A change after which measurements have given uncertainties; it notes the trials that are asked for."""
+
+    def __init__(self, kind: str, expected: tuple[str, ...], error: str = "", **u: float) -> None:
+        self.u, self.error, self.asked = u, error, list[int]()
+        self.change = Change(kind, f"with {kind}", {}, (1,), dict.fromkeys(expected, 0.0), self.state)
+
+    def state(self, count: int, _limit: TimeLimit) -> list[Statement]:
+        if self.error:
+            raise InputError("study.toml", "", self.error, "another")
+        self.asked.append(count)
+        return [stated(name, u, count=count) for name, u in self.u.items()]
+
+
+def missed(*names: str) -> dict[str, Statement]:
+    return {name: stated(name, 0.8) for name in names}
+
+
+def test_the_least_effort_is_tried_first_and_no_change_for_a_measurement_that_fits_already() -> None:
+    view = Fake("view", ("a", "b"), a=0.02, b=0.7)
+    spray = Fake("spray", ("a",), a=0.01, b=0.01)
+    sensor = Fake("sensor", ("a", "b"), a=0.01, b=0.02)
+    never = Fake("calibration", ("b",), b=0.01)
+    found = find_remedies(missed("a", "b"), [one.change for one in (view, spray, sensor, never)], 40)
+    assert [one.change.kind for one in found.tried] == ["view", "sensor"]
+    assert not spray.asked and not never.asked and not found.open
+    document = RemediesEntry.model_validate(remedies_document(found))
+    assert {name: one.fits_by for name, one in document.measurements.items()} == {"a": 0, "b": 1}
+    first, second = remedies_in_words(document)
+    assert first == "with view: a (u 0.020 mm, before 0.80 mm) fits (40 virtual measurements)"
+    assert second == "with sensor: b (u 0.020 mm, before 0.80 mm) fits (40 virtual measurements)"
+
+
+def test_a_quarter_of_the_trials_excludes_a_hopeless_change_and_more_decide_a_good_one() -> None:
+    hopeless, good = Fake("view", ("a",), a=0.9), Fake("spray", ("a",), a=0.02)
+    find_remedies(missed("a"), [hopeless.change, good.change], 40)
+    assert hopeless.asked == [10]
+    assert good.asked == [10, 40]
+    near = Fake("view", ("a",), a=0.11)  # 0.128 is needed: the interval of the demand of 40 trials contains 1
+    find_remedies(missed("a"), [near.change], 40)
+    assert near.asked == [10, 40, 160]
+    missing = Fake("view", ("a",), a=0.14)  # open after ten trials, but a third above the demand of a fit
+    assert stated("a", 0.14, count=10).verdict == "not decided"
+    find_remedies(missed("a"), [missing.change], 40)
+    assert missing.asked == [10]
+
+
+def test_an_impossible_change_is_reported_and_the_next_one_tried() -> None:
+    wrong, good = Fake("exposure", ("a",), "exposures cannot be merged"), Fake("spray", ("a",), a=0.02)
+    found = find_remedies(missed("a"), [wrong.change, good.change], 40)
+    assert "cannot be merged" in remedies_document(found)["impossible"][0]["reason"]
+    assert [one.change.kind for one in found.tried] == ["spray"]
+
+
+def test_without_time_nothing_is_confirmed_and_the_changes_are_named() -> None:
+    good = Fake("spray", ("a",), a=0.02)
+    found = find_remedies(missed("a"), [good.change], 40, TimeLimit(0.0))
+    assert not good.asked and found.open == ["a"]
+    lines = remedies_in_words(RemediesEntry.model_validate(remedies_document(found)))
+    assert lines == ["a: not tried", "not tried for lack of time: with spray; with another sensor"]
+
+
+def test_the_nearest_of_insufficient_changes_is_named() -> None:
+    far, near = Fake("view", ("a",), a=0.9), Fake("spray", ("a",), a=0.4)
+    lines = remedies_in_words(
+        RemediesEntry.model_validate(remedies_document(find_remedies(missed("a"), [far.change, near.change], 40)))
+    )
+    assert lines == ["a (u 0.40 mm, 0.12 mm needed): none of 2 changes tried suffices; nearest is with spray"]
+    worse, worst = Fake("view", ("a",), a=0.9), Fake("spray", ("a",), a=1.4)
+    lines = remedies_in_words(
+        RemediesEntry.model_validate(remedies_document(find_remedies(missed("a"), [worse.change, worst.change], 40)))
+    )
+    assert lines == ["a (u 0.80 mm, 0.12 mm needed): none of 2 changes tried helps"]
+    nothing = RemediesEntry.model_validate(remedies_document(Remedies(missed("a"))))
+    assert remedies_in_words(nothing) == ["a: by its budget, no single change that mitsim knows suffices"]
+
+
+def test_keys_of_a_change_replace_single_keys_of_the_study() -> None:
+    unknowns = {"calibration": {"row_mrad": 0.5}, "light": {"room": "dark cell"}}
+    file = StudyFile.model_validate(
+        {"scene": "a.xml", "task": "t.toml", "sensor": "ensenso-n10", "views": {}, "unknowns": unknowns}
+    )
+    changed = changed_file(file, {"unknowns": {"calibration": {"scale": 0.25}}, "sprayed": True})
+    assert changed.unknowns.calibration.row_mrad == 0.5 and changed.unknowns.calibration.scale == 0.25
+    assert changed.unknowns.light.room == "dark cell" and changed.sprayed
+    assert changed.views == file.views
