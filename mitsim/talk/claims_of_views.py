@@ -1,0 +1,199 @@
+"""State the claims of the talk's slides on views, with the figures that were found."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import xarray as xr
+
+from characterisation.scores.rank_agreement import spearman
+from characterisation.tasks.task_reading import read_task
+from mitsim.running.numbers import two_digits, unit_symbol
+from mitsim.talk import view_figures as figures
+from mitsim.talk.claims_of_sensors import collected
+from mitsim.talk.judged_views import SCORES, Judged, true_error
+from mitsim.talk.make import trials_name
+from mitsim.talk.results import Results
+from mitsim.talk.slides import Claim, Slide, verdict
+from mitsim.talk.talk_file import ExampleEntry, Talk
+
+#: mean rank correlation of bins from which agreement is very good, and good
+_VERY_GOOD, _GOOD = -0.8, -0.5
+
+#: number of bins at each end that are called bad and good views
+_END = 3
+
+
+def judged_of(talk: Talk, results: Results, measured: dict[str, xr.Dataset], slide: Slide) -> Judged:
+    """Return scores and errors of all samples that have them; ``measured`` errors replace virtual ones."""
+    names = {one.name: one.key for one in talk.file.samples}
+    scores = collected(results, {name: f"scores_{key}" for name, key in names.items()}, slide)
+    wanted = {one.name: trials_name(one) for one in talk.file.samples if one.key not in measured}
+    errors = collected(results, wanted, slide)
+    errors |= {name: measured[key] for name, key in names.items() if key in measured}
+    both = [name for name in names if name in scores and name in errors]
+    task = read_task(talk.folder / talk.file.task)
+    return Judged(task, scores, {name: errors[name] for name in both})
+
+
+def scoring(talk: Talk, judged: Judged) -> Slide:
+    """Return slide *Viewpoint Scoring*."""
+    slide = Slide("Viewpoint Scoring")
+    name = talk.file.sphere.sample
+    if name not in judged.scores:
+        slide.missing.append(f"scores_{talk.sample(name).key}")
+        return slide
+    scores, feature = judged.scores[name], talk.file.shown_feature
+    words = f"Number of points on {feature} ({name}) over the views that the stage reaches"
+    slide.pictures["reach"] = (figures.reach_figure(scores, feature), words)
+    points = scores["n"].sel(feature=feature).values
+    reached, outside = scores.sizes["view"], scores.sizes["outside"]
+    slide.claims.append(
+        Claim(
+            "Sub divide icosahedron to sample a sphere. Ensure reachability by the tilt table.",
+            f"The three-axis table reaches {reached} of {reached + outside} directions; {scores.attrs['moved_out']} views "
+            f"were moved out, clear of the part. {feature} has {points.min():.0f} to {points.max():.0f} points.",
+            "shown",
+        )
+    )
+    return slide
+
+
+def view_score(talk: Talk, judged: Judged) -> Slide:
+    """Return slide *The View Score*."""
+    slide, shown = Slide("The View Score"), talk.file.sphere
+    if shown.sample not in judged.scores:
+        slide.missing.append(f"scores_{talk.sample(shown.sample).key}")
+        return slide
+    scores = judged.scores[shown.sample]
+    shapes = list(judged.task.shapes_for(shown.measurement))
+    words = f"S_f, R_f, S_m, R_m and V_m over the views: {shown.measurement}, {shown.sample}"
+    slide.pictures["scores"] = (figures.scores_figure(scores, shown.measurement, shapes), words)
+    here = scores.sel(measurement=shown.measurement)
+    sums, product = here["S_m"].values.astype(float), here["R_m"].values.astype(float)
+    high = sums >= np.quantile(sums, 0.75)
+    hidden = int((high & (product < 0.5)).sum())
+    found = f"Of the quarter of views with the largest S_m, {hidden} of {int(high.sum())} have R_m below 0.5."
+    better = hidden > 0
+    if shown.sample in judged.errors:
+        error = true_error(judged.errors[shown.sample], shown.measurement)
+        known = np.isfinite(error)
+        alone = spearman(sums[known], error[known])
+        together = spearman(np.where(here["possible"].values > 0, here["V_m"].values, 0)[known], error[known])
+        found += f" Rank correlation with the true error of views: S_m alone {alone:+.2f}, V_m {together:+.2f}."
+        better = together < alone
+    slide.claims.append(
+        Claim(
+            "[S_m] is susceptible to bias. Doesn't take into account if all features are actually visible.",
+            found.replace("-", "−"),
+            verdict(better, hidden > 0),
+        )
+    )
+    return slide
+
+
+def examples(talk: Talk, judged: Judged) -> Slide:
+    """Return slides *Example Result*."""
+    slide = Slide("Example Results")
+    for one in talk.file.examples:
+        if one.sample not in judged.errors or one.sample not in judged.scores:
+            slide.missing.append(trials_name(talk.sample(one.sample)))
+            continue
+        words = f"Deciles of V_m for {one.measurement} ({one.sample}), and spheres of V_m and of the true error"
+        picture = figures.example_figure(judged, one.sample, one.measurement)
+        slide.pictures[f"example_{one.measurement}"] = (picture, words)
+        slide.claims.append(_example(judged, one))
+    return slide
+
+
+_WORDS = {
+    "18": "Only very small number of views have measurable data, which are accurately predicted by the view score. We "
+    "see good correlation between the view score and measurement accuracy and uncertainty.",
+    "19": "Good correlation. Regions of poor accuracy and impossible measurements due to occlusion are accurately "
+    "predicted. Less distinction between top 30% of views.",
+    "20": "Despite ideal conditions the view angle is still very important and significant benefits can be had.",
+}
+
+
+def _example(judged: Judged, one: ExampleEntry) -> Claim:
+    cell, errors = judged.cell(one.sample, one.measurement, "V_m"), judged.errors[one.sample]
+    values, views, share = cell["error"].values, cell["views"].values, cell["share"].values
+    unit = unit_symbol(str(judged.scores[one.sample]["unit"].sel(measurement=one.measurement).item()))
+    possible = int(views[1:].sum())
+    trials = errors["error"].sel(measurement=one.measurement).values
+    measurable = int((np.isfinite(trials).mean(axis=1) >= 0.5).sum())
+    known = np.flatnonzero(np.isfinite(values[1:])) + 1
+    correlations = [cell.attrs[f"{name}_correlation"] for name in ("error", "deviation")]
+    ratio = float(values[known[0]] / values[known[-1]]) if len(known) > 1 else math.nan
+    best = [values[number] for number in known[-3:]]
+    top = max(best) / min(best) if len(best) > 1 else math.nan
+    found = (
+        f"{one.measurement}, {one.sample}: {possible} of {int(views.sum())} views are possible by V_m; {measurable} have "
+        f"a value in at least half of the trials. Trials with a value: {_percent(share[0])} where V_m says impossible, "
+        f"{_percent(_mean_share(cell))} elsewhere. Rank correlation of bins with error {_signed(correlations[0])}, with "
+        f"standard deviation {_signed(correlations[1])}. Worst over best bin: {_ratio(ratio)}"
+        f"{'' if math.isnan(ratio) else f' ({two_digits(values[known[0]])} to {two_digits(values[known[-1]])} {unit})'}. "
+        f"The errors of the best three bins differ by the factor {_ratio(top)}."
+    )
+    good = [correlation < _GOOD for correlation in correlations if not math.isnan(correlation)]
+    return Claim(_WORDS.get(one.slide, one.measurement), found, verdict(bool(good) and all(good), any(good)))
+
+
+def _mean_share(cell: xr.Dataset) -> float:
+    views, share = cell["views"].values[1:], cell["share"].values[1:]
+    return float(np.nansum(views * np.nan_to_num(share)) / views.sum()) if views.sum() else math.nan
+
+
+def _percent(share: float) -> str:
+    return "no views" if math.isnan(share) else f"{100 * share:.0f} %"
+
+
+def _signed(value: float) -> str:
+    return "unknown" if math.isnan(value) else f"{value:+.2f}".replace("-", "−")
+
+
+def _ratio(value: float) -> str:
+    return "unknown" if math.isnan(value) else f"{value:.1f}"
+
+
+def accuracy(judged: Judged) -> Slide:
+    """Return slide *View Score Accuracy*."""
+    slide = Slide("View Score Accuracy")
+    if not judged.errors:
+        return slide
+    words = "Mean rank of the ten bins for error and standard deviation, by V_m, predicted risk and number of points"
+    slide.pictures["accuracy"] = (figures.ranks_figure(judged), words)
+    count = len(judged.task.measurements) * len(judged.errors)
+    found = {
+        (kind, quantity): judged.ranks(kind, quantity) for kind in SCORES for quantity in ("error", "deviation")
+    }
+
+    def interval(kind: str, quantity: str) -> str:
+        about = found[kind, quantity].attrs
+        ends = f"{_signed(about['correlation_low'])} to {_signed(about['correlation_high'])}"
+        return f"{_signed(about['correlation'])} ({ends})"
+
+    talks = [found["V_m", quantity].attrs["correlation"] for quantity in ("error", "deviation")]
+    slide.claims.append(
+        Claim(
+            "Comparison of our predicted bin rank based on the view score and actual bin ranking are very good.",
+            f"Over {count} cells, {len(judged.task.measurements)} measurements of {len(judged.errors)} samples, the mean "
+            "rank correlation of bins with error and with standard deviation is "
+            + "; ".join(f"{name} {interval(kind, 'error')} and {interval(kind, 'deviation')}" for kind, name in SCORES.items())
+            + ".",
+            verdict(max(talks) <= _VERY_GOOD, max(talks) <= _GOOD),
+        )
+    )
+    misses = np.abs(found["V_m", "error"]["rank"].values - np.arange(10, 0, -1))
+    bad, good = float(np.nanmean(misses[:_END])), float(np.nanmean(misses[-_END:]))
+    slide.claims.append(
+        Claim(
+            "Especially good at predicting bad views.",
+            f"The mean rank by error misses the predicted one by {bad:.1f} for the three worst bins, and by {good:.1f} for "
+            f"the three best. Mean ranks from the worst bin to the best: "
+            f"{', '.join(f'{rank:.1f}' for rank in found['V_m', 'error']['rank'].values)}.",
+            verdict(bad < good),
+        )
+    )
+    return slide

@@ -1,0 +1,61 @@
+"""Render what sensors project on the artefact: frames of fringes or dots, for the strip that opens the page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from mitsim.capture.simulated.rendering import Rendering
+from mitsim.scene.load import load_scene
+from mitsim.sensor.poses import look_at
+from mitsim.study.scene_geometry import hull_corners
+from mitsim.talk.talk_file import sensor_in
+from mitsim.maps.campaign.orders import prepared_sensor
+
+#: size of a frame [px], and the largest number of frames
+WIDTH_PX, HEIGHT_PX, MOST_FRAMES = 280, 210, 8
+
+#: direction of the view, from the part
+_FROM = np.array([0.25, -0.72, 0.65])
+
+#: largest number of surfaces on a light path
+_DEPTH = 2
+
+
+def projected_frames(folder: str, scene: str, parameters: tuple[tuple[str, str], ...], sensor: str) -> xr.Dataset:
+    """Return frames (frame, row, column) of the artefact in a sensor's projected images, in 8 bits.
+
+    All frames share one scale. A sensor that projects one image has one frame.
+    """
+    chosen = sensor_in(folder, sensor)
+    loaded = load_scene(Path(folder) / scene, chosen.wavelength_nm, dict(parameters))
+    near, far = chosen.working_range_mm
+    radius = float(np.linalg.norm(loaded.bounds[1] - loaded.bounds[0])) / 2
+    distance = min(max(near + radius, 3.2 * radius), far - radius)
+    direction = _FROM / np.linalg.norm(_FROM)
+    pose = look_at(loaded.centre + distance * direction, loaded.centre, sensor=chosen)
+    rendering = Rendering(16, _DEPTH)
+    capture = prepared_sensor(chosen).simulated.capture(loaded, pose, seed=1, rendering=rendering)
+    name, stack = next(iter(capture.images.items()))
+    chosen_frames = stack[np.unique(np.linspace(0, len(stack) - 1, MOST_FRAMES).round().astype(int))]
+    places = capture.rig.cameras[name].project(pose.inverse().points(hull_corners(loaded)))
+    return xr.Dataset({"frames": (("frame", "row", "column"), _fitted(chosen_frames.astype(float), places))})
+
+
+def _fitted(frames: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return frames cut to the part with the proportions of the strip, in 8 bits."""
+    from PIL import Image
+
+    low, high = places.min(axis=0), places.max(axis=0)
+    middle, half = (low + high) / 2, 0.56 * max((high - low)[0], (high - low)[1] * WIDTH_PX / HEIGHT_PX)
+    box = (middle[0] - half, middle[1] - half * HEIGHT_PX / WIDTH_PX)
+    box += (middle[0] + half, middle[1] + half * HEIGHT_PX / WIDTH_PX)
+    bright = np.percentile(frames, 99.5)
+    out = []
+    for frame in frames:
+        image = Image.fromarray((255 * np.clip(frame / bright, 0, 1) ** 0.7).astype(np.uint8))
+        inside = image.transform((WIDTH_PX, HEIGHT_PX), Image.Transform.EXTENT, box, Image.Resampling.BICUBIC)
+        out.append(np.asarray(inside))
+    return np.stack(out)
