@@ -24,6 +24,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from characterisation.files.errors import InputError
 from characterisation.scores.rank_agreement import spearman
 
 Floats = NDArray[np.float64]
@@ -81,7 +82,7 @@ def deciles(score: ArrayLike, error: ArrayLike) -> xr.Dataset:
 
     Raises
     ------
-    ValueError
+    InputError
         If there is not one row of errors for each view.
 
     See Also
@@ -90,15 +91,17 @@ def deciles(score: ArrayLike, error: ArrayLike) -> xr.Dataset:
 
     Examples
     --------
+    >>> import characterisation
     >>> import numpy as np
     >>> score = np.arange(20.0)
-    >>> found = deciles(score, 20 - score)
+    >>> found = characterisation.deciles(score, 20 - score)
     >>> found["error"].sel(bin=[1, 10]).values.tolist(), found.attrs["error_correlation"]
     ([19.5, 1.5], -1.0)
     """
     bins, errors = bins_of(score), np.asarray(error, float)
     if bins.ndim != 1 or errors.ndim not in (1, 2) or len(errors) != len(bins):
-        raise ValueError(f"deciles: errors {errors.shape} for scores {bins.shape}, expected (view,) or (view, trial)")
+        allowed = f"({bins.size},) or ({bins.size}, trials), one row for each view"
+        raise InputError("deciles", "error", f"the shape {errors.shape} for scores of {bins.shape}", allowed)
     errors = errors.reshape(len(bins), -1)
     known = np.isfinite(errors)
     count = known.sum(axis=1)

@@ -11,11 +11,10 @@ from characterisation.scores.rank_agreement import spearman
 from characterisation.tasks.task_reading import read_task
 from mitsim.running.numbers import two_digits, unit_symbol
 from mitsim.talk import view_figures as figures
-from mitsim.talk.claims_of_sensors import collected
 from mitsim.talk.judged_views import SCORES, Judged, true_error
 from mitsim.talk.make import trials_name
 from mitsim.talk.results import Results
-from mitsim.talk.slides import Claim, Slide, verdict
+from mitsim.talk.slides import Claim, Slide, collected, mean_of, verdict
 from mitsim.talk.talk_file import ExampleEntry, Talk
 
 #: mean rank correlation of bins from which agreement is very good, and good
@@ -52,8 +51,8 @@ def scoring(talk: Talk, judged: Judged) -> Slide:
     slide.claims.append(
         Claim(
             "Sub divide icosahedron to sample a sphere. Ensure reachability by the tilt table.",
-            f"The three-axis table reaches {reached} of {reached + outside} directions; {scores.attrs['moved_out']} views "
-            f"were moved out, clear of the part. {feature} has {points.min():.0f} to {points.max():.0f} points.",
+            f"The three-axis table reaches {reached} of {reached + outside} directions; {scores.attrs['moved_out']} "
+            f"views were moved out, clear of the part. {feature} has {points.min():.0f} to {points.max():.0f} points.",
             "shown",
         )
     )
@@ -128,12 +127,13 @@ def _example(judged: Judged, one: ExampleEntry) -> Claim:
     ratio = float(values[known[0]] / values[known[-1]]) if len(known) > 1 else math.nan
     best = [values[number] for number in known[-3:]]
     top = max(best) / min(best) if len(best) > 1 else math.nan
+    ends = "" if math.isnan(ratio) else f" ({two_digits(values[known[0]])} to {two_digits(values[known[-1]])} {unit})"
     found = (
-        f"{one.measurement}, {one.sample}: {possible} of {int(views.sum())} views are possible by V_m; {measurable} have "
-        f"a value in at least half of the trials. Trials with a value: {_percent(share[0])} where V_m says impossible, "
-        f"{_percent(_mean_share(cell))} elsewhere. Rank correlation of bins with error {_signed(correlations[0])}, with "
-        f"standard deviation {_signed(correlations[1])}. Worst over best bin: {_ratio(ratio)}"
-        f"{'' if math.isnan(ratio) else f' ({two_digits(values[known[0]])} to {two_digits(values[known[-1]])} {unit})'}. "
+        f"{one.measurement}, {one.sample}: {possible} of {int(views.sum())} views are possible by V_m; {measurable} "
+        f"have a value in at least half of the trials. Trials with a value: {_percent(share[0])} where V_m says "
+        f"impossible, {_percent(_mean_share(cell))} elsewhere. Rank correlation of bins with error "
+        f"{_signed(correlations[0])}, with standard deviation {_signed(correlations[1])}. Worst over best bin: "
+        f"{_ratio(ratio)}{ends}. "
         f"The errors of the best three bins differ by the factor {_ratio(top)}."
     )
     good = [correlation < _GOOD for correlation in correlations if not math.isnan(correlation)]
@@ -142,7 +142,7 @@ def _example(judged: Judged, one: ExampleEntry) -> Claim:
 
 def _mean_share(cell: xr.Dataset) -> float:
     views, share = cell["views"].values[1:], cell["share"].values[1:]
-    return float(np.nansum(views * np.nan_to_num(share)) / views.sum()) if views.sum() else math.nan
+    return float((views * np.nan_to_num(share)).sum() / views.sum()) if views.sum() else math.nan
 
 
 def _percent(share: float) -> str:
@@ -165,9 +165,7 @@ def accuracy(judged: Judged) -> Slide:
     words = "Mean rank of the ten bins for error and standard deviation, by V_m, predicted risk and number of points"
     slide.pictures["accuracy"] = (figures.ranks_figure(judged), words)
     count = len(judged.task.measurements) * len(judged.errors)
-    found = {
-        (kind, quantity): judged.ranks(kind, quantity) for kind in SCORES for quantity in ("error", "deviation")
-    }
+    found = {(kind, quantity): judged.ranks(kind, quantity) for kind in SCORES for quantity in ("error", "deviation")}
 
     def interval(kind: str, quantity: str) -> str:
         about = found[kind, quantity].attrs
@@ -178,20 +176,22 @@ def accuracy(judged: Judged) -> Slide:
     slide.claims.append(
         Claim(
             "Comparison of our predicted bin rank based on the view score and actual bin ranking are very good.",
-            f"Over {count} cells, {len(judged.task.measurements)} measurements of {len(judged.errors)} samples, the mean "
-            "rank correlation of bins with error and with standard deviation is "
-            + "; ".join(f"{name} {interval(kind, 'error')} and {interval(kind, 'deviation')}" for kind, name in SCORES.items())
+            f"Over {count} cells, {len(judged.task.measurements)} measurements of {len(judged.errors)} samples, the "
+            "mean rank correlation of bins with error and with standard deviation is "
+            + "; ".join(
+                f"{name} {interval(kind, 'error')} and {interval(kind, 'deviation')}" for kind, name in SCORES.items()
+            )
             + ".",
             verdict(max(talks) <= _VERY_GOOD, max(talks) <= _GOOD),
         )
     )
     misses = np.abs(found["V_m", "error"]["rank"].values - np.arange(10, 0, -1))
-    bad, good = float(np.nanmean(misses[:_END])), float(np.nanmean(misses[-_END:]))
+    bad, good = mean_of(misses[:_END]), mean_of(misses[-_END:])
     slide.claims.append(
         Claim(
             "Especially good at predicting bad views.",
-            f"The mean rank by error misses the predicted one by {bad:.1f} for the three worst bins, and by {good:.1f} for "
-            f"the three best. Mean ranks from the worst bin to the best: "
+            f"The mean rank by error misses the predicted one by {bad:.1f} for the three worst bins, and by {good:.1f} "
+            f"for the three best. Mean ranks from the worst bin to the best: "
             f"{', '.join(f'{rank:.1f}' for rank in found['V_m', 'error']['rank'].values)}.",
             verdict(bad < good),
         )

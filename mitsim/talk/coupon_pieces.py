@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from characterisation.coupon.patch_table import PATCHES, overall
 from characterisation.coupon.patches import Coupon, measure_patches
-
 from characterisation.files.datasets import read_dataset
 from characterisation.files.documents import read_toml
 from characterisation.files.errors import InputError
@@ -47,18 +46,26 @@ _MOST_PATCHES = 4000
 _LARGEST_DEG = 70.0
 
 
-def campaign_of(
-    folder: str, file: str, sensor: str, distance: float, roughness: float | None, **changes: object
-) -> Campaign:
-    """Return a campaign of one sample of a file, by its Ra (None for matt white), at one distance [mm]."""
-    path = Path(folder) / file
+@dataclass(frozen=True)
+class CouponPlace:
+    """One sample of a campaign file before a sensor: its Ra [um], None for matt white, and its distance [mm]."""
+
+    campaign: str
+    sensor: str
+    distance: float
+    roughness: float | None
+
+
+def campaign_of(folder: str, place: CouponPlace, **changes: object) -> Campaign:
+    """Return the campaign of one sample at one distance."""
+    path, roughness, distance = Path(folder) / place.campaign, place.roughness, place.distance
     content = read_toml(path, CampaignFile)
     entries = [one for one in content.samples if roughness_of(one) == roughness]
     if not entries:
         named = "matt white" if roughness is None else f"Ra {roughness:g}"
         raise InputError(path, "samples", "no such sample", f"one of {named}", "the talk shows it")
     updated = content.model_copy(update={"distances_mm": [distance], "samples": entries, **changes})
-    return plan_campaign(path, updated, sensor_in(folder, sensor))
+    return plan_campaign(path, updated, sensor_in(folder, place.sensor))
 
 
 def roughness_of(entry: SampleEntry) -> float | None:
@@ -72,9 +79,7 @@ def tilted(angle_deg: float) -> Floats:
     return np.array([math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)])
 
 
-def characterised(
-    folder: str, campaign: str, sensor: str, distance: float, Ra: float, subdivisions: int, refined: int, seed: int
-) -> xr.Dataset:
+def characterised(folder: str, place: CouponPlace, subdivisions: int, refined: int, seed: int) -> xr.Dataset:
     """Return the samples of a coupon at one distance and their map: orientations refined where F or sigma changes.
 
     Over ``shot``: the normal ``shot_x`` and ``shot_y`` of each capture, in the order in which they were taken, and its
@@ -82,7 +87,7 @@ def characterised(
     ``patch_y``, F and sigma. Over (b, a): the fields of the map.
     """
     bands = [Band(up_to_deg=20, subdivisions=subdivisions), Band(up_to_deg=80, subdivisions=max(subdivisions - 1, 0))]
-    plan = campaign_of(folder, campaign, sensor, distance, Ra, orientations=bands)
+    plan = campaign_of(folder, place, orientations=bands)
     if plan.file.refine is not None:
         changed = plan.file.refine.model_copy(update={"subdivisions": refined})
         plan = replace(plan, file=plan.file.model_copy(update={"refine": changed}))
@@ -101,7 +106,8 @@ def characterised(
     here = patches.isel(patch=np.sort(chosen))
     planned = len(plan.file.normals())
     normals = np.array([shot.normal for shot in shots])
-    data = xr.Dataset(attrs={"distance_mm": distance, "Ra_um": Ra, "patches": patches.sizes["patch"]})
+    count = patches.sizes["patch"]
+    data = xr.Dataset(attrs={"distance_mm": place.distance, "Ra_um": place.roughness, "patches": count})
     data["shot_x"], data["shot_y"] = ("shot", normals[:, 0]), ("shot", normals[:, 1])
     data["level"] = ("shot", (np.arange(len(shots)) >= planned).astype(np.int8))
     for name, column in (
@@ -117,15 +123,18 @@ def characterised(
     return data.assign_coords(a=("a", whole["a"].values), b=("b", whole["b"].values))
 
 
-def tilts(folder: str, campaign: str, sensor: str, distance: float, Ra: float, angles: tuple[float, ...]) -> xr.Dataset:
+def tilts(folder: str, place: CouponPlace, angles: tuple[float, ...]) -> xr.Dataset:
     """Return F by three definitions, sigma along V and along N, and the sizes of patches, over the tilt.
 
     The coupon and a matt-white one stand at the same pose; the second is the reference of ``fraction_reference``.
-    ``fraction_density`` is the talk's rho. ``along_ray`` and ``along_normal`` [mm] are of matt white, so that the finish
-    does not change with the tilt, and ``metal_along_ray`` is of the coupon.
+    ``fraction_density`` is the talk's rho. ``along_ray`` and ``along_normal`` [mm] are of matt white, whose finish
+    looks the same at every tilt, and ``metal_along_ray`` is of the coupon.
     """
-    prepared = prepared_sensor(sensor_in(folder, sensor))
-    plans = {name: campaign_of(folder, campaign, sensor, distance, rough) for name, rough in (("metal", Ra), ("white", None))}
+    prepared = prepared_sensor(sensor_in(folder, place.sensor))
+    plans = {
+        "metal": campaign_of(folder, place),
+        "white": campaign_of(folder, replace(place, roughness=None)),
+    }
     rows: list[dict[str, float]] = []
     for angle in angles:
         clouds = {name: _taken(prepared, plan, tilted(angle)) for name, plan in plans.items()}
@@ -155,10 +164,10 @@ def tilts(folder: str, campaign: str, sensor: str, distance: float, Ra: float, a
     return xr.Dataset(columns, {"tilt": ("tilt", np.array(angles, float), {"units": "deg"})})
 
 
-def sub_clouds(folder: str, campaign: str, sensor: str, distance: float, Ra: float, angle: float) -> xr.Dataset:
+def sub_clouds(folder: str, place: CouponPlace, angle: float) -> xr.Dataset:
     """Return the cloud of a tilted coupon with its patches: status (row, column), and the ellipses (patch,)."""
-    prepared = prepared_sensor(sensor_in(folder, sensor))
-    plan = campaign_of(folder, campaign, sensor, distance, Ra)
+    prepared = prepared_sensor(sensor_in(folder, place.sensor))
+    plan = campaign_of(folder, place)
     cloud, coupon = _taken(prepared, plan, tilted(angle))
     patches = measure_patches(cloud, coupon)
     window, corner = _window(cloud, coupon)
@@ -167,20 +176,18 @@ def sub_clouds(folder: str, campaign: str, sensor: str, distance: float, Ra: flo
     depth = np.where(cloud.valid, cloud.points[..., 2], np.nan)[window]
     data["depth"] = (("y", "x"), depth.astype(np.float32), {"units": "mm"})
     data["status"] = (("y", "x"), cloud.status[window])
-    return data.assign_attrs(tilt_deg=angle, distance_mm=distance)
+    return data.assign_attrs(tilt_deg=angle, distance_mm=place.distance)
 
 
-def hold_out(
-    folder: str, campaign: str, sensor: str, map_name: str, distance: float, Ra: float | None, count: int, seed: int
-) -> xr.Dataset:
+def hold_out(folder: str, place: CouponPlace, map_name: str, count: int, seed: int) -> xr.Dataset:
     """Return F and sigma of one sample at one distance, captured and predicted, over poses no map was made from.
 
     Over ``pose``: ``incidence`` [rad], and ``fraction`` and ``sigma`` [mm] as ``..._measured`` and ``..._predicted``.
     The other variables are those of :func:`characterisation.maps.validation.residual_table`, of this one row.
     """
-    prepared, plan = PreparedSensor(sensor_in(folder, sensor)), campaign_of(folder, campaign, sensor, distance, Ra)
+    prepared, plan = prepared_sensor(sensor_in(folder, place.sensor)), campaign_of(folder, place)
     series = replace(plan.series[0], seed=plan.series[0].seed ^ (seed + 1))
-    rng = np.random.default_rng([seed, round(distance), 0 if Ra is None else round(1000 * Ra)])
+    rng = np.random.default_rng([seed, round(place.distance), round(1000 * (place.roughness or 0.0))])
     normals = random_normals(count, min(_LARGEST_DEG, plan.file.largest_deg), rng)
     performance_map = map_in(folder, map_name)
     take = simulated_source(prepared.simulated, plan.file.samples_per_pixel)
@@ -194,21 +201,19 @@ def hold_out(
     return data
 
 
-def clouds_of_coupon(
-    folder: str, campaign: str, sensor: str, map_name: str, distance: float, Ra: float, angle: float, seed: int
-) -> xr.Dataset:
+def clouds_of_coupon(folder: str, place: CouponPlace, map_name: str, angle: float, seed: int) -> xr.Dataset:
     """Return the captured cloud of a large coupon and one drawn from the map, as residuals along V from the true plane.
 
     ``captured`` and ``drawn`` (row, column) [mm] are NaN without a point.
     """
-    prepared = prepared_sensor(sensor_in(folder, sensor))
-    plan = campaign_of(folder, campaign, sensor, distance, Ra, coupon_px=5000.0)  # as large as the field of view
+    prepared = prepared_sensor(sensor_in(folder, place.sensor))
+    plan = campaign_of(folder, place, coupon_px=5000.0)  # as large as the field of view
     cloud, coupon = _taken(prepared, plan, tilted(angle))
     scene, pose = plan.series[0].sample.scene, plan.shot(plan.series[0], tilted(angle)).sensor_from_coupon
     known = CharacterisedScene(scene, map_in(folder, map_name))
     drawn = prepared.predictor.predict(known, pose.inverse(), np.random.default_rng(seed), correlated=True)
     window, _ = _window(cloud, coupon)
-    data = xr.Dataset(attrs={"distance_mm": distance, "Ra_um": Ra, "tilt_deg": angle})
+    data = xr.Dataset(attrs={"distance_mm": place.distance, "Ra_um": place.roughness, "tilt_deg": angle})
     for name, one in (("captured", cloud), ("drawn", drawn)):
         rays = one.grid.rays()
         reach = ((coupon.centre - one.grid.origin) @ coupon.normal) / (rays @ coupon.normal)

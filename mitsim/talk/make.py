@@ -100,7 +100,9 @@ def make(
     for piece in pieces:
         results.digests[piece.name] = piece.digest(talk.folder)
     missing = [piece for piece in pieces if results.get(piece.name) is None]
+    shown = [one.sample for one in talk.file.examples]
     wanted = [sample for sample in talk.file.samples if sample.key not in measured]
+    wanted.sort(key=lambda sample: sample.name not in shown)  # those of the examples first
     samples = [_unfinished(talk, results, sample, folder) for sample in wanted]
     unfinished = [one for one in samples if one is not None]
     place = str(talk.folder)

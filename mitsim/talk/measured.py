@@ -89,9 +89,7 @@ def _errors(talk: Talk, sample: SampleEntry, place: Path) -> dict[str, float]:
     settings, imager = decoder_settings(capture, talk.sensor)
     cloud = capture_cloud(capture, settings, imager=imager)
     assert capture.world_from_sensor is not None  # as _shown has checked
-    results = measure_task(
-        cloud, study.task, study.scene, capture.world_from_sensor, margin_px=margin_of(settings)
-    )
+    results = measure_task(cloud, study.task, study.scene, capture.world_from_sensor, margin_px=margin_of(settings))
     return {name: float(one.error) for name, one in zip(study.task.measurements, results, strict=True)}
 
 

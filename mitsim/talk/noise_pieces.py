@@ -42,13 +42,15 @@ class TwoNormals:
     def density(self, values: Floats) -> Floats:
         """Return the density [1/mm] at values [mm]."""
         return np.asarray(
-            (1 - self.share) * stats.norm.pdf(values, 0, self.narrow) + self.share * stats.norm.pdf(values, 0, self.wide)
+            (1 - self.share) * stats.norm.pdf(values, 0, self.narrow)
+            + self.share * stats.norm.pdf(values, 0, self.wide)
         )
 
     def distribution(self, values: Floats) -> Floats:
         """Return the distribution function at values [mm]."""
         return np.asarray(
-            (1 - self.share) * stats.norm.cdf(values, 0, self.narrow) + self.share * stats.norm.cdf(values, 0, self.wide)
+            (1 - self.share) * stats.norm.cdf(values, 0, self.narrow)
+            + self.share * stats.norm.cdf(values, 0, self.wide)
         )
 
 
@@ -99,8 +101,7 @@ def described(found: Residuals) -> xr.Dataset:
         for model in (stats.norm.cdf(ordered, 0, sigma), two.distribution(ordered))
     ]
     likelihoods = [
-        float(np.log(np.maximum(one, 1e-300)).mean())
-        for one in (stats.norm.pdf(values, 0, sigma), two.density(values))
+        float(np.log(np.maximum(one, 1e-300)).mean()) for one in (stats.norm.pdf(values, 0, sigma), two.density(values))
     ]
     gain = 2 * found.independent * (likelihoods[1] - likelihoods[0]) - 2 * math.log(max(found.independent, 1))
     rows, columns = np.nonzero(np.isfinite(found.image))

@@ -8,11 +8,11 @@ import numpy as np
 import xarray as xr
 
 from mitsim.capture.simulated.rendering import Rendering
-from mitsim.scene.load import load_scene
-from mitsim.sensor.poses import look_at
-from mitsim.study.scene_geometry import hull_corners
-from mitsim.talk.talk_file import sensor_in
 from mitsim.maps.campaign.orders import prepared_sensor
+from mitsim.scene.load import load_scene
+from mitsim.scene.ray_casting.triangles import hull_corners
+from mitsim.sensor.poses import look_at
+from mitsim.talk.talk_file import sensor_in
 
 #: size of a frame [px], and the largest number of frames
 WIDTH_PX, HEIGHT_PX, MOST_FRAMES = 280, 210, 8

@@ -20,7 +20,7 @@ from characterisation.files.atomic_io import write_text
 from mitsim.report.style import write_png
 from mitsim.report.templates import write_page
 from mitsim.running.numbers import listed
-from mitsim.talk import claims_of_sensors, claims_of_views
+from mitsim.talk import claims_of_coupons, claims_of_sensors, claims_of_views
 from mitsim.talk.results import Results
 from mitsim.talk.sensor_figures import opening_figure
 from mitsim.talk.slides import Slide, Verdict
@@ -64,7 +64,7 @@ def slides_of(talk: Talk, results: Results, measured: dict[str, xr.Dataset]) -> 
     judged = claims_of_views.judged_of(talk, results, measured, lacking)
     accuracy = claims_of_views.accuracy(judged)
     accuracy.missing.extend(lacking.missing)
-    collection, processing, regions = claims_of_sensors.coupons(talk, results)
+    collection, processing, regions = claims_of_coupons.coupons(talk, results)
     return [
         claims_of_sensors.surfaces(talk, results),
         collection,
@@ -72,7 +72,7 @@ def slides_of(talk: Talk, results: Results, measured: dict[str, xr.Dataset]) -> 
         claims_of_sensors.noise(talk, results),
         regions,
         claims_of_sensors.performance_maps(talk),
-        claims_of_sensors.validation(talk, results),
+        claims_of_coupons.validation(talk, results),
         claims_of_views.scoring(talk, judged),
         claims_of_views.view_score(talk, judged),
         claims_of_views.examples(talk, judged),
@@ -139,11 +139,11 @@ def write_talk(
 
 def _intro(talk: Talk, measured: dict[str, xr.Dataset]) -> list[str]:
     lines = [
-        "Every figure of the talk “Task Specific Viewpoint Optimisation” (Kinnell and Justham, Hamburg 2018), made again "
-        "by simulation, beside the claim of its slide. Quotations are the talk’s own words.",
+        "Every figure of the talk “Task Specific Viewpoint Optimisation” (Kinnell and Justham, Hamburg 2018), made "
+        "again by simulation, beside the claim of its slide. Quotations are the talk’s own words.",
         f"Views are those of {talk.sensor.name} before the talk’s artefact. The true error of a view is that of "
-        f"{talk.file.trials} virtual measurements: calibration, finish, light, temperature, pose and noise are drawn anew "
-        "for each, then the images are rendered, decoded and measured.",
+        f"{talk.file.trials} virtual measurements: calibration, finish, light, temperature, pose and noise are drawn "
+        "anew for each, then the images are rendered, decoded and measured.",
     ]
     if measured:
         lines.append(f"The errors of {listed(sorted(measured))} are those of real captures.")
@@ -170,7 +170,10 @@ def _markdown(
     missing: Sequence[str],
 ) -> str:
     lines = [f"# {TITLE}", "", *(line for part in intro for line in (part, ""))]
-    lines += [f"`{_COMMAND}` draws this page from the kept results in a minute; without `--kept` it makes missing ones.", ""]
+    lines += [
+        f"`{_COMMAND}` draws this page from the kept results in a minute; without `--kept` it makes missing ones.",
+        "",
+    ]
     if missing:
         lines += [f"Not made yet: {_missing(missing)}.", ""]
     made = [f"<!-- made by: {_COMMAND}; takes 60 s -->", "<!-- made by: as above -->"]

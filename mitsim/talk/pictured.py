@@ -14,9 +14,8 @@ import xarray as xr
 from characterisation.point_cloud import Status
 from mitsim.maps.prediction import performance
 from mitsim.study import StudyFile, open_study
-from mitsim.study.session import Session
-from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.plan import rendering_of
+from mitsim.study.virtual.rendered import RenderedMeasurements
 from mitsim.study.virtual.study_unknowns import study_unknowns
 from mitsim.views import View
 
@@ -75,7 +74,7 @@ def _counts(renderer: RenderedMeasurements, shapes, view: View, valid, performan
     rows = []
     for name in shapes:
         here = seen & (label == scene.names.index(name))
-        expected = np.nan if fraction is None else float(np.nansum(fraction[here]))
+        expected = np.nan if fraction is None else float(np.nan_to_num(fraction[here]).sum())
         rows.append((int(here.sum()), int(valid.ravel()[ideal.pixel[here]].sum()), expected))
     possible, points, expected = np.array(rows).T
     return xr.Dataset(

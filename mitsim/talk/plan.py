@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from mitsim.maps.campaign.plan import CampaignFile, sensor_checksum
 from mitsim.scene import backend
 from mitsim.scene.xml_check import named_digests
 from mitsim.talk import coupon_pieces, noise_pieces, opening_pieces, pictured, view_pieces
+from mitsim.talk.coupon_pieces import CouponPlace
 from mitsim.talk.results import VERSION
 from mitsim.talk.talk_file import SampleEntry, Talk, sensor_in
 
@@ -69,7 +70,7 @@ class Piece:
         content = {
             "version": VERSION,
             "function": self.function,
-            "arguments": [one.model_dump(mode="json") if isinstance(one, BaseModel) else one for one in self.arguments],
+            "arguments": [_as_plain(one) for one in self.arguments],
             "sensors": [sensor_checksum(sensor_in(folder, name)) for name in self.sensors],
             "scenes": [_scene_digest(folder / path, parameters) for path, parameters in self.scenes],
             "files": [_file_digest(folder / name) for name in self.files],
@@ -98,21 +99,21 @@ def pieces_of(talk: Talk) -> list[Piece]:
         Piece(f"finish_{one.key}", "finish", (talk.study_file(one), number), sensor, (_scene(one),))
         for one in file.finishes
     ]
-    place = (coupons.campaign, file.sensor, coupons.distance_mm, coupons.Ra)
+    place = CouponPlace(coupons.campaign, file.sensor, coupons.distance_mm, coupons.roughness_um)
     campaign = read_toml(talk.folder / coupons.campaign, CampaignFile)
-    beside = str(Path(coupons.campaign).parent)
-    of_coupons = tuple((f"{beside}/{one.scene}", ()) for one in campaign.samples)
+    of_coupons = tuple((str(Path(coupons.campaign).parent / one.scene), ()) for one in campaign.samples)
     refined = (coupons.subdivisions, coupons.refined, file.seed)
-    pieces.append(Piece("characterised", "characterised", (*place, *refined), sensor, of_coupons))
-    pieces.append(Piece("tilts", "tilts", (*place, tuple(coupons.tilts_deg)), sensor, of_coupons))
-    pieces.append(Piece("sub_clouds", "sub_clouds", (*place, _SUB_CLOUDS_TILT_DEG), sensor, of_coupons))
+    pieces.append(Piece("characterised", "characterised", (place, *refined), sensor, of_coupons))
+    pieces.append(Piece("tilts", "tilts", (place, tuple(coupons.tilts_deg)), sensor, of_coupons))
+    pieces.append(Piece("sub_clouds", "sub_clouds", (place, _SUB_CLOUDS_TILT_DEG), sensor, of_coupons))
     pieces += [Piece(f"noise_{_key(name)}", "noise", (name, file.seed), (name,)) for name in file.noise_sensors]
-    shown = (coupons.campaign, file.sensor, known, coupons.shown_distance_mm, coupons.shown_Ra)
-    pieces.append(Piece("clouds", "clouds", (*shown, _CLOUDS_TILT_DEG, file.seed), sensor, of_coupons, known))
+    shown = CouponPlace(coupons.campaign, file.sensor, coupons.shown_distance_mm, coupons.shown_roughness_um)
+    pieces.append(Piece("clouds", "clouds", (shown, known, _CLOUDS_TILT_DEG, file.seed), sensor, of_coupons, known))
     for sample in campaign.samples:
         rough = coupon_pieces.roughness_of(sample)
         for distance in coupons.validated_distances_mm:
-            arguments = (coupons.campaign, file.sensor, known, distance, rough, coupons.poses, file.seed)
+            there = CouponPlace(coupons.campaign, file.sensor, distance, rough)
+            arguments = (there, known, coupons.poses, file.seed)
             pieces.append(Piece(validation_name(rough, distance), "validation", arguments, sensor, of_coupons, known))
     for one in file.samples:
         study = (talk.study_file(one),)
@@ -141,6 +142,12 @@ def compared_views(talk: Talk) -> tuple[int, ...]:
     """Return the numbers of views, evenly chosen from all candidates, for the comparison of light."""
     numbers = [view.number for view in talk.views]
     return tuple(numbers[:: max(1, -(-len(numbers) // _COMPARED_VIEWS))])
+
+
+def _as_plain(argument: Any) -> Any:
+    if isinstance(argument, BaseModel):
+        return argument.model_dump(mode="json")
+    return asdict(argument) if is_dataclass(argument) and not isinstance(argument, type) else argument
 
 
 def _scene(one: SampleEntry) -> tuple[str, tuple[tuple[str, str], ...]]:

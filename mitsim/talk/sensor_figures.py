@@ -31,7 +31,6 @@ Floats = NDArray[np.float64]
 _GRADIENT = 2.5
 
 
-
 def _bare(axes: Axes) -> None:
     axes.set(xticks=[], yticks=[])
 
@@ -40,7 +39,9 @@ def opening_figure(frames: Mapping[str, xr.Dataset]) -> Figure:
     """Draw the rendered frames of each sensor in a strip."""
     with drawing():
         most = max(one.sizes["frame"] for one in frames.values())
-        figure = Figure((1.75 * min(most, 4) * 2, 1.62 * sum(-(-one.sizes["frame"] // 8) or 1 for one in frames.values())))
+        figure = Figure(
+            (1.75 * min(most, 4) * 2, 1.62 * sum(-(-one.sizes["frame"] // 8) or 1 for one in frames.values()))
+        )
         rows = list(frames.items())
         grid = np.asarray(figure.subplots(len(rows), most, squeeze=False))
         for row, (name, one) in zip(grid, rows, strict=True):
@@ -201,7 +202,9 @@ def results_figure(found: xr.Dataset, blinding: tuple[float, float]) -> Figure:
         for axes in panels:
             _gradient_axes(axes, blinding if axes is not panels[2] else None)
         at = {"color": VERMILION, "fontsize": 8, "ha": "center"}
-        panels[1].annotate("self-blinding", blinding, (0.9, 1.6), arrowprops={"arrowstyle": "->", "color": VERMILION}, **at)
+        panels[1].annotate(
+            "self-blinding", blinding, (0.9, 1.6), arrowprops={"arrowstyle": "->", "color": VERMILION}, **at
+        )
         panels[1].text(0, -2.28, "adverse scattering", **at)
     return figure
 
@@ -258,7 +261,9 @@ def validation_figure(clouds: xr.Dataset, cells: Sequence[tuple[str, float, xr.D
             order = np.argsort(one["incidence"].values)
             incidence = np.degrees(one["incidence"].values[order])
             for key, name, label in (("F", "fraction", "F [1]"), ("sigma", "sigma", "σ [mm]")):
-                axes[key].plot(incidence, one[f"{name}_measured"].values[order], "o-", ms=4, color=BLUE, label="captured")
+                axes[key].plot(
+                    incidence, one[f"{name}_measured"].values[order], "o-", ms=4, color=BLUE, label="captured"
+                )
                 axes[key].plot(
                     incidence, one[f"{name}_predicted"].values[order], "x--", color=VERMILION, label="from the map"
                 )
@@ -291,7 +296,9 @@ def light_figure(found: Mapping[str, tuple[xr.Dataset, xr.Dataset]]) -> Figure:
         figure = Figure((2.1 * len(found) + 0.5, 2.5), layout="constrained")
         row = np.asarray(figure.subplots(1, len(found), squeeze=False, sharey=True))[0]
         for axes, (name, pair) in zip(row, found.items(), strict=True):
-            for one, mark, colour, words in zip(pair, "ox", (MUTED, VERMILION), ("direct light", "all light"), strict=True):
+            for one, mark, colour, words in zip(
+                pair, "ox", (MUTED, VERMILION), ("direct light", "all light"), strict=True
+            ):
                 expected, captured = fractions(one)
                 axes.plot(expected, captured, mark, ms=4.5, color=colour, label=words)
             axes.plot([0, 1], [0, 1], color=INK, lw=0.6)
@@ -307,5 +314,3 @@ def fractions(one: xr.Dataset) -> tuple[Floats, Floats]:
     enough = one["possible"].values >= 100
     possible = one["possible"].values[enough]
     return one["expected"].values[enough] / possible, one["points"].values[enough] / possible
-
-

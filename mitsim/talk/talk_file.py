@@ -19,6 +19,7 @@ from mitsim.study.tables import MeasureTable, ScoreTable
 from mitsim.views import View, ViewsTable
 
 Number = Annotated[float, Field(gt=0, le=1e5)]
+Tilt = Annotated[float, Field(ge=0, le=80)]
 
 
 class SampleEntry(Document):
@@ -50,20 +51,20 @@ class ExampleEntry(Document):
 class CouponsTable(Document):
     """Coupons: their campaign file, the one of slides 2, 3 and 5, and the poses of the validation.
 
-    ``Ra`` and ``distance_mm`` choose the coupon whose samples are drawn; ``subdivisions`` are those of its orientations
-    within 20 deg, one more than outside. The validation has ``poses`` of every sample at each of
-    ``validated_distances_mm``, and ``shown_poses`` of the shown one.
+    ``roughness_um`` (Ra) and ``distance_mm`` choose the coupon whose samples are drawn. ``subdivisions`` are those of
+    its orientations within 20 deg, one less outside; ``refined`` bounds the added ones. The validation has ``poses`` of
+    every sample at each of ``validated_distances_mm``; the clouds of the ``shown_`` coupon are compared.
     """
 
     campaign: str = "../coupon/maps.toml"
-    Ra: Number = 0.37
+    roughness_um: Number = 0.37
     distance_mm: Number = 600.0
     subdivisions: int = Field(default=3, ge=1, le=4)
     refined: int = Field(default=4, ge=1, le=5)
-    tilts_deg: Annotated[list[Annotated[float, Field(ge=0, le=80)]], Field(min_length=1)] = [0, 10, 20, 30, 40, 50, 60, 70]
-    validated_distances_mm: Annotated[list[Number], Field(min_length=1)] = [450, 600, 750]
+    tilts_deg: list[Tilt] = Field(default=[0, 10, 20, 30, 40, 50, 60, 70], min_length=1)
+    validated_distances_mm: list[Number] = Field(default=[450, 600, 750], min_length=1)
     poses: int = Field(default=8, ge=1, le=1000)
-    shown_Ra: Number = 0.09
+    shown_roughness_um: Number = 0.09
     shown_distance_mm: Number = 600.0
 
 

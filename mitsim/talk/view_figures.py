@@ -48,7 +48,9 @@ def sphere(axes: Axes, scores: xr.Dataset, values: Floats, title: str, label: st
             norm, colours = LogNorm(low, max(high, 1.05 * low)), f"{SEQUENTIAL}_r"
         else:
             norm, colours = Normalize(0 if low >= 0 else low, max(high, 1e-9)), SEQUENTIAL
-        shown = axes.scatter(*places[known].T, c=values[known], s=size, norm=norm, cmap=colours, lw=0.3, ec=MUTED, zorder=4)
+        shown = axes.scatter(
+            *places[known].T, c=values[known], s=size, norm=norm, cmap=colours, lw=0.3, ec=MUTED, zorder=4
+        )
         bar = colour_scale(
             axes.figure, shown, axes, label, extend="max" if error else "neither", location="bottom", shrink=0.8
         )
@@ -93,7 +95,9 @@ def example_figure(judged: Judged, sample: str, measurement: str) -> Figure:
     with drawing():
         figure = Figure((11.2, 3.5), layout="constrained")
         panels = figure.subplots(1, 4, width_ratios=(1, 1, 0.95, 0.95))
-        for axes, name, label in zip(panels, ("error", "deviation"), ("mean |error|", "standard deviation"), strict=False):
+        for axes, name, label in zip(
+            panels, ("error", "deviation"), ("mean |error|", "standard deviation"), strict=False
+        ):
             bars(axes, cell, name)
             axes.set_ylabel(f"{label} [{unit}]")
         score = judged.score(sample, measurement, "V_m")
@@ -113,9 +117,9 @@ def bars(axes: Axes, cell: xr.Dataset, name: str) -> None:
     ends = known & np.isfinite(low)
     spread = np.abs(np.stack([values - low, high - values])[:, ends])
     axes.errorbar(cell["bin"].values[ends], values[ends], spread, fmt="none", ecolor=INK, elinewidth=0.8, capsize=1.8)
-    top = 1.15 * float(np.nanmax(values)) if known.any() else 1.0
+    top = 1.15 * float(values[known].max()) if known.any() else 1.0
     if known.any():
-        axes.set_ylim(0, min(max(top, float(np.nanmax(np.where(ends, high, 0)) * 1.03)), 2.2 * top))
+        axes.set_ylim(0, min(max(top, 1.03 * float(np.where(ends, high, 0).max())), 2.2 * top))
     empty = (cell["views"].values > 0) & ~known
     axes.plot(cell["bin"].values[empty], np.full(empty.sum(), 0.03 * axes.get_ylim()[1]), "x", color=VERMILION, ms=6)
     axes.set_xticks(range(11), ["im-\nposs.", *map(str, range(1, 11))])
@@ -138,8 +142,12 @@ def ranks_figure(judged: Judged) -> Figure:
                 correlation = found.attrs["correlation"]
                 label = name if math.isnan(correlation) else f"{name}: correlation {correlation:+.2f}".replace("-", "−")
                 colour = (BLUE, VERMILION, "#009e73")[number]
-                axes.errorbar(place, rank, spread, fmt="osD"[number] + "-", ms=4, lw=0.9, capsize=2, color=colour, label=label)
-            axes.set(xlabel="decile of the score, 10 is best", title=f"by {words}", xticks=range(1, 11), ylim=(0.5, 10.5))
+                axes.errorbar(
+                    place, rank, spread, fmt="osD"[number] + "-", ms=4, lw=0.9, capsize=2, color=colour, label=label
+                )
+            axes.set(
+                xlabel="decile of the score, 10 is best", title=f"by {words}", xticks=range(1, 11), ylim=(0.5, 10.5)
+            )
             axes.legend(fontsize=7.5)
         panels[0].set_ylabel("mean rank of the bin, 1 is best")
     return figure

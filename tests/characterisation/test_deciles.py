@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from characterisation.files.errors import InputError
 from characterisation.scores.deciles import bin_ranks, bins_of, deciles, mean_interval, mean_ranks
 
 
@@ -110,5 +111,5 @@ def test_a_score_without_information_has_ranks_near_the_middle() -> None:
 
 
 def test_errors_of_another_number_of_views_are_rejected() -> None:
-    with pytest.raises(ValueError, match="deciles: errors"):
+    with pytest.raises(InputError, match=r"the shape \(1,\) for scores of \(2,\)"):
         deciles([1.0, 2.0], [1.0])

@@ -55,7 +55,7 @@ refined = 1
 tilts_deg = [0, 40]
 validated_distances_mm = [600]
 poses = 2
-shown_Ra = 0.37
+shown_roughness_um = 0.37
 [views]
 subdivisions = 1
 lowest_elevation_deg = 0
@@ -108,7 +108,7 @@ def test_the_page_has_every_slide_with_its_claims_and_pictures(made: tuple[Path,
     for name in pictures:
         with Image.open(output / name) as picture:
             assert np.ptp(np.asarray(picture.convert("L"))) > 100
-    assert "src=\"http" not in page
+    assert 'src="http' not in page
     assert "nan" not in re.sub(r"data:[^\"]*", "", page).lower().replace("nanstr", "")
 
 
