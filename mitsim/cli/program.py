@@ -94,7 +94,7 @@ for command in (
     app.command(name=command.__name__.rstrip("_"))(command)
 for name, group in {
     "study": command_group(
-        "Take single steps of a study: predict, compare sensors, state one view, plan its exposures; make the talk again.",
+        "Take single steps of a study: predict, compare sensors, state a view, plan exposures; make the talk again.",
         studies.score,
         studies.choose,
         studies.state,

@@ -57,11 +57,11 @@ def coupons(talk: Talk, results: Results) -> list[Slide]:
         picture = figures.collection_figure(poses, found["sub_clouds"], tilts, (blinding[0], blinding[1]))
         words = "Poses in gradient space, a cloud cut into sub-clouds, and the projected area of these over the tilt"
         collection.pictures["collection"] = (picture, words)
-        collection.claims += [_density(poses, normal), _area(tilts)]
+        collection.claims.extend([_density(poses, normal), _area(tilts)])
     if "tilts" in found:
         words = "F by three definitions, and sigma along V and along N, over the tilt"
         processing.pictures["processing"] = (figures.processing_figure(found["tilts"]), words)
-        processing.claims += _processing(found["tilts"])
+        processing.claims.extend(_processing(found["tilts"]))
     else:
         processing.missing.append("tilts")
     if "characterised" in found:

@@ -75,22 +75,24 @@ def noise(talk: Talk, results: Results) -> Slide:
     two = [name for name, one in found.items() if one.attrs["two"]]
     kurtosis = ", ".join(f"{name} {one.attrs['kurtosis']:+.2f}".replace("-0", "−0") for name, one in found.items())
     worst = max(apart.values())
-    slide.claims += [
-        Claim(
-            "They are predominantly gaussian.",
-            f"Excess kurtosis: {kurtosis}. The distributions differ from the normal one by at most {worst:.3f}.",
-            verdict(worst < _GAUSSIAN, sorted(apart.values())[len(apart) // 2] < _GAUSSIAN),
-        ),
-        Claim(
-            "Some fringe projection sensors can be sums of gaussians.",
-            f"A sum of two normals is needed for {listed(two) if two else 'none of them'}.",
-            verdict(bool(two)),
-            ""
-            if two
-            else "The simulated fringes are sinusoidal and their imagers linear; a real projector's gamma and "
-            "vibration, which this preset does not have, make periodic errors.",
-        ),
-    ]
+    slide.claims.extend(
+        [
+            Claim(
+                "They are predominantly gaussian.",
+                f"Excess kurtosis: {kurtosis}. The distributions differ from the normal one by at most {worst:.3f}.",
+                verdict(worst < _GAUSSIAN, sorted(apart.values())[len(apart) // 2] < _GAUSSIAN),
+            ),
+            Claim(
+                "Some fringe projection sensors can be sums of gaussians.",
+                f"A sum of two normals is needed for {listed(two) if two else 'none of them'}.",
+                verdict(bool(two)),
+                ""
+                if two
+                else "The simulated fringes are sinusoidal and their imagers linear; a real projector's gamma and "
+                "vibration, which this preset does not have, make periodic errors.",
+            ),
+        ]
+    )
     return slide
 
 
@@ -109,22 +111,24 @@ def performance_maps(talk: Talk) -> Slide:
     ratio = median_of(sigma[0, -1] / sigma[0, 0])
     names = [finish_name(*known.samples[number]).split(", ")[-1] for number in order]
     falls, grows = bool((np.diff(usable) <= 0.02).all()), bool((np.diff(noise_of) >= -0.02 * noise_of[:-1]).all())
-    slide.claims += [
-        Claim(
-            "We can see the drastic influence of distance, surface texture and surface orientation.",
-            f"On matt white σ grows {ratio:.1f} times from {near:g} to {far:g} mm. Of all orientations, F is at least "
-            f"{_USABLE:g} for {', '.join(f'{100 * u:.0f} % ({n})' for n, u in zip(names, usable, strict=True))}.",
-            verdict(ratio > 1.5 and usable.max() - usable.min() > 0.1),
-        ),
-        Claim(
-            "More shininess and lower roughness both reduce usable surface normals and increases noise.",
-            f"Median σ where F is at least {_USABLE:g}, at {near:g} mm: "
-            f"{', '.join(f'{s:.3f} mm ({n})' for n, s in zip(names, noise_of, strict=True))}.",
-            verdict(falls and grows, usable[-1] < usable[0] or noise_of[-1] > noise_of[0]),
-            ""
-            if falls and grows
-            else "Where a shiny surface returns points at all, its lobe returns much light, and its points are then "
-            "no noisier; the loss of orientations is the larger effect.",
-        ),
-    ]
+    slide.claims.extend(
+        [
+            Claim(
+                "We can see the drastic influence of distance, surface texture and surface orientation.",
+                f"On matt white σ grows {ratio:.1f} times from {near:g} to {far:g} mm. F is at least {_USABLE:g} for "
+                f"{', '.join(f'{100 * u:.0f} % ({n})' for n, u in zip(names, usable, strict=True))} of orientations.",
+                verdict(ratio > 1.5 and usable.max() - usable.min() > 0.1),
+            ),
+            Claim(
+                "More shininess and lower roughness both reduce usable surface normals and increases noise.",
+                f"Median σ where F is at least {_USABLE:g}, at {near:g} mm: "
+                f"{', '.join(f'{s:.3f} mm ({n})' for n, s in zip(names, noise_of, strict=True))}.",
+                verdict(falls and grows, usable[-1] < usable[0] or noise_of[-1] > noise_of[0]),
+                ""
+                if falls and grows
+                else "Where a shiny surface returns points, its lobe returns much light, and they are no noisier. "
+                "The loss of orientations is the larger effect.",
+            ),
+        ]
+    )
     return slide
