@@ -12,7 +12,7 @@ from mitsim.running.numbers import finish_name, listed
 from mitsim.talk import sensor_figures as figures
 from mitsim.talk.results import Results
 from mitsim.talk.slides import Claim, Slide, collected, largest_of, mean_of, median_of, verdict
-from mitsim.talk.talk_file import Talk, map_in
+from mitsim.talk.talk_file import Talk, map_in, sensor_key
 
 #: F from which a surface counts as usable
 _USABLE = 0.5
@@ -37,36 +37,35 @@ def surfaces(talk: Talk, results: Results) -> Slide:
     }
     spread = largest_of([largest_of(values) + largest_of(-values) for values in by_feature.values()])
     known = map_in(talk.folder, talk.map_name)
-    near, far = (_fraction_at(known, distance) for distance in (known.data["distance"].values[[0, -1]]))
+    ends = known.data["distance"].values[[0, -1]]
+    near, far = (_noise_at(known, distance) for distance in ends)
     values = list(shares.values())
     slide.claims.append(
         Claim(
             "Surface finish, position and orientation affect measurement quality.",
             f"Share of points: {', '.join(f'{name} {100 * value:.0f} %' for name, value in shares.items())}. "
-            f"Features of one finish, which face other ways, differ by up to {100 * spread:.0f} %. Ground aluminium at "
-            f"25° has F {near:.2f} at the near and {far:.2f} at the far end of the range.",
-            verdict(
-                max(values) - min(values) > 0.1 and spread > 0.1 and abs(near - far) > 0.05, max(values) > min(values)
-            ),
+            f"Features of one finish, which face other ways, differ by up to {100 * spread:.0f} %. From "
+            f"{ends[0]:g} to {ends[1]:g} mm the σ of ground aluminium grows from {near:.2f} to {far:.2f} mm.",
+            verdict(max(values) - min(values) > 0.1 and spread > 0.1 and far > 1.2 * near, max(values) > min(values)),
         )
     )
     return slide
 
 
-def _fraction_at(known: PerformanceMap, distance: float) -> float:
-    """Return the mean F of the roughest metal of a map at 25 deg, over all azimuths."""
+def _noise_at(known: PerformanceMap, distance: float) -> float:
+    """Return the mean sigma [mm] of the roughest metal of a map at 25 deg, over all azimuths."""
     turn = np.linspace(0, 2 * math.pi, 73)[:-1]
     normals = np.stack(
         [math.sin(0.436) * np.cos(turn), math.sin(0.436) * np.sin(turn), np.full(72, math.cos(0.436))], 1
     )
     finish, rough = max(((f, r) for f, r in known.samples if not math.isnan(r)), key=lambda one: one[1])
-    return mean_of(known.query(finish, rough, distance, normals).fraction)
+    return mean_of(known.query(finish, rough, distance, normals).sigma)
 
 
 def noise(talk: Talk, results: Results) -> Slide:
     """Return slide *Noise Distributions*."""
     slide = Slide("Noise Distributions")
-    found = collected(results, {name: f"noise_{name}" for name in talk.file.noise_sensors}, slide)
+    found = collected(results, {name: f"noise_{name}" for name in map(sensor_key, talk.file.noise_sensors)}, slide)
     if not found:
         return slide
     words = f"Residuals of {listed(list(found))} on a matt-white plate, with their histograms and the normal curve"

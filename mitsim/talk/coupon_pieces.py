@@ -42,6 +42,9 @@ _DRAWN = ("row", "column", "semi_major", "semi_minor", "recovered_fraction", "in
 #: largest number of patches of a campaign that are kept for drawing
 _MOST_PATCHES = 4000
 
+#: steps of residuals that are kept [mm], the number that stands for no point, and the largest side of a picture [px]
+STEP_MM, NO_POINT, _SIDE_PX = 0.02, -32768, 300
+
 #: largest incidence of poses of the validation [deg]
 _LARGEST_DEG = 70.0
 
@@ -204,7 +207,7 @@ def hold_out(folder: str, place: CouponPlace, map_name: str, count: int, seed: i
 def clouds_of_coupon(folder: str, place: CouponPlace, map_name: str, angle: float, seed: int) -> xr.Dataset:
     """Return the captured cloud of a large coupon and one drawn from the map, as residuals along V from the true plane.
 
-    ``captured`` and ``drawn`` (row, column) [mm] are NaN without a point.
+    ``captured`` and ``drawn`` (row, column), thinned, are in steps of :data:`STEP_MM`; :data:`NO_POINT` is no point.
     """
     prepared = prepared_sensor(sensor_in(folder, place.sensor))
     plan = campaign_of(folder, place, coupon_px=5000.0)  # as large as the field of view
@@ -218,7 +221,11 @@ def clouds_of_coupon(folder: str, place: CouponPlace, map_name: str, angle: floa
         rays = one.grid.rays()
         reach = ((coupon.centre - one.grid.origin) @ coupon.normal) / (rays @ coupon.normal)
         off = np.linalg.norm(one.points - one.grid.origin, axis=-1) - reach
-        data[name] = (("row", "column"), np.where(one.valid, off, np.nan)[window].astype(np.float32), {"units": "mm"})
+        cut = np.where(one.valid, off, np.nan)[window]
+        step = max(1, -(-max(cut.shape) // _SIDE_PX))
+        steps = np.nan_to_num(np.clip(cut[::step, ::step] / STEP_MM, -30_000, 30_000), nan=NO_POINT)
+        data[name] = (("row", "column"), steps.round().astype(np.int16), {"units": f"{STEP_MM:g} mm"})
+        data.attrs[f"share_{name}"] = float(one.valid[window].mean())
     return data
 
 

@@ -15,7 +15,10 @@ from mitsim.sensor.poses import look_at
 from mitsim.talk.talk_file import sensor_in
 
 #: size of a frame [px], and the largest number of frames
-WIDTH_PX, HEIGHT_PX, MOST_FRAMES = 280, 210, 8
+WIDTH_PX, HEIGHT_PX, MOST_FRAMES = 280, 210, 5
+
+#: brightness of a frame that is shown, over that of the brightest
+_LIT = 0.1
 
 #: direction of the view, from the part
 _FROM = np.array([0.25, -0.72, 0.65])
@@ -27,7 +30,8 @@ _DEPTH = 2
 def projected_frames(folder: str, scene: str, parameters: tuple[tuple[str, str], ...], sensor: str) -> xr.Dataset:
     """Return frames (frame, row, column) of the artefact in a sensor's projected images, in 8 bits.
 
-    All frames share one scale. A sensor that projects one image has one frame.
+    All frames share one scale. Of many frames some are chosen evenly, of those that are not dark. A sensor that
+    projects one image has one frame.
     """
     chosen = sensor_in(folder, sensor)
     loaded = load_scene(Path(folder) / scene, chosen.wavelength_nm, dict(parameters))
@@ -39,7 +43,9 @@ def projected_frames(folder: str, scene: str, parameters: tuple[tuple[str, str],
     rendering = Rendering(16, _DEPTH)
     capture = prepared_sensor(chosen).simulated.capture(loaded, pose, seed=1, rendering=rendering)
     name, stack = next(iter(capture.images.items()))
-    chosen_frames = stack[np.unique(np.linspace(0, len(stack) - 1, MOST_FRAMES).round().astype(int))]
+    bright = stack.reshape(len(stack), -1).mean(axis=1, dtype=float)
+    lit = stack[bright > _LIT * bright.max()]
+    chosen_frames = lit[np.unique(np.linspace(0, len(lit) - 1, MOST_FRAMES).round().astype(int))]
     places = capture.rig.cameras[name].project(pose.inverse().points(hull_corners(loaded)))
     return xr.Dataset({"frames": (("frame", "row", "column"), _fitted(chosen_frames.astype(float), places))})
 

@@ -24,7 +24,7 @@ from mitsim.talk import claims_of_coupons, claims_of_sensors, claims_of_views
 from mitsim.talk.results import Results
 from mitsim.talk.sensor_figures import opening_figure
 from mitsim.talk.slides import Slide, Verdict
-from mitsim.talk.talk_file import Talk
+from mitsim.talk.talk_file import Talk, sensor_key
 
 TITLE = "The talk, made again"
 
@@ -38,7 +38,10 @@ COLOURS: dict[Verdict, str] = {
 }
 
 #: resolution of the pictures, and their number of colours
-_DPI, _COLOURS = 96, 96
+_DPI, _COLOURS = 120, 160
+
+#: resolution at which the page shows them [1/in]
+_SHOWN_DPI = 92
 
 _COMMAND = "mitsim study talk scenes/talk/talk.toml -o runs/talk --kept"
 
@@ -100,7 +103,7 @@ def write_talk(
     slides = slides_of(talk, results, measured)
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
-    frames = {name: results.get(f"opening_{Path(name).stem}") for name in talk.file.opening_sensors}
+    frames = {sensor_key(name): results.get(f"opening_{sensor_key(name)}") for name in talk.file.opening_sensors}
     known = {name: one for name, one in frames.items() if one is not None}
     words = f"What {listed(list(known))} see of the artefact: rendered images of the projected light"
     opening = _drawn(images, "opening", opening_figure(known), words) if known else None
@@ -158,7 +161,7 @@ def _missing(names: Sequence[str]) -> str:
 def _drawn(images: Path, name: str, figure: Figure, alt: str) -> _Picture:
     path = write_png(figure, images / f"talk_{name}.png", _DPI, _COLOURS)
     with Image.open(path) as image:
-        width, height = image.size
+        width, height = (round(side * _SHOWN_DPI / _DPI) for side in image.size)
     return _Picture(path, alt, width, height)
 
 

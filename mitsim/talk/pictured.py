@@ -13,6 +13,7 @@ import xarray as xr
 
 from characterisation.point_cloud import Status
 from mitsim.maps.prediction import performance
+from mitsim.report.sheet_figures import image_on_grid
 from mitsim.study import StudyFile, open_study
 from mitsim.study.virtual.plan import rendering_of
 from mitsim.study.virtual.rendered import RenderedMeasurements
@@ -38,8 +39,7 @@ def picture_of_finish(folder: str, file: StudyFile, number: int) -> xr.Dataset:
         slice(max(rows.min() - _MARGIN_PX, 0), rows.max() + _MARGIN_PX),
         slice(max(columns.min() - _MARGIN_PX, 0), columns.max() + _MARGIN_PX),
     )
-    stack = next(iter(capture.images.values()))
-    image = stack[int(stack.reshape(len(stack), -1).mean(axis=1).argmax())]
+    image = np.nan_to_num(image_on_grid(capture, cloud))
     depth = np.where(cloud.valid, cloud.points[..., 2], np.nan)
     pixel = ("row", "column")
     data = _counts(renderer, study.task.shapes, view, cloud.valid)

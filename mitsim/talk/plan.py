@@ -27,7 +27,7 @@ from mitsim.scene.xml_check import named_digests
 from mitsim.talk import coupon_pieces, noise_pieces, opening_pieces, pictured, view_pieces
 from mitsim.talk.coupon_pieces import CouponPlace
 from mitsim.talk.results import VERSION
-from mitsim.talk.talk_file import SampleEntry, Talk, sensor_in
+from mitsim.talk.talk_file import SampleEntry, Talk, sensor_in, sensor_key
 
 #: functions of pieces: each takes the talk's folder and its arguments
 FUNCTIONS: dict[str, Callable[..., xr.Dataset]] = {
@@ -42,6 +42,9 @@ FUNCTIONS: dict[str, Callable[..., xr.Dataset]] = {
     "noise": noise_pieces.noise_of,
     "scores": view_pieces.scores_of,
 }
+
+#: number of poses of the sample whose clouds are compared, over that of the others: it returns points in few of them
+_SHOWN_POSES = 3
 
 #: elevation, and azimuth from the part's x axis, of the view in which finishes are pictured [deg]
 _PICTURED = (50.0, -70.0)
@@ -91,7 +94,7 @@ def pieces_of(talk: Talk) -> list[Piece]:
     number = pictured_view(talk)
     sensor, known = (file.sensor,), talk.map_name
     pieces = [
-        Piece(f"opening_{_key(name)}", "opening", (one.scene, _plain(one), name), (name,), (_scene(one),))
+        Piece(f"opening_{sensor_key(name)}", "opening", (one.scene, _plain(one), name), (name,), (_scene(one),))
         for name in file.opening_sensors
         for one in (file.finishes or file.samples)[:1]
     ]
@@ -106,14 +109,15 @@ def pieces_of(talk: Talk) -> list[Piece]:
     pieces.append(Piece("characterised", "characterised", (place, *refined), sensor, of_coupons))
     pieces.append(Piece("tilts", "tilts", (place, tuple(coupons.tilts_deg)), sensor, of_coupons))
     pieces.append(Piece("sub_clouds", "sub_clouds", (place, _SUB_CLOUDS_TILT_DEG), sensor, of_coupons))
-    pieces += [Piece(f"noise_{_key(name)}", "noise", (name, file.seed), (name,)) for name in file.noise_sensors]
+    pieces += [Piece(f"noise_{sensor_key(name)}", "noise", (name, file.seed), (name,)) for name in file.noise_sensors]
     shown = CouponPlace(coupons.campaign, file.sensor, coupons.shown_distance_mm, coupons.shown_roughness_um)
     pieces.append(Piece("clouds", "clouds", (shown, known, _CLOUDS_TILT_DEG, file.seed), sensor, of_coupons, known))
     for sample in campaign.samples:
         rough = coupon_pieces.roughness_of(sample)
         for distance in coupons.validated_distances_mm:
             there = CouponPlace(coupons.campaign, file.sensor, distance, rough)
-            arguments = (there, known, coupons.poses, file.seed)
+            poses = coupons.poses * (_SHOWN_POSES if rough == coupons.shown_roughness_um else 1)
+            arguments = (there, known, poses, file.seed)
             pieces.append(Piece(validation_name(rough, distance), "validation", arguments, sensor, of_coupons, known))
     for one in file.samples:
         study = (talk.study_file(one),)
@@ -156,10 +160,6 @@ def _scene(one: SampleEntry) -> tuple[str, tuple[tuple[str, str], ...]]:
 
 def _plain(one: SampleEntry) -> tuple[tuple[str, str], ...]:
     return tuple((name, str(value)) for name, value in sorted(one.parameters.items()))
-
-
-def _key(name: str) -> str:
-    return Path(name).stem
 
 
 @lru_cache(maxsize=64)

@@ -14,15 +14,17 @@ from matplotlib.patches import Ellipse, Patch
 from numpy.typing import NDArray
 from scipy import stats
 
+from characterisation.lambert_projection import lambert_projection
 from characterisation.maps.performance_map import PerformanceMap
-from characterisation.plots.clouds import REASONS, depth_limits, residual_limit
+from characterisation.plots.clouds import depth_limits, residual_limit
 from characterisation.plots.discs import noise_limits, plain_log_ticks
 from characterisation.plots.style import BLUE, DIVERGING, FIELD, INK, MUTED, NOISE, SEQUENTIAL, VERMILION, drawing
 from characterisation.point_cloud import Status
-from mitsim.report.cloud_figures import draw_status
+from mitsim.report.cloud_figures import REASONS, draw_status
 from mitsim.report.figures import colour_bar, matt_to_shiny
 from mitsim.report.style import colour_scale
 from mitsim.running.numbers import finish_name
+from mitsim.talk.coupon_pieces import NO_POINT, STEP_MM
 from mitsim.talk.noise_pieces import TwoNormals
 
 Floats = NDArray[np.float64]
@@ -38,20 +40,20 @@ def _bare(axes: Axes) -> None:
 def opening_figure(frames: Mapping[str, xr.Dataset]) -> Figure:
     """Draw the rendered frames of each sensor in a strip."""
     with drawing():
-        most = max(one.sizes["frame"] for one in frames.values())
-        figure = Figure(
-            (1.75 * min(most, 4) * 2, 1.62 * sum(-(-one.sizes["frame"] // 8) or 1 for one in frames.values()))
-        )
-        rows = list(frames.items())
-        grid = np.asarray(figure.subplots(len(rows), most, squeeze=False))
-        for row, (name, one) in zip(grid, rows, strict=True):
-            for axes, number in zip(row, range(most), strict=True):
-                _bare(axes)
-                axes.set_axis_off()
-                if number < one.sizes["frame"]:
-                    axes.imshow(one["frames"].values[number], cmap="gray", vmin=0, vmax=255)
-            row[0].set_title(name, loc="left", fontsize=8)
-        figure.subplots_adjust(0.005, 0.01, 0.995, 0.9, 0.02, 0.18)
+        shown = [(name, frame) for name, one in frames.items() for frame in one["frames"].values]
+        across = min(len(shown), 6)
+        down = -(-len(shown) // across)
+        figure = Figure((1.85 * across, 1.6 * down))
+        grid = np.asarray(figure.subplots(down, across, squeeze=False)).ravel()
+        for axes in grid:
+            axes.set_axis_off()
+        before = ""
+        for axes, (name, frame) in zip(grid, shown, strict=False):
+            axes.imshow(frame, cmap="gray", vmin=0, vmax=255)
+            if name != before:
+                axes.set_title(name, loc="left", fontsize=8)
+            before = name
+        figure.subplots_adjust(0.004, 0.01, 0.996, 0.88, 0.02, 0.15)
     return figure
 
 
@@ -183,30 +185,42 @@ def results_figure(found: xr.Dataset, blinding: tuple[float, float]) -> Figure:
         panels[0].set_title(f"{found.attrs['patches']:,} point cloud samples".replace(",", " "))
         sigma = found["ray_noise_std"].values
         norms = (Normalize(0, 1), LogNorm(*noise_limits(sigma)))
-        a, b = np.meshgrid(found["a"].values, found["b"].values)
-        square = a**2 + b**2
-        z = 1 - square / 2
-        with np.errstate(invalid="ignore", divide="ignore"):
-            scale = np.sqrt(np.maximum(1 - square / 4, 0)) / np.where(z > 0.2, z, np.nan)
+        inside = _in_gradient_space(found["a"].values.astype(float))
         for axes, values, norm, colours, label in (
             (panels[1], found["recovered_fraction"].values, norms[0], SEQUENTIAL, "F [1]"),
             (panels[2], sigma, norms[1], NOISE, "σ [mm]"),
         ):
-            known = np.isfinite(scale)
-            shown = axes.scatter(
-                (a * scale)[known], (b * scale)[known], c=values[known], s=5, marker="s", lw=0, norm=norm, cmap=colours
+            shown = axes.imshow(
+                np.ma.masked_invalid(values[inside]),
+                origin="lower",
+                extent=(-_GRADIENT, _GRADIENT) * 2,
+                norm=norm,
+                cmap=colours,
             )
             bar = colour_scale(figure, shown, axes, label, extend="neither", shrink=0.8)
             if isinstance(norm, LogNorm):
                 plain_log_ticks(bar, float(norm.vmin or 0), float(norm.vmax or 1))
         for axes in panels:
             _gradient_axes(axes, blinding if axes is not panels[2] else None)
-        at = {"color": VERMILION, "fontsize": 8, "ha": "center"}
-        panels[1].annotate(
-            "self-blinding", blinding, (0.9, 1.6), arrowprops={"arrowstyle": "->", "color": VERMILION}, **at
-        )
-        panels[1].text(0, -2.28, "adverse scattering", **at)
+        arrow = {"arrowstyle": "->", "color": INK}
+        box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0}
+        for words, place, at in (
+            ("self-blinding", blinding, (1.2, 1.0)),
+            ("adverse scattering", (0.0, -2.1), (1.2, -1.3)),
+        ):
+            panels[1].annotate(words, place, at, arrowprops=arrow, bbox=box, fontsize=8, ha="center", zorder=6)
     return figure
+
+
+def _in_gradient_space(axis: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the nodes (b, a) of a map's equal-area grid at a regular grid of gradients."""
+    steps = np.linspace(-_GRADIENT, _GRADIENT, 201)
+    x, y = np.meshgrid(steps, steps)
+    normals = np.stack([x, y, np.ones_like(x)], axis=-1)
+    places = lambert_projection(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+    step = axis[1] - axis[0]
+    nodes = np.clip(np.rint((places - axis[0]) / step), 0, len(axis) - 1).astype(np.int64)
+    return nodes[..., 1], nodes[..., 0]
 
 
 def maps_figure(performance_map: PerformanceMap) -> Figure:
@@ -249,9 +263,13 @@ def validation_figure(clouds: xr.Dataset, cells: Sequence[tuple[str, float, xr.D
     with drawing():
         figure = Figure((10.4, 6.3), layout="constrained")
         axes = figure.subplot_mosaic([["captured", "drawn", "F", "sigma"], ["rF", "rF", "rs", "rs"]])
-        limit = residual_limit(np.concatenate([clouds[name].values.ravel() for name in ("captured", "drawn")]))
-        for name in ("captured", "drawn"):
-            picture = axes[name].imshow(clouds[name].values, cmap=DIVERGING, vmin=-limit, vmax=limit)
+        pictures = {
+            name: np.where(clouds[name].values == NO_POINT, np.nan, STEP_MM * clouds[name].values.astype(float))
+            for name in ("captured", "drawn")
+        }
+        limit = residual_limit(np.concatenate([one.ravel() for one in pictures.values()]))
+        for name, one in pictures.items():
+            picture = axes[name].imshow(one, cmap=DIVERGING, vmin=-limit, vmax=limit)
             axes[name].set_facecolor(FIELD)
             axes[name].set_title(f"{shown} at {clouds.attrs['distance_mm']:g} mm: {name}", fontsize=8.5)
             _bare(axes[name])

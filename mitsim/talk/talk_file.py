@@ -161,6 +161,11 @@ def read_talk(path: str | Path) -> Talk:
     return Talk(path, file)
 
 
+def sensor_key(name: str) -> str:
+    """Return the name of a preset or of a sensor file as part of a file name."""
+    return Path(name).stem if name.endswith(".toml") else name
+
+
 def sensor_in(folder: str | Path, name: str) -> Sensor:
     """Return a preset by its name, or the sensor of a TOML file, whose path is relative to ``folder``."""
     return load_sensor(Path(folder) / name if name.endswith(".toml") else name)

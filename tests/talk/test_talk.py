@@ -63,7 +63,7 @@ lowest_elevation_deg = 0
 axes = [
     {{ name = "pan", direction = [0, 1, 0], limits_deg = [-60, 60] }},
     {{ name = "tilt", direction = [1, 0, 0], limits_deg = [-95, 20] }},
-    {{ name = "turn", direction = [0, 0, 1], limits_deg = [-160, 160] }},
+    {{ name = "turn", direction = [0, 0, 1], limits_deg = [-130, 130] }},
 ]
 """,
         encoding="utf-8",
