@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
+from PIL import Image
 
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.maps.campaign.orders import prepared_sensor
@@ -50,14 +52,12 @@ def projected_frames(folder: str, scene: str, parameters: tuple[tuple[str, str],
     return xr.Dataset({"frames": (("frame", "row", "column"), _fitted(chosen_frames.astype(float), places))})
 
 
-def _fitted(frames: np.ndarray, places: np.ndarray) -> np.ndarray:
+def _fitted(frames: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Return frames cut to the part with the proportions of the strip, in 8 bits."""
-    from PIL import Image
-
     low, high = places.min(axis=0), places.max(axis=0)
     middle, half = (low + high) / 2, 0.56 * max((high - low)[0], (high - low)[1] * WIDTH_PX / HEIGHT_PX)
-    box = (middle[0] - half, middle[1] - half * HEIGHT_PX / WIDTH_PX)
-    box += (middle[0] + half, middle[1] + half * HEIGHT_PX / WIDTH_PX)
+    reach = half * np.array([1.0, HEIGHT_PX / WIDTH_PX])
+    box = (*(middle - reach).tolist(), *(middle + reach).tolist())
     bright = np.percentile(frames, 99.5)
     out = []
     for frame in frames:

@@ -6,11 +6,14 @@ Validation*.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
+from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import Status
 from mitsim.maps.prediction import performance
 from mitsim.report.sheet_figures import image_on_grid
@@ -64,7 +67,14 @@ def features_in_light(folder: str, file: StudyFile, numbers: tuple[int, ...]) ->
     return xr.concat(found, xr.Variable("view", list(numbers)))
 
 
-def _counts(renderer: RenderedMeasurements, shapes, view: View, valid, performance_map=None) -> xr.Dataset:
+def _counts(
+    renderer: RenderedMeasurements,
+    shapes: Iterable[str],
+    view: View,
+    valid: NDArray[np.bool_],
+    performance_map: PerformanceMap | None = None,
+) -> xr.Dataset:
+    """Return possible, captured and expected points (feature,) of a view; NaN for expected ones without a map."""
     scene, pose = renderer.study.scene, view.world_from_sensor
     surfaces = renderer.predictor.surfaces(scene, pose)
     ideal, labels = renderer.predictor.ideal(surfaces), renderer.predictor.labels(scene, pose, surfaces)
@@ -72,17 +82,18 @@ def _counts(renderer: RenderedMeasurements, shapes, view: View, valid, performan
     label = labels.ravel()[ideal.pixel]
     fraction = None if performance_map is None else performance(ideal, scene, performance_map)[0]
     rows = []
-    for name in shapes:
+    names = list(shapes)
+    for name in names:
         here = seen & (label == scene.names.index(name))
         expected = np.nan if fraction is None else float(np.nan_to_num(fraction[here]).sum())
         rows.append((int(here.sum()), int(valid.ravel()[ideal.pixel[here]].sum()), expected))
     possible, points, expected = np.array(rows).T
     return xr.Dataset(
         {"possible": ("feature", possible), "points": ("feature", points), "expected": ("feature", expected)},
-        {"feature": list(shapes)},
+        {"feature": names},
     )
 
 
-def _eight_bits(image: np.ndarray) -> np.ndarray:
+def _eight_bits(image: NDArray[np.float64]) -> NDArray[np.uint8]:
     low, high = np.percentile(image, (0.5, 99.7))
-    return (255 * np.clip((image - low) / max(high - low, 1), 0, 1) ** 0.6).astype(np.uint8)
+    return np.asarray(255 * np.clip((image - low) / max(high - low, 1), 0, 1) ** 0.6, np.uint8)

@@ -125,8 +125,8 @@ def pieces_of(talk: Talk) -> list[Piece]:
     numbers = compared_views(talk)
     for one in file.samples:
         for name, depth in (("direct", 1), ("all", file.light_path_depth)):
-            arguments = (talk.study_file(one, depth), numbers)
-            pieces.append(Piece(f"light_{name}_{one.key}", "light", arguments, sensor, (_scene(one),), known))
+            seen = (talk.study_file(one, depth), numbers)
+            pieces.append(Piece(f"light_{name}_{one.key}", "light", seen, sensor, (_scene(one),), known))
     return pieces
 
 

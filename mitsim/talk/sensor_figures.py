@@ -268,8 +268,8 @@ def validation_figure(clouds: xr.Dataset, cells: Sequence[tuple[str, float, xr.D
             for name in ("captured", "drawn")
         }
         limit = residual_limit(np.concatenate([one.ravel() for one in pictures.values()]))
-        for name, one in pictures.items():
-            picture = axes[name].imshow(one, cmap=DIVERGING, vmin=-limit, vmax=limit)
+        for name, residuals in pictures.items():
+            picture = axes[name].imshow(residuals, cmap=DIVERGING, vmin=-limit, vmax=limit)
             axes[name].set_facecolor(FIELD)
             axes[name].set_title(f"{shown} at {clouds.attrs['distance_mm']:g} mm: {name}", fontsize=8.5)
             _bare(axes[name])
@@ -303,7 +303,7 @@ def validation_figure(clouds: xr.Dataset, cells: Sequence[tuple[str, float, xr.D
                 axes[key].bar(places, values, 0.92 * width, label=f"{distance:g} mm", color=f"C{number}")
             axes[key].axhline(10, color=VERMILION, lw=1)
             axes[key].set_xticks(range(len(names)), names)
-            axes[key].set_ylabel(label)
+            axes[key].set(ylabel=label, ylim=(0, max(13.0, axes[key].get_ylim()[1])))
         axes["rF"].legend(loc="upper left")
     return figure
 
@@ -311,7 +311,7 @@ def validation_figure(clouds: xr.Dataset, cells: Sequence[tuple[str, float, xr.D
 def light_figure(found: Mapping[str, tuple[xr.Dataset, xr.Dataset]]) -> Figure:
     """Draw captured over expected F of the artefact's features, in direct light alone and in all light, by sample."""
     with drawing():
-        figure = Figure((2.1 * len(found) + 0.5, 2.5), layout="constrained")
+        figure = Figure((2.1 * len(found) + 0.5, 2.9), layout="constrained")
         row = np.asarray(figure.subplots(1, len(found), squeeze=False, sharey=True))[0]
         for axes, (name, pair) in zip(row, found.items(), strict=True):
             for one, mark, colour, words in zip(

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from characterisation.plots.discs import disc
-from characterisation.plots.style import BLUE, INK, MUTED, SEQUENTIAL, VERMILION, drawing
+from characterisation.plots.style import BLUE, INK, MUTED, SEQUENTIAL, VERMILION, drawing, figure_of
 from mitsim.report.style import colour_scale, plain_log
 from mitsim.report.view_figures import sphere_of_views, view_places
 from mitsim.running.numbers import unit_symbol
@@ -41,18 +41,19 @@ def sphere(axes: Axes, scores: xr.Dataset, values: Floats, title: str, label: st
         around = np.arctan2(outside[:, 1], outside[:, 0])
         there = (2 * np.sin(zenith / 2))[:, None] * np.stack([np.cos(around), np.sin(around)], axis=-1)
         axes.plot(*there[np.linalg.norm(there, axis=1) < reach].T, "s", ms=4, mfc="none", mec=MUTED, zorder=3)
-    axes.scatter(*places[~known].T, marker="x", s=0.4 * size, c=MUTED, lw=0.9, zorder=3)
+    x, y = places.T
+    axes.scatter(x[~known], y[~known], marker="x", s=0.4 * size, c=MUTED, lw=0.9, zorder=3)
     if known.any():
         low, high = float(values[known].min()), float(np.percentile(values[known], 95 if error else 100))
+        norm: Normalize = Normalize(0 if low >= 0 else low, max(high, 1e-9))
         if error and low > 0:
-            norm, colours = LogNorm(low, max(high, 1.05 * low)), f"{SEQUENTIAL}_r"
-        else:
-            norm, colours = Normalize(0 if low >= 0 else low, max(high, 1e-9)), SEQUENTIAL
+            norm = LogNorm(low, max(high, 1.05 * low))
+        colours = f"{SEQUENTIAL}_r" if error else SEQUENTIAL
         shown = axes.scatter(
-            *places[known].T, c=values[known], s=size, norm=norm, cmap=colours, lw=0.3, ec=MUTED, zorder=4
+            x[known], y[known], c=values[known], s=size, norm=norm, cmap=colours, lw=0.3, ec=MUTED, zorder=4
         )
         bar = colour_scale(
-            axes.figure, shown, axes, label, extend="max" if error else "neither", location="bottom", shrink=0.8
+            figure_of(axes), shown, axes, label, extend="max" if error else "neither", location="bottom", shrink=0.8
         )
         if isinstance(norm, LogNorm):
             plain_log(bar.ax.xaxis)
