@@ -90,10 +90,8 @@ def _density(poses: xr.Dataset, normal: Floats) -> Claim:
     incidence = np.degrees(np.arcsin(np.clip(np.hypot(poses["shot_x"].values, poses["shot_y"].values), 0, 1)))
     near, rim = apart <= _DETAIL_DEG[0], incidence > _DETAIL_DEG[1]
     areas = [1 - math.cos(math.radians(angle)) for angle in (*_DETAIL_DEG, 80.0)]
-    blind, middle, grazing = (
-        here.sum() / area
-        for here, area in ((near, areas[0]), (~near & ~rim, areas[1] - areas[0]), (rim, areas[2] - areas[1]))
-    )
+    regions = ((near, areas[0]), (~near & ~rim, areas[1] - areas[0]), (rim, areas[2] - areas[1]))
+    blind, middle, grazing = (max(int(here.sum()), 1) / area for here, area in regions)
     added = level == 1
     few = bool(added.any()) and not bool((added & near).any())
     return Claim(

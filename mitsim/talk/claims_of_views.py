@@ -80,12 +80,12 @@ def view_score(talk: Talk, judged: Judged) -> Slide:
         known = np.isfinite(error)
         alone = spearman(sums[known], error[known])
         together = spearman(np.where(here["possible"].values > 0, here["V_m"].values, 0)[known], error[known])
-        found += f" Rank correlation with the true error of views: S_m alone {alone:+.2f}, V_m {together:+.2f}."
+        found += f" Rank correlation with the true error of views: S_m alone {_signed(alone)}, V_m {_signed(together)}."
         better = together < alone
     slide.claims.append(
         Claim(
             "[S_m] is susceptible to bias. Doesn't take into account if all features are actually visible.",
-            found.replace("-", "−"),
+            found,
             verdict(better, hidden > 0),
         )
     )
@@ -190,9 +190,9 @@ def accuracy(judged: Judged) -> Slide:
     slide.claims.append(
         Claim(
             "Especially good at predicting bad views.",
-            f"The mean rank by error misses the predicted one by {bad:.1f} for the three worst bins, and by {good:.1f} "
-            f"for the three best. Mean ranks from the worst bin to the best: "
-            f"{', '.join(f'{rank:.1f}' for rank in found['V_m', 'error']['rank'].values)}.",
+            f"The mean rank by error misses the predicted one by {_ratio(bad)} for the three worst bins, and by "
+            f"{_ratio(good)} for the three best. Mean ranks from the worst bin to the best: "
+            f"{', '.join(_ratio(rank) for rank in found['V_m', 'error']['rank'].values)}.",
             verdict(bad < good),
         )
     )
