@@ -13,6 +13,7 @@ import importlib.metadata
 import re
 import sys
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 
 from packaging.requirements import Requirement
@@ -150,34 +151,33 @@ def refused() -> dict[str, str]:
     return {name: licence or "not known" for name, licence in found.items() if not licence or parts(licence) - ALLOWED}
 
 
-def table() -> str:
-    """The table as Markdown."""
-    needed = closure()
+def table(packages: Mapping[str, str]) -> str:
+    """Return packages and their licences as a Markdown table: a row for each licence."""
+    licences = sorted(set(packages.values()))
     rows = [
-        f"| {name} | {licence_of(name) or 'not known'} | {', '.join(sorted(by))} |"
-        for name, by in sorted(needed.items())
+        f"| {licence or 'not known'} | {', '.join(name for name, own in sorted(packages.items()) if own == licence)} |"
+        for licence in licences
     ]
-    return "\n".join(["| package | licence | needed by |", "|---|---|---|", *rows])
+    return "\n".join(["| licence | packages |", "|---|---|", *rows])
 
 
 PAGE = """# Licences
 
-This table lists the packages that mitsim and its extras install, with their dependencies, on the machine that made
-this page. The command `python .ci/licences.py` makes the page. It exits with 1 if a licence is not on its list of
-allowed licences. These are permissive licences, and weak copyleft (MPL-2.0, LGPL-2.1) of dynamically linked libraries
-that users can replace. The tests check every installed package against this list.
+The packages that mitsim and its extras install, with their dependencies, without the tools of the tests and vendors'
+SDKs that `pip` does not install (NxLib). The tests compare every installed package with this list, and reject licences
+that are neither permissive nor weak copyleft (MPL-2.0, LGPL-2.1) of dynamically linked libraries that users can
+replace.
 
-Licences are SPDX names, from the metadata of each package. Where the metadata says too little, the script records the
-place where the licence was read. The wheels of NumPy, SciPy and OpenCV also contain libgfortran, whose GCC runtime
-exception allows distribution with any software. The table excludes the tools of the tests, and vendors' SDKs that
-`pip` does not install (NxLib).
+Licences are SPDX names, from the metadata of each package, or from the source that `.ci/licences.py` records. The
+wheels of NumPy, SciPy and OpenCV also contain libgfortran, whose GCC runtime exception allows distribution with any
+software.
 
 """
 
 
 def main() -> int:
     """Print the page, and tell what is refused."""
-    print(PAGE + table())
+    print(PAGE + table({name: licence_of(name) for name in closure()}))
     wrong = refused()
     for name, licence in wrong.items():
         print(f"{name}: {licence}, which is not on the list of what may come in", file=sys.stderr)

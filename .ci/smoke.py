@@ -118,7 +118,7 @@ def exports() -> None:
     for suffix in ("pcd", "e57", "mcap"):
         mitsim("export", "cloud", "cloud.ply", "-o", f"cloud.{suffix}")
     mitsim("export", "map", "ensenso-n10", "-o", "exported_map")
-    for name in ("pygltflib", "pxr.Usd", "rerun", "pypcd4", "pye57", "mcap_ros2.writer"):
+    for name in ("pygltflib", "pxr.Usd", "rerun", "pypcd4", "pye57", "rosbags.rosbag2"):
         importlib.import_module(name)
 
 

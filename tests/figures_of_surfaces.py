@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
 
 from mitsim.scene.surface.coherence import EVEN_FROM
-from mitsim.scene.surface.microfacet import Distribution
+from mitsim.scene.surface.microfacet import Distribution, slope_density
 
 
 def lobe_factor(numbers: tuple[float, float, float], mean_cosine: ArrayLike) -> NDArray[np.float64]:
@@ -24,6 +25,27 @@ def alpha_of_half_width(width: float, distribution: Distribution) -> float:
     h = np.cos(width) ** -4.0
     q = np.sqrt(2 * h) - 1 if distribution == "ggx" else np.log(2 * h)
     return float(np.tan(width) / np.sqrt(q))
+
+
+def half_width(alpha: float, distribution: Distribution) -> float:
+    """Return the angle from the mean normal [rad] at which D(m) has fallen to half its value there.
+
+    Raises
+    ------
+    ValueError
+        For a lobe so wide that D never falls to half before it rises again towards grazing normals.
+    """
+    # D rises again towards grazing normals, so the first fall is bracketed on a grid
+    angles = np.linspace(0, np.pi / 2 - 1e-3, 2000)
+    density = slope_density((np.tan(angles) / alpha) ** 2, distribution) / np.cos(angles) ** 4
+    below = np.flatnonzero(density < 0.5)
+    if not len(below):
+        raise ValueError(f"a {distribution} lobe of alpha {alpha:g} has no half width")
+
+    def excess(angle: float) -> float:
+        return float(slope_density((np.tan(angle) / alpha) ** 2, distribution) / np.cos(angle) ** 4 - 0.5)
+
+    return float(brentq(excess, 0.0, angles[below[0]], xtol=1e-12))
 
 
 def short_wave_height(sigma_um: float, correlation_um: float, nu: float, longest_um: float) -> float:

@@ -41,7 +41,7 @@ _PLACES = 500
 #: Largest number of residuals from which their correlation is estimated.
 _RESIDUALS = 1000
 
-#: Share by which the residuals of a fit may exceed those of the nominal surface, by rounding.
+#: Share by which the residuals of a fit may exceed those of the nominal surface, and residuals [mm], by rounding.
 _ROUNDING = 1e-6
 
 
@@ -87,7 +87,7 @@ def check_surface(
         return
     zero, rays = np.zeros(fit.parameter_count), rays_from(viewpoint, array)
     residual, _, cosine = fit.linearised(zero, array, rays)
-    used = (np.abs(cosine) > GRAZING_COSINE) & (np.abs(residual) <= CLIP * fit.residual_std)
+    used = (np.abs(cosine) > GRAZING_COSINE) & (np.abs(residual) <= CLIP * max(fit.residual_std, _ROUNDING))
     nominal_residual = nominal.linearised(zero, array[used], None if rays is None else rays[used])[0]
     if residual[used] @ residual[used] > (1 + _ROUNDING) * (nominal_residual @ nominal_residual) + _ROUNDING**2:
         sizes = [float(np.sqrt(np.mean(one**2))) for one in (residual[used], nominal_residual)]

@@ -23,7 +23,9 @@ SEAL = b"mitsim sha256 "
 LARGEST_FILE = 256 * 1024**2
 
 
-def read_bounded(file: Path, absent: str | None = None, hint: str = "", largest: int = LARGEST_FILE) -> bytes:
+def read_bounded(
+    file: Path, absent: str | None = None, hint: str = "", largest: int = LARGEST_FILE, first: int | None = None
+) -> bytes:
     """Read a plain file of at most ``largest`` bytes.
 
     Parameters
@@ -36,6 +38,8 @@ def read_bounded(file: Path, absent: str | None = None, hint: str = "", largest:
         Advice that the errors add.
     largest
         Largest size [bytes].
+    first
+        Number of bytes to read from its beginning; all without it.
 
     Raises
     ------
@@ -53,7 +57,7 @@ def read_bounded(file: Path, absent: str | None = None, hint: str = "", largest:
         if about.st_size > largest:
             raise InputError(file, "size", f"{about.st_size} bytes", f"up to {largest} bytes", hint)
         with file.open("rb") as stream:
-            data = stream.read(largest + 1)
+            data = stream.read(largest + 1 if first is None else first)
         if len(data) > largest:
             raise InputError(file, "size", f"over {largest} bytes", f"up to {largest} bytes", hint)
         return data

@@ -262,7 +262,20 @@ def _explain(
             return InputError(where, field, "a whole number of too many digits", "-2^63 to 2^63 - 1", also)
         case _:
             allowed = fault["msg"].removeprefix("Input should be ")
+            for python, toml in _TYPES.items():
+                allowed = allowed.replace(python, toml)
             return InputError(where, field, shown(fault["input"], where), allowed, also)
+
+
+#: types in pydantic's messages, and what a user writes
+_TYPES = {
+    "a valid tuple": "a list",
+    "a valid list": "a list",
+    "a valid integer": "a whole number",
+    "a valid number": "a number",
+    "a valid string": "a text",
+    "a valid boolean": "true or false",
+}
 
 
 def _joined(*sentences: str) -> str:

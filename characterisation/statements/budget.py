@@ -27,13 +27,13 @@ Floats = NDArray[np.float64]
 #: lines that no group of unknowns explains: common to the captures of a day, and new in each capture
 INTERACTION, NOISE = "interaction", "noise"
 
-#: least number of trials with a value for a budget
+#: least number of trials with a value for a budget; chosen
 LEAST_TRIALS = 30
 
-#: width of the interval of a share above which the trials are too few to tell it
+#: width of the interval of a share above which the trials are too few to tell it; chosen
 _TOO_WIDE = 0.5
 
-#: half width of an interval, in standard errors
+#: half width of a 95 % interval, in standard errors
 _HALF = 2.0
 
 

@@ -25,10 +25,8 @@ def name_reference(package: str) -> str:
         blocks.append(f"## {heading}")
         promised = members(rows)
         for cell, _ in rows:
-            name = bare(cell)
-            if name.startswith(f"{SHORT[package]}."):
-                name = name.removeprefix(f"{SHORT[package]}.")
-                blocks.append(directive(f"{package}.{name}", promised.get(name, [])))
+            name = bare(cell).removeprefix(f"{SHORT[package]}.")
+            blocks.append(directive(f"{package}.{name}", promised[name] if heading == "Types" else []))
     return "\n\n".join(blocks)
 
 
@@ -44,17 +42,8 @@ def tables(package: str) -> list[tuple[str, list[tuple[str, str]]]]:
 
 
 def members(rows: list[tuple[str, str]]) -> dict[str, list[str]]:
-    """Return the promised members of each type: those with a row, and those that its own row names."""
-    found: dict[str, list[str]] = {}
-    for cell, told in rows:
-        owner, _, member = bare(cell).rpartition(".")
-        named = re.findall(r"`([a-z]\w*|[A-Z_]{2,})`", told)
-        if owner in SHORT.values():
-            found[member] = [] if named == ["value"] else named
-        elif owner in found:
-            beside = named if told.startswith("with ") or member.isupper() else []
-            found[owner] += [one for one in (member, *beside) if one not in found[owner]]
-    return found
+    """Return the promised members of each type: those that its row names."""
+    return {bare(cell).rpartition(".")[2]: re.findall(r"`([a-z]\w*|[A-Z_]{2,})`", told) for cell, told in rows}
 
 
 def directive(path: str, promised: list[str]) -> str:

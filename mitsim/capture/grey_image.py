@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from characterisation.files.checked_files import LARGEST_FILE, read_bounded
 from characterisation.files.errors import InputError
-from mitsim.sensor.png import LONGEST_SIDE_PX, PNG_SIGNATURE, decode_png, png_chunks
+from mitsim.sensor.png import LONGEST_SIDE_PX, PNG_SIGNATURE, check_png, decode_png
 
 #: suffixes of the image files that are read
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
@@ -66,10 +66,27 @@ def read_grey(path: Path, *, green: bool = False, channel: int | None = None) ->
     InputError
         If the file cannot be read, is not an image, or has channels that differ.
     """
+    return decode_grey(_bytes_of(path), path, green=green, channel=channel)
+
+
+def read_depths(path: Path) -> NDArray[Any]:
+    """Read a grey image (H, W) of whole numbers, as :func:`read_grey` does, or of floating point.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_grey`.
+    """
+    data = _bytes_of(path)
+    image = _decoded(data, path, None)
+    return image if image.dtype.kind == "f" and max(image.shape) <= LONGEST_SIDE_PX else _checked(image, path)
+
+
+def _bytes_of(path: Path) -> bytes:
     data = read_bounded(path)
     if not data:
         raise InputError(path, "size", "0 bytes", f"1 to {LARGEST_FILE} bytes")
-    return decode_grey(data, path, green=green, channel=channel)
+    return data
 
 
 def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel: int | None = None) -> Image:
@@ -95,9 +112,14 @@ def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel:
     --------
     read_grey : from a file
     """
+    return _checked(_decoded(data, where, CHANNELS["green"] if green else channel), where)
+
+
+def _decoded(data: bytes, where: str | Path, channel: int | None) -> NDArray[Any]:
+    """Return the numbers (H, W) of an image: its only channel, or the one that is asked for."""
     is_png = data.startswith(PNG_SIGNATURE)
     if is_png:
-        png_chunks(data, where)  # OpenCV would decode the undamaged part of a damaged PNG
+        check_png(data, where)  # OpenCV would decode the undamaged part of a damaged PNG
     image = None
     with suppress(cv2.error):  # reported below, as where OpenCV returns None
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
@@ -105,17 +127,13 @@ def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel:
         raise InputError(where, "", "a file that is not an image, or is damaged", f"one of {', '.join(SUFFIXES)}")
     if image.ndim == 3:
         colours = image[..., :3] if image.shape[2] >= 3 else image[..., :1]
-        if green:
-            channel = CHANNELS["green"]
         if channel is not None and image.shape[2] >= 3:
-            return np.ascontiguousarray(_checked(image[..., channel], where))
+            return np.ascontiguousarray(image[..., channel])
         if (colours != colours[..., :1]).any():
             hint = "convert it without changing its levels; for a colour camera, take one channel or the raw image"
             raise InputError(where, "colour", f"{image.shape[2]} channels that differ", "a grey image", hint)
-        image = np.ascontiguousarray(image[..., 0])
-    elif is_png:
-        image = decode_png(data, where)
-    return _checked(image, where)
+        return np.ascontiguousarray(image[..., 0])
+    return decode_png(data, where) if is_png else image
 
 
 def _checked(image: NDArray[Any], where: str | Path) -> Image:

@@ -72,7 +72,7 @@ def compare(
 def _imported(recording: Path, folder: Path, frame: int | None, calibration: Path | None) -> Path:
     """Import a recording into a capture folder."""
     from mitsim.capture.folder import write_capture
-    from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+    from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
     from mitsim.running.progress import say
 
     options = ReadOptions(frame=frame, calibration=None if calibration is None else str(calibration))

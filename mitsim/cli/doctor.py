@@ -41,7 +41,7 @@ _OPTIONAL = {
     "cadquery-ocp-novtk": "mitsim part of STEP files",
     "pypcd4": "mitsim export to PCD",
     "pye57": "mitsim export to E57",
-    "mcap-ros2-support": "mitsim export to ROS 2",
+    "rosbags": "recordings of ROS, mitsim export to ROS 2",
     "rerun-sdk": "mitsim export to Rerun",
     "pygltflib": "mitsim export to glTF",
     "usd-core": "mitsim export to USD",

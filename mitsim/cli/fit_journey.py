@@ -119,7 +119,7 @@ def _map(campaign: Path, sensor: Path, folder: Path) -> PerformanceMap:
         seconds = time.monotonic() - start
     more = ", and more where F or sigma changes fast" if plan.file.refine is not None else ""
     say(
-        f"step 2 of 3: the map, {count} captures of about {seconds:.1f} s: {time_in_words(count * seconds)}{more}. "
+        f"step 2 of 3: the map, {count} captures of about {seconds:.2g} s: {time_in_words(count * seconds)}{more}. "
         "An interrupted map is continued"
     )
     return simulate_campaign(plan, folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
 
@@ -46,7 +47,10 @@ def import_(
         typer.Option(help="Sensor that took it, a preset or TOML file; it supplies name, cameras and range."),
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration of the cameras: TOML, JSON, OpenCV's YAML or XML, DepthAI's JSON.")
+        str | None,
+        typer.Option(
+            metavar="FILE", help="Calibration of the cameras: TOML, JSON, OpenCV's YAML or XML, DepthAI's JSON."
+        ),
     ] = None,
     kind: Annotated[
         str | None,
@@ -66,22 +70,24 @@ def import_(
         typer.Option(help="For a folder of images: files of one camera, NAME=PATTERN (left='cam0_*.png'). Repeatable."),
     ] = None,
     channel: Annotated[str | None, typer.Option(help="For colour images: red, green or blue; default green.")] = None,
-    exposure: Annotated[float | None, typer.Option(help="Exposure time of every image [s].")] = None,
+    exposure_s: Annotated[float | None, typer.Option("--exposure", help="Exposure time of every image [s].")] = None,
     pose: Annotated[
-        Path | None,
+        str | None,
         typer.Option(
-            help="Pose of the sensor: pose.json, or a text file with the 4 x 4 matrix world_from_sensor [mm]."
+            metavar="FILE",
+            help="Pose of the sensor: pose.json, or a text file with the 4 x 4 matrix world_from_sensor [mm].",
         ),
     ] = None,
     sample: Annotated[
         str | None, typer.Option(help="For a coupon: the label of its sample in a campaign (aluminium/ground Ra 0.4).")
     ] = None,
     projector: Annotated[str | None, typer.Option(help="State of the projector: on or off.")] = None,
-    depth_range: Annotated[
+    range_mm: Annotated[
         tuple[float, float] | None, typer.Option("--range", help="Nearest and farthest depth to decode [mm].")
     ] = None,
-    scale: Annotated[
-        float | None, typer.Option(min=1e-6, max=1e4, help="For a depth image: depth per grey level [mm]; default 1.")
+    scale_mm: Annotated[
+        float | None,
+        typer.Option("--scale", min=1e-6, max=1e4, help="For a depth image: depth per grey level [mm]; default 1."),
     ] = None,
     invalid: Annotated[
         int | None,
@@ -89,17 +95,20 @@ def import_(
     ] = None,
     unit: Annotated[
         str | None,
-        typer.Option(help="Unit of a cloud: um, mm, cm or m; default: m if the median distance is below 20, else mm."),
+        typer.Option(
+            help="Unit of a cloud: um, mm, cm, m, inch or foot; default: m if the median distance is below 20, else mm."
+        ),
     ] = None,
     axes: Annotated[
         str | None,
         typer.Option(help="Axes of a cloud: opencv (y down, z forward) or opengl (y up, z backward); default opencv."),
     ] = None,
     link: Annotated[
-        Path | None,
+        str | None,
         typer.Option(
+            metavar="FILE",
             help="For a cloud of an Ensenso: its *_calib.json. Its Link (the transform to a workspace) is undone, so "
-            "that points are in the sensor frame."
+            "that points are in the sensor frame.",
         ),
     ] = None,
     subpixel_bits: Annotated[
@@ -111,36 +120,20 @@ def import_(
 
     Example: mitsim import recording.zip -o captures/real
     """
+    given = locals()  # by the names of the fields of ReadOptions
     from mitsim.capture.folder import is_written, write_capture
-    from mitsim.capture.recordings.recognise import KINDS, ReadOptions, read_recording
+    from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
+    from mitsim.capture.recordings.recognise import NAMES
     from mitsim.capture.recordings.recording_files import plain_name
     from mitsim.decoding.checks.sanity import with_warnings
     from mitsim.running.progress import say
 
-    options = ReadOptions(
-        sensor=sensor,
-        calibration=None if calibration is None else str(calibration),
-        camera=camera,
-        frame=frame,
-        range_mm=depth_range,
-        scale_mm=scale,
-        invalid=invalid,
-        unit=unit,
-        axes=axes,
-        link=None if link is None else str(link),
-        subpixel_bits=subpixel_bits,
-        topic=tuple(topic) if topic else None,
-        images=_patterns(images),
-        channel=channel,
-        exposure_s=exposure,
-        pose=None if pose is None else str(pose),
-        sample=sample,
-        projector=projector,
-    )
+    named = {one.name: given[one.name] for one in fields(ReadOptions)}
+    options = ReadOptions(**named | {"topic": tuple(topic) if topic else None, "images": _patterns(images)})
     imported = read_recording(path, options, kind)
     capture = with_warnings(imported.capture)
     folder = output or Path(plain_name(path.resolve().stem) + "_capture")
-    say(f"{path}: {KINDS[imported.kind].name}, of {capture.sensor}, {capture.technology}, {capture.source}")
+    say(f"{path}: {NAMES[imported.kind]}, of {capture.sensor}, {capture.technology}, {capture.source}")
     for name in SETTINGS_TO_CHECK:
         if name in capture.settings:
             say(f"  {name}: {capture.settings[name]}")

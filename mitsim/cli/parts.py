@@ -131,7 +131,9 @@ def part(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Scene folder to write.")] = None,
     units: Annotated[
         str | None,
-        typer.Option(help="Unit of a file that does not state it: mm, m or inch; default: that of the file, else mm."),
+        typer.Option(
+            help="Unit of a file that states none: um, mm, cm, m, inch or foot; default: that of the file, else mm."
+        ),
     ] = None,
     metal: Annotated[str | None, typer.Option(help="Metal of all faces; default aluminium.")] = None,
     process: Annotated[str | None, typer.Option(help="Machining process of all faces; default ground.")] = None,

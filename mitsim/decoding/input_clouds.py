@@ -8,7 +8,7 @@ capture if there is one.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from characterisation import cloud_files
@@ -16,12 +16,13 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture
-from mitsim.capture.recordings.organised_cloud import read_organised_cloud, read_stored_cloud
-from mitsim.capture.recordings.recognise import KINDS, ReadOptions, kind_of, read_recording, unorganised_cloud
+from mitsim.capture.recordings.any_recording import KINDS, ReadOptions, read_recording
+from mitsim.capture.recordings.organised_cloud import NoGridError, read_organised_cloud, read_stored_cloud
+from mitsim.capture.recordings.recognise import kind_of
 from mitsim.decoding.cloud import Settings, decoder_settings
 from mitsim.decoding.coded_images import decoded_once
 from mitsim.decoding.kept_clouds import kept_cloud
-from mitsim.decoding.plain_clouds import is_array_or_text, plain_cloud, read_plain_cloud
+from mitsim.decoding.plain_clouds import is_array_or_text, is_map_of_depths, plain_cloud, read_plain_cloud
 from mitsim.running.progress import say
 from mitsim.sensor.matcher import MatcherSettings
 
@@ -29,7 +30,7 @@ from mitsim.sensor.matcher import MatcherSettings
 _SUFFIXES = (".ply", ".pcd", ".zdf")
 
 #: text that identifies a cloud file of ``mitsim decode``, and the length of the header in which it stands [bytes]
-_MARK, _HEAD = b"\ncomment mitsim ", 4096
+_MARK, _HEAD = b"\ncomment mitsim ", 1 << 20
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ def read_cloud(
     """
     if path.is_file() and _is_mitsim_ply(path):
         return InputCloud(path, cloud_files.read_cloud(path), None)
-    if is_array_or_text(path):
+    if is_array_or_text(path) and not is_map_of_depths(path):
         return _plain(path, *read_plain_cloud(path))
     if (path / "capture.json").exists():
         capture = read_capture(path)
@@ -112,13 +113,12 @@ def read_cloud(
                 raise
             return _plain(path, *plain_cloud(stored.points, path))
     elif path.exists():
-        options = ReadOptions(topic=topic, frame=frame, sensor=sensor)
-        if "sensor" not in KINDS[kind_of(path, options)].options:
-            options = replace(options, sensor=None)
-        plain = unorganised_cloud(path, options)
-        if plain is not None:
-            return _plain(path, *plain_cloud(plain, path))
-        capture = read_recording(path, options).capture
+        kind = kind_of(path, sensor=sensor)
+        used = sensor if "sensor" in KINDS[kind].options else None
+        try:
+            capture = read_recording(path, ReadOptions(topic=topic, frame=frame, sensor=used), kind).capture
+        except NoGridError as error:
+            return _plain(path, *plain_cloud(error.points, path))
         for warning in capture.settings.get("warnings", []):
             say(f"warning: {warning}")
     else:
@@ -126,7 +126,7 @@ def read_cloud(
             path,
             "",
             "no such file or folder",
-            "a cloud (.ply, .pcd, .npy, .mat, .xyz), a capture folder, or folders of these",
+            "a cloud (.ply, .pcd, .npy, .npz, .mat, .xyz), a capture folder, or folders of these",
         )
     settings, imager = decoder_settings(capture, sensor)
     chosen = (settings, imager, topic, frame, sensor)
@@ -145,6 +145,7 @@ def margin_of(settings: Settings) -> int:
 
 
 def _is_mitsim_ply(path: Path) -> bool:
+    """Return whether a file is a cloud of ``mitsim decode``: one that ``mitsim export`` wrote states no grid."""
     with path.open("rb") as file:
         head = file.read(_HEAD)
-    return head.startswith(b"ply\n") and _MARK in head
+    return head.startswith(b"ply\n") and b'"grid"' in head.partition(_MARK)[2].partition(b"\n")[0]

@@ -189,8 +189,7 @@ def _mesh(shape: Any, merge: float) -> MeshFacts | None:
     triangles = np.array(shape.faces_buffer(), np.int64).reshape(-1, 3)
     if shape.has_flipped_normals():
         triangles = triangles[:, ::-1]
-    smooth = bool(shape.has_vertex_normals()) and not shape.has_face_normals()
-    return mesh_facts(vertices, triangles, merge, bool(shape.has_vertex_texcoords()), smooth)
+    return mesh_facts(vertices, triangles, merge, bool(shape.has_vertex_texcoords()))
 
 
 def _merged_mesh(shapes: tuple[ShapeFacts, ...], merge: float) -> MeshFacts | None:

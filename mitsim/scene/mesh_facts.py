@@ -22,7 +22,7 @@ class MeshFacts:
     - ``open_edges``, ``nonmanifold_edges``: number of edges of only one triangle, and of more than two.
     - ``volume`` [mm^3], positive if the normals point outward; 0 if the mesh is not closed.
     - ``degenerate``, ``duplicate``: number of triangles without area, and of repeated triangles.
-    - ``texture``, ``smooth``: whether the vertices have texture coordinates u, v, and normals.
+    - ``texture``: whether the vertices have texture coordinates u, v.
     - ``open_edge_ends`` (open_edges, 2, 3): end points of the open edges [mm].
     """
 
@@ -34,7 +34,6 @@ class MeshFacts:
     degenerate: int
     duplicate: int
     texture: bool
-    smooth: bool
     open_edge_ends: Floats = field(default_factory=lambda: np.empty((0, 2, 3)), repr=False)
 
     @property
@@ -43,9 +42,7 @@ class MeshFacts:
         return self.open_edges == self.nonmanifold_edges == 0
 
 
-def mesh_facts(
-    vertices: Floats, triangles: NDArray[np.int64], merge: float, texture: bool = False, smooth: bool = False
-) -> MeshFacts:
+def mesh_facts(vertices: Floats, triangles: NDArray[np.int64], merge: float, texture: bool = False) -> MeshFacts:
     """Return the facts about a mesh. The volume is a sum over triangles of a . (b x c) / 6, about the mean vertex.
 
     Parameters
@@ -54,8 +51,8 @@ def mesh_facts(
         (n, 3) [mm], and (m, 3) indices of vertices.
     merge
         Vertices in one cell of a grid of this spacing [mm] are merged.
-    texture, smooth
-        Whether the vertices have u, v and normals.
+    texture
+        Whether the vertices have u and v.
     """
     _, first, inverse = np.unique(np.round(vertices / merge), axis=0, return_index=True, return_inverse=True)
     vertices, triangles = vertices[first], inverse.reshape(-1)[triangles]
@@ -80,6 +77,5 @@ def mesh_facts(
         int(degenerate.sum()),
         duplicate,
         texture,
-        smooth,
         vertices[edges[count == 1]],
     )

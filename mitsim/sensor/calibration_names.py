@@ -25,7 +25,7 @@ _WRITTEN: dict[str, tuple[str, str, str]] = {
     "distortion": (
         """
         distortion_coefficients distortion_coeffs distortion_coeff dist_coeffs dist_coeff dist_coefs distCoeff
-        camera_distortion cam_kc cam_dist kc Dc D D1 distCoeffs distCoeffs1 distCoeffsL
+        distortion camera_distortion cam_kc cam_dist kc Dc D D1 distCoeffs distCoeffs1 distCoeffsL
         distortion_coefficients_1 distortion_coefficients_left D_left left_distortion
         left_distortion_coefficients kc_left kc_cam DL dist dist1 distL +D1
         """,
@@ -35,7 +35,7 @@ _WRITTEN: dict[str, tuple[str, str, str]] = {
         """,
         """
         projector_distortion proj_kc pro_kc pro_dist proj_dist kp Dp kc_proj kc_projector D2 distCoeffs2
-        kc_right +D2
+        kc_right +D_proj +D2
         """,
     ),
     "size": (
@@ -47,17 +47,17 @@ _WRITTEN: dict[str, tuple[str, str, str]] = {
         image_size_2 image_size imageSize camera_size cam_size camera_resolution img_size frame_size frameSize
         resolution +size2 +size
         """,
-        "projector_size projectorSize proj_size pro_size projector_resolution proj_resolution pattern_size",
+        "projector_size projectorSize proj_size pro_size projector_resolution proj_resolution pattern_size +size_proj",
     ),
     "rotation": (
         "",
         "R rotation rotation_matrix R_stereo om +R",
-        "R projector_R proj_R pro_R Rp R_p rotation rotation_matrix om +R",
+        "R projector_R proj_R pro_R Rp R_p rotation rotation_matrix om +R_proj +R",
     ),
     "translation": (
         "",
         "T t translation translation_vector T_stereo +T",
-        "T t projector_T projector_t proj_T proj_t pro_T pro_t Tp tp T_p translation translation_vector +T",
+        "T t projector_T projector_t proj_T proj_t pro_T pro_t Tp tp T_p translation translation_vector +T_proj +T",
     ),
 }
 

@@ -8,22 +8,19 @@ sources and the table that qualifies it (:mod:`mitsim.sensor.calibration_qualifi
 - Computer Vision Toolbox of MATLAB: a structure made by ``toStruct``. Pixels count from 1, and sizes are (rows,
   columns). ``IntrinsicMatrix``, ``RotationOfCamera2`` and ``TranslationOfCamera2`` act on row vectors, so the matrices
   are transposed; ``K`` and ``PoseCamera2`` (R2022b and later) act on column vectors.
-- Kalibr (``camchain.yaml``): K is (fu, fv, pu, pv); ``T_cn_cnm1`` takes coordinates of the camera before to this
-  one, in metres.
-- ORB-SLAM, librealsense and others: ``fx``, ``fy``, ``cx`` (or ``ppx``), ``cy`` and ``k1``, ``k2``, ``p1``, ``p2``,
-  ``k3`` as single numbers, in a map or behind ``Camera.``.
+- Kalibr, ORB-SLAM, librealsense and others, whose values stand in maps: :mod:`mitsim.sensor.calibration_eyes`.
 - ROS: a message ``sensor_msgs/CameraInfo`` has the values of a calibration file as flat lists, under one letter each.
 """
 
 from __future__ import annotations
 
 import math
-import re
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mitsim.sensor.calibration_eyes import Composed, eyes_of, usual_values, vector
 
 #: endings of names in MATLAB's toolbox and similar programs: one camera, the cameras of a pair, camera and projector
 _ENDINGS = ("", "_left", "_right", "_cam", "_proj", "_camera", "_projector")
@@ -37,19 +34,10 @@ _MESSAGE = {
 }
 
 
-@dataclass(frozen=True)
-class Composed:
-    """A ``value`` in OpenCV's form, the dotted names of its ``sources``, and the ``table`` that qualifies it."""
-
-    value: NDArray[np.float64]
-    sources: tuple[str, ...]
-    table: dict[str, Any]
-
-
 def with_usual_names(tree: dict[str, Any]) -> dict[str, Any]:
     """Return the tree of one file, with composed values under names that begin with a plus."""
     out = _of_message(tree)
-    out |= _single_numbers(out) | _bouguet(out) | _kalibr(out)
+    out |= usual_values(eyes_of(out)) | _bouguet(out)
     for name, holder in [("", tree), *((name, value) for name, value in tree.items() if isinstance(value, dict))]:
         if isinstance(holder.get("CameraParameters1"), dict):
             out |= _toolbox_pair(holder, name)
@@ -73,37 +61,6 @@ def _of_message(tree: dict[str, Any]) -> dict[str, Any]:
     return out | {"image_width": tree["width"], "image_height": tree["height"]}
 
 
-def _single_numbers(tree: dict[str, Any]) -> dict[str, Any]:
-    """Return the first camera whose values are single numbers."""
-    maps = [(f"{name}.", value, "") for name, value in tree.items() if isinstance(value, dict)]
-    for source, table, before in (("", tree, ""), ("", tree, "Camera."), ("", tree, "Camera1."), *maps):
-        fx, fy, cx, cy = (_number(table, before, *names) for names in (("fx",), ("fy",), ("cx", "ppx"), ("cy", "ppy")))
-        if fx is None or fy is None or cx is None or cy is None:
-            continue
-        lens = {"camera_model": table.get(f"{before}type") or table.get(f"{before}camera_model")} | table
-        fisheye = str(lens["camera_model"]).lower().startswith("kannala")
-        usual = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        bent = [_number(table, before, name) for name in usual]
-        least = max((index + 1 for index, value in enumerate(bent) if value is not None), default=0)
-        count = next(each for each in (0, 4, 5, 8) if each >= least)
-        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        out = {
-            "+K": Composed(matrix, (f"{source}{before}fx",), lens),
-            "+D1": Composed(np.array([value or 0.0 for value in bent[:count]]), (), lens),
-        }
-        width, height = _number(table, before, "width"), _number(table, before, "height")
-        if width is not None and height is not None:
-            out["+size"] = Composed(np.array([width, height]), (), lens)
-        return out
-    return {}
-
-
-def _number(table: dict[str, Any], before: str, *names: str) -> float | None:
-    """Return the first of several names that has one finite number."""
-    found = (vector(table.get(f"{before}{name}"), 1) for name in names)
-    return next((float(each[0]) for each in found if each is not None), None)
-
-
 def _bouguet(tree: dict[str, Any]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for ending in _ENDINGS:
@@ -117,34 +74,6 @@ def _bouguet(tree: dict[str, Any]) -> dict[str, Any]:
     width, height = (vector(tree.get(name), 1) for name in ("nx", "ny"))
     if width is not None and height is not None:
         out["+size"] = Composed(np.concatenate([width, height]), ("nx", "ny"), tree)
-    return out
-
-
-def _kalibr(tree: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of the first two cameras of a chain."""
-    names = sorted(
-        (name for name, value in tree.items() if re.fullmatch(r"cam\d+", name) and isinstance(value, dict)),
-        key=lambda name: int(name[3:]),
-    )
-    out: dict[str, Any] = {}
-    for number, name in zip("12", names, strict=False):
-        camera = tree[name]
-        numbers = vector(camera.get("intrinsics"))
-        if numbers is None or "camera_model" not in camera or len(numbers) < 4:
-            return {}
-        fx, fy, cx, cy = numbers[-4:]  # the parameters of other models, which are refused, precede them
-        out[f"+K{number}"] = Composed(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), (f"{name}.intrinsics",), camera)
-        bent = vector(camera.get("distortion_coeffs"))
-        if bent is not None:
-            out[f"+D{number}"] = Composed(bent, (f"{name}.distortion_coeffs",), camera)
-        size = vector(camera.get("resolution"), 2)
-        if size is not None:
-            out["+size" if number == "1" else "+size2"] = Composed(size, (f"{name}.resolution",), camera)
-        step = vector(camera.get("T_cn_cnm1"), 16)
-        if number == "2" and step is not None:
-            motion, metres = step.reshape(4, 4), {"unit": "m"}
-            out["+R"] = Composed(motion[:3, :3], (f"{name}.T_cn_cnm1",), metres)
-            out["+T"] = Composed(motion[:3, 3], (f"{name}.T_cn_cnm1",), metres)
     return out
 
 
@@ -214,14 +143,3 @@ def _toolbox_camera(camera: dict[str, Any], name: str, number: str, units: dict[
 
 def _dotted(*names: str) -> str:
     return ".".join(name for name in names if name)
-
-
-def vector(value: Any, size: int | None = None) -> NDArray[np.float64] | None:
-    """Return a value as finite numbers (n,), by rows; None if it is anything else, or has another ``size``."""
-    if value is None:
-        return None
-    try:
-        numbers = np.asarray(value, float).reshape(-1)
-    except (ValueError, TypeError):
-        return None
-    return numbers if np.isfinite(numbers).all() and (size is None or len(numbers) == size) else None

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
-from mitsim.sensor.calibration_programs import vector
+from mitsim.sensor.calibration_eyes import LENS_MODELS, vector
 from mitsim.sensor.camera import Camera
 
 #: focal length over the longer side: fields of view from 169 deg to 0.06 deg
@@ -43,6 +43,9 @@ UNITS_MM = {
     for word in words.split()
 }
 
+#: units of length that an option may name [mm]
+LENGTHS_MM = {word: UNITS_MM[word] for word in ("um", "mm", "cm", "m", "inch", "foot")}
+
 #: names under which files state their unit of length
 _UNIT_NAMES = ("unit", "units", "length_unit", "world_units", "WorldUnits", "translation_unit", "baseline_unit")
 
@@ -52,13 +55,23 @@ _NOT_LENGTHS = ("px", "pixel", "pixels", "deg", "degree", "degrees", "rad", "rad
 #: OpenCV's lens models by the names that programs give them
 _MODELS = {
     **dict.fromkeys(
-        ("plumb_bob", "radtan", "rational_polynomial", "brown_conrady", "none", "pinhole", "perspective"), "perspective"
+        (
+            *("plumb_bob", "radtan", "radial-tangential", "rational_polynomial", "brown_conrady", "none"),
+            *("pinhole", "perspective", "opencv"),
+        ),
+        "perspective",
     ),
-    **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt", "kannalabrandt8", "kb4"), "fisheye"),
+    **dict.fromkeys(
+        ("equidistant", "fisheye", "opencv_fisheye", "kannala_brandt", "kannalabrandt8", "kb4"),
+        "fisheye",
+    ),
 }
 
-#: values of ``camera_model`` that are none of OpenCV's; other texts there may name a device
+#: values of other names than ``distortion_model`` that are none of OpenCV's; other texts there may name a device
 _OTHER_MODELS = ("omni", "omnidirectional", "mei", "eucm", "ds", "double_sphere", "fov", "scaramuzza", "ocam")
+
+#: models of librealsense that are OpenCV's only if all coefficients are zero
+_OF_ZEROS = ("inverse_brown_conrady", "modified_brown_conrady", "ftheta")
 
 #: shortest baseline [mm] that raises no doubt about the unit
 _SHORTEST_MM = 1.0
@@ -244,12 +257,15 @@ def lens_model(
         If the model is none of OpenCV's, or contradicts the given one.
     """
     found: str | None = None
-    for name in ("camera_model", "distortion_model"):
+    for name in LENS_MODELS:
         text = table.get(name)
         if not isinstance(text, str) or not text:
             continue
-        known = _MODELS.get(text.lower())
-        other = text.lower() in _OTHER_MODELS if name == "camera_model" else known is None and not straight
+        word = text.lower().removeprefix("distortion.")  # as librealsense's wrappers write it
+        known = _MODELS.get(word)
+        other = word in _OTHER_MODELS or (word in _OF_ZEROS and not straight)
+        if name == "distortion_model":
+            other = known is None and not straight
         if other and given is None:
             hint = 'if the coefficients are OpenCV\'s, say so in a sensor file: model = "perspective" or "fisheye"'
             raise InputError(where, name, repr(text), f"OpenCV's models: {', '.join(_MODELS)}", hint)

@@ -307,13 +307,6 @@ class Rig:
         length = np.linalg.norm(direction)
         return direction / length if length > 0 else np.array([1.0, 0.0, 0.0])
 
-    @property
-    def epipolar(self) -> tuple[int, int]:
-        """Return the image axis of disparities (1: along rows) and the sign of the second eye's direction (1 or -1)."""
-        aside = self.reference.sensor_from_camera.rotation.T @ self.baseline_direction
-        columns = bool(abs(aside[0]) >= abs(aside[1]))
-        return int(columns), 1 if aside[1 - columns] > 0 else -1
-
 
 def stereo_rectification(left: Camera, right: Camera) -> Rectification:
     """Rectify a pair as OpenCV does (Bouguet's method): equal rotation of both cameras, focal length kept in scale.

@@ -32,6 +32,12 @@ from mitsim.sensor.image_role import (
 )
 
 
+def check_displayable(mean: float, contrast: float) -> None:
+    """Raise a ValueError unless fringes stay within 0 and 1."""
+    if mean - contrast < -1e-12 or mean + contrast > 1 + 1e-12:
+        raise ValueError("mean and contrast whose fringes stay within 0 and 1")
+
+
 class PlainImages(Document):
     """``count`` images without a code: ``white``, ``black``, or ``unused`` images that no decoder needs."""
 
@@ -60,7 +66,7 @@ class GrayImages(Document):
     show: Literal["gray"]
     axis: Axis = "columns"
     bits: int | None = Field(default=None, ge=1, le=15)
-    stripe_px: Annotated[float, Field(ge=1, le=1e5)] | None = None
+    stripe_px: Annotated[float, Field(ge=1, le=1e6)] | None = None
     first: Literal["most_significant", "least_significant"] = "most_significant"
     inverse: Literal["none", "each", "before", "all"] = "none"
     offset_px: Offset | None = None
@@ -164,8 +170,7 @@ class ImageSequence(Document):
 
     @model_validator(mode="after")
     def _decodable(self) -> ImageSequence:
-        if self.mean - self.contrast < -1e-12 or self.mean + self.contrast > 1 + 1e-12:
-            raise ValueError("mean and contrast whose fringes stay within 0 and 1")
+        check_displayable(self.mean, self.contrast)
         if not self.axes:
             raise ValueError("at least one group of gray or fringes")
         plain = [group.show for group in self.images if isinstance(group, PlainImages)]

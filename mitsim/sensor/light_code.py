@@ -1,7 +1,7 @@
 """Define the codes of a structured-light projector: its sequence of images, and the role of each.
 
-Signal chain: code -> roles, the list of its images in display order -> for each role the value 0..1 at a projector
-coordinate -> patterns in projector pixels.
+Signal chain: code -> the image sequence that it abbreviates -> roles, the list of its images in display order -> for
+each role the value 0..1 at a projector coordinate -> patterns in projector pixels.
 
 A code runs along one axis: with ``columns`` the value changes with the column u, with ``rows`` with the row v. Pixel
 centres lie at integers, so the left edge of the projector is at u = -0.5. All codes count from there, unless ``wave``,
@@ -19,7 +19,6 @@ Lasers in Engineering 50(4), 2012.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 from typing import Annotated, Literal
 
@@ -29,19 +28,15 @@ from pydantic import Field, field_validator, model_validator
 
 from characterisation.files.documents import Document
 from characterisation.files.errors import InputError
-from mitsim.sensor.image_role import (
-    Axis,
-    Offset,
-    Origin,
-    Period,
-    Role,
-    Share,
-    Steps,
-    Wave,
-    offset_in_pixels,
-    origin_shift,
+from mitsim.sensor.image_role import Axis, Offset, Origin, Period, Role, Share, Steps, Wave
+from mitsim.sensor.image_sequence import (
+    FringeImages,
+    GrayImages,
+    Group,
+    ImageSequence,
+    PlainImages,
+    check_displayable,
 )
-from mitsim.sensor.image_sequence import ImageSequence
 
 
 class PhaseShift(Document):
@@ -75,13 +70,14 @@ class PhaseShift(Document):
     def _consistent(self) -> PhaseShift:
         if isinstance(self.steps, list) and len(self.steps) != len(self.periods_px):
             raise ValueError(f"steps: one number, or as many as there are periods ({len(self.periods_px)})")
-        _displayable(self.mean, self.contrast)
+        check_displayable(self.mean, self.contrast)
         return self
 
-    @property
-    def steps_of_period(self) -> tuple[int, ...]:
-        """Return N of each period."""
-        return tuple(self.steps) if isinstance(self.steps, list) else (self.steps,) * len(self.periods_px)
+    def sequence(self) -> ImageSequence:
+        """Return the code as an image sequence."""
+        steps = self.steps if isinstance(self.steps, list) else [self.steps] * len(self.periods_px)
+        fringes = [_fringes(self, period, count) for period, count in zip(self.periods_px, steps, strict=True)]
+        return _sequence(fringes, self.mean, self.contrast)
 
 
 class GrayCode(Document):
@@ -108,6 +104,16 @@ class GrayCode(Document):
             raise ValueError("inverse or white_black (or both): without them bits have no threshold")
         return self
 
+    def sequence(self) -> ImageSequence:
+        """Return the code as an image sequence."""
+        along: tuple[Axis, ...] = ("columns", "rows") if self.axis == "both" else (self.axis,)
+        inverse: Literal["each", "none"] = "each" if self.inverse else "none"
+        gray = [
+            GrayImages(show="gray", axis=axis, bits=self.bits, inverse=inverse, offset_px=self.offset_px)
+            for axis in along
+        ]
+        return _sequence([*_plain(self.white_black), *gray])
+
 
 class GrayCodePhaseShift(Document):
     """Gray code for the order of the fringe, phase shifting inside it.
@@ -133,58 +139,46 @@ class GrayCodePhaseShift(Document):
 
     @model_validator(mode="after")
     def _consistent(self) -> GrayCodePhaseShift:
-        _displayable(self.mean, self.contrast)
+        check_displayable(self.mean, self.contrast)
         return self
+
+    def sequence(self) -> ImageSequence:
+        """Return the code as an image sequence."""
+        stripe = self.period_px / 2 if self.complementary else self.period_px
+        inverse: Literal["each", "none"] = "each" if self.inverse else "none"
+        gray = GrayImages(show="gray", axis=self.axis, stripe_px=stripe, inverse=inverse)
+        images: list[Group] = [*_plain(self.white_black), gray, _fringes(self, self.period_px, self.steps)]
+        return _sequence(images, self.mean, self.contrast)
+
+
+def _fringes(code: PhaseShift | GrayCodePhaseShift, period_px: float, steps: int) -> FringeImages:
+    return FringeImages(show="fringes", axis=code.axis, period_px=period_px, steps=steps, wave=code.wave, at=code.at)
+
+
+def _plain(shown: bool) -> list[PlainImages]:
+    return [PlainImages(show="white"), PlainImages(show="black")] if shown else []
+
+
+def _sequence(images: Sequence[Group], mean: float = 0.5, contrast: float = 0.5) -> ImageSequence:
+    return ImageSequence(kind="image_sequence", images=list(images), mean=mean, contrast=contrast)
 
 
 LightCode = PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence
 
 
+def sequence(code: LightCode) -> ImageSequence:
+    """Return a code as an image sequence."""
+    return code if isinstance(code, ImageSequence) else code.sequence()
+
+
 def axes(code: LightCode) -> tuple[Axis, ...]:
     """Return the axes along which a code gives a coordinate."""
-    if isinstance(code, ImageSequence):
-        return code.axes
-    return ("columns", "rows") if code.axis == "both" else (code.axis,)
+    return sequence(code).axes
 
 
 def has_fringes(code: LightCode, axis: Axis) -> bool:
     """Return whether phases, not only the stripes of a Gray code, give the coordinate along an axis."""
-    if isinstance(code, ImageSequence):
-        return bool(code.fringes(axis))
-    return not isinstance(code, GrayCode) and code.axis == axis
-
-
-def stripes(code: GrayCode | GrayCodePhaseShift, extent: int) -> tuple[int, float]:
-    """Return the number of Gray bits along an axis of ``extent`` pixels and the width of the finest stripe [px].
-
-    Raises
-    ------
-    InputError
-        If the code has more bits than the pixels need.
-    """
-    if isinstance(code, GrayCodePhaseShift):
-        stripe = code.period_px / 2 if code.complementary else code.period_px
-        return max(1, int(np.ceil(np.log2(np.ceil(extent / stripe))))), stripe
-    needed = max(1, int(np.ceil(np.log2(extent))))
-    bits = code.bits or needed
-    if bits > needed:
-        raise InputError("pattern", "bits", bits, f"up to {needed}, which distinguish all {extent} {code.axis}")
-    if code.offset_px is not None and code.offset_px != "centred" and code.offset_px + extent > 2**needed:
-        raise InputError(
-            "pattern", "offset_px", code.offset_px, f"up to {2**needed - extent}, for {bits} bits over {extent} px"
-        )
-    return bits, float(2 ** (needed - bits))
-
-
-def gray_offset(code: GrayCode | GrayCodePhaseShift, extent: int) -> float:
-    """Return the offset of the Gray code along an axis of ``extent`` pixels [px].
-
-    Raises
-    ------
-    InputError
-        As for :func:`stripes`.
-    """
-    return offset_in_pixels(code.offset_px, *stripes(code, extent), extent) if isinstance(code, GrayCode) else 0.0
+    return bool(sequence(code).fringes(axis))
 
 
 def roles(code: LightCode, width: int, height: int) -> list[Role]:
@@ -193,28 +187,19 @@ def roles(code: LightCode, width: int, height: int) -> list[Role]:
     White and black come first. Then, for each axis (columns first), the Gray bits from the most significant on, each
     followed by its inverse. Then, for each period from the longest on, its N shifts. An image sequence has its own
     order.
+
+    Raises
+    ------
+    InputError
+        If the Gray bits do not cover the projector, or a Gray code has more of them than the projector needs.
     """
-    if isinstance(code, ImageSequence):
-        return code.roles(width, height)
-    out: list[Role] = []
-    if not isinstance(code, PhaseShift):
-        if code.white_black:
-            out += [Role("white"), Role("black")]
+    if isinstance(code, GrayCode):
         for axis in axes(code):
             extent = width if axis == "columns" else height
-            (bits, stripe), offset = stripes(code, extent), gray_offset(code, extent)
-            for bit in range(bits):
-                out.append(Role("gray", axis, bit, stripe * 2 ** (bits - 1 - bit), offset=offset))
-                if code.inverse:
-                    out.append(replace(out[-1], kind="gray_inverse"))
-    if not isinstance(code, GrayCode):
-        every = _fringes(code)
-        out += [
-            Role("phase", code.axis, index, period, 2 * np.pi * k / steps + origin_shift(code.wave, code.at, period))
-            for index, (period, steps) in enumerate(every)
-            for k in range(steps)
-        ]
-    return out
+            needed = max(1, (extent - 1).bit_length())
+            if (code.bits or 0) > needed:
+                raise InputError("pattern", "bits", code.bits, f"up to {needed}, which distinguish all {extent} {axis}")
+    return sequence(code).roles(width, height)
 
 
 def value(code: LightCode, role: Role, coordinate: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -268,14 +253,3 @@ def check_stack(stack: NDArray[np.generic], roles: Sequence[Role]) -> None:
         raise InputError("image stack", "shape", stack.shape, f"({len(roles)}, rows, columns), as the code defines")
     if stack.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         raise InputError("image stack", "dtype", stack.dtype, "uint8, uint16, float32 or float64 grey levels")
-
-
-def _fringes(code: PhaseShift | GrayCodePhaseShift) -> list[tuple[float, int]]:
-    if isinstance(code, GrayCodePhaseShift):
-        return [(code.period_px, code.steps)]
-    return list(zip(code.periods_px, code.steps_of_period, strict=True))
-
-
-def _displayable(mean: float, contrast: float) -> None:
-    if mean - contrast < -1e-12 or mean + contrast > 1 + 1e-12:
-        raise ValueError("mean and contrast whose fringes stay within 0 and 1")

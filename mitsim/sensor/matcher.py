@@ -2,11 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from mitsim.sensor.decoder_settings import DepthSettings
+
+
+def odd(size: int) -> int:
+    """Return a size [px]; raise a ValueError unless it is odd."""
+    if size % 2 == 0:
+        raise ValueError("an odd number of pixels")
+    return size
+
+
+def _odd_or_none(size: int) -> int:
+    if size != 0 and (size % 2 == 0 or size < 5):
+        raise ValueError("0, or an odd number of pixels from 5")
+    return size
+
+
+OddSum = Annotated[int, Field(ge=1, le=31), AfterValidator(odd)]
+ContrastWindow = Annotated[int, Field(ge=0, le=101), AfterValidator(_odd_or_none)]
 
 
 class MatcherSettings(DepthSettings):
@@ -41,9 +58,9 @@ class MatcherSettings(DepthSettings):
     level_key = "minimum_contrast_dn"
 
     method: Literal["sgbm", "census", "correlation"] = "sgbm"
-    contrast_window_px: int = Field(default=0, ge=0, le=101)
+    contrast_window_px: ContrastWindow = 0
     census_window_px: Literal[3, 5, 7, 9] = Field(default=7, repr=False)
-    block_size: int = Field(default=5, ge=1, le=31)
+    block_size: OddSum = 5
     p1: float = Field(default=8, ge=0, le=1000)
     p2: float = Field(default=32, ge=0, le=1000)
     uniqueness_percent: int = Field(default=5, ge=0, le=100)
@@ -62,20 +79,6 @@ class MatcherSettings(DepthSettings):
     def support_px(self) -> int:
         """Return the side of the square of pixels that the cost of one pixel depends on."""
         return self.block_size + (self.census_window_px - 1 if self.method == "census" else 0)
-
-    @field_validator("block_size")
-    @classmethod
-    def _odd(cls, size: int) -> int:
-        if size % 2 == 0:
-            raise ValueError("an odd number of pixels")
-        return size
-
-    @field_validator("contrast_window_px")
-    @classmethod
-    def _odd_or_none(cls, size: int) -> int:
-        if size != 0 and (size % 2 == 0 or size < 5):
-            raise ValueError("0, or an odd number of pixels from 5")
-        return size
 
     @model_validator(mode="after")
     def _check_penalties(self) -> MatcherSettings:

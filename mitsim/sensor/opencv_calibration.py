@@ -11,21 +11,20 @@ of the two cameras. Values that qualify these numbers are those of :mod:`mitsim.
 
 from __future__ import annotations
 
-import math
 import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from characterisation.files.documents import Document, validate
 from characterisation.files.errors import InputError, nearest
+from mitsim.sensor.calibration_eyes import size_of
 from mitsim.sensor.calibration_names import USUAL_NAMES, Names
-from mitsim.sensor.calibration_programs import vector
+from mitsim.sensor.calibration_numbers import by_rows, checked_matrix, numbers_of
 from mitsim.sensor.calibration_qualifiers import (
     baseline_note,
     lens_model,
@@ -136,15 +135,14 @@ def _sized(table: dict[str, Any], size: tuple[int, int] | None) -> dict[str, Any
     return table | {"cameras": sized}
 
 
-def has_pair(path: Path) -> bool:
-    """Return whether a calibration file has matrices of two cameras, and the pose of the second.
+def has_pair(tree: CalibrationTree) -> bool:
+    """Return whether calibration files have matrices of two cameras, and the pose of the second.
 
     Raises
     ------
     InputError
-        If the file cannot be read.
+        If the files contradict one another.
     """
-    tree = read_tree([path])
     return all(any(tree.find(key) for key in USUAL_NAMES[what][1]) for what in ("matrix", "rotation", "translation"))
 
 
@@ -206,6 +204,8 @@ class _Values:
         keys = self.calibration_table.keys.get(name, EyeKeys())
         given = getattr(keys, what)
         names = (given,) if given else USUAL_NAMES[what][place]
+        if keys.matrix and (what == "matrix" or not given):
+            names = (*(f"+{what} of {each}" for each in (keys.matrix, keys.matrix.rpartition(".")[0])), *names)
         if keys.file and what in ("matrix", "distortion", "size"):
             # a file of one eye uses the names of a single camera
             names = tuple(f"{keys.file}:{key}" for key in ((given,) if given else names + USUAL_NAMES[what][0]))
@@ -215,9 +215,9 @@ class _Values:
             names = tuple(key for key in names if key not in USUAL_NAMES[what][1])
         for key in names:
             found = self.tree.find(key)
-            if found is not None:
-                name_in_file = key.rpartition(":")[2].removeprefix("+")
-                return replace(found, value=_numbers(found.value, found.file, name_in_file, shapes))
+            if found is not None and (key == given or what == "size" or not isinstance(found.value, dict)):
+                value = size_of(found.value) if what == "size" and isinstance(found.value, dict) else found.value
+                return replace(found, value=numbers_of(value, found.file, found.name, shapes))
         if needed or given:
             self.missing.append((name, what, names))
         return None
@@ -243,7 +243,7 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
     The sensor file's ``own`` keys may be missing in the calibration.
     """
     calibration_table, file = values.calibration_table, ", ".join(dict.fromkeys(map(str, values.tree.files)))
-    matrix = values.find(name, place, "matrix", ((3, 3),), needed="focal_px" not in own)
+    matrix = values.find(name, place, "matrix", ((3, 3), (9,)), needed="focal_px" not in own)
     table = {} if matrix is None else matrix.table
     values.tables.append(table)
     found = values.find(name, place, "distortion", ((0,), (4,), (5,), (8,), (12,), (14,)), needed=False)
@@ -258,7 +258,10 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
     size = _size(values, name, place, table)
     out: dict[str, Any] = {"model": model, "distortion": distortion.tolist()}
     if matrix is not None:
-        K = _checked_matrix(matrix.value, name, file)
+        K, by_columns = by_rows(matrix.value)
+        K = checked_matrix(K, name, file)
+        if by_columns:
+            values.notes.append(f"calibration {matrix.file.name}: {name}: its matrix is written by columns")
         read_out = read_out_of(table, matrix.file)
         if read_out is not None:
             width, height = own.get("width"), own.get("height")
@@ -272,33 +275,24 @@ def _eye(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[st
     return out | (_pose(values, name, place, own) if place > 0 else {})
 
 
-def _checked_matrix(K: NDArray[np.float64], name: str, file: str) -> NDArray[np.float64]:
-    if abs(K[0, 1]) > 1e-9 and K[0, 0] > 0:
-        hint = "calibrate without skew: est_alpha = 0 in MATLAB's toolbox"
-        raise InputError(file, f"matrix of {name}", f"a skew of {K[0, 1]:.3g} px", "fx 0 cx, 0 fy cy, 0 0 1", hint)
-    if K[0, 0] <= 0 or K[1, 1] <= 0 or abs(K[2, 2] - 1) > 1e-9:
-        raise InputError(file, f"matrix of {name}", np.round(K, 3).tolist(), "fx 0 cx, 0 fy cy, 0 0 1")
-    return K
-
-
 def _size(values: _Values, name: str, place: int, table: dict[str, Any]) -> tuple[int, int] | None:
     """Return the image size (width, height) [px] of an eye that the files state; None without one.
 
-    ``table`` has the matrix of the eye; an ``image_width`` and ``image_height`` beside the matrix come first.
+    ``table`` has the matrix of the eye; a width and height beside the matrix come first.
     """
     size = values.find(name, place, "size", ((2,),), needed=False)
     if size is not None:
         return int(size.value[0]), int(size.value[1])
-    beside = [vector(table.get(key), 1) for key in ("image_width", "image_height")]
+    beside = size_of(table)
     own_file = values.calibration_table.keys.get(name, EyeKeys()).file
-    if beside[0] is not None and beside[1] is not None and (place < 2 or own_file or table is not values.tables[0]):
-        return int(beside[0][0]), int(beside[1][0])
+    if beside is not None and (place < 2 or own_file or table is not values.tables[0]):
+        return int(beside[0]), int(beside[1])
     if place == 2 and not own_file:
         return None
     sides = [values.tree.find(f"{own_file}:{key}" if own_file else key) for key in ("image_width", "image_height")]
     if sides[0] is None or sides[1] is None:
         return None
-    width, height = (_numbers([each.value], each.file, "image_width", ((1,),)) for each in sides if each)
+    width, height = (numbers_of([each.value], each.file, "image_width", ((1,),)) for each in sides if each)
     return int(width[0]), int(height[0])
 
 
@@ -332,20 +326,3 @@ def _pose(values: _Values, name: str, place: int, own: dict[str, Any]) -> dict[s
         turn = Rotation.from_matrix(R.T)
         angles = turn.as_euler("xyz", degrees=True).tolist()
     return {"rotation_deg": angles, "position_mm": (-turn.apply(T)).tolist()}
-
-
-def _numbers(value: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
-    """Convert a matrix or lists to an array of one of several shapes; row and column vectors are equivalent."""
-    try:
-        values = np.asarray(value, float)
-    except (ValueError, TypeError):
-        values = np.array(math.nan)
-    vector = len(shapes[0]) == 1
-    found = values.reshape(-1) if vector and values.ndim and values.size == max(values.shape) else values
-    if found.shape not in shapes or not np.isfinite(found).all():
-        if vector and values.ndim and values.size == 0 and (0,) in shapes:
-            return np.empty(0)
-        allowed = " or ".join(" x ".join(map(str, shape)) for shape in shapes) + " finite numbers"
-        shown = f"an array of {' x '.join(map(str, values.shape))}" if values.ndim else "something else"
-        raise InputError(file, key, shown, allowed)
-    return found

@@ -18,12 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-#: camera axes of Mitsuba in those of OpenCV (the matrix is its own inverse)
-MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0])
-
-#: film coordinate (pixel corner at 0) minus OpenCV pixel coordinate (pixel centre at 0)
-FILM_OFFSET_PX = 0.5
-
 
 @dataclass(frozen=True)
 class Transform:
@@ -101,10 +95,3 @@ def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike, roll_deg: flo
     upright = np.stack([x, np.cross(z, x), z], axis=1)
     roll = Rotation.from_euler("z", roll_deg, degrees=True).as_matrix()
     return Transform(upright @ roll, position)
-
-
-def mitsuba_to_world(world_from_camera: Transform) -> NDArray[np.float64]:
-    """Return the ``to_world`` matrix (4, 4) of a stock Mitsuba sensor or projector at the pose of a camera."""
-    out = world_from_camera.matrix()
-    out[:3, :3] = out[:3, :3] @ MITSUBA_FROM_OPENCV
-    return out

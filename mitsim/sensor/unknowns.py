@@ -15,6 +15,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from characterisation.files.documents import Document
 from mitsim.sensor.drift import Drift
+from mitsim.sensor.matcher import ContrastWindow, OddSum, odd
 
 NotNegative = Annotated[float, Field(ge=0)]
 Percent = Annotated[float, Field(ge=0, le=100)]
@@ -33,24 +34,10 @@ def _from_one(ends: tuple[float, float]) -> tuple[float, float]:
     return ends
 
 
-def _odd(size: int) -> int:
-    if size % 2 == 0:
-        raise ValueError("an odd number of pixels")
-    return size
-
-
-def _odd_or_none(size: int) -> int:
-    if size != 0 and (size % 2 == 0 or size < 5):
-        raise ValueError("0, or an odd number of pixels from 5")
-    return size
-
-
 #: a range of numbers over 0
 Factors = Annotated[tuple[_OverZero, _OverZero], AfterValidator(_in_order)]
 
-OddBlock = Annotated[int, Field(ge=3, le=31), AfterValidator(_odd)]
-OddSum = Annotated[int, Field(ge=1, le=31), AfterValidator(_odd)]
-ContrastWindow = Annotated[int, Field(ge=0, le=101), AfterValidator(_odd_or_none)]
+OddBlock = Annotated[int, Field(ge=3, le=31), AfterValidator(odd)]
 
 #: illuminance [lx] of the named rooms: EN 12464-1 requires 500 lx at workplaces
 ROOMS = {"office": 500.0, "dark cell": 0.0}

@@ -304,12 +304,12 @@ def _map(study: Study, twin: RenderedMeasurements | None, folder: Path) -> Perfo
 
 
 def _residual(renderer: RenderedMeasurements, number: int) -> RenderResidual:
-    """Return the render noise of a view, rendered as in its trials; takes as long as three trials."""
+    """Return the render noise of a view without kept light paths, which trials have; takes three trials' time."""
     study = renderer.study
     pose, camera = study.view(number).world_from_sensor, next(iter(study.sensor.rig.cameras))
     found = render_residual(renderer.simulated, study.scene, pose, camera, renderer.rendering, seed=study.file.seed)
     if found.noise > LIMIT:
-        say(f"view {number}: {found}; all trials of a finish share this noise, so it counts as an effect of the finish")
+        say(f"view {number}: {found}")
     return warn_above_limit(f"view {number}", found) if found.quadrature > LIMIT else found
 
 

@@ -33,7 +33,8 @@ from mitsim.study.scene_geometry import write_scene_geometry
 from mitsim.study.screened_errors import stated_shares
 from mitsim.study.session import Session
 from mitsim.study.view_sets.confirmed_set import Search, joining_in_words
-from mitsim.study.virtual.race import Raced, raced_errors, with_race
+from mitsim.study.virtual.race import Raced
+from mitsim.study.virtual.race_tables import raced_errors, with_race
 from mitsim.views import write_views
 
 

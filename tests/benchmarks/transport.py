@@ -27,7 +27,8 @@ from mitsim.scene.load import load_scene
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.scene.ray_casting.eye import Eye
 from mitsim.sensor.preset import load_sensor
-from mitsim.sensor.transforms import look_at, mitsuba_to_world
+from mitsim.sensor.transforms import look_at
+from tests.stock_mitsuba import mitsuba_to_world
 
 SCENE = Path(__file__).parents[2] / "scenes/two_pillars/two_pillars.xml"
 SAMPLES, ROUNDS = 16, 7

@@ -143,6 +143,8 @@ def test_the_command_calibrates_a_table(tmp_path):
         ("a.yml", "%YAML:1.0\n---\nother: 3\n"),
         ("a.npz", "no archive"),
         ("a.json", "{}"),
+        ("a.yml", "%YAML:1.0\n---\nimage_points: " + "[" * 100_000),
+        ("a.json", '{"image_points": ' + "[" * 100_000),
     ],
 )
 def test_files_without_corners_are_refused(tmp_path, name, text):

@@ -198,6 +198,34 @@ def test_depths_with_both_origins_are_stated_where_nothing_decides():
     assert said(replace(stated(capture, sequence(gray())), source="simulated")) == ""
 
 
+@pytest.mark.parametrize("shown", [1, 3, 10])
+@pytest.mark.parametrize("width", [200, 240])
+def test_an_offset_of_both_axes_is_measured_by_the_rows(width, shown):
+    """A program that counts from 1: depths are off by a column, without any other sign."""
+    beamer = wide(200, 150, 211) if width == 200 else wide(240, 192, 253)
+    capture = taken(sequence(gray(offset_px=shown), gray("rows", offset_px=shown)), beamer=beamer)
+    assert said(capture) == ""
+    words = said(stated(capture, sequence(gray(), gray("rows"))))
+    assert f"offset_px = {shown} in [pattern]" in words
+    assert said(stated(capture, sequence(gray(offset_px=0), gray("rows", offset_px=0)))).count("offset_px") == 0
+
+
+@pytest.mark.parametrize("down", [-2.0, 1.5])
+def test_a_projector_that_stands_lower_is_no_offset(down):
+    """The rows miss by a distance that grows toward the camera, or by no whole pixel."""
+    capture = taken(sequence(gray(), gray("rows")), beamer=wide(200, 150, 211))
+    assert "offset_px" not in said(with_rig_moved(capture, down))
+
+
+def with_rig_moved(capture, down):
+    projector = capture.rig.projector
+    place = projector.sensor_from_camera
+    moved = replace(
+        projector, sensor_from_camera=Transform(place.rotation, place.translation + np.array([0.0, down, 0.0]))
+    )
+    return replace(capture, rig=replace(capture.rig, projector=moved))
+
+
 def test_a_range_decides_between_origins():
     capture = stated(taken(sequence(gray(offset_px="centred")), beamer=wide(240, 192, 253)), sequence(gray()))
     near = SETTINGS.model_copy(update={"near_mm": 400, "far_mm": 540})

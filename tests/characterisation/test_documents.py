@@ -163,3 +163,18 @@ def test_a_value_in_place_of_a_table_gets_the_keys_of_the_table():
     ):
         with pytest.raises(InputError, match=place):
             validate("a.toml", table, Whole)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "allowed"),
+    [
+        ("width", "wide", "a whole number"),
+        ("focal", 3, "a list"),
+        ("focal", [1, "x"], "a number"),
+        ("model", 3, "a text"),
+    ],
+)
+def test_types_are_named_as_toml_has_them(key, value, allowed):
+    camera = {"width": 640, "focal": [1, 1]} | {key: value}
+    with pytest.raises(InputError, match=f"allowed: {allowed}"):
+        validate("a.toml", TABLE | {"cameras": {"left": camera}}, Whole)

@@ -161,15 +161,16 @@ def test_what_is_displaced_by_more_than_a_hundredth_of_the_way_is_no_point() -> 
         expected_fit(surface, replace(points, displaced=np.where(mostly, 8.0, 0.0)), 100)
 
 
-def test_a_radius_as_uncertain_as_half_of_itself_is_measured_two_times_in_three() -> None:
+def test_a_radius_that_the_points_do_not_determine_has_no_chance() -> None:
     surface = SURFACES["cylinder"]
     points = seen(surface, 1.0, 1e-6, 1.0, 0.01)
     sure = expected_fit(surface, points, 100)
     assert sure.chance == 1.0
-    scale = 10.0 / np.sqrt(sure.covariance[4, 4])
-    noisy = expected_fit(surface, replace(points, persistent=points.persistent * scale), 100)
-    assert np.sqrt(noisy.covariance[4, 4]) == pytest.approx(10.0)
-    assert noisy.chance == pytest.approx(norm.cdf(1) - norm.cdf(-1))
+    for radius_uncertainty, chance in ((0.1, 1.0), (10.0, 0.0)):  # 10 mm is half the radius
+        scale = radius_uncertainty / np.sqrt(sure.covariance[4, 4])
+        noisy = expected_fit(surface, replace(points, persistent=points.persistent * scale), 100)
+        assert np.sqrt(noisy.covariance[4, 4]) == pytest.approx(radius_uncertainty)
+        assert noisy.chance == pytest.approx(chance, abs=1e-9)
     plane = SURFACES["plane"]
     without_radius = expected_fit(plane, seen(plane, 1.0, 0.1, 1.0, 50.0), 100)
     assert without_radius.chance == 1.0

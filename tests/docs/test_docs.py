@@ -39,7 +39,6 @@ from mitsim.sensor.rig_covariance import CovarianceFile
 from mitsim.sensor.sensor_file import ImagerTable, ProjectorTable, SensorFile
 from mitsim.sensor.unknowns import UnknownsTable
 from mitsim.study import StudyFile
-from mitsim.study.choice_document import ChoiceDocument
 from mitsim.study.many_captures import ManyFile
 from mitsim.study.run_folder import RunDocument
 from mitsim.study.scoring import pose_columns
@@ -48,10 +47,11 @@ from tests.proofs.laboratory.cases import LaboratoryFile
 from tests.proofs.part_cases import PartCasesFile
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PROOFS = ROOT / "tests" / "proofs" / "README.md"
+PAGES = [ROOT / "README.md", PROOFS, *sorted((ROOT / "docs").rglob("*.md"))]
 FORMAT_PAGES = sorted((ROOT / "docs" / "reference" / "formats").glob("*.md"))
 #: text of all pages of formats; a marker stands once among them
-FORMATS = "\n\n".join(page.read_text(encoding="utf-8") for page in FORMAT_PAGES)
+FORMATS = "\n\n".join(page.read_text(encoding="utf-8") for page in [*FORMAT_PAGES, PROOFS])
 COMMANDS = typer.main.get_command(app).commands
 
 
@@ -77,9 +77,7 @@ TOML_MODELS = {
 JSON_MODELS = {
     "capture": CaptureDocument,
     "stage_calibration": StageCalibrationFile,
-    "run": RunDocument,
     "statement": StatementDocument,
-    "choice": ChoiceDocument,
 }
 
 by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -287,8 +285,9 @@ def is_table(value: object) -> bool:
     return hasattr(value, "model_fields") or hasattr(value, "__pydantic_config__")
 
 
-def test_index_of_formats_links_every_page_and_names_every_command():
+def test_index_of_formats_links_every_page_and_the_pages_name_every_command():
     index = next(page for page in FORMAT_PAGES if page.name == "index.md").read_text(encoding="utf-8")
+    text = " ".join(FORMATS.split())
     linked = {target.partition("#")[0] for target in re.findall(r"\]\(([^)\s]+)\)", index)}
     assert {page.name for page in FORMAT_PAGES} - {"index.md"} <= linked
     every = {
@@ -296,7 +295,7 @@ def test_index_of_formats_links_every_page_and_names_every_command():
         for name, command in COMMANDS.items()
         for one in getattr(command, "commands", {"": None})
     } - {"measure clouds", "calibrate rig"}  # the first of their groups, called without their names
-    assert {name for name in every if f"`mitsim {name}`" not in index} == set()
+    assert {name for name in every if f"`mitsim {name}`" not in text} == set()
 
 
 @pytest.mark.parametrize("page", [page for page in FORMAT_PAGES if page.name != "index.md"], ids=lambda page: page.stem)
@@ -305,21 +304,18 @@ def test_page_of_a_format_has_an_example_before_its_first_table(page):
     assert 0 < text.index("\n```") < text.index("\n|")
 
 
-def test_documented_sources_of_unknowns_have_the_defaults_of_the_model():
+def test_every_unknown_with_a_default_has_its_source():
     page = (ROOT / "docs" / "reference" / "unknowns.md").read_text(encoding="utf-8")
-    defaults = {
-        key: field.default
-        for group in UnknownsTable.model_fields.values()
-        for key, field in group.annotation.model_fields.items()
-    }
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("|")]
-    told = {}
-    for cells in rows:
-        keys = re.findall(r"`(\w+)`", cells[1]) if len(cells) == 5 else []
-        values = [re.match(r"[\d.e-]+$", part) for part in cells[2].split(", ")] if keys else []
-        told |= {key: float(value[0]) for key, value in zip(keys, values, strict=False) if value}
-    assert {"vergence_mrad", "room_factor", "body_per_kelvin", "told_deg"} <= set(told)
-    assert told == {key: defaults[key] for key in told}
+    sourced = {name for cells in rows for name in re.findall(r"`(\w+\.\w+)`", cells[0])}
+    keys = {
+        f"{group}.{key}": field.default
+        for group, table in UnknownsTable.model_fields.items()
+        for key, field in table.annotation.model_fields.items()
+    }
+    assert sourced <= set(keys)
+    numbers = {key for key, default in keys.items() if type(default) in (int, float)}
+    assert numbers <= sourced
     known = {
         cells[0].strip("`"): (float(cells[1]), float(cells[2])) for cells in rows if cells[0].strip("`") in POSE_KNOWN
     }
@@ -437,8 +433,9 @@ def test_documented_keys_of_a_run_hold_what_the_report_reads():
     assert set(RunDocument.model_fields) <= first_column("columns: run.json")
 
 
-def test_architecture_names_code_that_exists():
-    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+@by_page
+def test_pages_name_code_that_exists(page):
+    text = " ".join(page.read_text(encoding="utf-8").split())
     for path, name in re.findall(r"`((?:mitsim|characterisation)/[\w/]+\.py)(?:: ([\w.]+))?`", text):
         source = (ROOT / path).read_text(encoding="utf-8")
         last = name.rpartition(".")[2]

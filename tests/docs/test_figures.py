@@ -57,6 +57,7 @@ def test_every_fence_has_a_language(page):
 def test_commands_and_tests_that_markers_name_exist(page):
     for one in figures(page):
         assert one.source
+        assert "; takes " not in one.source, f"{one.where}: write the time as '; takes 5 min -->'"
         if one.marker == "made by":
             assert one.seconds > 0, f"{one.where}: say how long it takes"
         if one.marker == "held by":

@@ -6,13 +6,14 @@ import sys
 import numpy as np
 import pytest
 import trimesh
+import yaml
 
 from characterisation.files.errors import MissingEnvironmentError
 from mitsim.capture.recordings.pcd import decode_pcd
 from mitsim.report.export.cloud_points import COVARIANCE, cloud_points
 from mitsim.report.export.cloud_writers import write_cloud_pcd, write_cloud_ply
 from mitsim.report.export.e57 import PREFIX, write_e57
-from mitsim.report.export.ros_bag import _CLOUD, _FRAMES, Stamped, write_mcap
+from mitsim.report.export.ros_bag import Stamped, write_mcap
 
 from .known_cloud import POSE, expected, known_cloud, symmetric
 
@@ -112,25 +113,22 @@ def extension(libe57, file, header, names):
     return out.T
 
 
-def test_mcap_is_read_by_rosbags(tmp_path):
-    pytest.importorskip("mcap_ros2")
-    highlevel = pytest.importorskip("rosbags.highlevel")
+def test_mcap_is_read_by_another_library(tmp_path):
+    pytest.importorskip("rosbags")
+    reader = pytest.importorskip("mcap_ros2.reader")
     cloud, path = known_cloud(), tmp_path / "cloud.mcap"
     points = cloud_points(cloud)
     write_mcap(
         [Stamped("/view_0007/predicted", "view_0007_optical", points, POSE), Stamped("/other", "camera", points, None)],
         path,
     )
-    with highlevel.AnyReader([path]) as bag:
-        read = [
-            (connection.topic, when, bag.deserialize(data, connection.msgtype))
-            for connection, when, data in bag.messages()
-        ]
-        latched = [one.ext.offered_qos_profiles for one in bag.connections if one.topic == "/tf_static"]
+    assert list(tmp_path.iterdir()) == [path]
+    every = list(reader.read_ros2_messages(str(path)))
+    read = [(one.channel.topic, one.log_time_ns, one.ros_msg) for one in every]
     assert [topic for topic, *_ in read] == ["/tf_static", "/view_0007/predicted", "/other"]
     assert [when for _, when, _ in read] == [1e9, 1e9, 2e9]
-    (profile,) = latched[0]
-    assert profile.durability.name == "TRANSIENT_LOCAL" and profile.reliability.name == "RELIABLE"
+    (profile,) = yaml.safe_load(every[0].channel.metadata["offered_qos_profiles"])
+    assert profile["durability"] == "transient_local" and profile["reliability"] == "reliable"
     (frame,) = read[0][2].transforms  # of the clouds, one has a pose
     assert (frame.header.frame_id, frame.child_frame_id) == ("part", "view_0007_optical")
     message = read[1][2]
@@ -139,7 +137,7 @@ def test_mcap_is_read_by_rosbags(tmp_path):
     columns = [(one.name, types[one.datatype], one.offset) for one in message.fields]
     names, formats, offsets = zip(*columns, strict=True)
     dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": message.point_step})
-    table = np.frombuffer(message.data.tobytes(), dtype)
+    table = np.frombuffer(bytes(message.data), dtype)
     wanted = expected(cloud, None, 0.001)
     found = np.stack([table[axis] for axis in "xyz"], axis=-1)
     np.testing.assert_allclose(found, wanted["points"], rtol=FLOAT)
@@ -148,16 +146,6 @@ def test_mcap_is_read_by_rosbags(tmp_path):
         getattr(frame.transform.translation, axis) for axis in "xyz"
     ]
     np.testing.assert_allclose(moved, expected(cloud, POSE, 0.001)["points"], atol=1e-6)
-
-
-def test_messages_are_those_of_ros_2():
-    typesys = pytest.importorskip("rosbags.typesys")
-    known = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE).fielddefs
-    for definition, name in ((_CLOUD, "sensor_msgs/msg/PointCloud2"), (_FRAMES, "tf2_msgs/msg/TFMessage")):
-        written = typesys.get_types_from_msg(definition, name)
-        assert len(written) > 3
-        for kind, fields in written.items():
-            assert fields == known[kind], kind
 
 
 def rotate(q, points):

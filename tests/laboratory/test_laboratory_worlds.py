@@ -119,7 +119,7 @@ def test_fringes_decode_to_the_pillars_of_their_nominal_size(tmp_path):
 def judged(tmp_path_factory):
     """Ten worlds of white pillars before a coarse N10, and the folder and rows of the run."""
     folder = tmp_path_factory.mktemp("laboratory")
-    rows = read_cases(cases_file(folder, coarse_sensor("ensenso-n10", 3, folder)))
+    rows = read_cases(cases_file(folder, coarse_sensor("ensenso-n10", 2, folder)))
     return rows, folder, run.run_rows(rows, folder)
 
 

@@ -30,10 +30,10 @@ def plane(offset=0.0):
     return points
 
 
-def ply(points):
+def ply(points, names="xyz"):
     rows = points.reshape(-1, 3)
     head = "ply\nformat binary_little_endian 1.0\nelement vertex {}\n{}end_header\n"
-    return head.format(len(rows), "".join(f"property float {a}\n" for a in "xyz")).encode() + rows.tobytes()
+    return head.format(len(rows), "".join(f"property float {a}\n" for a in names)).encode() + rows.tobytes()
 
 
 def save(path, points):
@@ -85,6 +85,95 @@ def test_a_cloud_without_a_camera_is_measured_and_is_a_reference(tmp_path, name)
     assert "in mm, which" in there.stderr
 
 
+def text(separator=" ", head="", columns="{x}{s}{y}{s}{z}", mark=".", missing="nan", end="\n"):
+    """A text of the plane; ``mark`` is the decimal mark."""
+    rows = [
+        columns.format(
+            s=separator, n=number, **{a: f"{v:.4f}".replace(".", mark) for a, v in zip("xyz", row, strict=True)}
+        )
+        for number, row in enumerate(plane(2.0).reshape(-1, 3).tolist())
+    ]
+    return (head + end.join(rows) + end).replace("nan", missing)
+
+
+TEXTS = {
+    "semicolons and decimal commas": text(";", mark=","),
+    "spaces and decimal commas": text(" ", mark=","),
+    "tabs, decimal commas, empty fields": text("\t", "X\tY\tZ\n", mark=",", missing=""),
+    "numbered rows": text(",", "index,x,y,z\n", "{n}{s}{x}{s}{y}{s}{z}"),
+    "columns in another order": text(",", "z,x,y\n", "{z}{s}{x}{s}{y}"),
+    "a first row of empty fields": "x;y;z\n;;\n" + text(";", mark=",", missing=""),
+    "names in quotes": text(",", '"x","y","z"\n'),
+    "names with units": text(";", "x [mm]; y [mm]; z [mm]\n"),
+    "names in a comment": text(" ", "//X Y Z Intensity\n", "{x}{s}{y}{s}{z}{s}7"),
+    "names after other columns": text(",", "# scan\n# r,g,b,x,y,z\n", "1{s}2{s}3{s}{x}{s}{y}{s}{z}"),
+    "empty fields": text(",", missing=""),
+    "points and commas": text(", "),
+    "a number of points": text(" ", "2700\n"),
+    "carriage returns": text(",", end="\r\n"),
+}
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("name", TEXTS)
+def test_texts_of_many_programs(tmp_path, name, encoding):
+    """Before, a decimal comma made two numbers of one, and a column of indices was x."""
+    (tmp_path / "a.csv").write_bytes(TEXTS[name].encode(encoding))
+    cloud, about = read_plain_cloud(tmp_path / "a.csv")
+    np.testing.assert_allclose(cloud.points[cloud.valid], plane(2.0)[np.isfinite(plane()[..., 0])], atol=1e-3)
+    assert "in mm, which" in about
+
+
+def test_names_that_do_not_fit_the_columns_are_refused(tmp_path):
+    (tmp_path / "a.csv").write_text("x,y,z\n1,2,3,4\n")
+    with pytest.raises(InputError, match=r"the names x, y, z of 4 columns"):
+        read_cloud(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text("x,y\n1,2,3\n")
+    with pytest.raises(InputError, match=r"the names x, y of 3 columns"):
+        read_cloud(tmp_path / "a.csv")
+
+
+def saved_arrays(folder):
+    """The points of a plane in arrays of many shapes."""
+    points = plane(2.0)
+    flat = points.reshape(-1, 3)
+    table = np.rec.fromarrays(flat.T, names="x,y,z")
+    np.save(folder / "axis first.npy", np.moveaxis(points, -1, 0))
+    np.save(folder / "by columns.npy", flat.T)
+    np.save(folder / "table.npy", table)
+    np.savez(folder / "beside an image.npz", image=np.full((HEIGHT, WIDTH, 3), 9, np.uint8), points=points)
+    np.savez(folder / "objects.npz", points=points, about=np.array({"rms": 1}, dtype=object))
+    savemat(folder / "by columns.mat", {"xyz": flat.T.astype(float)})
+    savemat(folder / "structure.mat", {"cloud": {"Location": points.astype(float), "Count": 2700.0}})
+    return sorted(folder.glob("*.*"))
+
+
+def test_arrays_of_many_shapes(tmp_path):
+    paths = saved_arrays(tmp_path)
+    assert len(paths) == 7
+    for path in paths:
+        cloud = read_cloud(path).cloud
+        np.testing.assert_allclose(cloud.points[cloud.valid], plane(2.0)[np.isfinite(plane()[..., 0])], rtol=1e-6)
+
+
+def test_three_images_of_depths_are_no_points(tmp_path):
+    """They have the shape of x, y and z before rows and columns, but no coordinate on both sides of the axis."""
+    depth = np.full((3, HEIGHT, WIDTH), 700, np.uint16)
+    np.savez(tmp_path / "a.npz", depth=depth, image=np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    with pytest.raises(InputError, match="--frame: found 3 images of depths"):
+        read_cloud(tmp_path / "a.npz", "kinect-v2")
+    cloud = read_cloud(tmp_path / "a.npz", "kinect-v2", frame="2").cloud
+    assert cloud.points[cloud.valid][:, 2] == pytest.approx(700.0)
+    assert cloud.grid.width == WIDTH
+
+
+def test_a_map_of_depths_has_the_camera_of_a_sensor(tmp_path):
+    np.save(tmp_path / "a.npy", np.full((HEIGHT, WIDTH), 700.0))
+    with pytest.raises(InputError, match="a depth image alone"):
+        read_cloud(tmp_path / "a.npy")
+    assert read_cloud(tmp_path / "a.npy", "kinect-v2").cloud.points[..., 2] == pytest.approx(700.0)
+
+
 def test_metres_are_recognised_and_the_rays_pass_through_the_points(tmp_path):
     cloud, about = read_plain_cloud(save(tmp_path / "a.xyz", plane() / 1000))
     assert "in m, which" in about
@@ -94,6 +183,22 @@ def test_metres_are_recognised_and_the_rays_pass_through_the_points(tmp_path):
     assert points[:, 2] == pytest.approx(600.0, abs=1e-3)
     along = points / np.linalg.norm(points, axis=1, keepdims=True)
     np.testing.assert_allclose(cloud.grid.rays()[seen], along, atol=1e-6)
+
+
+def test_a_ply_with_capital_names_and_a_space_in_its_first_line(tmp_path):
+    (tmp_path / "a.ply").write_bytes(ply(plane(2.0), "XYZ").replace(b"ply\n", b"ply \n", 1))
+    cloud = read_cloud(tmp_path / "a.ply").cloud
+    assert cloud.points[cloud.valid][:, 2] == pytest.approx(602.0)
+
+
+def test_a_cloud_that_was_exported_is_measured(tmp_path):
+    """Its header names mitsim, too, but states no grid."""
+    pytest.importorskip("pypcd4")
+    decoded(tmp_path / "a.ply", plane(2.0))
+    for name in ("b.ply", "b.pcd"):
+        assert mitsim_here("export", "cloud", tmp_path / "a.ply", "-o", tmp_path / name).returncode == 0
+        cloud = read_cloud(tmp_path / name).cloud
+        np.testing.assert_allclose(cloud.points[cloud.valid], plane(2.0)[np.isfinite(plane()[..., 0])], rtol=1e-6)
 
 
 def test_a_reference_with_a_grid_may_lie_anywhere(tmp_path):

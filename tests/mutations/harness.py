@@ -32,7 +32,7 @@ IMPORTED = [
     "report.conftest",
     "mitsim.scene.authoring.read_mesh",
     "mitsim.maps.campaign.plan",
-    "mitsim.capture.recordings.recognise",
+    "mitsim.capture.recordings.any_recording",
     "netCDF4",
     "scipy.io",
 ]

@@ -239,6 +239,32 @@ def _read_cameras(path):
     read_calibration(path, (160, 120))
 
 
+def _maps_of_cameras(name):
+    """Two cameras in maps of unlike form, a projector, and a pose."""
+
+    def make(folder):
+        camera = {"intrinsics": {"fx": 600.0, "fy": 601.0, "ppx": 80.0, "ppy": 60.0}, "distortion": {"k1": -0.1}}
+        other = {"camera_matrix": [600.0, 0, 80, 0, 600, 60, 0, 0, 1], "dist_coeffs": [-0.1, 0.1, 0, 0, 0]}
+        pose = {"R": np.eye(3).tolist(), "T": [-60.0, 0.0, 0.0]}
+        projector = {"K": {"rows": 3, "cols": 3, "dt": "d", "data": [900, 0, 80, 0, 900, 60, 0, 0, 1]}}
+        table = {
+            "left": camera,
+            "right": other | pose,
+            "projector": projector,
+            "resolution": {"width": 160, "height": 120},
+        }
+        path = folder / name
+        if name.endswith(".json"):
+            path.write_text(json.dumps(table, indent=1), encoding="utf-8")
+        else:
+            import yaml
+
+            path.write_text(yaml.dump(table), encoding="utf-8")
+        return path
+
+    return make
+
+
 _CALIBRATION = {
     "K1": np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]),
     "D1": np.zeros(5),
@@ -555,28 +581,62 @@ def _array(channels):
     return make
 
 
+def _archive(folder):
+    sys.path.insert(0, str(ROOT / "tests" / "recordings"))
+    from cloud_files_of_others import pinhole_cloud
+
+    np.savez_compressed(folder / "array.npz", points=pinhole_cloud(), image=np.zeros((48, 64, 3), np.uint8))
+    return folder / "array.npz"
+
+
+def _points(name):
+    """A cloud in a text, of names, decimal commas and empty fields; or in a structure of MATLAB."""
+
+    def make(folder):
+        sys.path.insert(0, str(ROOT / "tests" / "recordings"))
+        from cloud_files_of_others import pinhole_cloud
+
+        rows = pinhole_cloud().reshape(-1, 3)[::9].astype(float)
+        if name.endswith(".mat"):
+            from scipy.io import savemat
+
+            savemat(folder / name, {"cloud": {"Location": rows.T, "Count": len(rows)}})
+        else:
+            text = "".join(";".join(f"{value:.3f}" for value in row) + "\n" for row in rows)
+            (folder / name).write_text("x [mm];y [mm];z [mm]\n" + text.replace("nan", "").replace(".", ","))
+        return folder / name
+
+    return make
+
+
+def _read_points(path):
+    from mitsim.decoding.input_clouds import read_cloud
+
+    read_cloud(path)
+
+
 def _read_any(path):
-    from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+    from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 
     read_recording(path, ReadOptions())
 
 
 def _read_depths(path):
-    from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+    from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 
     read_recording(path, ReadOptions(sensor="realsense-d435"))
 
 
 def _read_bag(path):
     """Both topics, of which one may be damaged alone."""
-    from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+    from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 
     read_recording(path, ReadOptions(topic=("/points",), frame="0"))
     read_recording(path, ReadOptions(topic=("/camera/depth/image_rect_raw",), frame="0"))
 
 
 def _read_recording(path):
-    from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+    from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 
     read_recording(path.parent if path.suffix == ".json" else path, ReadOptions())
 
@@ -619,6 +679,9 @@ READERS: dict[str, Reader] = {
     "gridless.ply": Reader(_gridless, _read_any),
     "points.npy": Reader(_array(3), _read_any),
     "depths.npy": Reader(_array(0), _read_depths),
+    "points.npz": Reader(_archive, _read_any),
+    "points.csv": Reader(_points("points.csv"), _read_points),
+    "points.mat": Reader(_points("points.mat"), _read_points),
     "cloud.ply": Reader(_cloud, _read_cloud),
     "foreign.ply": Reader(_foreign, _decode_foreign),
     "image.png": Reader(_image, _read_image),
@@ -631,6 +694,8 @@ READERS: dict[str, Reader] = {
     "calibration.yaml of ROS": Reader(_ros, _read_cameras),
     "camchain.yaml": Reader(_kalibr, _read_cameras),
     "stereo.mat": Reader(_toolbox, _read_cameras),
+    "maps.json": Reader(_maps_of_cameras("maps.json"), _read_cameras),
+    "maps.yaml": Reader(_maps_of_cameras("maps.yaml"), _read_cameras),
     "heights.npy": Reader(_heights(".npy"), _read_heights),
     "heights.csv": Reader(_heights(".csv"), _read_heights),
     "profile.csv": Reader(_profile, _read_profile),

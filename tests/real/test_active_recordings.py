@@ -12,8 +12,8 @@ from figures_of_surfaces import mean_run_length
 
 from characterisation.coupon.metrics import ray_noise_std
 from characterisation.region_of_interest import Roi
+from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 from mitsim.capture.recordings.ensenso import read_ensenso
-from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.decoding.cloud import capture_cloud, decoder_settings

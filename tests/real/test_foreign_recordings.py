@@ -15,7 +15,7 @@ from characterisation.coupon.metrics import ray_noise_std
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 from mitsim.decoding.checks.pair_sanity import row_error_warnings
 from mitsim.decoding.checks.sanity import pair_row_error
 from mitsim.decoding.cloud import capture_cloud, decoder_settings

@@ -6,9 +6,7 @@ import csv
 
 import numpy as np
 import pytest
-from figures_of_surfaces import alpha_of_half_width
-
-from mitsim.scene.surface.microfacet import half_width
+from figures_of_surfaces import alpha_of_half_width, half_width
 
 pytestmark = pytest.mark.real
 

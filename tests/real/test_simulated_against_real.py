@@ -13,7 +13,7 @@ import pytest
 
 from characterisation.region_of_interest import Roi
 from mitsim.capture.folder import read_capture, write_capture
-from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 from mitsim.sensor.preset import load_sensor
 from mitsim.twin.compare.captures_run import validate_captures
 from mitsim.twin.sensor.response import first_knee

@@ -547,7 +547,7 @@ def test_without_the_extra_other_recordings_load_and_these_say_what_to_install(r
         "import sys; sys.modules.update(dict.fromkeys(('mcap', 'mcap_protobuf', 'lz4', 'zstandard', 'google')))\n"
         "import mitsim.cli.import_recording, mitsim.decoding.input_clouds\n"
         "from characterisation.files.errors import MissingEnvironmentError\n"
-        "from mitsim.capture.recordings.recognise import ReadOptions, read_recording\n"
+        "from mitsim.capture.recordings.any_recording import ReadOptions, read_recording\n"
         "try: read_recording(sys.argv[1], ReadOptions(frame=0))\n"
         "except MissingEnvironmentError as error: print(error)\n"
     )

@@ -20,9 +20,9 @@ from characterisation.cloud_files import WrittenFrame, read_cloud, write_cloud
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import read_capture, write_capture
+from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 from mitsim.capture.recordings.calibration_file import read_calibration
 from mitsim.capture.recordings.ensenso import read_ensenso
-from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 from mitsim.capture.workspace import written_frame
 from mitsim.cli.program import app
 from mitsim.decoding.device_maps import camera_map_geometry, decode_device_map

@@ -23,10 +23,10 @@ from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.folder import read_capture, write_capture
+from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 from mitsim.capture.recordings.depth_image import read_depth_image
 from mitsim.capture.recordings.organised_cloud import read_organised_cloud
 from mitsim.capture.recordings.pinhole_fit import fit_pinhole
-from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 from mitsim.capture.recordings.stereo_pair import read_stereo_pair
 from mitsim.decoding.cloud import capture_cloud, capture_geometry, decoder_settings, sensor_geometry
 from mitsim.maps.campaign.acquire import coupon_cloud

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import netCDF4
 import numpy as np
 import pytest
 from cloud_files_of_others import pinhole_cloud, ply
 
 from characterisation.files.errors import InputError
+from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 from mitsim.capture.recordings.calibration_file import read_calibration
 from mitsim.capture.recordings.pinhole_fit import fit_pinhole, grid_of
-from mitsim.capture.recordings.recognise import ReadOptions, kind_of, read_recording
+from mitsim.capture.recordings.recognise import kind_of
 from mitsim.decoding.input_clouds import read_cloud
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.png import encode_png
@@ -166,6 +168,45 @@ def test_depths_in_an_array_are_in_mm_or_in_m(tmp_path, dtype, metres, by_column
     capture = read_recording(tmp_path / "depth.npy", ReadOptions(calibration=pinhole_file(tmp_path))).capture
     expected = np.where(depth > 0, depth, np.nan)
     assert np.allclose(capture.derived["depth"], expected, atol=1e-3, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", ["a.tiff", "a.tif", "a.pfm", "a.pgm"])
+@pytest.mark.parametrize("metres", [False, True])
+def test_depths_in_images_of_floating_point_and_of_16_bits(tmp_path, name, metres):
+    """A PFM has its rows from the bottom."""
+    depth = np.nan_to_num(pinhole_cloud()[..., 2]).round()
+    whole = name == "a.pgm"
+    values = depth.astype(np.uint16) if whole else (depth / 1000 if metres else depth).astype(np.float32)
+    assert cv2.imwrite(str(tmp_path / name), values)
+    capture = read_recording(tmp_path / name, ReadOptions(calibration=pinhole_file(tmp_path))).capture
+    expected = np.where(depth > 0, depth, np.nan)
+    assert np.allclose(capture.derived["depth"], expected, atol=1e-3, equal_nan=True)
+
+
+def test_the_largest_level_is_no_depth(tmp_path):
+    """Before, pixels without a depth stood at 65.5 m."""
+    depth = np.nan_to_num(pinhole_cloud()[..., 2]).round().astype(np.uint16)
+    depth[:3] = 65535
+    assert cv2.imwrite(str(tmp_path / "a.png"), depth)
+    options = ReadOptions(calibration=pinhole_file(tmp_path))
+    capture = read_recording(tmp_path / "a.png", options).capture
+    assert np.isnan(capture.derived["depth"][:3]).all()
+    assert np.nanmax(capture.derived["depth"]) == depth[3:].max()
+    assert "6.2 % of the pixels have the level 65535" in capture.settings["warnings"][0]
+    told = read_recording(tmp_path / "a.png", replace(options, invalid=65535)).capture
+    assert "warnings" not in told.settings and np.isnan(told.derived["depth"][:3]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "says"), [("a.exr", "an EXR image"), ("a.raw", "bytes without their size"), ("a.jpg", "8 bits")]
+)
+def test_images_that_have_no_depths_are_refused_with_the_reason(tmp_path, name, says):
+    if name == "a.jpg":
+        cv2.imwrite(str(tmp_path / name), np.full((48, 64), 90, np.uint8))
+    else:
+        (tmp_path / name).write_bytes(bytes(100))
+    with pytest.raises(InputError, match=says):
+        read_recording(tmp_path / name, ReadOptions(calibration=pinhole_file(tmp_path)))
 
 
 def test_points_in_an_array_are_an_organised_cloud(tmp_path):

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture
+from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 from mitsim.capture.recordings.pose_file import read_pose
-from mitsim.capture.recordings.recognise import ReadOptions, read_recording
 from mitsim.capture.recordings.recording_files import frame_of
 from mitsim.cli.program import app
 from mitsim.sensor.camera import Camera

@@ -24,8 +24,9 @@ from characterisation.files.atomic_io import HOST
 from characterisation.files.errors import InputError
 from mitsim.capture.calibration import calibration_table
 from mitsim.capture.folder import read_capture
+from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
 from mitsim.capture.recordings.calibration_file import read_calibration
-from mitsim.capture.recordings.recognise import KINDS, ReadOptions, kind_of, read_recording
+from mitsim.capture.recordings.recognise import NAMES, kind_of
 from mitsim.cli.program import app
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.preset import load_sensor
@@ -94,8 +95,8 @@ def test_folders_are_told_by_the_names_in_them(tmp_path):
     assert kind_of(tmp_path / "d") == "depthai"
     (tmp_path / "i").mkdir()
     save(tmp_path / "i" / "left.png", b"")
-    assert kind_of(tmp_path / "i", ReadOptions(calibration="c.yml")) == "stereo-pair"
-    assert kind_of(tmp_path / "i", ReadOptions(sensor="ensenso-n10")) == "stereo-pair"
+    assert kind_of(tmp_path / "i", calibration="c.yml") == "stereo-pair"
+    assert kind_of(tmp_path / "i", sensor="ensenso-n10") == "stereo-pair"
     with pytest.raises(InputError, match=r"left\.png.*with --sensor or --calibration"):
         kind_of(tmp_path / "i")
     with pytest.raises(InputError, match="no such file or folder"):
@@ -110,7 +111,11 @@ def test_what_a_kind_does_not_heed_is_refused(tmp_path):
         read_recording(path, ReadOptions(scale_mm=2.0))
     with pytest.raises(InputError, match="did you mean 'ply'"):
         read_recording(path, ReadOptions(), "pyl")
-    for wrong, told in (({"axes": "z-up"}, "--axes"), ({"unit": "inch"}, "--unit"), ({"range_mm": (5, 4)}, "--range")):
+    for wrong, told in (
+        ({"axes": "z-up"}, "--axes"),
+        ({"unit": "furlong"}, "--unit"),
+        ({"range_mm": (5, 4)}, "--range"),
+    ):
         with pytest.raises(InputError, match=told):
             read_recording(path, ReadOptions(**wrong))
 
@@ -150,10 +155,11 @@ def test_presets_and_depthai_are_calibrations_too(tmp_path):
     [
         ("a.json", "{", "not JSON"),
         ("a.json", "[" * 100_000, "not JSON"),
-        ("a.json", {"fx": 1.0}, "fy, cx, cy, width, height: found nothing"),
+        ("a.json", {"fx": 1.0}, "found nothing; allowed: the matrix of camera. the file has fx"),
+        ("a.json", "[1]", "found a list"),
         ("a.json", PINHOLE | {"fx": -1.0}, "fx"),
         ("a.json", PINHOLE | {"distortion": [0.0] * 6}, "distortion"),
-        ("a.json", PINHOLE | {"focal": 3}, "focal: found an unknown key"),
+        ("a.json", PINHOLE | {"cx": "left"}, r"fx, fy, cx, cy: found \[\[60.0, 0.0, nan\]"),
         ("a.json", {"something": 1}, "camera_matrix"),
         ("a.json", {"cameras": []}, "cameras"),
         ("a.toml", "name = 3", "cameras|name"),
@@ -194,7 +200,7 @@ def test_the_command_imports_and_the_originals_are_untouched(tmp_path, monkeypat
     save(tmp_path / name, content)
     result = run("import", name, *options)
     folder = tmp_path / f"{Path(name).stem}_capture"
-    assert KINDS[kind_of(Path(name))].name in result.stderr and str(folder.name) in result.stderr
+    assert NAMES[kind_of(Path(name))] in result.stderr and str(folder.name) in result.stderr
     assert result.stdout == ""
     assert (folder / "vendor" / name).read_bytes() == content
     if "--calibration" in options:

@@ -1,9 +1,8 @@
-"""The rig files of the how-to, as they stand there: imported and decoded at the first try, from simulated folders."""
+"""The rig files in ``scenes/rigs``, as they are: imported and decoded at the first try, from simulated folders."""
 
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,8 +19,8 @@ from mitsim.sensor.camera import Camera
 from mitsim.sensor.preset import load_sensor
 from mitsim.sensor.transforms import Transform
 
-PAGE = (Path(__file__).parents[2] / "docs/how-to/rig-files.md").read_text(encoding="utf-8")
-FILES = dict(re.findall(r"<!-- rig: ([\w-]+) -->\n```toml\n(.*?)^```", PAGE, re.S | re.M))
+SCENES = Path(__file__).parents[2] / "scenes/rigs"
+FILES = {path.stem: path.read_text(encoding="utf-8") for path in sorted(SCENES.glob("*.toml"))}
 
 #: plane and ball stand about here [mm]
 DEPTH = 500.0

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from characterisation.files.errors import InputError
 from mitsim.capture.folder import read_capture
-from mitsim.capture.recordings.recognise import ReadOptions, kind_of, read_recording
+from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
+from mitsim.capture.recordings.recognise import kind_of
 from mitsim.capture.recordings.robi import read_robi
 from mitsim.capture.simulated.rendering import Rendering
 from mitsim.capture.simulated.simulate import SimulatedSensor

@@ -20,7 +20,9 @@ from ros_bags import (
 )
 
 from characterisation.files.errors import InputError
-from mitsim.capture.recordings.recognise import ReadOptions, read_recording
+from mitsim.capture.recordings import any_recording, ros_bag
+from mitsim.capture.recordings.any_recording import ReadOptions, read_recording
+from mitsim.decoding import input_clouds
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
 from mitsim.decoding.input_clouds import read_cloud
 
@@ -94,6 +96,28 @@ def test_every_encoding_of_a_depth_is_the_same_depth(tmp_path, made, tolerance):
     assert np.nanmax(np.abs(found - seen(depth_mm()))) < tolerance
 
 
+@pytest.mark.parametrize(
+    ("name", "encoding", "is_depth"),
+    [
+        ("/camera/aligned_depth_to_color/image_raw", "16UC1", True),
+        ("/camera/depth/image", "mono16", True),
+        ("/camera/rgb/image_mono", "mono16", False),
+        ("/camera/snr/image", "32FC1", False),
+        ("/camera/confidence/image", "16UC1", False),
+    ],
+)
+def test_an_image_of_16_bits_is_a_depth_by_its_topic_too(tmp_path, name, encoding, is_depth):
+    """Before, grey images of 16 bits and maps of the signal-to-noise ratio were depths."""
+    values = METRES if encoding == "32FC1" else depth_mm()
+    space = name.rpartition("/")[0]
+    path = bag(tmp_path, [(f"{space}/camera_info", info(ROS2)), (name, image(ROS2, values, encoding))])
+    if is_depth:
+        assert np.array_equal(depth_of(path), seen(depth_mm()), equal_nan=True)
+    else:
+        with pytest.raises(InputError, match=f"{name} .*Image, {encoding}"):
+            depth_of(path)
+
+
 def test_a_bag_of_the_viewer_of_realsense_has_its_own_unit(tmp_path):
     sensor = "/device_0/sensor_0"
     unit = typed(ROS1, "std_msgs/msg/Float32", data=0.0001)
@@ -164,6 +188,18 @@ def test_a_cloud_without_a_grid_is_measured_and_not_imported(tmp_path):
     found = read_cloud(path).cloud
     assert found.valid.sum() == (depth_mm() > 0).sum()
     assert np.nanmean(found.points[..., 2]) == pytest.approx(np.nanmean(points_m()[..., 2]) * 1000, abs=1e-3)
+
+
+@pytest.mark.parametrize("organised", [False, True])
+def test_a_bag_to_measure_is_recognised_and_opened_once(tmp_path, monkeypatch, organised):
+    points = points_m() if organised else points_m()[depth_mm() > 0][None]
+    path = bag(tmp_path, [("/points", cloud(ROS2, points))])
+    calls = []
+    for module, name in ((input_clouds, "kind_of"), (any_recording, "kind_of"), (ros_bag, "open_bag")):
+        real = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *a, name=name, real=real, **k: calls.append(name) or real(*a, **k))
+    assert (read_cloud(path).cloud.grid.height > 1) == organised
+    assert calls == ["kind_of", "open_bag"]
 
 
 def pair(store, second=1.0, baseline_m=0.05):

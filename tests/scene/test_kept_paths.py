@@ -173,12 +173,12 @@ def test_paths_are_kept_in_proportion_to_their_light_and_weigh_what_was_left_out
     rays, light = dots()
     every, roi = candidates(corner, rays, light, 1, depth=2)
     bsdfs = distinct_bsdfs(corner)
-    whole = light_of(every, bsdfs)
+    (whole,) = light_of(every, [bsdfs])
     assert len(mattering(every, [bsdfs], roi, 10 * len(every), 1)) == (whole > 0).sum()
     count, sums = len(every) // 8, []
     for seed in range(20):
         kept = mattering(every, [bsdfs], roi, count, seed)
-        carried = light_of(kept, bsdfs)
+        (carried,) = light_of(kept, [bsdfs])
         sums.append(carried.sum())
         assert abs(len(kept) - count) <= 1
         assert np.isin(kept.pixel, every.pixel).all()

@@ -19,7 +19,8 @@ from mitsim.scene.load import load_scene, scene_from_dict
 from mitsim.scene.ray_casting.camera_rays import CameraRays
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
-from mitsim.sensor.transforms import Transform, look_at, mitsuba_to_world
+from mitsim.sensor.transforms import Transform, look_at
+from tests.stock_mitsuba import mitsuba_to_world
 
 pytestmark = pytest.mark.usefixtures("no_other_scenes")
 

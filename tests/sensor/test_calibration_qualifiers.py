@@ -329,15 +329,15 @@ def test_names_of_a_projector_of_three_letters(tmp_path):
 
 
 def test_dotted_names_and_maps_are_read_or_named(tmp_path):
-    table = {"LEFT.K": K.tolist(), "LEFT.D": D.tolist(), "inner": {"K": K2.tolist(), "lens": D.tolist()}}
+    table = {"LEFT.K": K.tolist(), "LEFT.lens": D.tolist(), "inner": {"K": K2.tolist(), "lens": D.tolist()}}
     saved(tmp_path / "a.yaml", table)
     text = '[calibration]\nfile = "a.yaml"\nprojector = false\n[calibration.keys.camera]\nmatrix = "LEFT.K"\n'
     (tmp_path / "a.toml").write_text(text)
     (note,) = read_calibration(tmp_path / "a.toml", SIZE).notes
-    assert "values not read: LEFT.D, inner.K, inner.lens; camera without distortion" in note
+    assert "values not read: LEFT.lens, inner.K, inner.lens; camera without distortion" in note
     (tmp_path / "b.toml").write_text(text.replace("LEFT.K", "inner.K") + 'distortion = "inner.lens"\n')
     (note,) = read_calibration(tmp_path / "b.toml", SIZE).notes
-    assert "values not read: LEFT.D, LEFT.K." in note
+    assert "values not read: LEFT.K, LEFT.lens." in note
 
 
 def test_a_bad_value_of_the_second_camera_is_told(tmp_path):

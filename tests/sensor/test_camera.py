@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from mitsim.sensor.camera import Camera, Rectification, Rig, stereo_rectification
 from mitsim.sensor.preset import load_sensor
@@ -117,13 +116,3 @@ def test_the_baseline_points_to_the_second_eye(n10):
     direction = n10.rig.baseline_direction
     assert np.allclose(direction, [np.cos(np.radians(4.15)), 0, np.sin(np.radians(4.15))], atol=1e-4)
     assert np.array_equal(Rig({"one": n10.rig.reference}).baseline_direction, [1, 0, 0])
-
-
-@pytest.mark.parametrize(("aside", "expected"), [([60, 5, 0], (1, 1)), ([-60, 5, 9], (1, -1)), ([5, -60, 0], (0, -1))])
-def test_disparities_run_along_the_image_axis_that_the_second_eye_stands_on(n10, aside, expected):
-    first = n10.rig.reference
-    turned = Transform(Rotation.from_euler("z", 90, degrees=True).as_matrix(), first.centre)
-    for pose, place in ((first.sensor_from_camera, aside), (turned, turned.rotation @ aside)):
-        one = replace(first, sensor_from_camera=pose)
-        other = replace(first, sensor_from_camera=Transform(pose.rotation, pose.translation + place))
-        assert Rig({"one": one, "other": other}).epipolar == expected

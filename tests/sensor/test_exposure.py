@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from characterisation.files.errors import InputError
 from mitsim.sensor.exposure import automatic, bracket
 
 LIMITS = (1e-5, 1e-2)
@@ -52,29 +51,3 @@ def test_a_bracket_rises_within_the_limits(base, count, factor, one, other):
 @given(st.lists(st.floats(0, 1e12), min_size=1), st.floats(0.01, 1), st.floats(0, 100))
 def test_automatic_exposure_is_always_within_the_limits(rates, level, percentile):
     assert LIMITS[0] <= automatic(np.array(rates), 20000, level, percentile, LIMITS) <= LIMITS[1]
-
-
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        ({"level": 0}, "level"),
-        ({"level": 1.1}, "level"),
-        ({"percentile": 101}, "percentile"),
-        ({"full_well": 0}, "full_well"),
-        ({"limits_s": (1e-2, 1e-5)}, "limits_s"),
-        ({"levels": np.array([])}, "levels"),
-    ],
-)
-def test_automatic_exposure_says_what_is_wrong(change, field):
-    given = {"levels": np.ones(4), "full_well": 1e4, "level": 0.5, "percentile": 99, "limits_s": LIMITS}
-    with pytest.raises(InputError, match=field):
-        automatic(**(given | change))
-
-
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [({"base_s": 0}, "base_s"), ({"count": 0}, "count"), ({"factor": 1}, "factor"), ({"limits_s": (0, 1)}, "limits_s")],
-)
-def test_a_bracket_says_what_is_wrong(change, field):
-    with pytest.raises(InputError, match=field):
-        bracket(**({"base_s": 1e-3, "count": 3, "factor": 4, "limits_s": LIMITS} | change))

@@ -251,7 +251,7 @@ def test_a_sequence_that_cannot_be_decoded_is_refused(images, message):
 def test_an_offset_leaves_stripes_for_all_columns():
     with pytest.raises(InputError, match="from an offset of 29 px on"):
         gray_group({"offset_px": 29}).roles(WIDTH, HEIGHT)
-    with pytest.raises(InputError, match="offset_px"):
+    with pytest.raises(InputError, match="from an offset of 29 px on"):
         roles(GrayCode(offset_px=29), WIDTH, HEIGHT)
 
 

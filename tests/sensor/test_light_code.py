@@ -18,7 +18,6 @@ from mitsim.sensor.light_code import (
     check_stack,
     patterns,
     roles,
-    stripes,
     value,
 )
 
@@ -56,7 +55,7 @@ def test_neighbouring_stripes_differ_in_one_bit(bits):
     code = GrayCode(bits=bits, inverse=False)
     images = patterns(code, WIDTH, HEIGHT)[2:, 0]
     changes = np.abs(np.diff(images, axis=1)).sum(axis=0)
-    stripe = int(stripes(code, WIDTH)[1])
+    stripe = int(code.sequence().gray("columns")[0].stripes(WIDTH)[1])
     assert len(images) == (bits or 7)
     edges = np.arange(WIDTH - 1) % stripe == stripe - 1
     assert (changes[edges] == 1).all() and (changes[~edges] == 0).all()
@@ -66,7 +65,8 @@ def test_neighbouring_stripes_differ_in_one_bit(bits):
 
 def test_complementary_bit_halves_the_fringe():
     plain, half = (GrayCodePhaseShift(period_px=20, complementary=c) for c in (False, True))
-    assert stripes(plain, 640) == (5, 20) and stripes(half, 640) == (6, 10)
+    five, six = (code.sequence().gray("columns")[0].stripes(640) for code in (plain, half))
+    assert five == (5, 20) and six == (6, 10)
     kinds = [role.kind for role in roles(half, 640, 480)]
     assert kinds == ["white", "black", *["gray"] * 6, *["phase"] * 4]
 

@@ -3,6 +3,7 @@
 import ast
 import importlib.metadata
 import importlib.util
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -45,7 +46,8 @@ def test_every_licence_may_come_in(licences):
 def test_the_page_names_every_package(licences):
     page = (ROOT / "docs/reference/licences.md").read_text(encoding="utf-8")
     assert page.startswith(licences.PAGE)
-    missing = [name for name in licences.closure() if f"| {name} |" not in page]
+    named = {name for row in re.findall(r"^\| .* \| (.*) \|$", page, re.MULTILINE) for name in row.split(", ")}
+    missing = licences.closure().keys() - named
     assert not missing, "python .ci/licences.py > docs/reference/licences.md"
 
 

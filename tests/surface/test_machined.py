@@ -8,12 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from characterisation.files.errors import InputError
+from mitsim.scene.surface.diffraction import lobe_alpha
 from mitsim.scene.surface.gloss import lobe_gloss
 from mitsim.scene.surface.machined import MachinedFace, machined
 from mitsim.scene.surface.measured import height_map, profile
 from mitsim.scene.surface.metals import CONSTANTS, refractive_index
 from mitsim.scene.surface.processes import PROCESSES, feed, feed_slope
-from mitsim.scene.surface.roughness import band_limited_slope, rms_height
+from mitsim.scene.surface.roughness import band_limited_slope, correlation_length, matern, rms_height
 
 
 def random_profile(rng, points=20000, length=16.0, rms=0.5):
@@ -101,8 +102,10 @@ def test_spacing_of_turned_marks_is_the_feed():
 
 def test_a_measured_slope_takes_the_place_of_the_prior():
     found = machined(MachinedFace(process="ground", Ra=0.4, Rdq=0.05), 850)
-    nu = (PROCESSES["ground"].exponent - 1) / 2
-    assert np.isclose(band_limited_slope(rms_height(0.4), found.correlation_um, nu), np.sqrt(2) * 0.05)
+    nu, sigma = (PROCESSES["ground"].exponent - 1) / 2, rms_height(0.4)
+    length = correlation_length(sigma, np.sqrt(2) * 0.05, nu)
+    assert np.isclose(band_limited_slope(sigma, length, nu), np.sqrt(2) * 0.05)
+    assert np.isclose(found.alpha_v, lobe_alpha(lambda lag: matern(lag / length, nu), sigma, 850))
     assert found.alpha_factor == 1.25
     assert found.provenance.startswith("Rdq 0.05")
 

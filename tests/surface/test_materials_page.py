@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from figures_of_surfaces import alpha_of_half_width, short_wave_height
+from figures_of_surfaces import short_wave_height
 from scipy.optimize import brentq
 
 from mitsim.scene.surface.diffraction import coherent_share, lobe_alpha
 from mitsim.scene.surface.energy import directional_albedo, energy_factors
 from mitsim.scene.surface.machined import MachinedFace, machined
-from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN, half_width
+from mitsim.scene.surface.microfacet import GGX_PER_BECKMANN
 from mitsim.scene.surface.processes import PROCESSES
 from mitsim.scene.surface.roughness import (
     ALPHA_LARGEST,
@@ -20,7 +20,6 @@ from mitsim.scene.surface.roughness import (
     rms_height,
     stylus_slope,
 )
-from mitsim.scene.surface.scatter import ALPHA_FORM
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "explanation" / "materials.md"
 
@@ -36,17 +35,19 @@ def table(name):
 
 
 def processes():
-    for name, process in PROCESSES.items():
+    for (name, process), returned_light in zip(PROCESSES.items(), energy(), strict=True):
         ratio = f"{process.lay_ratio:g}" if process.lay_ratio < 1 else "none"
         usual = f"{process.usual[0]:g} to {process.usual[1]:g}"
-        yield [f"`{name}`", usual, f"{process.slope:g}", f"{process.exponent:g}", ratio, f"{process.beckmann:.2f}"]
+        shape = [f"{process.slope:g}", f"{process.exponent:g}", ratio, f"{process.beckmann:.2f}"]
+        yield [f"`{name}`", usual, *shape, *returned_light[1:]]
 
 
 def wide_angle():
     for name, process in PROCESSES.items():
         share, low, high = process.wide_angle, *process.usual
         ends = " to ".join(f"{share.share(ra):.3f}" for ra in (low, high))
-        yield [f"`{name}`", f"{share.per_um:g}", f"{share.largest:g}", f"{share.factor:g}", ends]
+        assert share.factor == 4.2
+        yield [f"`{name}`", f"{share.per_um:g}", f"{share.largest:g}", ends]
 
 
 def returned(process, roughness):
@@ -108,7 +109,6 @@ def published():
     """Our number and the published one of every row that has a number, each as the page prints it."""
     rolled, brushed = alpha("rolled", 0.3, lay="u"), alpha("brushed", 0.4, lay="u")
     saturated = brentq(lambda ra: speckle_contrast(coherent_share(rms_height(ra), 633)) - 0.99, 0.01, 0.2)
-    nickel = brentq(lambda ra: alpha("polished", ra).ggx_alpha[0] - 0.054, 0.06, 0.4)
     tanner = {rq: (alpha("ground", rq * RA_PER_RQ, 633).alpha_u, 1.772 * 0.152 * rq**0.4) for rq in (0.2, 0.5, 1, 1.5)}
     smooth, medium = coherent_share(0.05, 1000), coherent_share(0.14, 1000)
     yield "1a", f"A = {smooth:.2f}", "mostly coherent", smooth > 0.5
@@ -121,8 +121,7 @@ def published():
     yield "3a", f"{saturated:.3f} um", "0.25 um", 1 / 1.6 < saturated / 0.25 < 1.6
     fine, coarse = white_light_contrast(0.2), white_light_contrast(5)
     yield "3b", f"{fine:.2f} to {coarse:.2f}", "usable", fine > 0.5 and 0.05 < coarse < 0.2
-    yield "4a", f"{short_waves(0.21, 30.0):.2f} um", "0.13 um", None
-    yield "4b", f"{short_waves(2.66, 30.0):.2f} um", "0.86 um", abs(short_waves(2.66, 30.0) / 0.86 - 1) < 0.25
+    yield "4", f"{short_waves(2.66, 30.0):.2f} um", "0.86 um", abs(short_waves(2.66, 30.0) / 0.86 - 1) < 0.25
     for row, (across, along), ours in (
         ("5a", (0.160, 0.050), rolled),
         ("5b", (0.090, 0.040), rolled),
@@ -130,15 +129,8 @@ def published():
     ):
         yield f"{row} across", f"{ours.alpha_v:.3f}", f"{across:.3f}", across / 1.6 <= ours.alpha_v <= across * 1.6
         yield f"{row} along", f"{ours.alpha_u:.3f}", f"{along:.3f}", along / 1.6 <= ours.alpha_u <= along * 1.6
-    for row, share, ours in (("6a", 10 / 43, rolled), ("6b", 10 / 31, rolled), ("6c", 15 / 34, brushed)):
-        low, high = ours.wide_angle_range
-        assert low <= share <= high
-        yield row, f"{ours.wide_angle:.2f} ({low:.2f} to {high:.2f})", f"{share:.2f}", None
     yield "7a", "2", "1.95, 1.91", max(abs(c / 2 - 1) for c in (1.95, 1.91)) < 0.1
     yield "7b", "2", "0.82 to 1.70", max(abs(c / 2 - 1) for c in (0.82, 1.70)) < 0.1
-    yield "8a", f"at Ra {nickel:.2f} um", "0.054", None
-    spike = alpha_of_half_width(half_width(ALPHA_FORM, "beckmann"), "ggx")
-    yield "8b", f"{spike:.3f}", "0.004 to 0.006", None
     for letter, (ours, theirs) in zip("abcd", tanner.values(), strict=True):
         yield f"9{letter}", f"{ours:.3f}", f"{theirs:.3f}", theirs / 1.6 <= ours <= theirs * 1.6
     for row, found, theirs in (("10", gaussian(2.27, 20.9, 633.0), 0.217), ("11", gaussian(0.28, 1.77, 500.0), 0.316)):
@@ -147,7 +139,7 @@ def published():
     yield "12", f"up to {widest:.2f}", "0.394, 0.454, 0.553", widest > 0.553
 
 
-@pytest.mark.parametrize("rows", [processes, wide_angle, energy], ids=lambda rows: rows.__name__)
+@pytest.mark.parametrize("rows", [processes, wide_angle], ids=lambda rows: rows.__name__)
 def test_tables_of_priors_and_energy_are_those_of_the_code(rows):
     written = table(rows.__name__)
     computed = list(rows())
@@ -155,7 +147,7 @@ def test_tables_of_priors_and_energy_are_those_of_the_code(rows):
 
 
 def test_hits_and_misses_are_those_of_the_code():
-    words = {True: "hit", False: "miss", None: "not to be graded"}
+    words = {True: "hit", False: "miss"}
     written = {row[0]: row for row in table("published")}
     computed = list(published())
     assert list(written) == [row for row, *_ in computed]

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from figures_of_surfaces import alpha_of_half_width
+from figures_of_surfaces import alpha_of_half_width, half_width
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from mitsim.scene.surface.microfacet import (
     GGX_PER_BECKMANN,
-    half_width,
     shadowing,
     slope_density,
 )

@@ -287,7 +287,6 @@ def test_the_folder_holds_a_scene_that_loads_and_a_task_that_fits_it(plate):
         # the task is written to 0.1 um, and single precision knows 50 mm to 4e-6 mm
         assert np.abs(surface_distance(nominal, shape.mesh.vertices)).max() < 1e-3
         assert shape.mesh.texture
-        assert shape.mesh.smooth
         assert shape.back_hits <= 0.001 * max(shape.front_hits, 1000)
     example_lines = [line[2:] for line in (plate / "plate/task.toml").read_text().splitlines() if line.startswith("# ")]
     measured = tomllib.loads("\n".join(example_lines[example_lines.index("[measurements.boss_30mm_radius]") :]))
@@ -303,7 +302,9 @@ def test_normals_in_the_files_are_those_of_the_surface(plate):
     assert np.abs(normals - places * [1, 1, 0] / 15).max() < 1e-6
 
 
-@pytest.mark.parametrize(("units", "length_mm"), [(None, 1), ("mm", 1), ("inch", 25.4), ("m", 1000)])
+@pytest.mark.parametrize(
+    ("units", "length_mm"), [(None, 1), ("mm", 1), ("cm", 10), ("inch", 25.4), ("foot", 304.8), ("m", 1000)]
+)
 def test_units_are_turned_into_mm(tmp_path, units, length_mm):
     plate_with_pillar().apply_scale(1 / length_mm).export(tmp_path / "plate.stl")
     mesh = read_mesh(tmp_path / "plate.stl", units)
@@ -313,7 +314,7 @@ def test_units_are_turned_into_mm(tmp_path, units, length_mm):
 
 def test_a_part_in_metres_is_noticed(tmp_path):
     plate_with_pillar().apply_scale(0.001).export(tmp_path / "plate.stl")
-    with pytest.raises(InputError, match="give --units m"):
+    with pytest.raises(InputError, match="give --units if the file has another unit"):
         read_mesh(tmp_path / "plate.stl")
 
 
@@ -397,7 +398,7 @@ def test_whatever_a_file_holds_is_a_mesh_or_a_message(suffix, head, data):
     [
         ({"path": "plat.stl"}, "did you mean 'plate.stl'"),
         ({"path": "plate.dxf"}, "'.dxf'"),
-        ({"units": "cm"}, "mm, m, inch"),
+        ({"units": "furlong"}, "um, mm, cm, m, inch, foot"),
         ({"finishing": ("aluminum", "ground", 0.8)}, "did you mean 'aluminium'"),
         ({"finishing": ("aluminium", "grund", 0.8)}, "did you mean 'ground'"),
         ({"finishing": ("aluminium", "ground", 80)}, "0.005 to 10 um"),

@@ -134,7 +134,7 @@ def test_run_again_uses_the_map_and_gives_the_same(study_folder):
 
 
 def test_a_run_is_exported_for_other_tools(study_folder, tmp_path):
-    for module in ("rerun", "pygltflib", "pxr", "mcap_ros2", "pye57"):
+    for module in ("rerun", "pygltflib", "pxr", "rosbags", "pye57"):
         pytest.importorskip(module)
     folder, _ = study_folder
     shown = len(json.loads((folder / "out/run.json").read_text())["checked_views"])

@@ -1,5 +1,6 @@
 """The verdict of a fit, and what its file keeps of the file that it started from."""
 
+import itertools
 import re
 
 import pytest
@@ -45,6 +46,11 @@ def comments(text):
     return [found[1].strip() for line in text.splitlines() if (found := re.search(r"#\s*(.*)$", line))]
 
 
+def remarks(text):
+    """What stands after the first # of each line."""
+    return [line.partition("#")[2].strip() for line in text.splitlines()]
+
+
 @pytest.mark.parametrize("name", [name for name in presets() if name != "kinect-v2"])
 def test_every_comment_of_the_file_is_whole(name):
     """Those of the cameras' own numbers go with the numbers."""
@@ -57,6 +63,20 @@ def test_every_comment_of_the_file_is_whole(name):
     replaced = set(comments("\n".join(own)))
     for comment in comments(text):
         assert comment in replaced or comment in fitted
+    # a comment that continues on the next line stays in one piece
+    before = remarks("".join(table for table in tables if not table.startswith("[cameras.")))
+    after = remarks(fitted)
+    pairs = [pair for pair in itertools.pairwise(before) if all(one and before.count(one) == 1 for one in pair)]
+    for first, second in pairs:
+        at = next(n for n, one in enumerate(after) if one.endswith(first))
+        assert after[at + 1].endswith(second)
+
+
+def test_a_number_that_is_not_determined_comes_only_in_place_of_another():
+    kept = {"imager.prnu": Entry("0", "not determined", True), "imager.row_noise_e": Entry("0", "not determined", True)}
+    made = with_entries("[imager]\nprnu = 0.01  # known\n", kept)
+    assert made == "# prnu: not determined\n[imager]\nprnu = 0  # before: 0.01; known\n"
+    assert with_entries(made, {"room.gradient": Entry("[0, 0]", "x", True)}) == made
 
 
 def test_an_array_over_several_lines_is_replaced_whole():

@@ -11,7 +11,8 @@ import xarray as xr
 
 from characterisation.files.documents import validate
 from characterisation.tasks.task_file import Task
-from mitsim.study.virtual.race import ALL, Job, RaceRules, raced_errors, run_race, shortlist, with_race
+from mitsim.study.virtual.race import ALL, Job, RaceRules, run_race, shortlist
+from mitsim.study.virtual.race_tables import raced_errors, with_race
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
 

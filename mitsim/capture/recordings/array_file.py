@@ -1,22 +1,34 @@
-"""Read arrays of numbers that other programs saved as NumPy's ``.npy``, of any version, type and order."""
+"""Read arrays of numbers that other programs saved as NumPy's ``.npy`` and ``.npz``, and find the points among arrays.
+
+The axis of x, y and z is the last: (n, 3), (rows, columns, 3); or the first, as in MATLAB and PyTorch: (3, n),
+(3, rows, columns). Or x, y and z are three arrays, or three fields of one, of these names.
+"""
 
 from __future__ import annotations
 
 import io
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
+from mitsim.capture.recordings.recording_files import chosen_frame
 
 #: first bytes of an ``.npy`` file
 NPY_MAGIC = b"\x93NUMPY"
 
+#: most values of a point: x, y, z, normal and colour
+_MOST_VALUES = 9
 
-def numbers_of_npy(data: bytes, where: str | Path) -> NDArray[Any]:
-    """Return the array in the bytes of an ``.npy`` file, by rows.
+#: largest unpacked archive [bytes]
+_LARGEST_ARCHIVE = 4 * 1024**3
+
+
+def array_of_npy(data: bytes, where: str | Path) -> NDArray[Any]:
+    """Return the array in the bytes of an ``.npy`` file, by rows: real numbers, or a table of these.
 
     Raises
     ------
@@ -29,6 +41,91 @@ def numbers_of_npy(data: bytes, where: str | Path) -> NDArray[Any]:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         hint = "np.save writes such a file, np.savez an archive"
         raise InputError(where, "", f"an unreadable file ({reason})", "a .npy file with numbers", hint) from None
-    if array.dtype.kind not in "fiu":
+    if array.dtype.kind not in "fiu" and array.dtype.names is None:
         raise InputError(where, "dtype", str(array.dtype), "real numbers")
     return np.ascontiguousarray(array)
+
+
+def arrays_of_npz(data: bytes, where: str | Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of numbers in the bytes of an ``.npz`` archive, by name; arrays of objects are left out.
+
+    Raises
+    ------
+    InputError
+        If the bytes are not a complete archive, or too large.
+    """
+    allowed = "an .npz file of NumPy"
+    try:
+        with ZipFile(io.BytesIO(data)) as packed:
+            unpacked = sum(entry.file_size for entry in packed.infolist())
+            if unpacked > _LARGEST_ARCHIVE:
+                raise InputError(where, "size", f"{unpacked:,} bytes unpacked", f"up to {_LARGEST_ARCHIVE:,}")
+            members = {entry.filename: packed.read(entry) for entry in packed.infolist()}
+    except InputError:
+        raise
+    except Exception as error:  # a damaged archive raises many types of errors
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(where, "", f"an unreadable file ({reason})", allowed) from None
+    out: dict[str, NDArray[Any]] = {}
+    for name, member in members.items():
+        if member.startswith(NPY_MAGIC) and b"'|O'" not in member[:200]:
+            out[name.removesuffix(".npy")] = array_of_npy(member, f"{where}: {name}")
+    return out
+
+
+def map_in(data: bytes, where: Path, frame: int | None = None) -> NDArray[Any]:
+    """Return the points (rows, columns, 3), or else the depths (rows, columns), of an ``.npy`` or ``.npz`` file.
+
+    Parameters
+    ----------
+    data
+        Content of the file.
+    where
+        The file, for messages.
+    frame
+        Number of one of several images of depths, (frames, rows, columns), from 0.
+
+    Raises
+    ------
+    InputError
+        If the file has neither, several arrays of depths of which none is named so, or no such frame.
+    """
+    arrays = {"": array_of_npy(data, where)} if data.startswith(NPY_MAGIC) else arrays_of_npz(data, where)
+    points = points_among(arrays)
+    if points is not None and points.ndim == 3 and min(points.shape[:2]) > 1:
+        return points
+    flat = {name: one[..., 0] if one.ndim == 3 and one.shape[2] == 1 else one for name, one in arrays.items()}
+    depths = {name: one for name, one in flat.items() if one.ndim in (2, 3) and one.dtype.kind in "fiu"}
+    named = {name: one for name, one in depths.items() if "depth" in name.lower()} or depths
+    if len(named) != 1 or points is not None:
+        shapes = ", ".join(f"{name} {' x '.join(map(str, one.shape))}".strip() for name, one in arrays.items())[:300]
+        allowed = "points of rows x columns x 3, or depths of rows x columns"
+        raise InputError(where, "shape", shapes or "no arrays", allowed)
+    depth = next(iter(named.values()))
+    return depth if depth.ndim == 2 else depth[chosen_frame(frame, len(depth), where, "images of depths")]
+
+
+def points_among(arrays: dict[str, NDArray[Any]]) -> NDArray[Any] | None:
+    """Return the largest array of points (n, 3) or (rows, columns, 3) among arrays; None without one."""
+    fields = {
+        name: one[name] for one in arrays.values() if one.dtype.names for name in one.dtype.names if name in "xyzXYZ"
+    }
+    real = {name: one for name, one in (arrays | fields).items() if one.dtype.kind in "fiu"}
+    named = [next((one for name, one in real.items() if name.lower() == axis), None) for axis in "xyz"]
+    first = named[0]
+    if first is not None and all(one is not None and one.shape == first.shape for one in named):
+        joined = np.stack([np.asarray(one, np.float64) for one in named], axis=-1)
+        return joined.reshape(-1, 3) if joined.ndim == 2 or 1 in joined.shape[:-1] else joined
+    turned = [points for one in real.values() if (points := _with_points_last(one)) is not None]
+    return max(turned, key=lambda one: one.size, default=None)
+
+
+def _with_points_last(array: NDArray[Any]) -> NDArray[Any] | None:
+    """Return x, y, z of an array whose last or first axis has them; None if it has no such axis."""
+    if array.ndim not in (2, 3) or not array.size or array.dtype == np.uint8:  # of a colour image
+        return None
+    if 3 <= array.shape[-1] <= _MOST_VALUES:
+        return array[..., :3]
+    if array.shape[0] != 3 or min(array.shape[1:]) <= _MOST_VALUES or not (array[:2] < 0).any():
+        return None  # without x or y on both sides of the axis they are three images of depths
+    return np.moveaxis(array, 0, -1)

@@ -3,7 +3,7 @@
 ========================= ============================================================
 a sensor                  preset, or sensor TOML: its cameras
 a small TOML              ``[cameras.NAME]`` alone, or ``[calibration]``, as in a sensor TOML
-a small JSON              ``fx fy cx cy width height``, and optionally ``distortion``
+a small JSON              ``fx fy cx cy width height``, and optionally ``distortion``, ``name``
 DepthAI                   JSON with ``cameraData``: its left and right camera
 a capture's               ``calibration.json`` of a capture folder
 an Ensenso's              ``*_calib.json`` of a recording: left and right camera, manufacturer's rectification
@@ -13,10 +13,9 @@ others                    YAML, XML or JSON of OpenCV, ROS, Kalibr; .mat, .npz, 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -29,8 +28,10 @@ from mitsim.capture.recordings.depthai_calibration import is_depthai_calibration
 from mitsim.capture.recordings.json_fields import parsed_json
 from mitsim.capture.recordings.nxlib_calibration import nxlib_rig
 from mitsim.capture.recordings.nxlib_tree import NxLibTree
+from mitsim.capture.recordings.recording_files import plain_name
+from mitsim.sensor.calibration_eyes import cameras_of
 from mitsim.sensor.calibration_qualifiers import check_camera
-from mitsim.sensor.calibration_tree import tree_of
+from mitsim.sensor.calibration_tree import CalibrationTree, read_tree, tree_of
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.opencv_calibration import CalibrationTable, has_pair, with_calibration
 from mitsim.sensor.preset import load_sensor, presets
@@ -42,6 +43,7 @@ class Calibrated:
     """A ``rig`` read from a file, the name of its ``sensor``, and its range if the file states one.
 
     ``notes``: warnings for the user. ``nominal``: whether the cameras are those of a type of device, not of one unit.
+    ``unrelated``: whether they are several single cameras, such as those of colour and depth.
     """
 
     rig: Rig
@@ -49,6 +51,7 @@ class Calibrated:
     range_mm: tuple[float, float] | None = None
     notes: tuple[str, ...] = ()
     nominal: bool = False
+    unrelated: bool = False
 
 
 class RigFile(Document):
@@ -57,19 +60,6 @@ class RigFile(Document):
     name: str = ""
     calibration: CalibrationTable | None = None
     cameras: dict[str, OpticsTable] = Field(min_length=1, max_length=2)
-
-
-class PinholeFile(Document):
-    """A small JSON file: camera matrix [px], image size, and OpenCV's distortion coefficients."""
-
-    fx: float = Field(gt=0)
-    fy: float = Field(gt=0)
-    cx: float
-    cy: float
-    width: Annotated[int, Field(ge=1, le=16384)]
-    height: Annotated[int, Field(ge=1, le=16384)]
-    distortion: list[float] = Field(default=[], max_length=14)
-    name: str = ""
 
 
 def read_calibration(source: str | Path, size: tuple[int, int] | None = None) -> Calibrated:
@@ -104,7 +94,8 @@ def _read(source: str | Path, size: tuple[int, int] | None) -> Calibrated:
         return _of_opencv(path, size)
     if path.suffix.lower() != ".json":
         known = f".toml, .json, .yml, .yaml, .xml, .mat or .npz, or a preset: {', '.join(presets())}"
-        raise InputError(path, "", f"the ending {path.suffix!r}", known)
+        hint = "ROS's calibrator saves the same numbers as .yaml" if path.suffix.lower() in (".ini", ".txt") else ""
+        raise InputError(path, "", f"the ending {path.suffix!r}", known, hint)
     table = parsed_json(read_bounded(path, "a calibration"), path, "a calibration in JSON")
     if is_depthai_calibration(table):
         read = read_depthai_calibration(path)
@@ -112,11 +103,16 @@ def _read(source: str | Path, size: tuple[int, int] | None) -> Calibrated:
     if isinstance(table, dict) and isinstance(table.get("Calibration"), dict):
         tree = NxLibTree(read_bounded(path, "a calibration"), str(path))
         return Calibrated(nxlib_rig(tree, None if tree.has("Sensor/Size") else size), str(tree.get("ModelName", "")))
-    if isinstance(table, dict) and isinstance(table.get("cameras"), list):
+    if isinstance(table, dict) and _is_of_capture(table.get("cameras")):
         return Calibrated(rig_of(validate(path, table, CalibrationDocument)), "")
-    if isinstance(table, dict) and "fx" in table:
-        return _of_pinhole(path, table)
     return _of_opencv(path, size)
+
+
+def _is_of_capture(cameras: Any) -> bool:
+    """Return whether a value is the list of cameras of a capture folder, which another program may have, too."""
+    return isinstance(cameras, list) and all(
+        isinstance(each, dict) and "sensor_from_camera" in each for each in cameras
+    )
 
 
 def calibrated_by(tables: dict[str, dict[str, Any]], where: Path, size: tuple[int, int] | None) -> Calibrated:
@@ -175,6 +171,11 @@ def camera_of(calibrated: Calibrated, name: str | None, size: tuple[int, int], w
     cameras = calibrated.rig.cameras
     if name is not None and name not in cameras:
         raise InputError("--camera", "", repr(name), ", ".join(cameras))
+    fitting = [each for each, camera in cameras.items() if (camera.width, camera.height) == size]
+    if name is None and calibrated.unrelated and len(fitting) != 1:
+        found = ", ".join(f"{each} {camera.width} x {camera.height} px" for each, camera in cameras.items())
+        raise InputError(where, "--camera", f"{len(cameras)} cameras: {found}", "the one of these images", "name it")
+    name = fitting[0] if name is None and calibrated.unrelated else name
     camera = calibrated.rig.reference if name is None else cameras[name]
     if (camera.width, camera.height) != size:
         allowed = f"{camera.width} x {camera.height} px, as the calibration says"
@@ -233,20 +234,37 @@ def _of_toml(path: Path, size: tuple[int, int] | None) -> Calibrated:
 
 
 def _of_opencv(path: Path, size: tuple[int, int] | None) -> Calibrated:
-    """Read a pair if the file has the second camera, else one camera."""
-    cameras = ["left", "right"] if has_pair(path) else ["camera"]
-    asked = {"file": path.name, "projector": False, "cameras": cameras}
-    table, notes = with_calibration(path, {"calibration": asked}, size)
+    """Read a pair if the file has the second camera; all cameras of its maps if they belong to no pair; else one."""
+    tree = read_tree([path])
+    stated = tree.values[0].get("name")
+    sensor = stated if isinstance(stated, str) else ""
+    eyes, _ = cameras_of(tree.eyes())
+    if has_pair(tree) or len(eyes) < 2:
+        cameras = ["left", "right"] if has_pair(tree) else ["camera"]
+        rig, notes = _rig_of(path, tree, size, cameras, {})
+        return Calibrated(rig, sensor, notes=tuple(notes))
+    found: dict[str, Camera] = {}
+    told: list[str] = []
+    for eye in [*eyes, *eyes]:  # only at the second time the tree knows that the others are read
+        name = plain_name(eye.name.rpartition(".")[2])
+        rig, notes = _rig_of(path, tree, size, [name], {name: {"matrix": eye.matrix_map}})
+        if not any(_sees_alike(rig.reference, other) for other in found.values()):
+            found[name if name not in found else plain_name(eye.name)] = rig.reference
+        told = notes if eye is eyes[0] else [*told, *(note for note in notes if note not in told)]
+    return Calibrated(Rig(found), sensor, notes=tuple(told), unrelated=len(found) > 1)
+
+
+def _sees_alike(one: Camera, other: Camera) -> bool:
+    """Return whether two cameras have the same optics."""
+    return (one.width, one.height, one.model) == (other.width, other.height, other.model) and all(
+        np.array_equal(a, b) for a, b in ((one.matrix, other.matrix), (one.distortion, other.distortion))
+    )
+
+
+def _rig_of(
+    path: Path, tree: CalibrationTree, size: tuple[int, int] | None, cameras: list[str], keys: dict[str, dict[str, str]]
+) -> tuple[Rig, list[str]]:
+    asked = {"file": path.name, "projector": False, "cameras": cameras, "keys": keys}
+    table, notes = with_calibration(path, {"calibration": asked}, size, tree)
     read = validate(path, table, RigFile)
-    return Calibrated(Rig({name: each.camera() for name, each in read.cameras.items()}), "", notes=tuple(notes))
-
-
-def _of_pinhole(path: Path, table: dict[str, Any]) -> Calibrated:
-    read = validate(path, table, PinholeFile)
-    if len(read.distortion) not in (0, 4, 5, 8, 12, 14):
-        raise InputError(path, "distortion", f"{len(read.distortion)} numbers", "0, 4, 5, 8, 12 or 14, as OpenCV takes")
-    if not all(map(math.isfinite, (read.cx, read.cy))):
-        raise InputError(path, "cx, cy", f"{read.cx}, {read.cy}", "finite numbers")
-    matrix = np.array([[read.fx, 0.0, read.cx], [0.0, read.fy, read.cy], [0.0, 0.0, 1.0]])
-    distortion = np.array(read.distortion) if read.distortion else np.zeros(5)
-    return Calibrated(Rig({"camera": Camera(matrix, distortion, read.width, read.height)}), read.name)
+    return Rig({name: each.camera() for name, each in read.cameras.items()}), notes

@@ -18,8 +18,8 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.capture.grey_image import read_grey
-from mitsim.capture.recordings.array_file import NPY_MAGIC, numbers_of_npy
+from mitsim.capture.grey_image import read_depths
+from mitsim.capture.recordings.array_file import NPY_MAGIC, map_in
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.organised_cloud import FARTHEST_MM, METRES_UNDER
 from mitsim.sensor.camera import Rig
@@ -36,6 +36,7 @@ def read_depth_image(
     invalid: int | None = None,
     camera: str | None = None,
     sensor: str | None = None,
+    frame: int | None = None,
 ) -> Capture:
     """Read one depth image.
 
@@ -49,11 +50,13 @@ def read_depth_image(
         Depth of one level [mm]; by default 1, or 1000 for floating point with a median under
         :data:`~mitsim.capture.recordings.organised_cloud.METRES_UNDER`.
     invalid
-        Level of missing depths; by default 0.
+        Level of missing depths, beside 0 and the largest one of 16 bits.
     camera
         Name of the camera in the calibration; by default the first.
     sensor
         Name of the sensor; by default that of the calibration, or ``depth-camera``.
+    frame
+        Number of one of several images in a file of NumPy, from 0.
 
     Raises
     ------
@@ -61,7 +64,7 @@ def read_depth_image(
         If the image or the calibration cannot be read, the image has 8 bits, or its size differs from the camera's.
     """
     path = Path(path)
-    image = _levels(path)
+    image = _levels(path, frame)
     if image.dtype == np.uint8:
         hint = "an 8-bit picture has lost its depths: save the device's 16 bits"
         raise InputError(path, "depth", "8 bits", "16 bits", hint)
@@ -77,18 +80,25 @@ def read_depth_image(
         raise InputError(path, "", f"an image with only the level {invalid}", "an image with some depths")
     with np.errstate(over="ignore"):
         depth = image.astype(np.float32) * np.float32(scale_mm)
-    depth[(image == invalid) | ~np.isfinite(depth)] = np.nan
+    depth[(image == invalid) | (image == 0) | ~np.isfinite(depth)] = np.nan
+    full = np.iinfo(np.uint16).max
+    if image.dtype == np.uint16 and (image == full).any():
+        depth[image == full] = np.nan
+        if invalid != full:
+            share = 100 * float(np.mean(image == full))
+            settings["warnings"] = [f"{share:.2g} % of the pixels have the level {full}, the largest: left out"]
+        if np.isnan(depth).all():
+            raise InputError(path, "", f"an image with only the level {full}", "an image with some depths")
     read = read_calibration(calibration, (image.shape[1], image.shape[0]))
     return depth_capture(depth, read, path, settings, camera=camera, sensor=sensor)
 
 
-def _levels(path: Path) -> NDArray[Any]:
-    """Return the numbers (H, W) of an image file or an ``.npy``; integers of ``.npy`` of any size as floating point."""
+def _levels(path: Path, frame: int | None) -> NDArray[Any]:
+    """Return the numbers (H, W) of an image or a file of NumPy; integers of any size as floating point."""
     data = read_bounded(path, "a depth image")
-    if not data.startswith(NPY_MAGIC):
-        return read_grey(path)
-    values = numbers_of_npy(data, path)
-    values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
+    if not data.startswith(NPY_MAGIC) and path.suffix.lower() != ".npz":
+        return read_depths(path)
+    values = map_in(data, path, frame)
     if values.ndim != 2 or not all(1 <= side <= LONGEST_SIDE_PX for side in values.shape):
         raise InputError(path, "shape", " x ".join(map(str, values.shape)), "depths of rows x columns")
     if values.dtype.kind == "f" or values.dtype in (np.uint8, np.uint16):

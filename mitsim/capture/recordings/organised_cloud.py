@@ -27,7 +27,7 @@ from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.capture.recordings.array_file import NPY_MAGIC, numbers_of_npy
+from mitsim.capture.recordings.array_file import NPY_MAGIC, map_in
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.nxlib_calibration import sensor_from_rectified
 from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of
@@ -35,15 +35,12 @@ from mitsim.capture.recordings.pcd import decode_pcd
 from mitsim.capture.recordings.pinhole_fit import LEAST_POINTS, PINHOLE_RMS_PX, fit_pinhole, grid_of, off_the_rays
 from mitsim.capture.recordings.ply import decode_ply
 from mitsim.capture.recordings.zdf import HDF5_MAGIC, read_zdf
-from mitsim.sensor.calibration_qualifiers import UNITS_MM, check_camera
+from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, check_camera
 from mitsim.sensor.camera import Camera, Rig
 from mitsim.sensor.transforms import Transform
 
 Points = NDArray[np.float32]
 Axes = Literal["opencv", "opengl"]
-
-#: units of length of clouds [mm]
-CLOUD_UNITS_MM = {word: UNITS_MM[word] for word in ("um", "mm", "cm", "m")}
 
 #: median distance of the points, in the file's numbers, below which the unit is metres. All sensors here measure
 #: between 20 mm and 20 m
@@ -76,6 +73,12 @@ class StoredCloud:
     grey: NDArray[np.uint8] | None = None
 
 
+class NoGridError(InputError):
+    """A cloud that is not organised, where an organised one is needed; ``points`` (n, 3) as in the file."""
+
+    points: Points
+
+
 def read_stored_cloud(path: Path) -> StoredCloud:
     """Read a PLY, PCD, ZDF or NumPy file of another program; what its bytes are counts, not its suffix.
 
@@ -87,17 +90,18 @@ def read_stored_cloud(path: Path) -> StoredCloud:
     InputError
         If the file is damaged, of none of these formats, or was written by mitsim.
     """
-    data = read_bounded(path, "a PLY, PCD, ZDF or NumPy file")
+    expected = "a PLY, PCD, ZDF or NumPy file"
+    if path.suffix.lower() == ".zdf" or read_bounded(path, expected, first=len(HDF5_MAGIC)) == HDF5_MAGIC:
+        return _of_zdf(path)
+    data = read_bounded(path, expected)
     if data.startswith(b"ply"):
         read = decode_ply(data, path)
-        if any(line.startswith("comment mitsim ") for line in read.lines):
+        if any(line.startswith("comment mitsim ") and '"grid"' in line for line in read.lines):
             raise InputError(path, "", "a cloud written by mitsim", "a cloud of another program", "it needs no import")
         size = read.size or grid_of(read.points)
         found = {} if read.size or size is None else {"grid_from": "the points"}
         return StoredCloud(path, read.points, size, found)
-    if data.startswith(HDF5_MAGIC) or path.suffix.lower() == ".zdf":
-        return _of_zdf(path)
-    if data.startswith(NPY_MAGIC):
+    if data.startswith(NPY_MAGIC) or path.suffix.lower() == ".npz":
         return _of_npy(path, data)
     if path.suffix.lower() == ".ply" and b"FIELDS" not in data[:4096]:
         raise InputError(path, "", "a file without the header of a PLY", "a PLY file, whose first line is ply")
@@ -126,12 +130,12 @@ def _of_zdf(path: Path) -> StoredCloud:
 
 
 def _of_npy(path: Path, data: bytes) -> StoredCloud:
-    values = numbers_of_npy(data, path)
-    if values.ndim != 3 or values.shape[2] < 3 or min(values.shape[:2]) < 2:
+    values = map_in(data, path)
+    if values.ndim != 3 or min(values.shape[:2]) < 2:
         found = f"{values.dtype} of {' x '.join(map(str, values.shape))}"
         raise InputError(path, "shape", found, "points of rows x columns x 3, or depths of rows x columns")
     with np.errstate(over="ignore"):
-        points = values[..., :3].astype(np.float32)
+        points = values.astype(np.float32)
     return StoredCloud(path, points, (values.shape[1], values.shape[0]), {})
 
 
@@ -155,8 +159,8 @@ def read_organised_cloud(
         The camera of the grid, see :mod:`mitsim.capture.recordings.calibration_file`; by default a pinhole is fitted.
         With a rectification, the grid may also be that of the rectified left image, at full or reduced size.
     unit
-        ``um``, ``mm``, ``cm`` or ``m``; by default metres if the median distance is under :data:`METRES_UNDER`, else
-        millimetres.
+        One of :data:`~mitsim.sensor.calibration_qualifiers.LENGTHS_MM`; by default metres if the median distance is
+        under :data:`METRES_UNDER`, else millimetres.
     axes
         ``opencv``: x right, y down, z forward; ``opengl``: y up and z backward, which is converted.
     link
@@ -224,7 +228,9 @@ def _on_grid(
     if size is None:
         of_pcd = stored.points.ndim == 3
         field, found = ("HEIGHT", "1: a cloud") if of_pcd else ("", f"{count} points")
-        raise InputError(stored.path, field, f"{found} without a grid", "an organised cloud", hint)
+        error = NoGridError(stored.path, field, f"{found} without a grid", "an organised cloud", hint)
+        error.points = stored.points.reshape(-1, 3)
+        raise error
     if size[0] * size[1] != count:
         allowed = f"{size[0]} x {size[1]}, one for each pixel"
         raise InputError(stored.path, "", f"{count} points", allowed, hint)
@@ -241,8 +247,8 @@ def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = Non
     path
         The file, for messages.
     unit
-        One of :data:`CLOUD_UNITS_MM`; by default metres if the median distance is under :data:`METRES_UNDER`, else
-        millimetres.
+        One of :data:`~mitsim.sensor.calibration_qualifiers.LENGTHS_MM`; by default metres if the median distance is
+        under :data:`METRES_UNDER`, else millimetres.
     hint
         What to do if the points are too far away.
 
@@ -262,10 +268,10 @@ def scale_to_mm(points: NDArray[np.floating], path: Path, unit: str | None = Non
         raise InputError(path, "", "no points", "a cloud with x, y and z")
     distance = float(np.median(np.linalg.norm(seen.astype(float), axis=-1)))
     unit = unit or ("m" if distance < METRES_UNDER else "mm")
-    farthest = float(np.abs(seen).max()) * CLOUD_UNITS_MM[unit]
+    farthest = float(np.abs(seen).max()) * LENGTHS_MM[unit]
     if farthest > FARTHEST_MM:
         raise InputError(path, "x, y, z", f"{farthest:.3g} mm", f"up to {FARTHEST_MM:g} mm", hint)
-    points *= CLOUD_UNITS_MM[unit]
+    points *= LENGTHS_MM[unit]
     return unit, distance
 
 

@@ -79,6 +79,7 @@ class _Element:
     def with_property(self, name: str, kind: str, count: str = "") -> _Element:
         """Return the element with another property; a name that is there gets a number."""
         taken = {one.name for one in self.properties}
+        name = name.lower() if name in "XYZ" else name
         unique = name if name not in taken else f"{name} {len(taken)}"
         return replace(self, properties=(*self.properties, _Property(unique, kind, count)))
 
@@ -92,7 +93,7 @@ def decode_ply(data: bytes, where: str | Path) -> Ply:
         If the bytes are not a complete PLY whose vertices have x, y and z.
     """
     mark = re.search(rb"\nend_header[ \t]*\r?\n", data[:100_000])
-    if not re.match(rb"ply\r?\n", data) or mark is None:
+    if not re.match(rb"ply[ \t]*\r?\n", data) or mark is None:
         raise InputError(where, "", "a file without the header of a PLY", "a PLY file")
     lines = tuple(line.strip() for line in data[: mark.start()].decode("ascii", "replace").splitlines())
     order, elements = _elements(lines, where)

@@ -32,6 +32,7 @@ from mitsim.capture.recordings.ros_messages import (
     PACKED_IMAGE,
     calibration_of,
     depth_of,
+    encoding_of,
     grey_of,
     is_depth,
     label_of,
@@ -84,7 +85,7 @@ def chosen_topics(bag: RosBag, names: Sequence[str]) -> Chosen:
     if len(known) >= 2:
         hint = f"choose a pair with --topic LEFT --topic RIGHT: {_listed(bag, known)}"
         raise InputError(bag.path, "--topic", "images without depth", "depths, a cloud, or a pair", hint)
-    there = ", ".join(f"{topic.name} ({topic.kind})" for topic in list(bag.topics.values())[:6]) or "nothing"
+    there = ", ".join(_described(bag, topic) for topic in list(bag.topics.values())[:6]) or "nothing"
     raise InputError(bag.path, "", f"a bag with {there}", "depth images, organised clouds, or a pair of images")
 
 
@@ -95,9 +96,22 @@ def _what(bag: RosBag, topic: Topic) -> str:
     if topic.kind == CLOUD:
         return "cloud"
     if topic.kind in (IMAGE, PACKED_IMAGE):
-        infrared = any(word in topic.name.lower() for word in ("infra", "/ir", "thermal"))
-        return "depth" if not infrared and is_depth(read_message(bag, topic, 0)) else "image"
+        message, name = read_message(bag, topic, 0), topic.name.lower()
+        other = any(word in name for word in _NO_DEPTHS) and "depth" not in name
+        grey = encoding_of(message) == "mono16" and "depth" not in name  # which librealsense writes for both
+        return "depth" if is_depth(message) and not (other or grey) else "image"
     return ""
+
+
+#: words in topics of other images with the encodings of depths
+_NO_DEPTHS = ("infra", "/ir", "thermal", "snr", "confidence", "intensity", "amplitude", "disparity")
+
+
+def _described(bag: RosBag, topic: Topic) -> str:
+    """Return a topic, its kind, and the encoding of its images."""
+    is_image = topic.kind in (IMAGE, PACKED_IMAGE) and topic.count > 0
+    encoding = f", {encoding_of(read_message(bag, topic, 0))}" if is_image else ""
+    return f"{topic.name} ({topic.kind}{encoding})"
 
 
 def _listed(bag: RosBag, known: dict[str, str]) -> str:

@@ -104,8 +104,7 @@ def read_zdf(path: Path) -> Zdf:
         If it is no netCDF-4 file, is damaged or too large, or has no point cloud.
     """
     expected = "a .zdf file of Zivid"
-    with_magic = read_bounded(path, expected)[: len(HDF5_MAGIC)]
-    if with_magic != HDF5_MAGIC:
+    if read_bounded(path, expected, first=len(HDF5_MAGIC)) != HDF5_MAGIC:
         raise InputError(path, "", "a file that is not netCDF-4", expected, "save it again in Zivid Studio")
     found = _arrays(path, expected)
     points = found.get("pointcloud", found.get("xyz"))

@@ -10,6 +10,9 @@ view ray can meet:
 If two origins explain the pixels equally well, depth depends on the one that the sensor file states. A plane does not
 tell either: where the projector's image is parallel to the baseline, an offset turns planes into other planes.
 
+With codes along both axes any other origin is measured: the same offset of both moves the light of every pixel to one
+side of its view ray, as a code that counts from 1 does.
+
 Signal chain: images, every few pixels -> coordinates with each origin -> share of the lit pixels that each explains.
 """
 
@@ -23,7 +26,7 @@ from numpy.typing import NDArray
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import Status
 from mitsim.decoding.checks.code_lines import CodeLines
-from mitsim.decoding.checks.rig_sanity import LARGEST_MISS_PX, half_stripe, meet_light_planes
+from mitsim.decoding.checks.rig_sanity import LARGEST_MISS_PX, half_stripe, meet_light_planes, meeting
 from mitsim.decoding.coded_images import CodedImages
 from mitsim.decoding.structured_light.decoder import decode_coordinates
 from mitsim.decoding.structured_light.geometry import axis_across
@@ -43,6 +46,10 @@ _COARSE = 160
 #: An origin fits better than the stated one if it leaves at most this share of the pixels that the latter leaves
 #: unexplained, or explains many more; the least difference of the shares that counts.
 _FRACTION, _MANY, _LEAST = 0.25, 0.5, 0.02
+
+#: An offset is measured if the median miss [projector px] is at least this, and if the offset is whole to this [px]
+#: and leaves no larger median of the unsigned miss, beside that of a uniform error over a stripe; assumed.
+_LEAST_MISS_PX, _WHOLE_PX = 0.7, 0.2
 
 #: least share of the lit pixels that an origin explains to be believed
 _EXPLAINED = 0.3
@@ -69,8 +76,8 @@ def beyond_in_words(lines: CodeLines, axis: Axis) -> str:
 def gray_origin_warning(images: CodedImages, rig: Rig, others_may_be_meant: bool) -> str:
     """Return a warning if another origin of a Gray code fits the geometry of camera and projector better, or "".
 
-    The images of the first camera count. ``others_may_be_meant``: also warn if another origin fits as well, and the
-    sensor file does not state ``offset_px``.
+    The images of the first camera count. ``others_may_be_meant``: also warn if another origin fits as well, or is
+    measured, and the sensor file does not state ``offset_px``.
     """
     eye, projector, code, size = rig.reference, rig.projector, images.code, images.size
     if projector is None:
@@ -81,17 +88,27 @@ def gray_origin_warning(images: CodedImages, rig: Rig, others_may_be_meant: bool
     coarse = np.ascontiguousarray(stack[:, *places])
     rays = eye.rays(eye.pixel_grid()[places])
 
+    def decoded(tried: LightCode) -> dict[Axis, ProjectorCoordinate]:
+        return decode_coordinates(coarse, tried, size, images.settings, full_scale=images.full_scale)
+
     def seen_with(tried: LightCode) -> _Explained:
-        found = decode_coordinates(coarse, tried, size, images.settings, full_scale=images.full_scale)
-        return _Explained.of(eye, projector, rays, found, images.settings)
+        return _Explained.of(eye, projector, rays, decoded(tried), images.settings)
 
     try:
         others = {words: seen_with(with_origins(code, o)) for words, o in other_origins(code, size).items()}
         stated = seen_with(code) if others else None
+        words = "" if stated is None else _of_usual_origins(stated, others, others_may_be_meant, code)
+        if words or not others_may_be_meant or _states_origins(code):
+            return words
+        return _of_measured_origin(eye, projector, rays, decoded(code), code)
     except InputError:
         return ""
-    if stated is None:
-        return ""
+
+
+def _of_usual_origins(
+    stated: _Explained, others: dict[str, _Explained], others_may_be_meant: bool, code: LightCode
+) -> str:
+    """Return a warning if one of the usual origins explains more of the pixels, or as many, or ""."""
     words, best = max(others.items(), key=lambda each: each[1].share)
     if best.share < _EXPLAINED:
         return ""
@@ -106,6 +123,43 @@ def gray_origin_warning(images: CodedImages, rig: Rig, others_may_be_meant: bool
     return (
         f"the images do not tell where the Gray code begins: the points are at {stated.depth:.0f} mm if column or row "
         f"0 has code 0, and at {best.depth:.0f} mm if {words}, as in the programs of Lanman, Moreno and Taubin. "
+        "State offset_px, 0 or as the program shows it"
+    )
+
+
+def _of_measured_origin(
+    eye: Camera, projector: Camera, rays: Floats, found: dict[Axis, ProjectorCoordinate], code: LightCode
+) -> str:
+    """Return a warning if one offset of columns and rows brings the light onto the view rays, or ""."""
+    if len(found) < 2 or any(role.kind == "phase" for role in roles(code, projector.width, projector.height)):
+        return ""
+    known = np.all([each.status == Status.VALID for each in found.values()], axis=0) & np.isfinite(rays).all(axis=-1)
+    if known.mean() < _LEAST:
+        return ""
+    directions = eye.sensor_from_camera.directions(rays[known])
+
+    def miss(offset: float) -> Floats:
+        values = {axis: each.value[known] - offset for axis, each in found.items()}
+        found_miss = meeting(eye, projector, directions, values)[1]
+        return found_miss[np.isfinite(found_miss)]
+
+    at = [miss(offset) for offset in (0.0, 1.0)]
+    if not all(each.size for each in at):
+        return ""
+    at_0, at_1 = (float(np.median(each)) for each in at)
+    if abs(at_0) < _LEAST_MISS_PX or abs(at_1 - at_0) < _EXPLAINED:
+        return ""
+    exact = at_0 / (at_0 - at_1)
+    offset = round(exact)
+    if offset < 1 or abs(exact - offset) > _WHOLE_PX:
+        return ""
+    left, uniform = miss(float(offset)), max(half_stripe(each) for each in found.values()) / 2
+    if not left.size or float(np.median(np.abs(left))) > uniform + _WHOLE_PX:
+        return ""
+    fits = _in_words(dict.fromkeys(found, float(offset)))
+    return (
+        f"view rays miss the light that they decode by {abs(at_0):.1f} projector px in the median, all to one side: "
+        f"they fit if {fits}, as in a program that counts from another number; or the calibration is off by as much. "
         "State offset_px, 0 or as the program shows it"
     )
 

@@ -69,7 +69,7 @@ def camera_warnings(decoded: Mapping[Axis, ProjectorCoordinate], rig: Rig, setti
     if known.mean() < 0.005:
         return []
     coordinates = {axis: each.value[known] for axis, each in found.items()}
-    depth, miss = _meeting(eye, projector, rays[known], coordinates)
+    depth, miss = meeting(eye, projector, rays[known], coordinates)
     solved = depth[~np.isnan(depth)]  # without light beyond the fold of the projector's distortion
     behind = float(np.mean(~(solved > 0))) if solved.size else 0.0
     doubt = "check that the calibration belongs to these images, and that R and T are those of cv2.stereoCalibrate"
@@ -83,7 +83,7 @@ def camera_warnings(decoded: Mapping[Axis, ProjectorCoordinate], rig: Rig, setti
         if error > allowed:
             names: tuple[Axis, Axis] = ("columns", "rows")
             turned = {one: found[other].value[known] for one, other in (names, names[::-1])}
-            other = float(np.nanmedian(np.abs(_meeting(eye, projector, rays[known], turned)[1])))
+            other = float(np.nanmedian(np.abs(meeting(eye, projector, rays[known], turned)[1])))
             if other < allowed:
                 doubt = "they fit if columns and rows are exchanged in [pattern]"
             else:
@@ -107,7 +107,7 @@ def _other_place(eye: Camera, projector: Camera, rays: Floats, coordinates: dict
     }
     for words, place in readings.items():
         moved = replace(projector, sensor_from_camera=eye.sensor_from_camera @ place)
-        depth, miss = _meeting(eye, moved, rays, coordinates)
+        depth, miss = meeting(eye, moved, rays, coordinates)
         if np.mean(depth > 0) > 1 - _BEHIND / 3 and np.nanmedian(np.abs(miss)) < LARGEST_MISS_PX:
             return words
     return ""
@@ -119,10 +119,24 @@ def half_stripe(coordinate: ProjectorCoordinate) -> float:
     return float(np.median(sigma)) * np.sqrt(3) if sigma.size else 0.0
 
 
-def _meeting(eye: Camera, projector: Camera, rays: Floats, coordinates: dict[Axis, Floats]) -> tuple[Floats, Floats]:
+def meeting(eye: Camera, projector: Camera, rays: Floats, coordinates: dict[Axis, Floats]) -> tuple[Floats, Floats]:
     """Return the distance (n,) [mm] along rays at which they meet their light, and the miss distance [projector px].
 
-    With one axis the light is the plane of a column or row, which a lens bends slightly; rays cannot miss it.
+    The miss has a sign: across the epipolar line, to one side or the other. With one axis the light is the plane of a
+    column or row, which a lens bends slightly; rays cannot miss it.
+
+    Parameters
+    ----------
+    eye, projector
+        Camera and projector of a rig.
+    rays
+        (n, 3) directions from the camera, in the sensor frame.
+    coordinates
+        (n,) columns, rows or both [projector px].
+
+    See Also
+    --------
+    meet_light_planes : of one axis
     """
     start = eye.centre - projector.centre
     if len(coordinates) == 2:

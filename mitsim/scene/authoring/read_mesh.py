@@ -13,8 +13,8 @@ import trimesh
 
 from characterisation.files.errors import InputError, nearest
 from mitsim.scene.authoring.face import Floats, Ints
-from mitsim.scene.authoring.units import UNITS, commented_unit, unit_assumed, unit_words
-from mitsim.sensor.calibration_qualifiers import UNITS_MM
+from mitsim.scene.authoring.units import commented_unit, unit_assumed, unit_words
+from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, UNITS_MM
 
 STEP = (".step", ".stp", ".p21")
 _MESHES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".3mf")
@@ -59,8 +59,8 @@ def check_part_file(path: Path, units: str | None) -> None:
         If a check fails.
     """
     kind = path.suffix.lower()
-    if units is not None and units not in UNITS:
-        raise InputError("--units", "", repr(units), ", ".join(UNITS), nearest(units, list(UNITS)))
+    if units is not None and units not in LENGTHS_MM:
+        raise InputError("--units", "", repr(units), ", ".join(LENGTHS_MM), nearest(units, list(LENGTHS_MM)))
     if not path.is_file():
         there = sorted(p.name for p in path.parent.glob("*") if p.is_file()) if path.parent.is_dir() else []
         raise InputError(path, "", "no such file", "a STEP file or a mesh", nearest(path.name, there))
@@ -92,17 +92,17 @@ def _scale(path: Path, scene: Any, units: str | None) -> tuple[float, tuple[str,
     if stated is None:
         if units is None:
             return 1.0, (unit_assumed(path.name),)
-        return UNITS[units], ()
-    if units is None or math.isclose(stated, UNITS[units]):
+        return LENGTHS_MM[units], ()
+    if units is None or math.isclose(stated, LENGTHS_MM[units]):
         return stated, ()
-    return UNITS[units], (f"{path.name} states {unit_words(stated)} as its unit: --units {units} is used instead",)
+    return LENGTHS_MM[units], (f"{path.name} states {unit_words(stated)} as its unit: --units {units} is used instead",)
 
 
 def _stated_unit(path: Path, scene: Any) -> float | None:
     """Return the unit of length [mm] that a mesh file states, None without one."""
     kind = path.suffix.lower()
     if kind in (".glb", ".gltf"):
-        return UNITS["m"]
+        return LENGTHS_MM["m"]
     if kind == ".3mf":
         word = str(scene.metadata.get("units", "millimeter")).strip().lower()
         if word not in UNITS_MM:
@@ -147,5 +147,5 @@ def check_size(path: Path, points: Floats) -> None:
     """
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     if not 1.0 <= size <= 1e5:
-        hint = "give --units m or --units inch if the file uses them" if size < 1 else "see --units"
+        hint = "give --units if the file has another unit: m or inch, for example" if size < 1 else "see --units"
         raise InputError(path, "", f"a part {size:g} mm across", "1 mm to 100 m", hint)

@@ -39,7 +39,8 @@ from mitsim.scene.authoring.face import (
 )
 from mitsim.scene.authoring.part21 import StepText, read_step_text
 from mitsim.scene.authoring.segment_mesh import components
-from mitsim.scene.authoring.units import UNITS, step_units, unit_assumed, unit_words
+from mitsim.scene.authoring.units import step_units, unit_assumed, unit_words
+from mitsim.sensor.calibration_qualifiers import LENGTHS_MM
 
 #: default mesh of STEP without a sensor: distance from the true surface [mm], and angle between facets [rad]. The angle
 #: only keeps small round faces round, since the normals are exact
@@ -219,8 +220,8 @@ def _scale(path: Path, text: StepText, units: str | None) -> tuple[float, list[s
     if not stated:
         if units is None:
             return 1.0, [unit_assumed(path.name)]
-        return UNITS[units], []
-    if units is not None and not all(math.isclose(one, UNITS[units]) for one in stated):
+        return LENGTHS_MM[units], []
+    if units is not None and not all(math.isclose(one, LENGTHS_MM[units]) for one in stated):
         words = " and ".join(map(unit_words, stated))
         hint = "leave out --units: the file's dimensions and tolerances have units of their own, too"
         raise InputError("--units", "", repr(units), f"{words}, the unit that {path.name} states", hint)

@@ -13,10 +13,7 @@ import re
 from typing import Any
 
 from mitsim.scene.authoring.part21 import Entity, Enumeration, Reference, StepText, Typed
-from mitsim.sensor.calibration_qualifiers import UNITS_MM
-
-#: units of length that an option may name [mm]
-UNITS = {word: UNITS_MM[word] for word in ("mm", "m", "inch")}
+from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, UNITS_MM
 
 #: head of a file in which a comment may state the unit [bytes]
 _HEAD = 4096
@@ -43,14 +40,13 @@ _DEEPEST = 20
 
 
 def unit_words(size_mm: float) -> str:
-    """Return the name of a unit of ``size_mm``: ``mm``, ``m``, ``inch``, ``foot``; else its size in mm."""
-    names = {1e-3: "um", 1.0: "mm", 10.0: "cm", 1000.0: "m", 25.4: "inch", 304.8: "foot"}
-    return next((name for size, name in names.items() if math.isclose(size, size_mm)), f"{size_mm:g} mm")
+    """Return the name of a unit of ``size_mm``, as an option names it; else its size in mm."""
+    return next((name for name, size in LENGTHS_MM.items() if math.isclose(size, size_mm)), f"{size_mm:g} mm")
 
 
 def unit_assumed(name: str) -> str:
     """Return the remark about the file ``name`` that states no unit of length."""
-    return f"{name} states no unit of length: mm assumed; --units m or --units inch changes it"
+    return f"{name} states no unit of length: mm assumed; --units inch, for example, changes it"
 
 
 def commented_unit(suffix: str, data: bytes) -> float | None:

@@ -26,7 +26,7 @@ A material whose finish is never drawn, such as a stock BSDF of the scene's auth
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,9 +40,6 @@ from mitsim.scene.light_transport.low_discrepancy import z_positions
 from mitsim.scene.light_transport.projector_light import ProjectedLight
 
 Floats = NDArray[np.float32]
-
-#: index of the factor 1 among the factors of a path, for surfaces whose BSDF is part of the weight
-_ONE = 0
 
 
 @dataclass(frozen=True)
@@ -179,11 +176,12 @@ class KeptPaths:
         return out.reshape(light.codes, self.roi.height, self.roi.width)
 
 
-def light_of(paths: Candidates, bsdfs: Sequence[Any]) -> NDArray[np.float64]:
-    """Return the radiance (n,) of each path for a code of 1, for the BSDFs of the drawn finishes."""
+def light_of(paths: Candidates, finishes: Sequence[Sequence[Any]]) -> Iterator[NDArray[np.float64]]:
+    """Yield the radiance (n,) of each path for a code of 1, for the BSDFs of each of some drawn finishes."""
     vertices = Vertices(paths.material, paths.toward)
-    factors = np.asarray(vertices.factors(bsdfs), np.float64)
-    return np.asarray(paths.weight * factors[vertices.places].prod(axis=0))
+    for bsdfs in finishes:
+        factors = np.asarray(vertices.factors(bsdfs), np.float64)
+        yield np.asarray(paths.weight * factors[vertices.places].prod(axis=0))
 
 
 def mattering(paths: Candidates, finishes: Sequence[Sequence[Any]], roi: Roi, count: int, seed: int) -> Candidates:
@@ -203,8 +201,8 @@ def mattering(paths: Candidates, finishes: Sequence[Sequence[Any]], roi: Roi, co
         Of the choice.
     """
     size = np.zeros(len(paths))
-    for bsdfs in finishes:
-        size += light_of(paths, bsdfs) ** 2
+    for light in light_of(paths, finishes):
+        size += light**2
     size = np.sqrt(size / max(len(finishes), 1))
     order = np.argsort(z_positions(paths.pixel % roi.width, paths.pixel // roi.width), kind="stable")
     probability = np.minimum(size[order] / _threshold(size, count), 1.0)

@@ -11,7 +11,7 @@ gives the same records.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -76,13 +76,19 @@ def camera_paths(
     at_once = max(1, _AT_ONCE // max(1, len(pixels)))
     for first in range(0, tracing.samples, at_once):
         count = min(at_once, tracing.samples - first)
-        walk: Walk | None = _camera_start(one, index, first, count)
-        for number in range(1, tracing.depth + 1):
-            if walk is None:
-                break
-            walk, record = _camera_step(one, walk, number)
-            if record is not None:
-                yield record
+        yield from _records(one, _camera_start(one, index, first, count), _camera_step)
+
+
+def _records(
+    one: Tracer, walk: Walk | None, step: Callable[[Tracer, Walk, int], tuple[Walk | None, Candidates | None]]
+) -> Iterator[Candidates]:
+    """Yield the records of paths from surface to surface."""
+    for number in range(1, one.tracing.depth + 1):
+        if walk is None:
+            return
+        walk, record = step(one, walk, number)
+        if record is not None:
+            yield record
 
 
 def _camera_start(one: Tracer, pixels: Any, first: int, count: int) -> Walk:
@@ -200,13 +206,7 @@ def photon_paths(
     """
     one = Tracer(scene, rays, projector, pose, roi, tracing)
     for first in range(0, tracing.photons, _AT_ONCE):
-        walk: Walk | None = _photon_start(one, first, min(_AT_ONCE, tracing.photons - first))
-        for number in range(1, tracing.depth + 1):
-            if walk is None:
-                break
-            walk, record = _photon_step(one, walk, number)
-            if record is not None:
-                yield record
+        yield from _records(one, _photon_start(one, first, min(_AT_ONCE, tracing.photons - first)), _photon_step)
 
 
 def _photon_start(one: Tracer, first: int, count: int) -> Walk:

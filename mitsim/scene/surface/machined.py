@@ -103,13 +103,12 @@ class MachinedFace:
 
 @dataclass(frozen=True)
 class _Lobe:
-    """Alpha across and along the lay, its source, its one-sigma factor and the correlation length [um]."""
+    """Alpha across and along the lay, its source, and its one-sigma factor."""
 
     across: float
     along: float
     provenance: str
     factor: float
-    correlation: float = float("nan")
 
 
 def machined(
@@ -174,7 +173,6 @@ def machined(
         lay=face.lay or "none",
         energy_factor=energy_factors(alpha_u, alpha_v, normal_reflectance(face.metal, wavelength_nm)),
         coherent_alpha=_mirror_directions(lay, mirror),
-        correlation_um=lobe.correlation,
         beckmann_range=tails,
         turn_deg=turn_deg,
         lay_open=lay_is_open(face),
@@ -305,7 +303,7 @@ def _lobe(face: MachinedFace, process: Process, sigma: float, wavelength_nm: flo
     nu = (process.exponent - 1) / 2
     length = correlation_length(sigma, min(slope, ALPHA_LARGEST), nu)
     across = lobe_alpha(_matern_of(length, nu), sigma, wavelength_nm)
-    return _Lobe(across, across * ratio, words, factor, length)
+    return _Lobe(across, across * ratio, words, factor)
 
 
 def _matern_of(length_um: float, nu: float) -> Autocorrelation:
@@ -346,7 +344,7 @@ def _of_gloss(face: MachinedFace, process: Process, sigma: float, wavelength_nm:
     if length is None:  # geometric: the slope is the same at every wavelength
         return _Lobe(alpha, alpha * process.lay_ratio, words, FACTORS["gloss"])
     across = lobe_alpha(_matern_of(length, nu), sigma, wavelength_nm)
-    return _Lobe(across, across * process.lay_ratio, words, FACTORS["gloss"], length)
+    return _Lobe(across, across * process.lay_ratio, words, FACTORS["gloss"])
 
 
 def _length_of_alpha(alpha: float, sigma: float, nu: float) -> float | None:

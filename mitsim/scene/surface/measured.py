@@ -1,6 +1,6 @@
 """Evaluate measured heights, a profile trace or an areal map, for the scattering of light.
 
-Signal chain: CSV or .npy -> form removed (parabola of a trace, plane of a map) -> Ra, Rq, Rdq or Sa, Sq, Sdq (ISO
+Signal chain: CSV or .npy -> form removed (parabola of a trace, plane of a map) -> Ra, Rq or Sa, Sq (ISO
 21920-2, ISO 25178-2) -> structure function 1 - rho(tau) along the relevant directions.
 
 The structure function is the mean over pairs of points, <(z(x + tau) - z(x))^2> / (2 sigma^2). At short lags, where rho
@@ -10,7 +10,6 @@ with waviness (lambda_c) beforehand.
 
 from __future__ import annotations
 
-import csv
 import io
 import os
 from dataclasses import dataclass, field
@@ -42,12 +41,11 @@ _UM_PER = {"um": 1.0, "mm": 1e3}
 class Profile:
     """A trace with its form removed.
 
-    ``Ra``, ``Rq`` [um]; ``Rdq`` [1]; autocorrelation ``rho`` at ``lags`` [um], both (n,).
+    ``Ra``, ``Rq`` [um]; autocorrelation ``rho`` at ``lags`` [um], both (n,).
     """
 
     Ra: float
     Rq: float
-    Rdq: float
     lags: NDArray[np.float64] = field(repr=False)
     rho: NDArray[np.float64] = field(repr=False)
     name: str = "trace"
@@ -62,18 +60,13 @@ class Profile:
 class HeightMap:
     """An areal map with its plane removed.
 
-    - ``Sa``, ``Sq`` [um]; ``Sdq`` [1], the rms gradient.
-    - ``alpha_along``, ``alpha_across`` [1] in the geometric limit: sqrt(2) times the rms slope along and across the
-      lay.
+    - ``Sa``, ``Sq`` [um].
     - ``lay``: direction of the lay [rad] from the columns' axis (x) towards the rows' (y), -pi/2 to pi/2.
     - ``rho_along``, ``rho_across``: autocorrelations along and across it at ``lags`` [um], all (n,).
     """
 
     Sa: float
     Sq: float
-    Sdq: float
-    alpha_along: float
-    alpha_across: float
     lay: float
     lags: NDArray[np.float64] = field(repr=False)
     rho_along: NDArray[np.float64] = field(repr=False)
@@ -104,14 +97,12 @@ def profile(spacing_um: float, heights_um: ArrayLike, name: str = "trace") -> Pr
     z = np.asarray(heights_um, float)
     position = np.linspace(-1, 1, len(z))
     z = z - np.polynomial.polynomial.polyval(position, np.polynomial.polynomial.polyfit(position, z, 2))
-    slope = (z[6:] - 9 * z[5:-1] + 45 * z[4:-2] - 45 * z[2:-4] + 9 * z[1:-5] - z[:-6]) / (60 * spacing_um)
     variance = _variance(z)
     steps = _steps(len(z) // 4)
     structure = np.array([np.mean((z[k:] - z[:-k]) ** 2) for k in steps]) / (2 * variance)
     return Profile(
         float(np.abs(z).mean()),
         float(np.sqrt(variance)),
-        float(np.sqrt(np.mean(slope**2))),
         np.asarray(steps * spacing_um, float),
         1 - structure,
         name,
@@ -129,12 +120,12 @@ def read_profile(path: str | Path, where: str | Path = "", key: str = "profile")
         If the file is missing, is not such a table, is too short, has gaps or is flat.
     """
     path = Path(path)
-    rows = _rows(path, where, key)
-    header = [name.strip() for name in rows[0]] if rows else []
+    lines = _lines(path, where, key)
+    header = [name.strip() for name in lines[0].split(",")] if lines else []
     allowed = "a header of two columns, x_um or x_mm and z_um or z_mm"
     if sorted(name[:2] for name in header) != ["x_", "z_"] or any(name[2:] not in _UM_PER for name in header):
         raise InputError(path, "header", repr(",".join(header)), allowed)
-    values = _numbers(rows[1:], path, 2, 2)
+    values = _numbers(lines[1:], path)
     columns = {name[0]: values[:, i] * _UM_PER[name[2:]] for i, name in enumerate(header)}
     if len(values) < _FEWEST_POINTS:
         raise InputError(path, "", f"{len(values)} points", f"at least {_FEWEST_POINTS}")
@@ -169,7 +160,7 @@ def height_map(heights_um: ArrayLike, spacing_um: float, name: str = "height map
     dx = (8 * (z[2:-2, 3:-1] - z[2:-2, 1:-3]) - (z[2:-2, 4:] - z[2:-2, :-4])) / (12 * spacing_um)
     dy = (8 * (z[3:-1, 2:-2] - z[1:-3, 2:-2]) - (z[4:, 2:-2] - z[:-4, 2:-2])) / (12 * spacing_um)
     covariance = np.array([[np.mean(dx * dx), np.mean(dx * dy)], [np.mean(dx * dy), np.mean(dy * dy)]])
-    squares, axes = np.linalg.eigh(covariance)
+    axes = np.linalg.eigh(covariance)[1]
     lay = float(np.arctan2(axes[1, 0], axes[0, 0]))
     lay = (lay + np.pi / 2) % np.pi - np.pi / 2
     variance = _variance(z)
@@ -181,13 +172,9 @@ def height_map(heights_um: ArrayLike, spacing_um: float, name: str = "height map
         for turn in (lay, lay + np.pi / 2)
     )
     lags = np.asarray(steps * spacing_um, float)
-    along_slope, across_slope = np.sqrt(2 * np.maximum(squares, 0.0))
     return HeightMap(
         Sa=float(np.abs(z).mean()),
         Sq=float(np.sqrt(variance)),
-        Sdq=float(np.sqrt(squares.sum())),
-        alpha_along=float(along_slope),
-        alpha_across=float(across_slope),
         lay=lay,
         lags=lags,
         rho_along=along,
@@ -228,8 +215,7 @@ def read_height_map(path: str | Path, spacing_um: float, where: str | Path = "")
         if z.ndim != 2 or z.dtype.kind not in "fiu":
             raise InputError(path, "", f"an array of shape {z.shape} and type {z.dtype}", "a grid of real numbers")
     else:
-        rows = _rows(path, where, "height_map")
-        z = _numbers(rows, path, len(rows[0]) if rows else 0, 1)
+        z = _numbers(_lines(path, where, "height_map"), path)
     z = z.astype(float)
     if z.ndim != 2 or min(z.shape) < _SMALLEST_MAP or max(z.shape) > _LARGEST_MAP:
         allowed = f"{_SMALLEST_MAP} to {_LARGEST_MAP} each way"
@@ -271,27 +257,23 @@ def _there(path: Path, where: str | Path, key: str, allowed: str) -> None:
         raise InputError(where or path, key, f"no file {path}", allowed)
 
 
-def _rows(path: Path, where: str | Path, key: str) -> list[list[str]]:
-    """Return the rows of a CSV without empty lines and comments."""
+def _lines(path: Path, where: str | Path, key: str) -> list[str]:
+    """Return the lines of a CSV without empty lines and comments."""
     _there(path, where, key, "a file beside the scene XML")
-    try:
-        rows = list(csv.reader(read_text_bounded(path, largest=_LARGEST_TABLE).splitlines()))
-    except csv.Error as error:
-        raise InputError(path, "", f"a table that cannot be read ({error})", "a CSV of numbers") from None
-    return [row for row in rows if row and not row[0].startswith("#")]
+    lines = read_text_bounded(path, largest=_LARGEST_TABLE).splitlines()
+    return [line for line in lines if line.strip() and not line.startswith("#")]
 
 
-def _numbers(rows: list[list[str]], path: Path, columns: int, first: int) -> NDArray[np.float64]:
-    if not rows or not columns:
+def _numbers(lines: list[str], path: Path) -> NDArray[np.float64]:
+    """Return the numbers of a CSV, (rows, columns)."""
+    if not lines:
         raise InputError(path, "", "no numbers", "rows of numbers")
-    for number, row in enumerate(rows):
-        if len(row) != columns:
-            raise InputError(path, f"row {number + first}", f"{len(row)} values", f"{columns}, as in the first row")
     try:
-        values = np.array(rows, float).reshape(len(rows), columns)
+        values = np.loadtxt(lines, delimiter=",", ndmin=2)
     except ValueError as error:
-        raise InputError(path, "", f"a value that is not a number ({error})", "numbers with a decimal point") from None
+        allowed = "rows of equally many numbers with a decimal point"
+        raise InputError(path, "", f"a table that does not load ({str(error)[:200]})", allowed) from None
     gaps = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(gaps):
-        raise InputError(path, f"row {gaps[0] + first}", "a missing value", "finite numbers", "fill the gaps first")
+        raise InputError(path, f"row {gaps[0] + 1} of numbers", "a missing value", "finite numbers", "fill the gaps")
     return values

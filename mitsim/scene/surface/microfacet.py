@@ -15,7 +15,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
 
 Distribution = Literal["beckmann", "ggx"]
 
@@ -52,24 +51,3 @@ def fresnel(cosine: ArrayLike, n: float, k: float) -> NDArray[np.float64]:
     across = (c - index * refracted) / (c + index * refracted)
     within = (index * c - refracted) / (index * c + refracted)
     return np.asarray((np.abs(across) ** 2 + np.abs(within) ** 2) / 2)
-
-
-def half_width(alpha: float, distribution: Distribution) -> float:
-    """Return the angle from the mean normal [rad] at which D(m) has fallen to half its value there.
-
-    Raises
-    ------
-    ValueError
-        For a lobe so wide that D never falls to half before it rises again towards grazing normals.
-    """
-    # D rises again towards grazing normals, so the first fall is bracketed on a grid
-    angles = np.linspace(0, np.pi / 2 - 1e-3, 2000)
-    density = slope_density((np.tan(angles) / alpha) ** 2, distribution) / np.cos(angles) ** 4
-    below = np.flatnonzero(density < 0.5)
-    if not len(below):
-        raise ValueError(f"a {distribution} lobe of alpha {alpha:g} has no half width")
-
-    def excess(angle: float) -> float:
-        return float(slope_density((np.tan(angle) / alpha) ** 2, distribution) / np.cos(angle) ** 4 - 0.5)
-
-    return float(brentq(excess, 0.0, angles[below[0]], xtol=1e-12))

@@ -52,7 +52,6 @@ class Scatter:
     - ``lay``: direction of the marks.
     - ``energy_factor``: factors on the GGX and the Beckmann lobe that compensate the energy lost by single scattering.
     - ``coherent_alpha``: width of the coherent part along u and v.
-    - ``correlation_um``: lateral scale l of the heights [um]; NaN if not needed.
     - ``depolarising``: whether the wide-angle light was scattered inside the material (paint, white).
     """
 
@@ -68,7 +67,6 @@ class Scatter:
     lay: Lay = "none"
     energy_factor: tuple[float, float] = (1.0, 1.0)
     coherent_alpha: tuple[float, float] = (ALPHA_FORM, ALPHA_FORM)
-    correlation_um: float = float("nan")
     depolarising: bool = False
     beckmann_range: tuple[float, float] | None = None
     turn_deg: float | None = None

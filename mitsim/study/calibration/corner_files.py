@@ -29,9 +29,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from characterisation.files.checked_files import read_bounded, read_text_bounded
+from characterisation.files.checked_files import read_text_bounded
 from characterisation.files.errors import InputError
 from mitsim.capture.grey_image import read_grey
+from mitsim.sensor.calibration_formats import read_documents
 from mitsim.study.calibration.board import Board
 from mitsim.study.calibration.recorded import RecordedBoard
 
@@ -54,7 +55,8 @@ _SINGLES = ("image_points", "imgpoints", "Image_points")
 
 _IMAGES = frozenset({".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm"})
 
-_MOST_BYTES = 256 * 2**20
+#: suffixes of files of arrays
+_OF_ARRAYS = (".npz", ".yml", ".yaml", ".xml", ".json")
 
 _COLUMNS = ("pose", "camera", "column", "row", "x_px", "y_px")
 
@@ -84,10 +86,9 @@ def read_corners(path: str | Path, board: Board) -> RecordedCorners:
         seen, sizes = _of_images(path, board)
     elif path.suffix.lower() == ".csv":
         seen, sizes = _of_table(path, board)
-    elif path.suffix.lower() == ".npz":
-        seen, sizes = _of_arrays(path, _npz(path), board)
-    elif path.suffix.lower() in (".yml", ".yaml", ".xml", ".json"):
-        seen, sizes = _of_arrays(path, _opencv(path), board)
+    elif path.suffix.lower() in _OF_ARRAYS:
+        arrays = {name: value for document in read_documents(path) for name, value in document.items()}
+        seen, sizes = _of_arrays(path, arrays, board)
     else:
         allowed = "a folder of images, or a file .csv, .npz, .yml, .yaml, .xml or .json"
         raise InputError(path, "", "a file of another kind" if path.exists() else "nothing there", allowed)
@@ -238,28 +239,3 @@ def _size(path: Path, arrays: Mapping[str, Any]) -> tuple[int, int]:
     if not (0 < width <= 65535 and 0 < height <= 65535):
         raise InputError(path, "image_size", f"{width} x {height}", "1 to 65535 px")
     return width, height
-
-
-def _npz(path: Path) -> dict[str, Any]:
-    try:
-        with np.load(io.BytesIO(read_bounded(path, largest=_MOST_BYTES)), allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (ValueError, OSError, EOFError, KeyError) as error:
-        found = str(error)[:80] or "a damaged file"
-        raise InputError(path, "", found, "arrays of numbers, saved by numpy.savez") from None
-
-
-def _opencv(path: Path) -> dict[str, Any]:
-    text = read_text_bounded(path)
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        root = storage.root()
-        out: dict[str, Any] = {}
-        for name in root.keys():  # noqa: SIM118 - a node of OpenCV, not a dictionary
-            node = root.getNode(name)
-            value = node.mat() if not (node.isInt() or node.isReal() or node.isString()) else node.real()
-            if value is not None:
-                out[name] = value
-    except (cv2.error, SystemError, UnicodeError) as error:
-        raise InputError(path, "", str(error).strip().splitlines()[-1][:80], "a file of cv::FileStorage") from None
-    return out

@@ -4,8 +4,9 @@ Signal chain: number of trials -> trials, of which some repeat a day -> numbers 
 the seeds of groups that drew only a seed -> :func:`characterisation.statements.budget.budget`.
 
 Every draw is known: it follows from the trial alone (:mod:`mitsim.study.virtual.world`). The numbers are those behind
-the draw, of mean 0 and variance 1; of a decoder, its settings. Effects of calibration and pose are small, and linear in
-them. The errors may also depend on the squares of the numbers of finish, light and temperature.
+the draw, of mean 0 and variance 1; of a decoder, its settings, which the budget standardises. Effects of calibration
+and pose are small, and linear in them. The errors may also depend on the squares of the numbers of finish, light and
+temperature.
 """
 
 from __future__ import annotations
@@ -96,8 +97,6 @@ def drawn_numbers(
             if one not in known:
                 known[one] = _numbers(study, unknowns, source, group, one)
         rows = np.array([known[trial if group in FRESH else Trial(trial.day)] for trial in trials])
-        if group == "decoder":
-            rows = _standardised(rows)
         out[group] = np.hstack([rows, (rows**2 - 1) / np.sqrt(2)]) if group in _CURVED else rows
     return out
 
@@ -137,11 +136,3 @@ def _finish(numbers: Mapping[str, float]) -> list[float]:
         double = 2 * np.pi * float(ndtr(numbers["lay_direction"]))
         out += [np.sqrt(2) * np.cos(double), np.sqrt(2) * np.sin(double)]
     return out
-
-
-def _standardised(rows: Floats) -> Floats:
-    """Return columns (n, p) with mean 0 and variance 1, without those that do not vary."""
-    rows = rows - rows.mean(axis=0)
-    size = rows.std(axis=0)
-    varying = size > 1e-9
-    return np.asarray(rows[:, varying] / size[varying])

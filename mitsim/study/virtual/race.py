@@ -21,7 +21,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from characterisation.statements.selection import Standing, joint_samples, judge
-from characterisation.tasks.task_file import Task
 from mitsim.running.progress import say, say_progress, track
 from mitsim.study.virtual.trials import Outcome, TrialFolder
 from mitsim.study.virtual.world import Trial
@@ -40,7 +39,7 @@ _LEAST_GAIN = 0.001
 #: number of views beside the leader that get a batch in a round, for each choice that is open
 _CHALLENGERS = 4
 
-#: number of trials after which a round can end for lack of time; within them, trials share the light of a finish
+#: number of trials after which the state of a round is told; within them, trials share the light paths of a view
 _AT_ONCE = 16
 
 #: time between lines of progress [s]
@@ -215,7 +214,7 @@ def run_race(
     over
         Returns whether time is over; asked after every trial.
     after_round
-        Receives the state after every round.
+        Receives the state after every round, and within long rounds.
 
     See Also
     --------
@@ -230,6 +229,11 @@ def run_race(
     predicted = scores.sel(view=numbers)
     began = last = time.monotonic()
 
+    def state(wanted: dict[int, int]) -> Raced:
+        for number in wanted:
+            counts[number] = sum(trial in trials.known(number) for trial in _first_trials(wanted[number]))
+        return standings(predicted, numbers, trials, counts, rules)
+
     def measure(wanted: dict[int, int]) -> None:
         nonlocal last
         jobs = [
@@ -241,6 +245,8 @@ def run_race(
         done = 0
         # the most promising views come first, so that they have trials when time is over
         for first in range(0, len(jobs), _AT_ONCE):
+            if first:
+                after_round(state(wanted))
             for job, outcome in runner.run(runner.in_order(jobs[first : first + _AT_ONCE])):
                 trials.add(job.view.number, job.trial, outcome)
                 done += 1
@@ -253,12 +259,13 @@ def run_race(
     wanted = dict.fromkeys(numbers, FIRST)
     while True:
         measure(wanted)
-        for number in wanted:
-            counts[number] = sum(trial in trials.known(number) for trial in _first_trials(wanted[number]))
-        raced = standings(predicted, numbers, trials, counts, rules)
+        raced = state(wanted)
         wanted = _next_round(raced, counts, rules)
-        _say_state(raced, counts, time.monotonic() - began)
-        if raced.decided or not wanted or over():
+        ended = raced.decided or not wanted or over()
+        if ended or time.monotonic() - last > _SAY_EVERY_S:
+            last = time.monotonic()
+            _say_state(raced, counts, last - began)
+        if ended:
             return raced
         after_round(raced)
 
@@ -360,52 +367,8 @@ def _say_state(raced: Raced, counts: dict[int, int], seconds: float) -> None:
 
 
 def in_words(one: Standing, margin: float) -> str:
-    """Return how good a choice is, like ``expected within 4 % of the best (90 % sure to be within 10 %)``."""
-    loss = "expected to be the best" if one.loss < 0.005 else f"expected within {100 * one.loss:.0f} % of the best"
-    return f"{loss} ({100 * one.confidence:.0f} % sure to be within {100 * margin:.0f} %)"
-
-
-def with_race(scores: xr.Dataset, raced: Raced) -> xr.Dataset:
-    """Add ``measured_risk``, ``trials`` and ``final_rank`` (measurement, view) from the race.
-
-    Measured views come first, by their risk; the others follow in the order of screening.
-    """
-    names = [str(name) for name in scores["measurement"].values]
-    places = {int(view): place for place, view in enumerate(scores["view"].values)}
-    shape = (len(names), scores.sizes["view"])
-    risk, count = np.full(shape, np.nan), np.zeros(shape, int)
-    columns = [places[int(view)] for view in raced.views]
-    if columns:
-        risk[:, columns] = [raced.standings[name].risk for name in names]
-        count[:, columns] = (~np.isinf(raced.errors)).sum(axis=2)
-    screened = scores["uncertainty_rank"].transpose("measurement", "view").values
-    order = np.lexsort((screened, np.where(np.isfinite(risk), risk, np.inf)), axis=1)
-    rank = np.empty(shape, int)
-    np.put_along_axis(rank, order, np.broadcast_to(np.arange(1, shape[1] + 1), shape), axis=1)
-    by = ("measurement", "view")
-    out = scores.copy()
-    name = "root mean square error of virtual measurements over the square root of the share with a value"
-    out["measured_risk"] = (by, risk, {"long_name": name, "units": "mm or deg"})
-    out["trials"] = (by, count, {"long_name": "virtual measurements of the race", "units": "1"})
-    out["final_rank"] = (by, rank, {"long_name": "rank by race, then by screening; 1 is best", "units": "1"})
-    return out
-
-
-def raced_errors(raced: Raced, task: Task) -> xr.Dataset:
-    """Return the errors of the race (measurement, view, repeat), NaN without a value; the best view comes first.
-
-    ``tried`` distinguishes a trial without a value from one that was not made.
-    """
-    order = np.argsort(raced.standings[ALL].risk, kind="stable") if len(raced.views) else np.empty(0, int)
-    tried = ~np.isinf(raced.errors[:, order])
-    errors = np.where(tried, raced.errors[:, order], np.nan)
-    dims = ("measurement", "view", "repeat")
-    nominal = np.array([one.nominal for one in task.measurements.values()])[:, None, None]
-    return xr.Dataset(
-        {
-            "error": (dims, errors, {"units": "mm or deg"}),
-            "value": (dims, errors + nominal, {"units": "mm or deg"}),
-            "tried": (dims, tried.astype(np.int8), {"units": "1"}),
-        },
-        coords={"measurement": list(task.measurements), "view": raced.views[order]},
+    """Return how good a choice is, like ``its error expected 4 % above the least (90 % sure to be within 10 %)``."""
+    loss = (
+        "expected to be the best" if one.loss < 0.005 else f"its error expected {100 * one.loss:.0f} % above the least"
     )
+    return f"{loss} ({100 * one.confidence:.0f} % sure to be within {100 * margin:.0f} %)"

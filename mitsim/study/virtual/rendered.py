@@ -37,6 +37,7 @@ from mitsim.capture.simulated.simulate import SimulatedSensor
 from mitsim.decoding.cloud import capture_cloud, sensor_geometry
 from mitsim.maps.campaign.acquire import one_ahead
 from mitsim.maps.prediction import Predictor
+from mitsim.running.executor import available_memory
 from mitsim.scene.light_transport.plain_scene import distinct_bsdfs
 from mitsim.scene.light_transport.room_light import SeenSurfaces, directional_albedos
 from mitsim.scene.load import Scene, load_scene
@@ -65,8 +66,11 @@ _MARGIN_PX = 12
 _PLACEMENTS = 3.0
 
 
-#: memory of the paths of views that are kept for later trials [bytes]
-_KEPT_BYTES = 1 << 29
+#: memory of the paths of views that are kept for later trials [bytes]: at least, and at most
+_LEAST_KEPT, _MOST_KEPT = 1 << 29, 1 << 32
+
+#: share of the available memory that they may take beyond the least
+_KEPT_SHARE = 0.25
 
 #: finishes in whose light the paths to keep are chosen, beside the best estimate: numbers of draws
 _PROBING_FINISHES = (101, 102, 103, 104)
@@ -264,7 +268,9 @@ class RenderedMeasurements:
         """Return what all draws of a view share, made at its nominal pose and calibration on first use."""
         if view.number not in self._views:
             made = self._shared(self.simulated, view.world_from_sensor, view, self._keeps_paths)
-            while self._views and made.bytes + sum(one.bytes for one in self._views.values()) > _KEPT_BYTES:
+            kept = sum(one.bytes for one in self._views.values())
+            allowed = min(max(_LEAST_KEPT, kept + int(_KEPT_SHARE * available_memory())), _MOST_KEPT)
+            while self._views and made.bytes + sum(one.bytes for one in self._views.values()) > allowed:
                 self._views.pop(next(iter(self._views)))  # that was not used for the longest time
             self._views[view.number] = made
         used = self._views.pop(view.number)

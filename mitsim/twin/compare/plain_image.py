@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from mitsim.capture.capture import Capture
 from mitsim.decoding.cloud import capture_pattern
 from mitsim.decoding.decoder_registry import projector_size
-from mitsim.sensor.image_sequence import ImageSequence
-from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, PhaseShift, roles
+from mitsim.sensor.light_code import LightCode, roles
 
 _CODED = ("gray", "gray_inverse", "phase")
 
@@ -50,7 +49,7 @@ def plain_image(capture: Capture) -> PlainImage:
         If the capture's technology needs a pattern and the settings do not name one.
     """
     code = capture_pattern(capture)
-    if not isinstance(code, PhaseShift | GrayCode | GrayCodePhaseShift | ImageSequence):
+    if not isinstance(code, LightCode):
         return PlainImage((0,), "the first frame", True)
     kinds = [role.kind for role in roles(code, *projector_size(capture))]
     if "white" in kinds:

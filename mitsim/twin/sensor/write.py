@@ -1,8 +1,8 @@
 """Write the result of a fit: as a table, and into the text of a sensor file, whose comments are kept.
 
 Signal chain: text of the file -> line of every fitted key, else a new line in its table, else a new table at the end ->
-the value, preceded by a comment with its uncertainty and captures -> the cameras of the captured unit, its exposure ->
-text that is again a valid sensor file.
+the value, and above its table a comment with its uncertainty and captures -> the cameras of the captured unit, its
+exposure -> text that is again a valid sensor file.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _entries(fit: SensorFit) -> dict[str, Entry]:
         entries[key] = Entry(numbers(np.clip(values, -limit, limit), 5), comment)
     for kept in fit.undetermined:
         if kept.contained:
-            entries[kept.key] = Entry(number(kept.value), f"not determined; needs {kept.determined_by}")
+            entries[kept.key] = Entry(number(kept.value), f"not determined; needs {kept.determined_by}", True)
     if "misalignment.row_mrad" in entries:
         row, roll = (next(e for e in fit.estimates if e.key == f"misalignment.{key}_mrad") for key in ("row", "roll"))
         comment = "rotation of one unit's second camera off its calibration, assumed for the next unit too"
@@ -114,10 +114,14 @@ def _comment(one: FittedKey) -> str:
 
 @dataclass(frozen=True)
 class Entry:
-    """A ``value`` of a key in TOML syntax, and the ``comment`` above it."""
+    """A ``value`` of a key in TOML syntax, and the ``comment`` above its table.
+
+    ``optional``: a file without the key stays without it.
+    """
 
     value: str
     comment: str
+    optional: bool = False
 
 
 def number(value: float) -> str:
@@ -179,7 +183,8 @@ def with_exposure(text: str, seconds: float, comment: str) -> str:
             at = next(index for index, line in enumerate(lines) if _TABLE.match(line))
             kept = [f"# before: {line.strip()}" if _EXPOSURE_RULE.match(line) else line for line in lines[at + 1 :]]
             fixed = ['rule = "fixed"', f"# {comment}", f"exposure_s = {number(seconds)}"]
-            lines = [*lines[: at + 1], *fixed, *kept]
+            lines = [*lines[: at + 1], *kept]
+            lines[_end(lines) : _end(lines)] = fixed
         out += lines
     return "\n".join(out)
 
@@ -220,27 +225,43 @@ def _blocks(text: str) -> list[tuple[str, list[str]]]:
 
 
 def _with_entry(text: str, table: str, key: str, entry: Entry) -> str:
-    comment = [f"# {line}" for line in entry.comment.split("\n")] if entry.comment else []
+    """Set the value of a key; its comment stands above the header of its table, so that no comment in it is split."""
+    said = f"{key}: {entry.comment}" if table else entry.comment
+    comment = [f"# {line}" for line in said.split("\n")] if entry.comment else []
     blocks = _blocks(text)
     for name, lines in blocks:
         if name != table:
             continue
-        for index, line in enumerate(lines):
-            match = _KEY.match(line)
-            if match and match[2] == key:
-                end = _end_of_value(lines, index)
-                if end > index:  # an array over several lines stays as it was, as a comment
-                    old = [f"# before: {one.strip()}" for one in lines[index : end + 1]]
-                    lines[index : end + 1] = [*comment, *old, f"{key} = {entry.value}"]
-                else:
-                    before, remark = _value_and_remark(match[3])
-                    said = f"before: {before}" + f"; {remark}" * bool(remark)
-                    lines[index : index + 1] = [*comment, f"{key} = {entry.value}  # {said}"]
-                return "\n".join(line for _, part in blocks for line in part)
-        at = next((n for n, line in enumerate(lines) if _TABLE.match(line)), -1) + 1 if table else _first_key(lines)
-        lines[at:at] = [*comment, f"{key} = {entry.value}"]
+        header = next((n for n, line in enumerate(lines) if _TABLE.match(line)), -1) if table else -1
+        found = next((n for n, line in enumerate(lines) if (match := _KEY.match(line)) and match[2] == key), None)
+        if found is None and not entry.optional:
+            at = _end(lines) if table else _first_key(lines)
+            lines.insert(at, f"{key} = {entry.value}")
+            at = header if table else at
+            lines[at:at] = comment
+        elif found is not None:
+            lines[found : _end_of_value(lines, found) + 1] = _replaced(lines, found, f"{key} = {entry.value}")
+            at = header if table else found
+            lines[at:at] = comment
         return "\n".join(line for _, part in blocks for line in part)
-    return "\n".join([text.rstrip("\n"), "", f"[{table}]", *comment, f"{key} = {entry.value}", ""])
+    if entry.optional:
+        return text
+    return "\n".join([text.rstrip("\n"), "", *comment, f"[{table}]", f"{key} = {entry.value}", ""])
+
+
+def _replaced(lines: list[str], index: int, new: str) -> list[str]:
+    """Return the lines in place of the value that begins in a line: it stays as a comment."""
+    end = _end_of_value(lines, index)
+    if end > index:  # an array over several lines
+        return [*(f"# before: {one.strip()}" for one in lines[index : end + 1]), new]
+    match = _KEY.match(lines[index])
+    before, remark = _value_and_remark(match[3] if match else "")
+    return [f"{new}  # before: {before}" + f"; {remark}" * bool(remark)]
+
+
+def _end(lines: list[str]) -> int:
+    """Return the number of the line after the last one with a content."""
+    return max((n for n, line in enumerate(lines) if line.strip()), default=-1) + 1
 
 
 def _first_key(lines: list[str]) -> int:

@@ -28,8 +28,9 @@ from scipy.ndimage import gaussian_filter
 from characterisation.region_of_interest import Roi
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.projector import Projector
-from mitsim.sensor.transforms import Transform, mitsuba_to_world
+from mitsim.sensor.transforms import Transform
 from tests.proofs.laboratory.part import LaboratoryPart
+from tests.stock_mitsuba import mitsuba_to_world
 
 Images = NDArray[np.float32]
 

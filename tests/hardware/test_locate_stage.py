@@ -1,6 +1,5 @@
-"""The script of docs/how-to/first-capture.md, as it stands there, on an emulated stage and an emulated camera."""
+"""The script that locates a stage, as it is, on an emulated stage and an emulated camera."""
 
-import re
 from pathlib import Path
 
 import cv2
@@ -16,7 +15,7 @@ from mitsim.maps.campaign.stage_pose import read_stage_calibration
 
 nxlib = pytest.importorskip("nxlib", reason="pip install ensenso-nxlib: live Ensenso cameras")
 
-PAGE = Path(__file__).resolve().parents[2] / "docs/how-to/first-capture.md"
+SCRIPT = Path(__file__).resolve().parents[2] / "scenes/coupon/locate_stage.py"
 SIZE, PX_PER_MM = (1280, 1024), 8
 
 
@@ -32,8 +31,7 @@ def seen(board, node, pose):
     return cv2.resize(drawn, SIZE, interpolation=cv2.INTER_AREA)
 
 
-def test_the_script_of_the_page_calibrates_a_stage(tmp_path, monkeypatch):
-    (script,) = (block for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S) if "Charuco" in block)
+def test_the_script_calibrates_a_stage(tmp_path, monkeypatch):
     stage, port = emulated("ptu")
     monkeypatch.setattr("mitsim.capture.devices.stage.open_stage", lambda connection: stage)
     directions = np.array([[0.02, -1.0, 0.03], [1.0, 0.01, -0.02]])
@@ -57,7 +55,7 @@ def test_the_script_of_the_page_calibrates_a_stage(tmp_path, monkeypatch):
         f'{{ name = "{a["name"]}", channel = "{a["channel"]}", limits_deg = {a["limits_deg"]} }}' for a in PTU["axes"]
     )
     (tmp_path / "stage.toml").write_text(f'kind = "ptu"\nport = "emulated"\naxes = [{entries}]\n')
-    exec(compile(script, str(PAGE), "exec"), {})
+    exec(compile(SCRIPT.read_text(encoding="utf-8"), str(SCRIPT), "exec"), {})
     nxlib.api._nxlib.reset()
     read = read_stage_calibration("stage_calibration.json")
     angles = np.radians([12.0, -17.0])

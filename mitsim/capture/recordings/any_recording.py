@@ -1,0 +1,343 @@
+"""Read any supported recording as a capture.
+
+Signal chain: path -> kind (:mod:`mitsim.capture.recordings.recognise`) -> the kind's reader -> capture, and the
+original files unchanged.
+
+A kind is one entry of :data:`KINDS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from characterisation.files.checked_files import read_bounded
+from characterisation.files.errors import InputError, MissingEnvironmentError, nearest
+from mitsim.capture.capture import Capture
+from mitsim.capture.grey_image import channel_of
+from mitsim.capture.recordings.array_file import map_in
+from mitsim.capture.recordings.depth_image import read_depth_image
+from mitsim.capture.recordings.depthai_recording import calibration_beside, read_depthai_recording, recorded_streams
+from mitsim.capture.recordings.ensenso import ensenso_originals, image_sets, read_ensenso
+from mitsim.capture.recordings.image_folder import read_image_folder, size_of_images
+from mitsim.capture.recordings.organised_cloud import Axes, StoredCloud, read_organised_cloud
+from mitsim.capture.recordings.pose_file import read_pose
+from mitsim.capture.recordings.recognise import NAMES, kind_of
+from mitsim.capture.recordings.recording_files import frame_of, plain_name
+from mitsim.capture.recordings.robi import read_robi
+from mitsim.capture.recordings.stereo_pair import read_stereo_pair
+from mitsim.sensor.calibration_qualifiers import LENGTHS_MM
+from mitsim.sensor.preset import load_sensor, named_sensor
+
+AXES: tuple[Axes, ...] = ("opencv", "opengl")
+
+#: options for recordings of every kind
+FOR_ALL = ("range_mm", "exposure_s", "pose", "sample", "projector")
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """Options for reading a recording; None if not given.
+
+    - ``sensor``: a preset or sensor file.
+    - ``calibration``: see :mod:`mitsim.capture.recordings.calibration_file`; ``camera`` of it.
+    - ``frame``: which of several.
+    - ``range_mm``: depths to decode.
+    - ``scale_mm`` of a depth image's grey level, and its ``invalid`` level.
+    - ``unit`` and ``axes`` of a cloud; ``link``: an Ensenso's node that transformed it.
+    - ``subpixel_bits`` of disparities.
+    - ``topic`` of a bag of ROS: one, or those of a left and a right camera.
+    - ``images``: a pattern of file names for each camera; ``channel`` of colour images.
+
+    All kinds use ``exposure_s``; ``pose``, a file with ``world_from_sensor``; ``sample`` of a coupon; ``projector``,
+    ``on`` or ``off``.
+    """
+
+    sensor: str | None = None
+    calibration: str | None = None
+    camera: str | None = None
+    frame: int | str | None = None
+    range_mm: tuple[float, float] | None = None
+    scale_mm: float | None = None
+    invalid: int | None = None
+    unit: str | None = None
+    axes: str | None = None
+    link: str | None = None
+    subpixel_bits: int | None = None
+    topic: tuple[str, ...] | None = None
+    images: dict[str, str] | None = None
+    channel: str | None = None
+    exposure_s: float | None = None
+    pose: str | None = None
+    sample: str | None = None
+    projector: str | None = None
+
+    @property
+    def named(self) -> str | None:
+        """Return the name of the sensor, if one is given."""
+        return None if self.sensor is None else named_sensor(self.sensor)[0]
+
+    @property
+    def cameras(self) -> str | None:
+        """Return the source of the cameras: the calibration, else the sensor."""
+        return self.calibration or self.sensor
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A ``capture``, its ``kind``, and the ``originals`` by name."""
+
+    capture: Capture
+    kind: str
+    originals: dict[str, bytes] = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of recording: its function ``read``, and the ``options`` that it uses."""
+
+    read: Callable[[Path, ReadOptions], tuple[Capture, dict[str, bytes]]]
+    options: frozenset[str]
+
+
+def _read_ensenso(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    frame = frame_of(options.frame, path, image_sets(path))
+    return read_ensenso(path, frame=frame), ensenso_originals(path, frame)
+
+
+def _read_images(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    if options.sensor is None:
+        raise InputError(
+            path,
+            "",
+            "a folder of images",
+            "the rig that took them: --sensor my.toml",
+            "for a plain stereo pair --calibration suffices",
+        )
+    rig = load_sensor(options.sensor, "decoding", size_of_images(path))
+    if options.images:
+        rig = replace(rig, images={**(rig.images or {}), **options.images})
+    capture = read_image_folder(path, rig, channel_of(options.channel))
+    return replace(capture, settings=capture.settings | ({"warnings": list(rig.notes)} if rig.notes else {})), {}
+
+
+def _read_pair(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    source = _cameras(path, options, "a stereo pair")
+    capture = read_stereo_pair(
+        path,
+        source,
+        frame=options.frame,
+        sensor=options.named,
+        images=options.images,
+        channel=channel_of(options.channel),
+    )
+    kept = [path / name for name in capture.settings["files"].values()]
+    return capture, _originals([*kept, *_file_of(source)])
+
+
+def _read_depth(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    source = _cameras(path, options, "a depth image")
+    capture = read_depth_image(
+        path,
+        source,
+        scale_mm=options.scale_mm,
+        invalid=options.invalid,
+        camera=options.camera,
+        sensor=options.named,
+        frame=frame_of(options.frame, path),
+    )
+    return capture, _originals([path, *_file_of(source)])
+
+
+def _read_cloud(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    capture = _organised(path, options)
+    beside = [*_file_of(options.cameras), *([] if options.link is None else [Path(options.link)])]
+    return capture, _originals([path, *beside])
+
+
+def _read_array(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    """Read an array of rows x columns as depths, and one of rows x columns x 3 as points."""
+    is_depth = map_in(read_bounded(path), path, frame_of(options.frame, path)).ndim == 2
+    return _read_depth(path, options) if is_depth else _read_cloud(path, options)
+
+
+def _organised(cloud: Path | StoredCloud, options: ReadOptions) -> Capture:
+    """Read an organised cloud with the options of all clouds."""
+    axes = next((known for known in AXES if known == (options.axes or AXES[0])), None)
+    if axes is None:
+        raise InputError("--axes", "", repr(options.axes), " | ".join(AXES))
+    if options.unit is not None and options.unit not in LENGTHS_MM:
+        raise InputError("--unit", "", repr(options.unit), " | ".join(LENGTHS_MM))
+    return read_organised_cloud(
+        cloud,
+        calibration=options.cameras,
+        unit=options.unit,
+        axes=axes,
+        link=options.link,
+        camera=options.camera,
+        sensor=options.named,
+    )
+
+
+def _read_depthai(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    calibration = Path(options.calibration) if options.calibration else calibration_beside(path)
+    capture = read_depthai_recording(
+        path,
+        calibration,
+        frame=frame_of(options.frame, path),
+        subpixel_bits=options.subpixel_bits,
+        sensor=options.named,
+    )
+    return capture, _originals([*recorded_streams(path).values(), calibration])
+
+
+def _read_ros(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    with _needs_recordings(path, "a bag of ROS"):
+        from mitsim.capture.recordings import ros_bag, ros_recording
+    bag = ros_bag.open_bag(path)
+    chosen = ros_recording.chosen_topics(bag, options.topic or ())
+    frame = frame_of(options.frame, path)
+    if chosen.what == "cloud":
+        capture = _organised(ros_recording.read_ros_cloud(chosen, frame), options)
+    elif chosen.what == "pair":
+        capture = ros_recording.read_ros_pair(
+            chosen,
+            frame,
+            calibration=options.cameras,
+            channel=channel_of(options.channel),
+            sensor=options.named,
+        )
+    else:
+        capture = ros_recording.read_ros_depth(
+            chosen,
+            frame,
+            calibration=options.cameras,
+            scale_mm=options.scale_mm,
+            invalid=options.invalid,
+            camera=options.camera,
+            sensor=options.named,
+        )
+    number = int(frame or 0)
+    messages = {f"{plain_name(topic.name.strip('/').replace('/', '_'))}_{number}.msg": topic for topic in chosen.topics}
+    kept = {name: bag.message(topic.name, number) for name, topic in messages.items() if number < topic.count}
+    return capture, kept | _originals(_file_of(options.cameras))
+
+
+@contextmanager
+def _needs_recordings(path: Path, what: str) -> Iterator[None]:
+    """Say which packages a recording needs if they are not installed."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise MissingEnvironmentError(
+            f"{path}: {what} needs packages that are not installed ({error.name}): pip install 'mitsim[recordings]'"
+        ) from None
+
+
+def _read_robi(path: Path, options: ReadOptions) -> tuple[Capture, dict[str, bytes]]:
+    capture, files = read_robi(path, options.calibration, frame=frame_of(options.frame, path), sensor=options.named)
+    return capture, _originals(files)
+
+
+_OF_CLOUDS = frozenset({"calibration", "sensor", "camera", "unit", "axes", "link"})
+
+#: readers by the names that ``mitsim import --as`` takes
+KINDS: dict[str, Kind] = {
+    "ensenso": Kind(_read_ensenso, frozenset({"frame"})),
+    "depthai": Kind(_read_depthai, frozenset({"calibration", "frame", "subpixel_bits", "sensor"})),
+    "ros": Kind(_read_ros, frozenset({*_OF_CLOUDS, "topic", "frame", "scale_mm", "invalid", "channel"})),
+    "stereo-pair": Kind(_read_pair, frozenset({"calibration", "sensor", "frame", "images", "channel"})),
+    "robi": Kind(_read_robi, frozenset({"calibration", "frame", "sensor"})),
+    "images": Kind(_read_images, frozenset({"sensor", "images", "channel"})),
+    "depth": Kind(_read_depth, frozenset({"calibration", "sensor", "camera", "scale_mm", "invalid"})),
+    "ply": Kind(_read_cloud, _OF_CLOUDS),
+    "pcd": Kind(_read_cloud, _OF_CLOUDS),
+    "zdf": Kind(_read_cloud, _OF_CLOUDS),
+    "npy": Kind(_read_array, _OF_CLOUDS | {"scale_mm", "invalid", "frame"}),
+}
+
+
+def read_recording(path: str | Path, options: ReadOptions, kind: str | None = None) -> Imported:
+    """Read a recording of any kind.
+
+    Raises
+    ------
+    InputError
+        If its kind is unknown, an option does not apply to its kind, or it cannot be read.
+    """
+    path = Path(path)
+    if path.is_file() and not path.stat().st_size:
+        raise InputError(path, "size", "0 bytes", "a recording", "copy or record it again")
+    if kind is not None and kind not in KINDS:
+        raise InputError("--as", "", repr(kind), ", ".join(KINDS), nearest(kind, list(KINDS)))
+    kind = kind or kind_of(path, sensor=options.sensor, calibration=options.calibration)
+    for name in ReadOptions.__dataclass_fields__:
+        if getattr(options, name) is not None and name not in FOR_ALL and name not in KINDS[kind].options:
+            used = ", ".join(_option(each) for each in (*sorted(KINDS[kind].options), *FOR_ALL))
+            raise InputError(path, "", f"{_option(name)} for {NAMES[kind]}", used)
+    decoding, records = _options_for_all(options)
+    capture, originals = KINDS[kind].read(path, options)
+    for name in (options.images or {}) if kind in ("images", "stereo-pair") else ():
+        if name not in capture.rig.cameras:
+            raise InputError("--images", "", repr(name), ", ".join(capture.rig.cameras))
+    pose, covariance = (None, None) if options.pose is None else read_pose(options.pose)
+    capture = replace(
+        capture,
+        decoding=capture.decoding.model_copy(update=decoding),
+        settings=capture.settings | records,
+        world_from_sensor=pose or capture.world_from_sensor,
+        pose_covariance=covariance if pose is not None else capture.pose_covariance,
+    )
+    return Imported(capture, kind, originals)
+
+
+def _option(name: str) -> str:
+    return "--" + name.removesuffix("_mm").removesuffix("_s").replace("_", "-")
+
+
+def _options_for_all(options: ReadOptions) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what the options for every kind change in :class:`Decoding`, and the records that they add."""
+    decoding: dict[str, Any] = {}
+    records: dict[str, Any] = {}
+    if options.range_mm is not None:
+        near, far = options.range_mm
+        if not 0 < near < far <= 1e6:
+            raise InputError("--range", "", f"{near:g} {far:g}", "near before far, over 0, in mm")
+        decoding |= {"near_mm": near, "far_mm": far, "range_mm": (near, far)}
+    if options.exposure_s is not None:
+        if not 0 < options.exposure_s <= 1e3:
+            raise InputError("--exposure", "", f"{options.exposure_s:g}", "seconds, over 0 to 1000")
+        decoding["exposure_s"] = options.exposure_s
+    if options.sample is not None:
+        records["coupon"] = {"sample": options.sample}
+    if options.projector is not None:
+        if options.projector not in ("on", "off"):
+            raise InputError("--projector", "", repr(options.projector), "on | off")
+        records["projector_on"] = options.projector == "on"
+    return decoding, records
+
+
+def _cameras(path: Path, options: ReadOptions, what: str) -> str:
+    if options.cameras is None:
+        raise InputError(path, "", f"{what} alone", "the camera that took it: --calibration FILE, or --sensor")
+    return options.cameras
+
+
+def _file_of(source: Any) -> list[Path]:
+    """Return a calibration's file, if it is a file and not a preset's name."""
+    return [Path(source)] if source is not None and Path(source).is_file() else []
+
+
+def _originals(files: Iterable[Path]) -> dict[str, bytes]:
+    """Return the bytes of files by plain names; equal names are numbered."""
+    out: dict[str, bytes] = {}
+    for file in files:
+        name, number = plain_name(file.name), 1
+        while name in out:
+            number += 1
+            name = plain_name(f"{number}_{file.name}")
+        out[name] = read_bounded(file)
+    return out

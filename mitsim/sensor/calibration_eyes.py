@@ -1,0 +1,314 @@
+"""Find the cameras and the projector of a calibration whose values stand in maps, as programs write YAML and JSON.
+
+Signal chain: maps of one file, nested in any way -> eyes: each map that has a camera matrix -> values in OpenCV's form
+under names that begin with a plus.
+
+A camera matrix is a matrix under a usual name (:mod:`mitsim.sensor.calibration_names`); or the single numbers ``fx``,
+``fy``, ``cx``, ``cy`` (``ppx``, ``ppy`` of librealsense); or two lists, such as ``focal_length`` and
+``principal_point``; or one list of four beside a lens model or an image size (Kalibr, EuRoC). Distortion and pose stand
+in the same map, in a map inside it, or in those around it that have no other eye; size and model in any map around it.
+``T_cn_cnm1`` of Kalibr takes coordinates of the camera before to this one, in metres.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsim.sensor.calibration_names import USUAL_NAMES
+
+#: deepest map and longest list of maps that are searched, and most maps
+_DEEPEST, _LONGEST, _MOST = 8, 16, 4096
+
+#: names of focal lengths and principal points, in small letters: of single numbers, and of lists of two
+_SINGLE = (("fx", "fl_x"), ("fy", "fl_y"), ("cx", "ppx"), ("cy", "ppy"))
+_DOUBLE = (("focal_length", "focallength", "focal_px", "focal"), ("principal_point", "principalpoint", "principal_px"))
+
+#: names of an image's width and height
+_SIDES = (("width", "height"), ("image_width", "image_height"), ("w", "h"))
+
+#: names in small letters: of matrices in a map, of sizes, and of distortions
+_MATRICES = frozenset(name.lower() for name in (*USUAL_NAMES["matrix"][0], "matrix", "intrinsics", "intrinsic"))
+_SIZES = frozenset(name.lower() for name in USUAL_NAMES["size"][0])
+_LENSES = frozenset(name.lower() for name in (*USUAL_NAMES["distortion"][0], "coeffs"))
+
+#: single numbers of the distortion in OpenCV's order, and those of a fisheye lens
+_BENT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FISHEYE = ("k1", "k2", "k3", "k4")
+
+#: names under which maps state the model of a lens
+LENS_MODELS = ("camera_model", "distortion_model", "camera_type", "lens_model", "model_type", "model", "type")
+
+#: a map by its dotted name
+_Named = tuple[str, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Composed:
+    """A ``value`` in OpenCV's form, the dotted names of its ``sources``, and the ``table`` that qualifies it."""
+
+    value: NDArray[np.float64]
+    sources: tuple[str, ...]
+    table: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Eye:
+    """A camera or projector: the dotted ``name`` of its map, that of its matrix, and its ``values``.
+
+    ``values`` by ``matrix``, ``distortion``, ``size``, ``rotation`` and ``translation``; those that the file does not
+    state are missing.
+    """
+
+    name: str
+    matrix_map: str
+    values: dict[str, Composed] = field(repr=False)
+
+    @property
+    def is_projector(self) -> bool:
+        """Return whether a map of it is named after a projector."""
+        return re.search(r"proj(?!ection)", self.matrix_map.lower()) is not None
+
+    @property
+    def place(self) -> int | None:
+        """Return its place among cameras, which its name states: that of left and right, or a number."""
+        name = self.name.rpartition(".")[2].lower()
+        if "left" in name or "right" in name:
+            return int("right" in name)
+        number = re.search(r"(\d{1,4})$", name)
+        return None if number is None else int(number[1])
+
+
+def eyes_of(tree: dict[str, Any]) -> list[Eye]:
+    """Return the eyes of one file, in its order.
+
+    A matrix under a usual name in no map is none of them, since such names need no search.
+    """
+    found = []
+    for path in islice(_maps([("", _without_dots(tree))]), _MOST):
+        matrix = _matrix(*path[-1])
+        if matrix is not None and not any("radialdistortion" in map(str.lower, table) for _, table in path):
+            found.append((path, matrix))  # MATLAB's, whose pixels count from 1, has other readers
+    alone = not any(vector(value, 9) is not None for value in tree.values())
+    out: list[Eye] = []
+    for path, matrix in found:
+        depth = next(
+            at + 1
+            for at in range(len(path))
+            if at + 1 == len(path)
+            or (sum(other[at][1] is path[at][1] for other, _ in found if len(other) > at) == 1 and (at or alone))
+        )
+        out.append(_eye(path, depth, matrix))
+    return out
+
+
+def cameras_of(eyes: Sequence[Eye]) -> tuple[list[Eye], bool]:
+    """Return the eyes that are no projectors, and whether their order is known: from their names, or from a pose."""
+    cameras = [eye for eye in eyes if not eye.is_projector]
+    places = [eye.place for eye in cameras]
+    if None not in places and len(set(places)) == len(places):
+        return sorted(cameras, key=lambda eye: eye.place or 0), True
+    posed = ["rotation" in eye.values for eye in cameras]
+    return sorted(cameras, key=lambda eye: "rotation" in eye.values), posed.count(False) <= 1
+
+
+def usual_values(eyes: Sequence[Eye]) -> dict[str, Composed]:
+    """Return the values of eyes under the usual names with a plus, and each as ``+WHAT of NAME``.
+
+    Several cameras without an order have no usual names: the user has to choose.
+    """
+    out: dict[str, Composed] = {}
+    for eye in eyes:
+        for name in {eye.name, eye.matrix_map}:
+            out |= {f"+{what} of {name}": value for what, value in eye.values.items() if name}
+    cameras, ordered = cameras_of(eyes)
+    poses = {"rotation": "+R", "translation": "+T"}
+    if len(cameras) == 1:
+        out |= _under(cameras[0], {"matrix": "+K", "distortion": "+D1", "size": "+size"})
+    elif ordered and cameras:
+        out |= _under(cameras[0], {"matrix": "+K1", "distortion": "+D1", "size": "+size"})
+        out |= _under(cameras[1], {"matrix": "+K2", "distortion": "+D2", "size": "+size2"} | poses)
+    for eye in [eye for eye in eyes if eye.is_projector][:1]:
+        out |= _under(eye, {"matrix": "+K_proj", "distortion": "+D_proj", "size": "+size_proj"})
+        out |= _under(eye, {"rotation": "+R_proj", "translation": "+T_proj"})
+    return out
+
+
+def _under(eye: Eye, names: dict[str, str]) -> dict[str, Composed]:
+    return {name: eye.values[what] for what, name in names.items() if what in eye.values}
+
+
+def _without_dots(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the tree, in which names such as ``Camera.fx`` (ORB-SLAM) are maps."""
+    out = dict(tree)
+    for name, value in tree.items():
+        holder, dot, inner = name.rpartition(".")
+        if dot and isinstance(out.get(holder, {}), dict):
+            out[holder] = {**out.get(holder, {}), inner: value}
+    return out
+
+
+def _maps(path: list[_Named]) -> Iterator[list[_Named]]:
+    """Yield the path to each map: all maps around it, and the map itself last."""
+    yield path
+    name, table = path[-1]
+    if len(path) > _DEEPEST:
+        return
+    for key, value in table.items():
+        many = value if isinstance(value, list) and len(value) <= _LONGEST else [value]
+        for number, inner in enumerate(many):
+            if isinstance(inner, dict):
+                stated = inner.get("name")
+                own = key if many is not value else f"{key}.{stated if isinstance(stated, str) and stated else number}"
+                yield from _maps([*path, (_dotted(name, own), inner)])
+
+
+def _eye(path: list[_Named], depth: int, matrix: Composed) -> Eye:
+    """Return the eye of the last map of a path; the maps around it from ``depth`` on have no other eye."""
+    own: list[_Named] = []
+    for name, table in reversed(path[depth - 1 :]):
+        own += [(name, table)]
+        own += [(_dotted(name, key), value) for key, value in table.items() if _is_beside(value)]
+    around = [*own, *reversed(path[: depth - 1])]
+    qualifying: dict[str, Any] = {}
+    for _, table in reversed(around):
+        qualifying |= {key: value for key, value in table.items() if not isinstance(value, dict) or key == "roi"}
+    values = {
+        "matrix": Composed(matrix.value, matrix.sources, qualifying),
+        "distortion": _lens(own, is_fisheye(qualifying)),
+        "size": _size(around),
+        **_pose(own),
+    }
+    name = path[depth - 1][0] or (path[1][0] if len(path) > 1 else "")
+    return Eye(name, path[-1][0], {what: value for what, value in values.items() if value is not None})
+
+
+def _is_beside(value: Any) -> bool:
+    """Return whether a value is a map that may belong to an eye beside it: none with a camera matrix of its own."""
+    if not isinstance(value, dict):
+        return False
+    matrices = [numbers for each in value.values() if (numbers := vector(each, 9)) is not None]
+    return not any(numbers[0] > 1 and (numbers[6:] == (0, 0, 1)).all() for numbers in matrices)
+
+
+def _matrix(name: str, table: dict[str, Any]) -> Composed | None:
+    """Return the camera matrix of a map, whose name is empty for the file itself."""
+    low = {key.lower(): key for key in table}
+    for usual in sorted(_MATRICES & set(low)) if name else ():
+        numbers = vector(table[low[usual]], 9)
+        if numbers is not None:
+            return Composed(numbers.reshape(3, 3), (_dotted(name, low[usual]),), table)
+    four = vector(table.get(low.get("intrinsics", "")))
+    keys = [next((low[each] for each in names if each in low), "") for names in (*_SINGLE, *_DOUBLE)]
+    if all(keys[:4]):
+        fx, fy, cx, cy = (_number(table[key]) for key in keys[:4])
+        sources = keys[:4]
+    elif (focal := vector(table.get(keys[4]), 2)) is not None and (centre := vector(table.get(keys[5]), 2)) is not None:
+        fx, fy, cx, cy = *focal, *centre
+        sources = keys[4:]
+    elif four is not None and 4 <= len(four) < 9 and {"camera_model", "resolution"} & set(low):
+        fx, fy, cx, cy = four[-4:]  # the parameters of other models, which are refused, precede them
+        sources = [low["intrinsics"]]
+    else:
+        return None
+    return Composed(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), tuple(_dotted(name, each) for each in sources), {})
+
+
+def is_fisheye(table: dict[str, Any]) -> bool:
+    """Return whether a map states a fisheye lens, by any of the names of :data:`LENS_MODELS`."""
+    words = ("kannala", "fisheye", "equidistant", "kb4")
+    return any(word in str(table.get(name, "")).lower() for name in LENS_MODELS for word in words)
+
+
+def _lens(maps: list[_Named], fisheye: bool) -> Composed | None:
+    """Return the distortion in the first of several maps that states one, as a list or as single numbers."""
+    for name, table in maps:
+        low = {key.lower(): key for key in table}
+        for each in sorted(_LENSES & set(low)):
+            bent = vector(table[low[each]])
+            if bent is not None:
+                return Composed(bent, (_dotted(name, low[each]),), table)
+        names = [
+            each for each in (_FISHEYE if fisheye else _BENT) if vector(table.get(low.get(each, "")), 1) is not None
+        ]
+        if names:
+            order = _FISHEYE if fisheye else _BENT
+            count = next(each for each in (4, 5, 8) if each > order.index(names[-1]))
+            numbers = [_number(table[low[each]]) if each in names else 0.0 for each in order[:count]]
+            return Composed(np.array(numbers), tuple(_dotted(name, low[each]) for each in names), table)
+    return None
+
+
+def _size(maps: list[_Named]) -> Composed | None:
+    """Return width and height in the first of several maps that has them."""
+    for name, table in maps:
+        low = {key.lower(): key for key in table}
+        found = size_of(table)
+        if found is not None:
+            return Composed(found, (), table)
+        for each in sorted(_SIZES & set(low)):
+            found = size_of(table[low[each]])
+            if found is not None:
+                return Composed(found, (_dotted(name, low[each]),), table)
+    return None
+
+
+def size_of(value: Any) -> NDArray[np.float64] | None:
+    """Return width and height of a list of two, or of a map that names them; None of anything else."""
+    if not isinstance(value, dict):
+        return vector(value, 2)
+    low = {str(key).lower(): key for key in value}
+    for sides in _SIDES:
+        found = vector([value.get(low.get(side, "")) for side in sides], 2)
+        if found is not None:
+            return found
+    return None
+
+
+def _pose(maps: list[_Named]) -> dict[str, Composed]:
+    """Return R and T from the first camera to this eye, if its maps state them; those of no map need no search."""
+    for name, table in maps:
+        step = vector(table.get("T_cn_cnm1"), 16)
+        if step is not None:
+            motion, metres, source = step.reshape(4, 4), {"unit": "m"}, (_dotted(name, "T_cn_cnm1"),)
+            return {
+                "rotation": Composed(motion[:3, :3], source, metres),
+                "translation": Composed(motion[:3, 3], source, metres),
+            }
+        turn = next((each for each in ("R", "rotation", "rotation_matrix") if each in table), "")
+        shift = next((each for each in ("T", "t", "translation") if each in table), "")
+        R, T = vector(table.get(turn)), vector(table.get(shift), 3)
+        if name and T is not None and R is not None and len(R) in (3, 9):
+            rotation = R.reshape(3, 3) if len(R) == 9 else R
+            return {
+                "rotation": Composed(rotation, (_dotted(name, turn),), table),
+                "translation": Composed(T, (_dotted(name, shift),), table),
+            }
+    return {}
+
+
+def _number(value: Any) -> float:
+    """Return a number; NaN of what is none, which the check of the matrix refuses."""
+    found = vector(value, 1)
+    return float("nan") if found is None else float(found[0])
+
+
+def _dotted(*names: str) -> str:
+    return ".".join(name for name in names if name)
+
+
+def vector(value: Any, size: int | None = None) -> NDArray[np.float64] | None:
+    """Return a value as finite numbers (n,), by rows; None if it is anything else, or has another ``size``."""
+    if value is None:
+        return None
+    try:
+        numbers = np.asarray(value, float).reshape(-1)
+    except (ValueError, TypeError, OverflowError):
+        return None
+    return numbers if np.isfinite(numbers).all() and (size is None or len(numbers) == size) else None

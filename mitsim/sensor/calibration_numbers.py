@@ -1,0 +1,75 @@
+"""Convert the values of a calibration to arrays: camera matrices by rows, vectors of few lengths."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from characterisation.files.errors import InputError
+
+
+def numbers_of(value: Any, file: Path, key: str, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
+    """Convert a matrix or lists to an array of one of several shapes; row and column vectors are equivalent.
+
+    Parameters
+    ----------
+    value
+        As the file has it.
+    file, key
+        File and name of the value, for messages.
+    shapes
+        Those that are allowed, the vectors first.
+
+    Raises
+    ------
+    InputError
+        If it has another shape, or numbers that are not finite.
+    """
+    try:
+        values = np.asarray(value, float)
+    except (ValueError, TypeError, OverflowError):
+        values = np.array(math.nan)
+    vector = len(shapes[0]) == 1
+    found = values.reshape(-1) if vector and values.ndim and values.size == max(values.shape) else values
+    if found.shape not in shapes or not np.isfinite(found).all():
+        if vector and values.ndim and values.size == 0 and (0,) in shapes:
+            return np.empty(0)
+        allowed = " or ".join(" x ".join(map(str, shape)) for shape in shapes) + " finite numbers"
+        raise InputError(file, key, _shown(value, values), allowed)
+    return found
+
+
+def _shown(value: Any, values: NDArray[np.float64]) -> str:
+    """Return a value that cannot be used, for a message: few numbers as they are, the size of many."""
+    if isinstance(value, dict):
+        return f"a map of {', '.join(list(value)[:6])}"
+    if values.ndim and values.size <= 16 and not np.isfinite(values).all():
+        return str(values.tolist())
+    return f"an array of {' x '.join(map(str, values.shape))}" if values.ndim else "something else"
+
+
+def by_rows(K: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+    """Return K (3, 3) by rows, of nine numbers too, and whether it is written by columns, as Open3D does."""
+    K = K.reshape(3, 3)
+    by_columns = bool((K[:, 2] == (0, 0, 1)).all() and K[2, :2].all())
+    return (K.T if by_columns else K), by_columns
+
+
+def checked_matrix(K: NDArray[np.float64], name: str, file: str) -> NDArray[np.float64]:
+    """Return K (3, 3), the matrix of the eye ``name`` in a ``file``, after a check that it is a camera matrix.
+
+    Raises
+    ------
+    InputError
+        If it has a skew, or is no camera matrix by rows.
+    """
+    if abs(K[0, 1]) > 1e-9 and K[0, 0] > 0:
+        hint = "calibrate without skew: est_alpha = 0 in MATLAB's toolbox"
+        raise InputError(file, f"matrix of {name}", f"a skew of {K[0, 1]:.3g} px", "fx 0 cx, 0 fy cy, 0 0 1", hint)
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs([K[1, 0], *(K[2] - [0, 0, 1])]).max() > 1e-9:
+        raise InputError(file, f"matrix of {name}", np.round(K, 3).tolist(), "fx 0 cx, 0 fy cy, 0 0 1")
+    return K

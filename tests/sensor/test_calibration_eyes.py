@@ -1,0 +1,204 @@
+"""Cameras that stand in maps of any nesting, spelling and order are read with their lens, or refused with the reason.
+
+Before these tests the lens of a map beside that of the matrix was left out without a word, a matrix by columns had its
+principal point in the image's corner, and of the cameras of colour and depth the first was used for either's images.
+"""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from characterisation.files.errors import InputError
+from mitsim.capture.recordings.calibration_file import camera_of, read_calibration
+from mitsim.capture.recordings.depth_image import read_depth_image
+from mitsim.sensor.preset import load_sensor
+
+SIZE = (640, 480)
+FX, FY, CX, CY = 600.0, 601.2, 322.3, 241.7
+K = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
+K2 = np.array([[598.0, 0, 318.9], [0, 599.0, 238.2], [0, 0, 1]])
+D = [-0.3, 0.1, 0.001, -0.002, 0.01]
+OM, T = np.array([0.01, 0.2, -0.02]), np.array([-60.0, 0.5, 2.0])
+R = cv2.Rodrigues(OM)[0]
+
+NUMBERS = {"fx": FX, "fy": FY, "cx": CX, "cy": CY}
+OF_LIBREALSENSE = {"fx": FX, "fy": FY, "ppx": CX, "ppy": CY, "width": 640, "height": 480}
+SINGLES = dict(zip(("k1", "k2", "p1", "p2", "k3"), D, strict=True))
+CAPITALS = {name.upper(): value for name, value in NUMBERS.items()}
+
+#: one camera in the words of many programs
+FILES = {
+    "vins": {"distortion_parameters": SINGLES, "projection_parameters": NUMBERS, "image_width": 640, "model_type": "x"},
+    "zivid": {"CameraIntrinsics": {"CameraMatrix": CAPITALS, "Distortion": {k.upper(): v for k, v in SINGLES.items()}}},
+    "librealsense": OF_LIBREALSENSE | {"model": "distortion.brown_conrady", "coeffs": D},
+    "nested librealsense": {"intrinsics": OF_LIBREALSENSE | {"coeffs": D}, "depth_scale": 0.001},
+    "nerf": {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": 640, "h": 480, **SINGLES},
+    "lists of two": {"focal_length": [FX, FY], "principal_point": [CX, CY], "distortion": D},
+    "euroc": {
+        "camera_model": "pinhole",
+        "distortion_model": "radial-tangential",
+        "intrinsics": [FX, FY, CX, CY],
+        "distortion_coefficients": D,
+        "resolution": [640, 480],
+    },
+    "nine numbers": {"K": K.ravel().tolist(), "dist": D},
+    "nine numbers by columns": {"intrinsic_matrix": K.T.ravel().tolist(), "dist": D, "width": 640, "height": 480},
+    "transposed": {"camera_matrix": K.T.tolist(), "dist": D},
+    "capital letters": {"Camera_Matrix": K.tolist(), "Distortion_Coefficients": D, "image_Width": 640},
+    "a size in a map": {"intrinsics": NUMBERS, "distortion": SINGLES, "resolution": {"width": 640, "height": 480}},
+    "texts": {name: str(value) for name, value in {**NUMBERS, **SINGLES}.items()},
+    "a list of one": {"cameras": [{"name": "only", **NUMBERS, "dist_coeffs": D}]} | {"rms": 0.1},
+    "equal frames": {"frames": {f"frame_{number}": {**NUMBERS, **SINGLES} for number in range(3)}},
+}
+
+
+def saved(path, table):
+    path.write_text(json.dumps(table) if path.suffix == ".json" else yaml.dump(table), encoding="utf-8")
+    return path
+
+
+def sees(camera, matrix, bent, rotation=None, translation=None):
+    """The camera sees points where cv2.projectPoints puts them."""
+    points = np.random.default_rng(1).uniform([-80, -60, 400], [80, 60, 800], (50, 3))
+    turn, shift = np.zeros(3) if rotation is None else rotation, np.zeros(3) if translation is None else translation
+    expected, _ = cv2.projectPoints(points, turn, shift, matrix, np.array(bent))
+    np.testing.assert_allclose(camera.project(points), expected[:, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("ending", ["json", "yaml"])
+@pytest.mark.parametrize("name", FILES)
+def test_one_camera_in_the_words_of_many_programs(tmp_path, name, ending):
+    read = read_calibration(saved(tmp_path / f"a.{ending}", FILES[name]), SIZE)
+    assert len(read.rig.cameras) == 1
+    sees(read.rig.reference, K, D)
+    assert (read.rig.reference.width, read.rig.reference.height) == SIZE
+    by_columns = [f"calibration a.{ending}: camera: its matrix is written by columns"]
+    assert list(read.notes) == (by_columns if name in ("nine numbers by columns", "transposed") else [])
+
+
+def test_the_size_beside_a_matrix_suffices(tmp_path):
+    """As in the files of Open3D, without any image."""
+    read = read_calibration(saved(tmp_path / "a.json", FILES["nine numbers by columns"]))
+    assert (read.rig.reference.width, read.rig.reference.height) == SIZE
+
+
+PAIRS = {
+    "left and right": {
+        "right": {"camera_matrix": K2.tolist(), "dist_coeffs": D},
+        "left": {"camera_matrix": K.tolist(), "dist_coeffs": D},
+        "R": R.tolist(),
+        "T": T.tolist(),
+    },
+    "a pose in the second": {
+        "one": {"intrinsics": NUMBERS, "distortion": SINGLES},
+        "two": {
+            "intrinsics": {"fx": 598.0, "fy": 599.0, "cx": 318.9, "cy": 238.2},
+            "distortion": SINGLES,
+            "extrinsics": {"R": R.tolist(), "T": T.tolist()},
+        },
+    },
+    "numbers, and a map of the pose": {
+        "cameras": {"cam1": {"K": K2.tolist(), "D": D}, "cam0": {"K": K.tolist(), "D": D}},
+        "R": OM.tolist(),
+        "t": T.tolist(),
+    },
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_a_pair(tmp_path, name):
+    read = read_calibration(saved(tmp_path / "a.json", PAIRS[name]), SIZE)
+    sees(read.rig.cameras["left"], K, D)
+    sees(read.rig.cameras["right"], K2, D, OM, T)
+    assert read.notes == ()
+
+
+def test_a_camera_and_a_projector_in_maps(tmp_path):
+    table = {
+        "projector": {"K": K2.tolist(), "D": [0.0] * 5, "R": R.tolist(), "T": T.tolist(), "resolution": [912, 570]},
+        "camera": {"intrinsics": NUMBERS, "distortion": SINGLES, "resolution": [640, 480]},
+    }
+    saved(tmp_path / "a.json", table)
+    (tmp_path / "my.toml").write_text(
+        'name = "rig"\ntechnology = "structured_light"\n[calibration]\nfile = "a.json"\n[pattern]\nkind = "gray_code"\n'
+        "[decoder]\n"
+    )
+    sensor = load_sensor(tmp_path / "my.toml", "decoding")
+    sees(sensor.rig.reference, K, D)
+    sees(sensor.rig.projector, K2, np.zeros(5), OM, T)
+    assert (sensor.projector.optics.width, sensor.projector.optics.height, sensor.notes) == (912, 570, ())
+
+
+def colour_and_depth(size):
+    colour = {"fx": 900.0, "fy": 900.0, "ppx": 331.0, "ppy": 245.0, "width": size[0], "height": size[1]}
+    return {"color": colour, "depth": OF_LIBREALSENSE | {"coeffs": D}}
+
+
+def test_of_several_cameras_the_one_of_the_images_is_used(tmp_path):
+    read = read_calibration(saved(tmp_path / "a.json", colour_and_depth((1280, 720))), SIZE)
+    assert list(read.rig.cameras) == ["color", "depth"]
+    sees(camera_of(read, None, SIZE, "depth.png"), K, D)
+
+
+def test_of_several_cameras_of_one_size_one_is_to_be_named(tmp_path):
+    cv2.imwrite(str(tmp_path / "depth.png"), np.full(SIZE[::-1], 1000, np.uint16))
+    saved(tmp_path / "a.json", colour_and_depth(SIZE))
+    with pytest.raises(InputError, match="--camera: found 2 cameras: color 640 x 480 px, depth 640 x 480 px"):
+        read_depth_image(tmp_path / "depth.png", tmp_path / "a.json")
+    capture = read_depth_image(tmp_path / "depth.png", tmp_path / "a.json", camera="depth")
+    sees(capture.rig.reference, K, D)
+
+
+def test_a_map_named_in_a_sensor_file(tmp_path):
+    """With its matrix come its lens and its size."""
+    saved(tmp_path / "a.yaml", colour_and_depth(SIZE))
+    text = '[calibration]\nfile = "a.yaml"\nprojector = false\n'
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(InputError, match=r"the file has color\.fx"):
+        read_calibration(tmp_path / "a.toml")
+    (tmp_path / "a.toml").write_text(text + '[calibration.keys.camera]\nmatrix = "depth"\n')
+    sees(read_calibration(tmp_path / "a.toml").rig.reference, K, D)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"camera_type": "ds"}, "camera_type: found 'ds'"),
+        ({"model": "distortion.inverse_brown_conrady", "coeffs": D}, "model: found 'distortion.inverse_brown_conrady'"),
+        ({"fx": float("nan")}, r"fx, fy, ppx, ppy: found \[\[nan"),
+        ({"fx": "600,5"}, r"fx, fy, ppx, ppy: found \[\[nan"),
+        ({"coeffs": [0.1] * 6}, "coeffs: found an array of 6"),
+        ({"fx": 10**400}, r"fx, fy, ppx, ppy: found \[\[nan"),
+    ],
+)
+def test_what_no_model_of_opencv_describes_is_refused(tmp_path, more, message):
+    with pytest.raises(InputError, match=message):
+        read_calibration(saved(tmp_path / "a.json", OF_LIBREALSENSE | more), SIZE)
+
+
+def test_a_model_of_zeros_is_straight(tmp_path):
+    table = OF_LIBREALSENSE | {"model": "distortion.inverse_brown_conrady", "coeffs": [0.0] * 5}
+    sees(read_calibration(saved(tmp_path / "a.json", table), SIZE).rig.reference, K, np.zeros(5))
+
+
+def test_a_matrix_that_is_none_is_refused(tmp_path):
+    """Its principal point would be in the image's corner."""
+    bad = np.array([[FX, 0, 0], [0, FY, 0], [CX, CY, 2]])
+    with pytest.raises(InputError, match="matrix of camera"):
+        read_calibration(saved(tmp_path / "a.yaml", {"K": bad.tolist(), "D": D}), SIZE)
+
+
+def test_arrays_of_python_objects_are_left_out(tmp_path):
+    np.savez(tmp_path / "a.npz", mtx=K, dist=D, about=np.array({"rms": 0.2}, dtype=object))
+    sees(read_calibration(tmp_path / "a.npz", SIZE).rig.reference, K, D)
+
+
+def test_xml_of_other_programs_is_named(tmp_path):
+    (tmp_path / "a.xml").write_text('<?xml version="1.0"?>\n<calibration><f>600</f><cx>2.3</cx></calibration>\n')
+    with pytest.raises(InputError, match=r"XML of another program: it begins with <calibration>"):
+        read_calibration(tmp_path / "a.xml", SIZE)
