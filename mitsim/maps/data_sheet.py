@@ -109,10 +109,10 @@ class Recovery:
 class Residuals:
     """Residuals along V about the fitted plane.
 
-    ``values`` (n,) are in mm, and ``image`` (H, W) has them at their pixels, NaN elsewhere. ``correlation_px`` is the lag along a row at which their autocorrelation falls below 1/e.
-    ``independent`` is the number of points at that spacing. ``skewness`` and ``excess_kurtosis`` are those of all
-    values. ``p_normal`` is the p-value of the test of D'Agostino and Pearson on the independent points (Biometrika 60,
-    1973).
+    ``values`` (n,) are in mm, and ``image`` (H, W) has them at their pixels, NaN elsewhere. ``correlation_px`` is the
+    lag along a row at which their autocorrelation falls below 1/e. ``independent`` is the number of points at that
+    spacing. ``skewness`` and ``excess_kurtosis`` are those of all values. ``p_normal`` is the p-value of the test of
+    D'Agostino and Pearson on the independent points (Biometrika 60, 1973).
     """
 
     distance: float

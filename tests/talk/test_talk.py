@@ -168,7 +168,7 @@ def test_real_captures_replace_the_virtual_measurements_of_their_sample(
     results = Results(output / "kept", any_version=True)
     scores = results.get("scores_matt_white")
     assert scores is not None
-    best = int(scores["V_m"].sel(measurement="pillar1_radius").argmax())
+    best = int(scores["V_m"].sel(measurement="pillar1_radius").values.argmax())
     view = study.views[best]
     renderer = Session(study).renderer
     assert renderer is not None
