@@ -99,6 +99,7 @@ def _density(poses: xr.Dataset, normal: Floats) -> Claim:
         f"{int((level == 0).sum())} poses were planned and {int(added.sum())} added. Within {_DETAIL_DEG[0]:g}° of the "
         f"mirror direction they are {two_digits(blind / middle)} times as dense as in the middle, beyond "
         f"{_DETAIL_DEG[1]:g}° incidence {two_digits(grazing / middle)} times.",
+        f"{two_digits(blind / middle)} times as dense",
         verdict(bool(blind > middle and grazing > middle and added.any()), bool(added.any())),
         "None was added near the mirror direction, where the planned ones are dense already." if few else "",
     )
@@ -111,6 +112,7 @@ def _area(tilts: xr.Dataset) -> Claim:
         "Sub-segment the clouds to maintain a fixed projected area for each point cloud.",
         f"From {tilts['tilt'].values[0]:g}° to {tilts['tilt'].values[-1]:g}° the projected area changes by "
         f"{100 * change:.1f} %, the included angle stays {mean_of(included):.2f}°.",
+        f"area changes by {100 * change:.1f} %",
         verdict(change < 0.05),
     )
 
@@ -130,6 +132,7 @@ def _processing(tilts: xr.Dataset) -> list[Claim]:
             "Normalised for distance and surface angle, so isolates the effect of surface finish.",
             f"F by density differs from counted pixels by at most {apart:.3f}. F by the matt-white reference differs "
             f"by up to {other:.3f}: it also removes the points that white loses at a steep tilt.",
+            f"F differs by {apart:.3f} at most",
             verdict(apart < 0.05, apart < 0.1),
         ),
         Claim(
@@ -138,6 +141,7 @@ def _processing(tilts: xr.Dataset) -> list[Claim]:
             f"On matt white, from {tilts['tilt'].values[first]:g}° to {tilts['tilt'].values[last]:g}°, σ along V "
             f"changes by the factor {ray:.2f}, along N by {normal:.2f}. The cosine alone is "
             f"{math.cos(math.radians(float(tilts['tilt'].values[last]))):.2f}.",
+            f"σ × {ray:.2f} along V, × {normal:.2f} along N",
             verdict(abs(math.log(ray)) < abs(math.log(normal)), True),
             ""
             if abs(math.log(ray)) < abs(math.log(normal))
@@ -165,6 +169,7 @@ def _regions(one: xr.Dataset, normal: Floats) -> Claim:
         "We can see the regions of adverse scattering and self blinding which causes loss of data.",
         f"Mean F is {blind:.2f} within {_BLIND_DEG:g}° of the mirror direction, {ring:.2f} at {_RING_DEG[0]:g}° to "
         f"{_RING_DEG[1]:g}° from it, and {adverse:.2f} beyond {_ADVERSE_DEG:g}° incidence.",
+        f"F {blind:.2f} at the mirror direction, {adverse:.2f} at grazing incidence, {ring:.2f} between",
         verdict(blind < ring - 0.1 and adverse < ring - 0.1, blind < ring - 0.1 or adverse < ring - 0.1),
     )
 
@@ -203,6 +208,7 @@ def validation(talk: Talk, results: Results) -> Slide:
             "Largest mean |residual| of F and of σ at any distance: "
             + "; ".join(f"{name} {100 * f:.1f} % and {100 * s:.1f} %" for name, (f, s) in worst.items())
             + f". For {last}, {100 * floor:.1f} % of σ follow from few points alone.",
+            f"{sum(good.values())} of {len(good)} samples below 10 %",
             verdict(all(others), any(others)),
             f"{last} stays below the limit too: a single coupon sees no other surface." if good[last] else "",
         )
@@ -237,6 +243,7 @@ def _multiple_reflections(talk: Talk, results: Results, slide: Slide) -> None:
             "On the artefact the mean |residual| of F in direct light alone and in all light is "
             + "; ".join(f"{name} {100 * d:.1f} % and {100 * a:.1f} %" for name, (d, a) in residuals.items())
             + ".",
+            f"{last}: {100 * residuals[last][0]:.1f} % in direct light, {100 * residuals[last][1]:.1f} % in all",
             verdict(added[last] == max(added.values()) and added[last] > residuals[last][0], added[last] > 0.01),
             ""
             if added[last] > residuals[last][0]

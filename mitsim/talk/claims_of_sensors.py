@@ -46,6 +46,7 @@ def surfaces(talk: Talk, results: Results) -> Slide:
             f"Share of points: {', '.join(f'{name} {100 * value:.0f} %' for name, value in shares.items())}. "
             f"Features of one finish, which face other ways, differ by up to {100 * spread:.0f} %. From "
             f"{ends[0]:g} to {ends[1]:g} mm the σ of ground aluminium grows from {near:.2f} to {far:.2f} mm.",
+            f"{100 * min(values):.0f} to {100 * max(values):.0f} % of the points, by finish",
             verdict(max(values) - min(values) > 0.1 and spread > 0.1 and far > 1.2 * near, max(values) > min(values)),
         )
     )
@@ -79,11 +80,13 @@ def noise(talk: Talk, results: Results) -> Slide:
             Claim(
                 "They are predominantly gaussian.",
                 f"Excess kurtosis: {kurtosis}. The distributions differ from the normal one by at most {worst:.3f}.",
+                f"distributions differ by {worst:.3f} at most",
                 verdict(worst < _GAUSSIAN, sorted(apart.values())[len(apart) // 2] < _GAUSSIAN),
             ),
             Claim(
                 "Some fringe projection sensors can be sums of gaussians.",
                 f"A sum of two normals is needed for {listed(two) if two else 'none of them'}.",
+                f"needed for {len(two)} of {len(found)} sensors",
                 verdict(bool(two)),
                 ""
                 if two
@@ -116,12 +119,15 @@ def performance_maps(talk: Talk) -> Slide:
                 "We can see the drastic influence of distance, surface texture and surface orientation.",
                 f"On matt white σ grows {ratio:.1f} times from {near:g} to {far:g} mm. F is at least {_USABLE:g} for "
                 f"{', '.join(f'{100 * u:.0f} % ({n})' for n, u in zip(names, usable, strict=True))} of orientations.",
+                f"σ × {ratio:.1f}; {100 * usable.max():.0f} to {100 * usable.min():.0f} % of orientations",
                 verdict(ratio > 1.5 and usable.max() - usable.min() > 0.1),
             ),
             Claim(
                 "More shininess and lower roughness both reduce usable surface normals and increases noise.",
                 f"Median σ where F is at least {_USABLE:g}, at {near:g} mm: "
                 f"{', '.join(f'{s:.3f} mm ({n})' for n, s in zip(names, noise_of, strict=True))}.",
+                f"from matt to shiny: orientations {100 * usable[0]:.0f} to {100 * usable[-1]:.0f} %, "
+                f"σ × {noise_of[-1] / noise_of[0]:.2f}",
                 verdict(falls and grows, usable[-1] < usable[0] or noise_of[-1] > noise_of[0]),
                 ""
                 if falls and grows

@@ -53,6 +53,7 @@ def scoring(talk: Talk, judged: Judged) -> Slide:
             "Sub divide icosahedron to sample a sphere. Ensure reachability by the tilt table.",
             f"The three-axis table reaches {reached} of {reached + outside} directions; {scores.attrs['moved_out']} "
             f"views were moved out, clear of the part. {feature} has {points.min():.0f} to {points.max():.0f} points.",
+            f"{reached} of {reached + outside} directions",
             "shown",
         )
     )
@@ -86,6 +87,7 @@ def view_score(talk: Talk, judged: Judged) -> Slide:
         Claim(
             "[S_m] is susceptible to bias. Doesn't take into account if all features are actually visible.",
             found,
+            f"{hidden} of {int(high.sum())} views with a high S_m hide a feature",
             verdict(better, hidden > 0),
         )
     )
@@ -137,7 +139,8 @@ def _example(judged: Judged, one: ExampleEntry) -> Claim:
         f"The errors of the best three bins differ by the factor {_ratio(top)}."
     )
     good = [correlation < _GOOD for correlation in correlations if not math.isnan(correlation)]
-    return Claim(_WORDS.get(one.slide, one.measurement), found, verdict(bool(good) and all(good), any(good)))
+    figure = f"rank correlation {_signed(correlations[0])} with error, {_signed(correlations[1])} with deviation"
+    return Claim(_WORDS.get(one.slide, one.measurement), found, figure, verdict(bool(good) and all(good), any(good)))
 
 
 def _mean_share(cell: xr.Dataset) -> float:
@@ -182,6 +185,7 @@ def accuracy(judged: Judged) -> Slide:
                 f"{name} {interval(kind, 'error')} and {interval(kind, 'deviation')}" for kind, name in SCORES.items()
             )
             + ".",
+            f"rank correlation {_signed(talks[0])} with error, {_signed(talks[1])} with deviation",
             verdict(max(talks) <= _VERY_GOOD, max(talks) <= _GOOD),
         )
     )
@@ -193,6 +197,7 @@ def accuracy(judged: Judged) -> Slide:
             f"The mean rank by error misses the predicted one by {_ratio(bad)} for the three worst bins, and by "
             f"{_ratio(good)} for the three best. Mean ranks from the worst bin to the best: "
             f"{', '.join(_ratio(rank) for rank in found['V_m', 'error']['rank'].values)}.",
+            f"ranks missed by {_ratio(bad)} for bad views, {_ratio(good)} for good ones",
             verdict(bad < good),
         )
     )

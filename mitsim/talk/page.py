@@ -126,6 +126,7 @@ def write_talk(
                     {
                         "words": claim.words,
                         "found": claim.found,
+                        "figure": claim.figure,
                         "why": claim.why,
                         "verdict": claim.verdict,
                         "colour": COLOURS[claim.verdict],
@@ -198,4 +199,10 @@ def _markdown(
         for claim in slide.claims:
             found = f"**{claim.verdict.capitalize()}.** {claim.found}{' ' if claim.why else ''}{claim.why}"
             lines += [f"> {html.escape(claim.words, quote=False)}", "", html.escape(found, quote=False), ""]
+    lines += ["## Every claim with its figure", ""]
+    lines += ["| slide | claim of the talk | figure | verdict |", "|---|---|---|---|"]
+    for slide in slides:
+        for claim in slide.claims:
+            row = (slide.title, claim.words, claim.figure, claim.verdict)
+            lines.append(f"| {' | '.join(html.escape(cell, quote=False).replace('|', '&#124;') for cell in row)} |")
     return "\n".join(lines).rstrip() + "\n"

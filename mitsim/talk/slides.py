@@ -19,10 +19,14 @@ Verdict = Literal["holds", "holds in part", "does not hold", "shown", "missing"]
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim of a slide, word for word, and what was found: the numbers, the verdict, and why where it differs."""
+    """One claim of a slide, word for word, and what was found.
+
+    ``found`` has the numbers in sentences, ``figure`` those that decide. ``why`` explains a claim that does not hold.
+    """
 
     words: str
     found: str
+    figure: str
     verdict: Verdict
     why: str = ""
 
