@@ -125,17 +125,18 @@ def deciles(score: ArrayLike, error: ArrayLike) -> xr.Dataset:
         for name, values in (("error", size), ("deviation", spread)):
             row[name], row[f"{name}_low"], row[f"{name}_high"] = mean_interval(values[here])
         rows.append(row)
-    data = xr.Dataset(coords={"bin": np.arange(BINS + 1), "view": np.arange(len(bins))})
-    for name in rows[0]:
-        data[name] = ("bin", np.array([row[name] for row in rows]))
-    data["bin_of_view"] = ("view", bins)
-    for name, words in _QUANTITIES.items():
-        data[name].attrs["long_name"] = words
-        data[f"{name}_rank"] = ("bin", bin_ranks(data[name].values, data["views"].values))
-        ranks = data[f"{name}_rank"].values[1:]
+    columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    correlations = {}
+    for name in _QUANTITIES:
+        columns[f"{name}_rank"] = ranks = bin_ranks(columns[name], columns["views"])
         ranked = np.isfinite(ranks)
-        data.attrs[f"{name}_correlation"] = spearman(np.flatnonzero(ranked), ranks[ranked])
-    return data
+        correlations[f"{name}_correlation"] = spearman(np.flatnonzero(ranked), ranks[ranked])
+    data: dict[str, Any] = {
+        name: ("bin", values, {"long_name": _QUANTITIES[name]} if name in _QUANTITIES else {})
+        for name, values in columns.items()
+    }
+    coordinates = {"bin": np.arange(BINS + 1), "view": np.arange(len(bins))}
+    return xr.Dataset(data | {"bin_of_view": ("view", bins)}, coordinates, correlations)
 
 
 def bin_ranks(values: ArrayLike, views: ArrayLike) -> Floats:

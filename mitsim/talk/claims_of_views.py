@@ -11,7 +11,7 @@ from characterisation.scores.rank_agreement import spearman
 from characterisation.tasks.task_reading import read_task
 from mitsim.running.numbers import two_digits, unit_symbol
 from mitsim.talk import view_figures as figures
-from mitsim.talk.judged_views import SCORES, Judged, true_error
+from mitsim.talk.judged_views import QUANTITIES, SCORES, Judged, true_error
 from mitsim.talk.make import trials_name
 from mitsim.talk.results import Results
 from mitsim.talk.slides import Claim, Slide, collected, mean_of, verdict
@@ -166,16 +166,16 @@ def accuracy(judged: Judged) -> Slide:
     if not judged.errors:
         return slide
     words = "Mean rank of the ten bins for error and standard deviation, by V_m, predicted risk and number of points"
-    slide.pictures["accuracy"] = (figures.ranks_figure(judged), words)
+    found = {kind: judged.ranks(kind) for kind in SCORES}
+    slide.pictures["accuracy"] = (figures.ranks_figure(found), words)
     count = len(judged.task.measurements) * len(judged.errors)
-    found = {(kind, quantity): judged.ranks(kind, quantity) for kind in SCORES for quantity in ("error", "deviation")}
 
     def interval(kind: str, quantity: str) -> str:
-        about = found[kind, quantity].attrs
+        about = found[kind][quantity].attrs
         ends = f"{_signed(about['correlation_low'])} to {_signed(about['correlation_high'])}"
         return f"{_signed(about['correlation'])} ({ends})"
 
-    talks = [found["V_m", quantity].attrs["correlation"] for quantity in ("error", "deviation")]
+    talks = [found["V_m"][quantity].attrs["correlation"] for quantity in QUANTITIES]
     slide.claims.append(
         Claim(
             "Comparison of our predicted bin rank based on the view score and actual bin ranking are very good.",
@@ -189,14 +189,14 @@ def accuracy(judged: Judged) -> Slide:
             verdict(max(talks) <= _VERY_GOOD, max(talks) <= _GOOD),
         )
     )
-    misses = np.abs(found["V_m", "error"]["rank"].values - np.arange(10, 0, -1))
+    misses = np.abs(found["V_m"]["error"]["rank"].values - np.arange(10, 0, -1))
     bad, good = mean_of(misses[:_END]), mean_of(misses[-_END:])
     slide.claims.append(
         Claim(
             "Especially good at predicting bad views.",
             f"The mean rank by error misses the predicted one by {_ratio(bad)} for the three worst bins, and by "
             f"{_ratio(good)} for the three best. Mean ranks from the worst bin to the best: "
-            f"{', '.join(_ratio(rank) for rank in found['V_m', 'error']['rank'].values)}.",
+            f"{', '.join(_ratio(rank) for rank in found['V_m']['error']['rank'].values)}.",
             f"ranks missed by {_ratio(bad)} for bad views, {_ratio(good)} for good ones",
             verdict(bad < good),
         )

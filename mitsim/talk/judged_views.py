@@ -21,6 +21,9 @@ Floats = NDArray[np.float64]
 #: scores that are compared, in words
 SCORES = {"V_m": "view score V_m", "risk": "predicted risk", "points": "number of points"}
 
+#: quantities of a bin that are ranked, in words
+QUANTITIES = {"error": "mean error", "deviation": "standard deviation"}
+
 #: least number of points on a feature; as of the view score
 _LEAST_POINTS = 100
 
@@ -43,10 +46,10 @@ class Judged:
         tried = errors["tried"].values > 0
         return deciles(score[tried], errors["error"].sel(measurement=measurement).values[tried])
 
-    def ranks(self, kind: str, quantity: str) -> xr.Dataset:
-        """Return the mean ranks of the bins over all measurements and samples with errors."""
+    def ranks(self, kind: str) -> dict[str, xr.Dataset]:
+        """Return the mean ranks of the bins over all measurements and samples with errors, by :data:`QUANTITIES`."""
         cells = [self.cell(sample, name, kind) for sample in self.errors for name in self.task.measurements]
-        return mean_ranks(cells, quantity)
+        return {quantity: mean_ranks(cells, quantity) for quantity in QUANTITIES}
 
 
 def score_of(scores: xr.Dataset, task: Task, measurement: str, kind: str) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
@@ -17,11 +17,9 @@ from characterisation.plots.style import BLUE, INK, MUTED, SEQUENTIAL, VERMILION
 from mitsim.report.style import colour_scale, plain_log
 from mitsim.report.view_figures import sphere_of_views, view_places
 from mitsim.running.numbers import unit_symbol
-from mitsim.talk.judged_views import SCORES, Judged, true_error
+from mitsim.talk.judged_views import QUANTITIES, SCORES, Judged, true_error
 
 Floats = NDArray[np.float64]
-
-_RANKS = {"error": "mean error", "deviation": "standard deviation"}
 
 
 def sphere(axes: Axes, scores: xr.Dataset, values: Floats, title: str, label: str, error: bool = False) -> None:
@@ -127,15 +125,18 @@ def bars(axes: Axes, cell: xr.Dataset, name: str) -> None:
     axes.set_xlabel("decile of V_m, 10 is best; × no value")
 
 
-def ranks_figure(judged: Judged) -> Figure:
-    """Draw the mean rank of the bins for error and standard deviation, by each score, with intervals."""
+def ranks_figure(ranks: Mapping[str, Mapping[str, xr.Dataset]]) -> Figure:
+    """Draw the mean rank of the bins for error and standard deviation, by each score, with intervals.
+
+    ``ranks`` are those of :meth:`~mitsim.talk.judged_views.Judged.ranks`, by the score.
+    """
     with drawing():
         figure = Figure((9.4, 3.6), layout="constrained")
         panels = figure.subplots(1, 2, sharey=True)
-        for axes, (quantity, words) in zip(panels, _RANKS.items(), strict=True):
+        for axes, (quantity, words) in zip(panels, QUANTITIES.items(), strict=True):
             axes.plot([1, 10], [10, 1], color=MUTED, lw=0.8, label="perfect")
             for number, (kind, name) in enumerate(SCORES.items()):
-                found = judged.ranks(kind, quantity)
+                found = ranks[kind][quantity]
                 rank = found["rank"].values
                 spread = np.stack([rank - found["rank_low"].values, found["rank_high"].values - rank])
                 spread = np.where(np.isfinite(spread), np.maximum(spread, 0), 0)
