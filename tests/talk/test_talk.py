@@ -23,8 +23,10 @@ SCENES = ROOT / "scenes"
 
 
 def small_talk(folder: Path) -> Path:
-    """Write the file of a small talk, whose sensor has pixels of nine times the area."""
-    coarse_sensor("ensenso-n10", 3, folder)
+    """Write the file of a small talk, whose sensor has pixels of sixteen times the area."""
+    sensor = coarse_sensor("ensenso-n10", 4, folder)
+    with sensor.open("a", encoding="utf-8") as file:
+        file.write('\n[unknowns.unit]\nmask = "own"\n')
     path = folder / "talk.toml"
     for name in ("task.toml", "matt_white.xml", "two_pillars.xml"):  # with pillars that coarse pixels resolve
         text = (SCENES / "two_pillars" / name).read_text(encoding="utf-8")
@@ -90,6 +92,14 @@ parameters = {{ Ra = 0.37 }}
     return path
 
 
+def copied(kept: Path, folder: Path, names: tuple[str, ...]) -> Path:
+    """Copy some of the kept results into a folder, and return it."""
+    folder.mkdir()
+    for name in names:
+        (folder / f"{name}.nc").write_bytes((kept / f"{name}.nc").read_bytes())
+    return folder
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Make the small talk once; return its file and its output folder."""
@@ -144,17 +154,13 @@ def test_kept_results_are_used_until_something_they_depend_on_changes(made: tupl
 
 def test_missing_results_are_named_on_the_page(made: tuple[Path, Path], tmp_path: Path) -> None:
     path, output = made
-    kept = tmp_path / "kept"
-    kept.mkdir()
-    for file in (output / "kept").iterdir():
-        if file.name not in ("trials_matt_white.nc", "noise_ensenso-n10.nc"):
-            (kept / file.name).write_bytes(file.read_bytes())
+    kept = copied(output / "kept", tmp_path / "kept", ("tilts", "trials_matt_white", "scores_matt_white"))
     talk, results = read_talk(path), Results(kept, any_version=True)
     missing = results_known(talk, results)
-    assert missing == ["noise_ensenso-n10", "trials_matt_white"]
+    assert set(missing) == {file.stem for file in (output / "kept").iterdir()} - {file.stem for file in kept.iterdir()}
     page = write_talk(talk, results, tmp_path, missing).read_text(encoding="utf-8")
-    assert page.count("Not made yet") >= 3
-    assert "trials_matt_white" in page
+    assert page.count("Not made yet") >= 6
+    assert "trials_Ra_0.37" in page
 
 
 def test_real_captures_replace_the_virtual_measurements_of_their_sample(
@@ -180,7 +186,8 @@ def test_real_captures_replace_the_virtual_measurements_of_their_sample(
     assert tried.sum() == tried[best] == 1
     radius = found["matt_white"]["error"].sel(measurement="pillar1_radius").values[best]
     assert abs(radius[0]) < 8.0  # mm, of a radius of 38 mm in coarse pixels
-    page = write_talk(talk, results, tmp_path / "page", [], found).read_text(encoding="utf-8")
+    some = Results(copied(output / "kept", tmp_path / "kept", ("scores_matt_white",)), any_version=True)
+    page = write_talk(talk, some, tmp_path / "page", [], found).read_text(encoding="utf-8")
     assert "real captures" in page
     write_capture(capture, tmp_path / "wood" / "first")
     with pytest.raises(InputError, match=r"matt white, Ra 0\.37"):
