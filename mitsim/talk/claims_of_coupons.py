@@ -130,9 +130,9 @@ def _processing(tilts: xr.Dataset) -> list[Claim]:
     return [
         Claim(
             "Normalised for distance and surface angle, so isolates the effect of surface finish.",
-            f"F by density differs from counted pixels by at most {apart:.3f}. F by the matt-white reference differs "
+            f"F by density differs from counted pixels by {_at_most(apart)}. F by the matt-white reference differs "
             f"by up to {other:.3f}: it also removes the points that white loses at a steep tilt.",
-            f"F differs by {apart:.3f} at most",
+            f"F differs by {_at_most(apart)}",
             verdict(apart < 0.05, apart < 0.1),
         ),
         Claim(
@@ -149,6 +149,10 @@ def _processing(tilts: xr.Dataset) -> list[Claim]:
             "reflects less light and a matching block covers more depth. The cosine in σ along N hides this.",
         ),
     ]
+
+
+def _at_most(value: float) -> str:
+    return "less than 0.001" if value < 0.001 else f"at most {value:.3f}"
 
 
 def _regions(one: xr.Dataset, normal: Floats) -> Claim:
@@ -237,12 +241,14 @@ def _multiple_reflections(talk: Talk, results: Results, slide: Slide) -> None:
     residuals = {name: [_residual(one) for one in pair] for name, pair in pairs.items()}
     added = {name: every - direct for name, (direct, every) in residuals.items()}
     last = list(added)[-1]
+    moved = _moved(*pairs[last])
     slide.claims.append(
         Claim(
             "The reason for this is on the shiny surface at distance, multiple reflection effects dominate.",
-            "On the artefact the mean |residual| of F in direct light alone and in all light is "
+            "A flat coupon sees no other face. On the artefact the mean |residual| of F in direct light alone and in all light is "
             + "; ".join(f"{name} {100 * d:.1f} % and {100 * a:.1f} %" for name, (d, a) in residuals.items())
-            + ".",
+            + f". Light from other faces {'raises' if moved > 0 else 'lowers'} the mean F of {last} by "
+            f"{abs(moved):.3f}.",
             f"{last}: {100 * residuals[last][0]:.1f} % in direct light, {100 * residuals[last][1]:.1f} % in all",
             verdict(added[last] == max(added.values()) and added[last] > residuals[last][0], added[last] > 0.01),
             ""
@@ -251,6 +257,12 @@ def _multiple_reflections(talk: Talk, results: Results, slide: Slide) -> None:
             "direct light: edges and curved faces, which flat coupons do not show.",
         )
     )
+
+
+def _moved(direct: xr.Dataset, every: xr.Dataset) -> float:
+    """Return the mean change of the captured F of features by light from other faces."""
+    (_, before), (_, after) = figures.fractions(direct), figures.fractions(every)
+    return mean_of(after) - mean_of(before)
 
 
 def _residual(one: xr.Dataset) -> float:

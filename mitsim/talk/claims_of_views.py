@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 import numpy as np
 import xarray as xr
 
 from characterisation.scores.rank_agreement import spearman
 from characterisation.tasks.task_reading import read_task
-from mitsim.running.numbers import two_digits, unit_symbol
+from mitsim.running.numbers import listed, two_digits, unit_symbol
 from mitsim.talk import view_figures as figures
 from mitsim.talk.judged_views import QUANTITIES, SCORES, Judged, true_error
 from mitsim.talk.make import trials_name
 from mitsim.talk.results import Results
-from mitsim.talk.slides import Claim, Slide, collected, mean_of, verdict
+from mitsim.talk.slides import Claim, Slide, collected, largest_of, mean_of, verdict
 from mitsim.talk.talk_file import ExampleEntry, Talk
 
 #: mean rank correlation of bins from which agreement is very good, and good
 _VERY_GOOD, _GOOD = -0.8, -0.5
+
+#: R_m below which a view lacks a feature, and S_m of such a view, over the largest, from which it misleads
+_HIDDEN, _BIASED = 0.1, 0.25
 
 #: number of bins at each end that are called bad and good views
 _END = 3
@@ -48,16 +52,26 @@ def scoring(talk: Talk, judged: Judged) -> Slide:
     slide.pictures["reach"] = (figures.reach_figure(scores, feature), words)
     points = scores["n"].sel(feature=feature).values
     reached, outside = scores.sizes["view"], scores.sizes["outside"]
+    reasons = Counter(_reason(str(words)) for words in scores["reason"].values)
+    others = f" Of the others {listed([f'{count} {why}' for why, count in reasons.most_common()])}." if reasons else ""
+    moved = scores.attrs["moved_out"] or "No"
     slide.claims.append(
         Claim(
             "Sub divide icosahedron to sample a sphere. Ensure reachability by the tilt table.",
-            f"The three-axis table reaches {reached} of {reached + outside} directions; {scores.attrs['moved_out']} "
-            f"views were moved out, clear of the part. {feature} has {points.min():.0f} to {points.max():.0f} points.",
+            f"The three-axis table reaches {reached} of {reached + outside} directions.{others} {moved} views were "
+            f"moved away to keep the sensor clear of the part. {feature} has {points.min():.0f} to {points.max():.0f} "
+            "points.",
             f"{reached} of {reached + outside} directions",
             "shown",
         )
     )
     return slide
+
+
+def _reason(words: str) -> str:
+    """Return why a direction is left out, without the numbers of the single case."""
+    kind, _, rest = words.partition(": ")
+    return f"need a {rest.split()[0]} beyond its limits" if kind == "stage" and " beyond " in rest else words
 
 
 def view_score(talk: Talk, judged: Judged) -> Slide:
@@ -72,23 +86,28 @@ def view_score(talk: Talk, judged: Judged) -> Slide:
     slide.pictures["scores"] = (figures.scores_figure(scores, shown.measurement, shapes), words)
     here = scores.sel(measurement=shown.measurement)
     sums, product = here["S_m"].values.astype(float), here["R_m"].values.astype(float)
-    high = sums >= np.quantile(sums, 0.75)
-    hidden = int((high & (product < 0.5)).sum())
-    found = f"Of the quarter of views with the largest S_m, {hidden} of {int(high.sum())} have R_m below 0.5."
-    better = hidden > 0
+    blocked = product < _HIDDEN
+    reach = largest_of(sums[blocked]) / sums.max() if blocked.any() else 0.0
+    figure = f"S_m up to {100 * reach:.0f} % of the largest with a feature out of sight"
+    found = (
+        f"{int(blocked.sum())} views see little of a feature (R_m below {_HIDDEN:g}). Their S_m is up to "
+        f"{100 * reach:.0f} % of the largest."
+    )
+    better = reach > _BIASED
     if shown.sample in judged.errors:
         error = true_error(judged.errors[shown.sample], shown.measurement)
         known = np.isfinite(error)
         alone = spearman(sums[known], error[known])
         together = spearman(np.where(here["possible"].values > 0, here["V_m"].values, 0)[known], error[known])
         found += f" Rank correlation with the true error of views: S_m alone {_signed(alone)}, V_m {_signed(together)}."
-        better = together < alone
+        better = better and together < alone
+        figure = f"rank correlation with error: S_m alone {_signed(alone)}, V_m {_signed(together)}"
     slide.claims.append(
         Claim(
             "[S_m] is susceptible to bias. Doesn't take into account if all features are actually visible.",
             found,
-            f"{hidden} of {int(high.sum())} views with a high S_m hide a feature",
-            verdict(better, hidden > 0),
+            figure,
+            verdict(better, reach > _BIASED),
         )
     )
     return slide

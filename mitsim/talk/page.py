@@ -145,9 +145,10 @@ def _intro(talk: Talk, measured: dict[str, xr.Dataset]) -> list[str]:
     lines = [
         "Every figure of the talk “Task Specific Viewpoint Optimisation” (Kinnell and Justham, Hamburg 2018), made "
         "again by simulation, beside the claim of its slide. Quotations are the talk’s own words.",
-        f"Views are those of {talk.sensor.name} before the talk’s artefact. The true error of a view is that of "
-        f"{talk.file.trials} virtual measurements: calibration, finish, light, temperature, pose and noise are drawn "
-        "anew for each, then the images are rendered, decoded and measured.",
+        f"{len(talk.views)} views of {talk.sensor.name} before the talk’s artefact are compared, in "
+        f"{len(talk.file.samples)} finishes. The true error of a view is that of {talk.file.trials} virtual "
+        "measurements: calibration, unit, decoder, finish, light, temperature, pose and noise are drawn anew for each, "
+        "then the images are rendered, decoded and measured.",
     ]
     if measured:
         lines.append(f"The errors of {listed(sorted(measured))} are those of real captures.")

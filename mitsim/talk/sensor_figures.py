@@ -169,7 +169,8 @@ def noise_figure(found: Mapping[str, xr.Dataset]) -> Figure:
             if one.attrs["two"]:
                 both = TwoNormals(one.attrs["narrow"], one.attrs["wide"], one.attrs["share"])
                 curve.plot(middle, both.density(middle), "--", color=VERMILION, lw=1.2, label="sum of two")
-            curve.set_title(f"σ {sigma:.2g} mm, kurtosis {one.attrs['kurtosis']:+.2f}", fontsize=8.5)
+            kurtosis = f"{one.attrs['kurtosis']:+.2f}".replace("-", "−")
+            curve.set_title(f"σ {sigma:.2g} mm, kurtosis {kurtosis}", fontsize=8.5)
             curve.set(xlabel="residual [mm]", yticks=[])
             curve.legend(fontsize=7, loc="upper right", handlelength=1.2)
     return figure
