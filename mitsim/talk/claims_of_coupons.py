@@ -245,7 +245,8 @@ def _multiple_reflections(talk: Talk, results: Results, slide: Slide) -> None:
     slide.claims.append(
         Claim(
             "The reason for this is on the shiny surface at distance, multiple reflection effects dominate.",
-            "A flat coupon sees no other face. On the artefact the mean |residual| of F in direct light alone and in all light is "
+            "A flat coupon sees no other face. On the artefact the mean |residual| of F in direct light alone and in "
+            "all light is "
             + "; ".join(f"{name} {100 * d:.1f} % and {100 * a:.1f} %" for name, (d, a) in residuals.items())
             + f". Light from other faces {'raises' if moved > 0 else 'lowers'} the mean F of {last} by "
             f"{abs(moved):.3f}.",
