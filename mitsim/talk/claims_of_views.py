@@ -29,7 +29,17 @@ _END = 3
 
 
 def judged_of(talk: Talk, results: Results, measured: dict[str, xr.Dataset], slide: Slide) -> Judged:
-    """Return scores and errors of all samples that have them; ``measured`` errors replace virtual ones."""
+    """Return scores and errors of all samples that have them.
+
+    Parameters
+    ----------
+    talk, results
+        The talk, and the results that there are.
+    measured
+        Errors of real captures by the key of their sample, in place of virtual ones.
+    slide
+        Takes the names of missing results.
+    """
     names = {one.name: one.key for one in talk.file.samples}
     scores = collected(results, {name: f"scores_{key}" for name, key in names.items()}, slide)
     wanted = {one.name: trials_name(one) for one in talk.file.samples if one.key not in measured}

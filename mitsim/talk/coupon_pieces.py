@@ -88,6 +88,17 @@ def characterised(folder: str, place: CouponPlace, subdivisions: int, refined: i
     Over ``shot``: the normal ``shot_x`` and ``shot_y`` of each capture, in the order in which they were taken, and its
     ``level``, 0 for the planned ones and 1 for those between them. Over ``patch``, at most 4000 of them: ``patch_x``,
     ``patch_y``, F and sigma. Over (b, a): the fields of the map.
+
+    Parameters
+    ----------
+    folder
+        Folder of the talk.
+    place
+        The coupon and its distance.
+    subdivisions, refined
+        Density of the planned orientations, and the largest one of those added.
+    seed
+        Of the choice of patches.
     """
     bands = [Band(up_to_deg=20, subdivisions=subdivisions), Band(up_to_deg=80, subdivisions=max(subdivisions - 1, 0))]
     plan = campaign_of(folder, place, orientations=bands)
@@ -187,6 +198,19 @@ def hold_out(folder: str, place: CouponPlace, map_name: str, count: int, seed: i
 
     Over ``pose``: ``incidence`` [rad], and ``fraction`` and ``sigma`` [mm] as ``..._measured`` and ``..._predicted``.
     The other variables are those of :func:`characterisation.maps.validation.residual_table`, of this one row.
+
+    Parameters
+    ----------
+    folder
+        Folder of the talk.
+    place
+        The coupon and its distance.
+    map_name
+        Map that predicts.
+    count
+        Number of poses.
+    seed
+        Of poses and noise.
     """
     prepared, plan = prepared_sensor(sensor_in(folder, place.sensor)), campaign_of(folder, place)
     series = replace(plan.series[0], seed=plan.series[0].seed ^ (seed + 1))
@@ -208,6 +232,19 @@ def clouds_of_coupon(folder: str, place: CouponPlace, map_name: str, angle: floa
     """Return the captured cloud of a large coupon and one drawn from the map, as residuals along V from the true plane.
 
     ``captured`` and ``drawn`` (row, column), thinned, are in steps of :data:`STEP_MM`; :data:`NO_POINT` is no point.
+
+    Parameters
+    ----------
+    folder
+        Folder of the talk.
+    place
+        The coupon and its distance.
+    map_name
+        Map from which the second cloud is drawn.
+    angle
+        Tilt of the coupon [deg].
+    seed
+        Of the drawn cloud.
     """
     prepared = prepared_sensor(sensor_in(folder, place.sensor))
     plan = campaign_of(folder, place, coupon_px=5000.0)  # as large as the field of view

@@ -53,7 +53,17 @@ class Judged:
 
 
 def score_of(scores: xr.Dataset, task: Task, measurement: str, kind: str) -> Floats:
-    """Return one score (view,) from the scores of a measurement, larger is better, NaN for an impossible view."""
+    """Return one score (view,), larger is better, NaN for an impossible view.
+
+    Parameters
+    ----------
+    scores
+        Scores of the views for the measurement.
+    task, measurement
+        The task, and the measurement in it.
+    kind
+        A key of :data:`SCORES`.
+    """
     if kind == "V_m":
         return np.where(scores["possible"].values > 0, scores["V_m"].values, np.nan)
     if kind == "risk":

@@ -34,6 +34,15 @@ def projected_frames(folder: str, scene: str, parameters: tuple[tuple[str, str],
 
     All frames share one scale. Of many frames some are chosen evenly, of those that are not dark. A sensor that
     projects one image has one frame.
+
+    Parameters
+    ----------
+    folder
+        Folder of the talk.
+    scene, parameters
+        Path of the artefact's scene, and values of its parameters.
+    sensor
+        Preset, or path of a sensor file.
     """
     chosen = sensor_in(folder, sensor)
     loaded = load_scene(Path(folder) / scene, chosen.wavelength_nm, dict(parameters))

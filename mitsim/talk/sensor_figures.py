@@ -104,7 +104,15 @@ def _gradient_axes(axes: Axes, blinding: tuple[float, float] | None = None) -> N
 
 
 def collection_figure(poses: xr.Dataset, cut: xr.Dataset, tilts: xr.Dataset, blinding: tuple[float, float]) -> Figure:
-    """Draw the poses of the coupon in gradient space, a cloud cut into sub-clouds, and the area of these."""
+    """Draw the poses of the coupon in gradient space, a cloud cut into sub-clouds, and the area of these.
+
+    Parameters
+    ----------
+    poses, cut, tilts
+        Results of :mod:`~mitsim.talk.coupon_pieces`: ``characterised``, ``sub_clouds`` and ``tilts``.
+    blinding
+        Gradient of the surface that mirrors the projector into the camera.
+    """
     with drawing():
         figure = Figure((10.6, 3.6), layout="constrained")
         left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1.05, 0.95))

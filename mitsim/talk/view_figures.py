@@ -25,7 +25,18 @@ Floats = NDArray[np.float64]
 def sphere(axes: Axes, scores: xr.Dataset, values: Floats, title: str, label: str, error: bool = False) -> None:
     """Draw a value (view,) of every candidate view on the sphere of views from above; a cross where it is NaN.
 
-    ``error`` draws small values bright, on a logarithmic scale.
+    Parameters
+    ----------
+    axes
+        Where to draw.
+    scores
+        Scores of the views, with their directions and those left out.
+    values
+        (view,).
+    title, label
+        Title of the picture, and label of the colour bar with the unit.
+    error
+        Draw small values bright, on a logarithmic scale.
     """
     places = view_places(scores)
     outside = scores["left_out"].values
