@@ -75,10 +75,11 @@ def deciles(score: ArrayLike, error: ArrayLike) -> xr.Dataset:
         number with a value in any trial; ``share``, the share of trials with a value [1]; ``score_low`` and
         ``score_high``; ``error`` and ``deviation``, means over the views of the mean absolute error and of the standard
         deviation, each with ``_low`` and ``_high``, the 95 % interval of the mean by Student's t (NaN for fewer than
-        two views, not below 0); ``error_rank`` and ``deviation_rank``, see :func:`bin_ranks`.
+        two views, not below 0); ``error_rank``, ``deviation_rank`` and ``share_rank``, see :func:`bin_ranks`. Rank 1
+        is the largest share.
 
-        Over ``view``: ``bin_of_view``. Attributes ``error_correlation`` and ``deviation_correlation`` are Spearman's
-        rank correlations of bin and quantity, over the bins with a value: -1 if each better bin is better measured.
+        Over ``view``: ``bin_of_view``. Attributes ``error_correlation``, ``deviation_correlation`` and
+        ``share_correlation`` are Spearman's correlations of bin and rank: -1 if each better bin is better measured.
 
     Raises
     ------
@@ -127,8 +128,9 @@ def deciles(score: ArrayLike, error: ArrayLike) -> xr.Dataset:
         rows.append(row)
     columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     correlations = {}
-    for name in _QUANTITIES:
-        columns[f"{name}_rank"] = ranks = bin_ranks(columns[name], columns["views"])
+    smallest_best = {name: columns[name] for name in _QUANTITIES} | {"share": -columns["share"]}
+    for name, values in smallest_best.items():
+        columns[f"{name}_rank"] = ranks = bin_ranks(values, columns["views"])
         ranked = np.isfinite(ranks)
         correlations[f"{name}_correlation"] = spearman(np.flatnonzero(ranked), ranks[ranked])
     data: dict[str, Any] = {
@@ -170,7 +172,7 @@ def mean_ranks(cells: Sequence[xr.Dataset], quantity: str = "error") -> xr.Datas
     cells
         At least one.
     quantity
-        ``error`` or ``deviation``.
+        ``error``, ``deviation`` or ``share``.
 
     Returns
     -------

@@ -146,6 +146,13 @@ _WORDS = {
 }
 
 
+#: why errors alone say little where many trials have no value
+_SURVIVORS = (
+    "A fit that its points do not determine is rejected, so a poor view shows the errors of its best trials alone; the "
+    "score predicts which views give a value."
+)
+
+
 def _example(judged: Judged, one: ExampleEntry) -> Claim:
     cell, errors = judged.cell(one.sample, one.measurement, "V_m"), judged.errors[one.sample]
     values, views, share = cell["error"].values, cell["views"].values, cell["share"].values
@@ -154,7 +161,7 @@ def _example(judged: Judged, one: ExampleEntry) -> Claim:
     trials = errors["error"].sel(measurement=one.measurement).values
     measurable = int((np.isfinite(trials).mean(axis=1) >= 0.5).sum())
     known = np.flatnonzero(np.isfinite(values[1:])) + 1
-    correlations = [cell.attrs[f"{name}_correlation"] for name in ("error", "deviation")]
+    correlations = [cell.attrs[f"{name}_correlation"] for name in QUANTITIES]
     ratio = float(values[known[0]] / values[known[-1]]) if len(known) > 1 else math.nan
     best = [values[number] for number in known[-3:]]
     top = max(best) / min(best) if len(best) > 1 else math.nan
@@ -163,13 +170,22 @@ def _example(judged: Judged, one: ExampleEntry) -> Claim:
         f"{one.measurement}, {one.sample}: {possible} of {int(views.sum())} views are possible by V_m; {measurable} "
         f"have a value in at least half of the trials. Trials with a value: {_percent(share[0])} where V_m says "
         f"impossible, {_percent(_mean_share(cell))} elsewhere. Rank correlation of bins with error "
-        f"{_signed(correlations[0])}, with standard deviation {_signed(correlations[1])}. Worst over best bin: "
+        f"{_signed(correlations[0])}, with standard deviation {_signed(correlations[1])}, with missing values "
+        f"{_signed(correlations[2])}. Worst over best bin: "
         f"{_ratio(ratio)}{ends}. "
         f"The errors of the best three bins differ by the factor {_ratio(top)}."
     )
-    good = [correlation < _GOOD for correlation in correlations if not math.isnan(correlation)]
+    good = [correlation < _GOOD for correlation in correlations[:2] if not math.isnan(correlation)]
+    predicts = correlations[2] < _GOOD
     figure = f"rank correlation {_signed(correlations[0])} with error, {_signed(correlations[1])} with deviation"
-    return Claim(_WORDS.get(one.slide, one.measurement), found, figure, verdict(bool(good) and all(good), any(good)))
+    why = _SURVIVORS if predicts and not all(good) else ""
+    return Claim(
+        _WORDS.get(one.slide, one.measurement),
+        found,
+        figure,
+        verdict(bool(good) and all(good), any(good) or predicts),
+        why,
+    )
 
 
 def _mean_share(cell: xr.Dataset) -> float:
@@ -194,7 +210,10 @@ def accuracy(judged: Judged) -> Slide:
     slide = Slide("View Score Accuracy")
     if not judged.errors:
         return slide
-    words = "Mean rank of the ten bins for error and standard deviation, by V_m, predicted risk and number of points"
+    words = (
+        "Mean rank of the ten bins by error, standard deviation and share of trials with a value, for V_m, predicted "
+        "risk and number of points"
+    )
     found = {kind: judged.ranks(kind) for kind in SCORES}
     slide.pictures["accuracy"] = (figures.ranks_figure(found), words)
     count = len(judged.task.measurements) * len(judged.errors)
@@ -204,30 +223,53 @@ def accuracy(judged: Judged) -> Slide:
         ends = f"{_signed(about['correlation_low'])} to {_signed(about['correlation_high'])}"
         return f"{_signed(about['correlation'])} ({ends})"
 
-    talks = [found["V_m"][quantity].attrs["correlation"] for quantity in QUANTITIES]
+    talks = [found["V_m"][quantity].attrs["correlation"] for quantity in ("error", "deviation")]
+    good = max(talks) <= _VERY_GOOD
+    why = f"{_SURVIVORS} The predicted risk also knows how the points constrain a fit."
     slide.claims.append(
         Claim(
             "Comparison of our predicted bin rank based on the view score and actual bin ranking are very good.",
             f"Over {count} cells, {len(judged.task.measurements)} measurements of {len(judged.errors)} samples, the "
-            "mean rank correlation of bins with error and with standard deviation is "
+            "mean rank correlation of bins with error, with standard deviation and with missing values is "
             + "; ".join(
-                f"{name} {interval(kind, 'error')} and {interval(kind, 'deviation')}" for kind, name in SCORES.items()
+                f"{name} {', '.join(interval(kind, quantity) for quantity in QUANTITIES)}"
+                for kind, name in SCORES.items()
             )
-            + ".",
+            + f". Of V_m with error, by sample: {'; '.join(_by_sample(judged))}.",
             f"rank correlation {_signed(talks[0])} with error, {_signed(talks[1])} with deviation",
-            verdict(max(talks) <= _VERY_GOOD, max(talks) <= _GOOD),
+            verdict(good, min(talks) <= _GOOD),
+            "" if good else why,
         )
     )
     misses = np.abs(found["V_m"]["error"]["rank"].values - np.arange(10, 0, -1))
-    bad, good = mean_of(misses[:_END]), mean_of(misses[-_END:])
+    bad, best = mean_of(misses[:_END]), mean_of(misses[-_END:])
+    cells = [judged.cell(sample, name, "V_m") for sample in judged.errors for name in judged.task.measurements]
+    impossible, possible = (
+        mean_of([cell["share"].values[0] for cell in cells]),
+        mean_of([_mean_share(cell) for cell in cells]),
+    )
     slide.claims.append(
         Claim(
             "Especially good at predicting bad views.",
             f"The mean rank by error misses the predicted one by {_ratio(bad)} for the three worst bins, and by "
-            f"{_ratio(good)} for the three best. Mean ranks from the worst bin to the best: "
+            f"{_ratio(best)} for the three best. Of the trials of views that V_m calls impossible "
+            f"{_percent(impossible)} have a value, of the others {_percent(possible)}. Mean ranks from the worst "
+            "bin to the best: "
             f"{', '.join(_ratio(rank) for rank in found['V_m']['error']['rank'].values)}.",
-            f"ranks missed by {_ratio(bad)} for bad views, {_ratio(good)} for good ones",
-            verdict(bad < good),
+            f"ranks missed by {_ratio(bad)} for bad views, {_ratio(best)} for good ones",
+            verdict(bad < best, impossible < possible / 2),
         )
     )
     return slide
+
+
+def _by_sample(judged: Judged) -> list[str]:
+    """Return, for each sample, the mean rank correlation of the bins of V_m, and the share of trials with a value."""
+    out = []
+    for sample, errors in judged.errors.items():
+        cells = [judged.cell(sample, name, "V_m") for name in judged.task.measurements]
+        middle = mean_of([cell.attrs["error_correlation"] for cell in cells])
+        tried = errors["error"].values[:, errors["tried"].values > 0]
+        share = float(np.isfinite(tried).mean()) if tried.size else math.nan
+        out.append(f"{sample} {_signed(middle)} ({_percent(share)} of the trials have a value)")
+    return out

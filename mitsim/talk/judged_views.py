@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 SCORES = {"V_m": "view score V_m", "risk": "predicted risk", "points": "number of points"}
 
 #: quantities of a bin that are ranked, in words
-QUANTITIES = {"error": "mean error", "deviation": "standard deviation"}
+QUANTITIES = {"error": "mean error", "deviation": "standard deviation", "share": "share of trials with a value"}
 
 #: least number of points on a feature; as of the view score
 _LEAST_POINTS = 100

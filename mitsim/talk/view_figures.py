@@ -137,13 +137,13 @@ def bars(axes: Axes, cell: xr.Dataset, name: str) -> None:
 
 
 def ranks_figure(ranks: Mapping[str, Mapping[str, xr.Dataset]]) -> Figure:
-    """Draw the mean rank of the bins for error and standard deviation, by each score, with intervals.
+    """Draw the mean rank of the bins by error, standard deviation and share of trials with a value, for each score.
 
     ``ranks`` are those of :meth:`~mitsim.talk.judged_views.Judged.ranks`, by the score.
     """
     with drawing():
-        figure = Figure((9.4, 3.6), layout="constrained")
-        panels = figure.subplots(1, 2, sharey=True)
+        figure = Figure((11.2, 3.6), layout="constrained")
+        panels = figure.subplots(1, len(QUANTITIES), sharey=True)
         for axes, (quantity, words) in zip(panels, QUANTITIES.items(), strict=True):
             axes.plot([1, 10], [10, 1], color=MUTED, lw=0.8, label="perfect")
             for number, (kind, name) in enumerate(SCORES.items()):
@@ -153,7 +153,7 @@ def ranks_figure(ranks: Mapping[str, Mapping[str, xr.Dataset]]) -> Figure:
                 spread = np.where(np.isfinite(spread), np.maximum(spread, 0), 0)
                 place = found["bin"].values + 0.13 * (number - 1)
                 correlation = found.attrs["correlation"]
-                label = name if math.isnan(correlation) else f"{name}: correlation {correlation:+.2f}".replace("-", "−")
+                label = name if math.isnan(correlation) else f"{name}: {correlation:+.2f}".replace("-", "−")
                 colour = (BLUE, VERMILION, "#009e73")[number]
                 axes.errorbar(
                     place, rank, spread, fmt="osD"[number] + "-", ms=4, lw=0.9, capsize=2, color=colour, label=label
@@ -161,6 +161,6 @@ def ranks_figure(ranks: Mapping[str, Mapping[str, xr.Dataset]]) -> Figure:
             axes.set(
                 xlabel="decile of the score, 10 is best", title=f"by {words}", xticks=range(1, 11), ylim=(0.5, 10.5)
             )
-            axes.legend(fontsize=7.5)
+            axes.legend(fontsize=7.5, title="mean rank correlation", title_fontsize=7.5)
         panels[0].set_ylabel("mean rank of the bin, 1 is best")
     return figure

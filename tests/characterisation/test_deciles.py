@@ -47,6 +47,17 @@ def test_impossible_views_are_a_bin_of_their_own_and_change_no_other() -> None:
     assert math.isnan(found["error_rank"].values[0])
 
 
+def test_a_bin_with_more_values_ranks_before_one_with_fewer() -> None:
+    error = np.ones((10, 20))
+    for view in range(10):
+        error[view, 10 + view :] = np.nan
+    found = deciles(np.arange(10.0), error)
+    assert found["share"].values[1:].tolist() == [(10 + view) / 20 for view in range(10)]
+    assert found["share_rank"].values[1:].tolist() == list(range(10, 0, -1))
+    assert found.attrs["share_correlation"] == pytest.approx(-1)
+    assert mean_ranks([found], "share")["rank"].values.tolist() == list(range(10, 0, -1))
+
+
 def test_a_bin_is_the_mean_over_its_views_of_mean_absolute_error_and_standard_deviation() -> None:
     score = np.repeat(np.arange(10.0), 2)
     error = np.zeros((20, 4))
