@@ -103,7 +103,7 @@ def example_figure(judged: Judged, sample: str, measurement: str) -> Figure:
     cell, errors = judged.cell(sample, measurement, "V_m"), judged.errors[sample]
     unit = unit_symbol(str(judged.scores[sample]["unit"].sel(measurement=measurement).item()))
     with drawing():
-        figure = Figure((11.2, 3.5), layout="constrained")
+        figure = Figure((11.2, 3.9), layout="constrained")
         panels = figure.subplots(1, 4, width_ratios=(1, 1, 0.95, 0.95))
         for axes, name, label in zip(
             panels, ("error", "deviation"), ("mean |error|", "standard deviation"), strict=False
@@ -118,7 +118,10 @@ def example_figure(judged: Judged, sample: str, measurement: str) -> Figure:
 
 
 def bars(axes: Axes, cell: xr.Dataset, name: str) -> None:
-    """Draw the bins of a decile data set as bars with intervals: x where no view of a bin has a value."""
+    """Draw the bins of a decile data set as bars with intervals: x where no view of a bin has a value.
+
+    The second line of a label is the share of trials with a value [%].
+    """
     values = cell[name].values
     low, high = cell[f"{name}_low"].values, cell[f"{name}_high"].values
     known = np.isfinite(values)
@@ -132,8 +135,10 @@ def bars(axes: Axes, cell: xr.Dataset, name: str) -> None:
         axes.set_ylim(0, min(max(top, 1.03 * float(np.where(ends, high, 0).max())), 2.2 * top))
     empty = (cell["views"].values > 0) & ~known
     axes.plot(cell["bin"].values[empty], np.full(empty.sum(), 0.03 * axes.get_ylim()[1]), "x", color=VERMILION, ms=6)
-    axes.set_xticks(range(11), ["im-\nposs.", *map(str, range(1, 11))])
-    axes.set_xlabel("decile of V_m, 10 is best; × no value")
+    shares = ["–" if math.isnan(share) else f"{100 * share:.0f}" for share in cell["share"].values]
+    names = ["imp.", *map(str, range(1, 11))]
+    axes.set_xticks(range(11), [f"{name}\n{share}" for name, share in zip(names, shares, strict=True)], fontsize=6.5)
+    axes.set_xlabel("decile of V_m, 10 is best, imp. is impossible\n% of trials with a value", fontsize=8)
 
 
 def ranks_figure(ranks: Mapping[str, Mapping[str, xr.Dataset]]) -> Figure:
