@@ -84,6 +84,7 @@ class TalkFile(Document):
     coupons: CouponsTable = CouponsTable()
     views: ViewsTable
     light_path_depth: int = Field(default=2, ge=1, le=16)
+    samples_per_pixel: int = Field(default=16, ge=1, le=4096)
     examples: list[ExampleEntry] = Field(default_factory=list)
     sphere: ExampleEntry
     shown_feature: str = "pillar2"
@@ -123,7 +124,7 @@ class Talk:
             characterisation=CharacterisationTable(map=self.file.map),
             views=self.file.views,
             score=ScoreTable(light_path_depth=min(depth, 2)),
-            measure=MeasureTable(by="render", light_path_depth=depth),
+            measure=MeasureTable(by="render", light_path_depth=depth, samples_per_pixel=self.file.samples_per_pixel),
         )
 
     def study(self, sample: SampleEntry) -> Study:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from shell import ROOT
+from shell import ROOT, mitsim_here
 from smaller_sensors import coarse_sensor
 
 from characterisation.files.errors import InputError
@@ -40,6 +40,7 @@ map = "ensenso-n10"
 task = "task.toml"
 trials = 2
 light_path_depth = 1
+samples_per_pixel = 4
 opening_sensors = ["ensenso-n10.toml"]
 noise_sensors = ["ensenso-n10.toml"]
 sphere = {{ measurement = "pillar1_radius", sample = "Ra 0.37" }}
@@ -94,7 +95,7 @@ parameters = {{ Ra = 0.37 }}
 
 def copied(kept: Path, folder: Path, names: tuple[str, ...]) -> Path:
     """Copy some of the kept results into a folder, and return it."""
-    folder.mkdir()
+    folder.mkdir(parents=True)
     for name in names:
         (folder / f"{name}.nc").write_bytes((kept / f"{name}.nc").read_bytes())
     return folder
@@ -192,3 +193,15 @@ def test_real_captures_replace_the_virtual_measurements_of_their_sample(
     write_capture(capture, tmp_path / "wood" / "first")
     with pytest.raises(InputError, match=r"matt white, Ra 0\.37"):
         measured_errors(talk, tmp_path)
+
+
+def test_command_draws_what_is_kept_and_names_what_is_missing(made: tuple[Path, Path], tmp_path: Path) -> None:
+    path, output = made
+    copied(output / "kept", tmp_path / "out" / "kept", ("tilts",))
+    done = mitsim_here("study", "talk", path, "-o", tmp_path / "out", "--kept", code=1)
+    assert re.search(r"\d+ results are missing: opening_ensenso-n10, ", done.stderr + done.stdout)
+    page = (tmp_path / "out" / "talk.html").read_text(encoding="utf-8")
+    assert "F by density differs" in page
+    assert page.count("Not made yet") >= 8
+    refused = mitsim_here("study", "talk", path, "-o", tmp_path / "out", "--kept", "--fresh", code=2)
+    assert "only one of the two" in refused.stderr
