@@ -43,8 +43,6 @@ _DPI, _COLOURS = 120, 160
 #: resolution at which the page shows them [1/in]
 _SHOWN_DPI = 92
 
-_COMMAND = "mitsim study talk scenes/talk/talk.toml -o runs/talk --kept"
-
 
 @dataclass(frozen=True)
 class _Picture:
@@ -137,7 +135,8 @@ def write_talk(
             for slide, drawn in zip(slides, pictures, strict=True)
         ],
     }
-    write_text(folder / "the-talk.md", _markdown(slides, pictures, opening, intro, missing))
+    command = f"mitsim study talk {talk.path.as_posix()} -o runs/talk --kept"
+    write_text(folder / "the-talk.md", _markdown(command, slides, pictures, opening, intro, missing))
     return write_page(folder / "talk.html", "talk.html.j2", content)
 
 
@@ -168,6 +167,7 @@ def _drawn(images: Path, name: str, figure: Figure, alt: str) -> _Picture:
 
 
 def _markdown(
+    command: str,
     slides: Sequence[Slide],
     pictures: Sequence[Sequence[_Picture]],
     opening: _Picture | None,
@@ -176,12 +176,12 @@ def _markdown(
 ) -> str:
     lines = [f"# {TITLE}", "", *(line for part in intro for line in (part, ""))]
     lines += [
-        f"`{_COMMAND}` draws this page from the kept results in a minute; without `--kept` it makes missing ones.",
+        f"`{command}` draws this page from the kept results in a minute; without `--kept` it makes missing ones.",
         "",
     ]
     if missing:
         lines += [f"Not made yet: {_missing(missing)}.", ""]
-    made = [f"<!-- made by: {_COMMAND}; takes 60 s -->", "<!-- made by: as above -->"]
+    made = [f"<!-- made by: {command}; takes 60 s -->", "<!-- made by: as above -->"]
     first = True
 
     def picture(one: _Picture) -> list[str]:
