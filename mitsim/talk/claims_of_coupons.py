@@ -215,6 +215,7 @@ def validation(talk: Talk, results: Results) -> Slide:
             f"{sum(good.values())} of {len(good)} samples below 10 %",
             verdict(all(others), any(others)),
             f"{last} stays below the limit too: a single coupon sees no other surface." if good[last] else "",
+            "validation",
         )
     )
     _multiple_reflections(talk, results, slide)
@@ -256,6 +257,7 @@ def _multiple_reflections(talk: Talk, results: Results, slide: Slide) -> None:
             if added[last] > residuals[last][0]
             else "Light from other faces moves F less than what the map misses in "
             "direct light: edges and curved faces, which flat coupons do not show.",
+            "light",
         )
     )
 

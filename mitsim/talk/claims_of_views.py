@@ -11,6 +11,7 @@ import xarray as xr
 from characterisation.scores.rank_agreement import spearman
 from characterisation.tasks.task_reading import read_task
 from mitsim.running.numbers import listed, two_digits, unit_symbol
+from mitsim.study import MINIMUM_POINTS
 from mitsim.talk import view_figures as figures
 from mitsim.talk.judged_views import QUANTITIES, SCORES, Judged, true_error
 from mitsim.talk.make import trials_name
@@ -23,6 +24,9 @@ _VERY_GOOD, _GOOD = -0.8, -0.5
 
 #: R_m below which a view lacks a feature, and S_m of such a view, over the largest, from which it misleads
 _HIDDEN, _BIASED = 0.1, 0.25
+
+#: quantities of a bin whose correlation with the score is told, in words
+_CORRELATED = {"error": "error", "deviation": "standard deviation", "share": "missing values"}
 
 #: number of bins at each end that are called bad and good views
 _END = 3
@@ -132,7 +136,7 @@ def examples(talk: Talk, judged: Judged) -> Slide:
             continue
         words = f"Deciles of V_m for {one.measurement} ({one.sample}), and spheres of V_m and of the true error"
         picture = figures.example_figure(judged, one.sample, one.measurement)
-        slide.pictures[f"example_{one.measurement}"] = (picture, words)
+        slide.pictures[_picture(one)] = (picture, words)
         slide.claims.append(_example(judged, one))
     return slide
 
@@ -160,6 +164,8 @@ def _example(judged: Judged, one: ExampleEntry) -> Claim:
     possible = int(views[1:].sum())
     trials = errors["error"].sel(measurement=one.measurement).values
     measurable = int((np.isfinite(trials).mean(axis=1) >= 0.5).sum())
+    if not possible:
+        return _nothing_possible(judged, one, measurable, float(share[0]))
     known = np.flatnonzero(np.isfinite(values[1:])) + 1
     correlations = [cell.attrs[f"{name}_correlation"] for name in QUANTITIES]
     ratio = float(values[known[0]] / values[known[-1]]) if len(known) > 1 else math.nan
@@ -171,8 +177,7 @@ def _example(judged: Judged, one: ExampleEntry) -> Claim:
         f"have a value in at least half of the trials. Trials with a value: {_percent(share[0])} where V_m says "
         f"impossible, {_percent(_mean_share(cell))} elsewhere. Rank correlation of bins with error "
         f"{_signed(correlations[0])}, with standard deviation {_signed(correlations[1])}, with missing values "
-        f"{_signed(correlations[2])}. Worst over best bin: "
-        f"{_ratio(ratio)}{ends}. "
+        f"{_signed(correlations[2])}. Error of the worst over the best bin: {_ratio(ratio)}{ends}. "
         f"The errors of the best three bins differ by the factor {_ratio(top)}."
     )
     good = [correlation < _GOOD for correlation in correlations[:2] if not math.isnan(correlation)]
@@ -185,7 +190,30 @@ def _example(judged: Judged, one: ExampleEntry) -> Claim:
         figure,
         verdict(bool(good) and all(good), any(good) or predicts),
         why,
+        _picture(one),
     )
+
+
+def _nothing_possible(judged: Judged, one: ExampleEntry, measurable: int, share: float) -> Claim:
+    """Return the claim of an example without views that are possible by V_m."""
+    points, shapes = judged.scores[one.sample]["n"], list(judged.task.shapes_for(one.measurement))
+    most = listed([f"{float(points.sel(feature=name).max()):.0f} points of {name}" for name in shapes])
+    views = points.sizes["view"]
+    return Claim(
+        _WORDS.get(one.slide, one.measurement),
+        f"{one.measurement}, {one.sample}: V_m calls all {views} views impossible. Some are expected to show up to "
+        f"{most}, but none to show {MINIMUM_POINTS} of each. Of the trials {_percent(share)} have a value nonetheless, "
+        f"since they also render light from other faces. {measurable or 'No'} views have one in at least half of their "
+        "trials.",
+        f"0 of {views} views possible by V_m, {measurable} measurable in half of the trials",
+        verdict(False, not measurable),
+        "The prediction that this cannot be measured holds. Without possible views there is no correlation to test.",
+        _picture(one),
+    )
+
+
+def _picture(one: ExampleEntry) -> str:
+    return f"example_{one.measurement}"
 
 
 def _mean_share(cell: xr.Dataset) -> float:
@@ -225,29 +253,29 @@ def accuracy(judged: Judged) -> Slide:
 
     talks = [found["V_m"][quantity].attrs["correlation"] for quantity in ("error", "deviation")]
     good = max(talks) <= _VERY_GOOD
+    trend = spearman(found["V_m"]["error"]["bin"].values, found["V_m"]["error"]["rank"].values)
     why = f"{_SURVIVORS} The predicted risk also knows how the points constrain a fit."
     slide.claims.append(
         Claim(
             "Comparison of our predicted bin rank based on the view score and actual bin ranking are very good.",
             f"Over {count} cells, {len(judged.task.measurements)} measurements of {len(judged.errors)} samples, the "
-            "mean rank correlation of bins with error, with standard deviation and with missing values is "
+            "mean rank correlation of bins is "
             + "; ".join(
-                f"{name} {', '.join(interval(kind, quantity) for quantity in QUANTITIES)}"
+                f"for {name} {', '.join(f'{interval(kind, q)} with {words}' for q, words in _CORRELATED.items())}"
                 for kind, name in SCORES.items()
             )
-            + f". Of V_m with error, by sample: {'; '.join(_by_sample(judged))}.",
-            f"rank correlation {_signed(talks[0])} with error, {_signed(talks[1])} with deviation",
-            verdict(good, min(talks) <= _GOOD),
+            + f". Of V_m with error, by sample: {'; '.join(_by_sample(judged))}. The mean ranks of the bins over all "
+            f"cells, as the talk shows them, have the rank correlation {_signed(trend)} with the bins.",
+            f"rank correlation {_signed(talks[0])} of a cell, {_signed(trend)} of the mean ranks",
+            verdict(good, trend <= _VERY_GOOD),
             "" if good else why,
         )
     )
     misses = np.abs(found["V_m"]["error"]["rank"].values - np.arange(10, 0, -1))
     bad, best = mean_of(misses[:_END]), mean_of(misses[-_END:])
     cells = [judged.cell(sample, name, "V_m") for sample in judged.errors for name in judged.task.measurements]
-    impossible, possible = (
-        mean_of([cell["share"].values[0] for cell in cells]),
-        mean_of([_mean_share(cell) for cell in cells]),
-    )
+    impossible = mean_of([cell["share"].values[0] for cell in cells])
+    possible = mean_of([_mean_share(cell) for cell in cells])
     slide.claims.append(
         Claim(
             "Especially good at predicting bad views.",

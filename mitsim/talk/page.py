@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import html
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from mitsim.running.numbers import listed
 from mitsim.talk import claims_of_coupons, claims_of_sensors, claims_of_views
 from mitsim.talk.results import Results
 from mitsim.talk.sensor_figures import opening_figure
-from mitsim.talk.slides import Slide, Verdict
+from mitsim.talk.slides import Claim, Slide, Verdict
 from mitsim.talk.talk_file import Talk, sensor_key
 
 TITLE = "The talk, made again"
@@ -119,17 +119,12 @@ def write_talk(
             {
                 "title": slide.title,
                 "missing": _missing(slide.missing),
-                "pictures": [one.shown() for one in drawn],
-                "claims": [
+                "parts": [
                     {
-                        "words": claim.words,
-                        "found": claim.found,
-                        "figure": claim.figure,
-                        "why": claim.why,
-                        "verdict": claim.verdict,
-                        "colour": COLOURS[claim.verdict],
+                        "picture": None if picture is None else picture.shown(),
+                        "claims": [{**asdict(claim), "colour": COLOURS[claim.verdict]} for claim in claims],
                     }
-                    for claim in slide.claims
+                    for picture, claims in _parts(slide, drawn)
                 ],
             }
             for slide, drawn in zip(slides, pictures, strict=True)
@@ -138,6 +133,15 @@ def write_talk(
     command = f"mitsim study talk {talk.path.as_posix()} -o runs/talk --kept"
     write_text(folder / "the-talk.md", _markdown(command, slides, pictures, opening, intro, missing))
     return write_page(folder / "talk.html", "talk.html.j2", content)
+
+
+def _parts(slide: Slide, drawn: Sequence[_Picture]) -> list[tuple[_Picture | None, list[Claim]]]:
+    """Return the pictures of a slide, each with the claims that it alone shows, and last all other claims."""
+    parts: list[tuple[_Picture | None, list[Claim]]] = [
+        (picture, [claim for claim in slide.claims if claim.picture == name])
+        for name, picture in zip(slide.pictures, drawn, strict=True)
+    ]
+    return [*parts, (None, [claim for claim in slide.claims if claim.picture not in slide.pictures])]
 
 
 def _intro(talk: Talk, measured: dict[str, xr.Dataset]) -> list[str]:
@@ -195,11 +199,11 @@ def _markdown(
         lines += [f"## {number}. {slide.title}", ""]
         if slide.missing:
             lines += [f"Not made yet: {_missing(slide.missing)}.", ""]
-        for one in drawn:
-            lines += picture(one)
-        for claim in slide.claims:
-            found = f"**{claim.verdict.capitalize()}.** {claim.found}{' ' if claim.why else ''}{claim.why}"
-            lines += [f"> {html.escape(claim.words, quote=False)}", "", html.escape(found, quote=False), ""]
+        for one, claims in _parts(slide, drawn):
+            lines += [] if one is None else picture(one)
+            for claim in claims:
+                found = f"**{claim.verdict.capitalize()}.** {claim.found}{' ' if claim.why else ''}{claim.why}"
+                lines += [f"> {html.escape(claim.words, quote=False)}", "", html.escape(found, quote=False), ""]
     lines += ["## Every claim with its figure", ""]
     lines += ["| slide | claim of the talk | figure | verdict |", "|---|---|---|---|"]
     for slide in slides:

@@ -22,6 +22,7 @@ class Claim:
     """One claim of a slide, word for word, and what was found.
 
     ``found`` has the numbers in sentences, ``figure`` those that decide. ``why`` explains a claim that does not hold.
+    ``picture`` names the picture of the slide that shows it; by default all do.
     """
 
     words: str
@@ -29,6 +30,7 @@ class Claim:
     figure: str
     verdict: Verdict
     why: str = ""
+    picture: str = ""
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ SCENES = ROOT / "scenes"
 
 
 def small_talk(folder: Path) -> Path:
-    """Write the file of a small talk, whose sensor has pixels of sixteen times the area."""
-    sensor = coarse_sensor("ensenso-n10", 4, folder)
+    """Write the file of a small talk, whose sensor has pixels of nine times the area."""
+    sensor = coarse_sensor("ensenso-n10", 3, folder)
     with sensor.open("a", encoding="utf-8") as file:
         file.write('\n[unknowns.unit]\nmask = "own"\n')
     path = folder / "talk.toml"
