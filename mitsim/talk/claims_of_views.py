@@ -25,9 +25,6 @@ _VERY_GOOD, _GOOD = -0.8, -0.5
 #: R_m below which a view lacks a feature, and S_m of such a view, over the largest, from which it misleads
 _HIDDEN, _BIASED = 0.1, 0.25
 
-#: quantities of a bin whose correlation with the score is told, in words
-_CORRELATED = {"error": "error", "deviation": "standard deviation", "share": "missing values"}
-
 #: number of bins at each end that are called bad and good views
 _END = 3
 
@@ -246,10 +243,8 @@ def accuracy(judged: Judged) -> Slide:
     slide.pictures["accuracy"] = (figures.ranks_figure(found), words)
     count = len(judged.task.measurements) * len(judged.errors)
 
-    def interval(kind: str, quantity: str) -> str:
-        about = found[kind][quantity].attrs
-        ends = f"{_signed(about['correlation_low'])} to {_signed(about['correlation_high'])}"
-        return f"{_signed(about['correlation'])} ({ends})"
+    def correlations(kind: str) -> str:
+        return listed([_signed(found[kind][quantity].attrs["correlation"]) for quantity in QUANTITIES])
 
     talks = [found["V_m"][quantity].attrs["correlation"] for quantity in ("error", "deviation")]
     good = max(talks) <= _VERY_GOOD
@@ -259,11 +254,8 @@ def accuracy(judged: Judged) -> Slide:
         Claim(
             "Comparison of our predicted bin rank based on the view score and actual bin ranking are very good.",
             f"Over {count} cells, {len(judged.task.measurements)} measurements of {len(judged.errors)} samples, the "
-            "mean rank correlation of bins is "
-            + "; ".join(
-                f"for {name} {', '.join(f'{interval(kind, q)} with {words}' for q, words in _CORRELATED.items())}"
-                for kind, name in SCORES.items()
-            )
+            "mean rank correlations of bins with error, with standard deviation and with missing values are "
+            + "; ".join(f"{correlations(kind)} for {name}" for kind, name in SCORES.items())
             + f". Of V_m with error, by sample: {'; '.join(_by_sample(judged))}. The mean ranks of the bins over all "
             f"cells, as the talk shows them, have the rank correlation {_signed(trend)} with the bins.",
             f"rank correlation {_signed(talks[0])} of a cell, {_signed(trend)} of the mean ranks",

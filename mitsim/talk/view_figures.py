@@ -147,7 +147,7 @@ def ranks_figure(ranks: Mapping[str, Mapping[str, xr.Dataset]]) -> Figure:
     ``ranks`` are those of :meth:`~mitsim.talk.judged_views.Judged.ranks`, by the score.
     """
     with drawing():
-        figure = Figure((11.2, 3.6), layout="constrained")
+        figure = Figure((11.2, 3.9), layout="constrained")
         panels = figure.subplots(1, len(QUANTITIES), sharey=True)
         for axes, (quantity, words) in zip(panels, QUANTITIES.items(), strict=True):
             axes.plot([1, 10], [10, 1], color=MUTED, lw=0.8, label="perfect")
@@ -158,14 +158,14 @@ def ranks_figure(ranks: Mapping[str, Mapping[str, xr.Dataset]]) -> Figure:
                 spread = np.where(np.isfinite(spread), np.maximum(spread, 0), 0)
                 place = found["bin"].values + 0.13 * (number - 1)
                 correlation = found.attrs["correlation"]
-                label = name if math.isnan(correlation) else f"{name}: {correlation:+.2f}".replace("-", "−")
+                ends = f"({found.attrs['correlation_low']:+.2f} to {found.attrs['correlation_high']:+.2f})"
+                label = name if math.isnan(correlation) else f"{name}: {correlation:+.2f} {ends}".replace("-", "−")
                 colour = (BLUE, VERMILION, "#009e73")[number]
                 axes.errorbar(
                     place, rank, spread, fmt="osD"[number] + "-", ms=4, lw=0.9, capsize=2, color=colour, label=label
                 )
-            axes.set(
-                xlabel="decile of the score, 10 is best", title=f"by {words}", xticks=range(1, 11), ylim=(0.5, 10.5)
-            )
-            axes.legend(fontsize=7.5, title="mean rank correlation", title_fontsize=7.5)
+            axes.set(xlabel="decile of the score, 10 is best", title=f"by {words}", xticks=range(1, 11))
+            axes.set(yticks=range(2, 11, 2), ylim=(0.5, 12.5))  # the legend is above
+            axes.legend(fontsize=6.5, title="mean rank correlation, 95 % interval", title_fontsize=6.5)
         panels[0].set_ylabel("mean rank of the bin, 1 is best")
     return figure
