@@ -46,7 +46,7 @@ def patch_metrics(
 ) -> tuple[Floats, Floats]:
     """Measure coverage F and noise sigma of a flat coupon's cloud, disc by disc.
 
-    :func:`measure_coupon` returns the same with intervals, distances and angles of incidence.
+    :func:`measure_coupon` returns the same with errors, distances and angles of incidence.
 
     Parameters
     ----------
@@ -126,9 +126,8 @@ def measure_coupon(
     -------
     xarray.Dataset
         One row per ``patch``: ``recovered_fraction`` F with ``fraction_low`` and ``fraction_high`` (95 %),
-        ``ray_noise_inliers`` sigma [mm], ``ray_noise_corrected`` [mm], which corrects for correlated neighbours, with
-        ``sigma_low`` and ``sigma_high`` (95 %), ``false_fraction``, ``distance`` |V| [mm], ``incidence`` [rad], ``row``
-        and ``column`` [px], and the other columns of a campaign's ``samples.nc``. ``to_dataframe()`` converts it to a
+        ``ray_noise_inliers`` sigma [mm], ``false_fraction``, ``distance`` |V| [mm], ``incidence`` [rad], ``row`` and
+        ``column`` [px], and the other columns of a campaign's ``samples.nc``. ``to_dataframe()`` converts it to a
         pandas table; :func:`overall` pools its rows.
 
     Raises

@@ -1,8 +1,7 @@
 """Compute the two metrics of a patch: the recovered fraction F of its points, and their noise sigma along the view ray.
 
 Signal chain for sigma: points of one patch -> plane fitted along the view rays -> residual of each point along its own
-ray -> standard deviation sigma -> chi-square interval. Sigma has n - 3 degrees of freedom, or fewer if the residuals
-correlate.
+ray -> standard deviation sigma, with n - 3 degrees of freedom.
 
 Signal chain for F: recovered points / possible points -> recovered fraction F -> binomial interval. The number of
 possible points is counted in pixels, computed from the calibrated pitch lambda, or measured on a matt-white reference.
@@ -22,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import betaincinv, gammaincinv
+from scipy.special import betaincinv
 
 Floats = NDArray[np.float64]
 
@@ -173,25 +172,6 @@ def _robust_sigma(residual: Floats, present: NDArray[np.bool_]) -> Floats:
 
     centred = np.abs(residual - masked_median(residual)[..., None])
     return np.asarray(_MAD_TO_SIGMA * masked_median(centred))
-
-
-def sigma_interval(sigma: ArrayLike, degrees: ArrayLike, confidence: float = 0.95) -> tuple[Floats, Floats]:
-    """Return the interval of a standard deviation for Gaussian noise: nu s^2 / chi^2 at both quantiles.
-
-    Parameters
-    ----------
-    sigma, degrees
-        s [mm], unbiased in s^2, and its degrees of freedom nu, which need not be whole
-        (:func:`characterisation.coupon.residual_field.plane_degrees`). The interval is NaN where nu is not positive.
-    confidence
-        Confidence of the interval, 0..1.
-    """
-    sigma, degrees = np.asarray(sigma, float), np.asarray(degrees, float)
-    nu = np.where(degrees > 0, degrees, np.nan)
-    tail = (1.0 - confidence) / 2.0
-    # chi^2 with nu degrees of freedom is twice a gamma variate of shape nu / 2
-    low, high = (sigma * np.sqrt(nu / (2.0 * gammaincinv(nu / 2.0, p))) for p in (1.0 - tail, tail))
-    return np.asarray(low), np.asarray(high)
 
 
 def recovered_fraction(

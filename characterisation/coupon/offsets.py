@@ -12,7 +12,7 @@ in common does not average out. For features that are large against the correlat
 
 Sigma refers to the patch's own plane, and fitting this plane removes part of a correlated field. Let the field have the
 correlation exp(-pi h^2 / a). The plane fit leaves the share kappa(a) = tr(M C) / (m - 3) of its variance. Here M = 1 -
-H, with the hat matrix H of a plane (:mod:`characterisation.coupon.residual_field`). Hence A = a / kappa(a), and A
+H, with the hat matrix H of a plane. Hence A = a / kappa(a), and A
 determines the area a of the field itself and its correlation length.
 
 K_2 is the covariance of patches that lie 2 to 4 diameters apart, and does not average out. At this distance, errors of

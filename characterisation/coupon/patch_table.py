@@ -67,12 +67,10 @@ def overall(patches: xr.Dataset) -> Overall:
 
 
 _COLUMNS_BY_UNIT = {
-    "mm": "ray_noise_std standard_error ray_noise_robust ray_noise_inliers ray_noise_corrected sigma_low sigma_high "
-    "distance semi_major semi_minor ray_offset",
+    "mm": "ray_noise_std standard_error ray_noise_robust ray_noise_inliers distance semi_major semi_minor ray_offset",
     "mm2": "offset_product_touching offset_product_apart",
     "rad": "incidence off_axis included_angle",
-    "px": "correlation_length correlation_length_pooled row column",
-    "px2": "correlation_area_pooled",
+    "px": "row column",
 }
 
 _UNITS = {name: unit for unit, names in _COLUMNS_BY_UNIT.items() for name in names.split()}

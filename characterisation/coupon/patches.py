@@ -25,17 +25,14 @@ from numpy.typing import NDArray
 
 from characterisation.coupon.discs import disc_offsets, independent_share
 from characterisation.coupon.metrics import (
-    RayNoise,
     clipped,
     density_fraction,
     ray_noise_std,
     recovered_fraction,
     reference_fraction,
-    sigma_interval,
 )
 from characterisation.coupon.offsets import known_offset, neighbour_products
 from characterisation.coupon.patch_table import patch_table
-from characterisation.coupon.residual_field import disc_autocorrelation, disc_lengths, disc_residuals, plane_degrees
 from characterisation.coupon.view_frame import in_view_frame
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import FALSE_SHARE_OF_DISTANCE, PointCloud, ViewGrid
@@ -142,13 +139,8 @@ def measure_patches(
         pixels), ``fraction_clipped`` (excess over 1 before F was limited to 1), ``points``, ``points_possible``,
         ``false_fraction`` (points that are not on the coupon, over the pixels of the disc).
 
-        Sigma: ``ray_noise_std`` [mm], its ``standard_error``, ``ray_noise_robust``, ``ray_noise_inliers``,
-        ``outlier_share``; ``ray_noise_corrected`` [mm], of the inliers, corrected for the correlated noise that the
-        plane fit removes; ``sigma_degrees``, its effective degrees of freedom; ``sigma_low`` and ``sigma_high``, its 95
-        % interval.
-
-        Correlation of the residuals: ``correlation_length`` [px] of the patch, ``correlation_length_pooled`` [px] and
-        ``correlation_area_pooled`` [px^2] of all patches of the cloud (the same in every row).
+        Sigma: ``ray_noise_std`` [mm], its ``standard_error`` for independent noise, ``ray_noise_robust``,
+        ``ray_noise_inliers``, ``outlier_share``.
 
         Offsets: ``ray_offset`` [mm], mean distance of the inliers along their rays from the known surface, and its mean
         products with the offsets of neighbours, ``offset_product_touching`` and ``offset_product_apart`` [mm^2]
@@ -213,7 +205,6 @@ def measure_patches(
         ray_noise_robust=noise.robust,
         ray_noise_inliers=noise.inlier_sigma,
         outlier_share=noise.outlier_share,
-        **_correlated(noise, radius_px),
         ray_offset=offset,
         offset_product_touching=touching,
         offset_product_apart=apart,
@@ -317,22 +308,4 @@ def _ellipses(
         "semi_minor": minor,
         "area_per_pixel": major * minor / radius_px**2,
         "included_angle": 2.0 * semi_axes(rays)[0],
-    }
-
-
-def _correlated(noise: RayNoise, radius_px: float) -> dict[str, Floats]:
-    """Return the columns that depend on the correlation of neighbouring residuals."""
-    field = disc_residuals(noise.inlier_residual, radius_px)
-    rho = disc_autocorrelation(field)
-    degrees, kept = plane_degrees(field, rho)
-    sigma = noise.inlier_sigma / np.sqrt(kept)
-    low, high = sigma_interval(sigma, degrees)
-    return {
-        "ray_noise_corrected": sigma,
-        "sigma_degrees": degrees,
-        "sigma_low": low,
-        "sigma_high": high,
-        "correlation_length": disc_lengths(field, sigma**2, rho),
-        "correlation_length_pooled": np.full(len(sigma), rho.length()),
-        "correlation_area_pooled": np.full(len(sigma), rho.area()),
     }

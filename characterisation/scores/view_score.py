@@ -21,7 +21,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from characterisation.files.atomic_io import atomic_write
-from characterisation.tasks.evaluation import Task
+from characterisation.tasks.task_file import Task
 
 Floats = NDArray[np.floating[Any]]
 

@@ -33,40 +33,11 @@ from characterisation.features.robust_fit import FitError, UndeterminedError
 from characterisation.features.surfaces import Surface
 from characterisation.files.errors import InputError, nearest
 from characterisation.point_cloud import PointCloud
-from characterisation.tasks.definitions import (
-    DEFINITIONS,
-    axis_angle,
-    axis_distance,
-    intersection_distance,
-    plane_axis_angle,
-    radius,
-)
+from characterisation.tasks.definitions import DEFINITIONS
 from characterisation.tasks.deviations import deviations, fold_of
 from characterisation.tasks.places import intersection, mid_plane
 from characterisation.tasks.result import Result, failed
 from characterisation.tasks.task_file import DERIVED, Feature, Measurement, Task
-from characterisation.tasks.task_reading import check_features, read_task
-
-__all__ = [
-    "DEFINITIONS",
-    "Estimate",
-    "Feature",
-    "InputQuantity",
-    "Measurement",
-    "MeasurementModel",
-    "Task",
-    "axis_angle",
-    "axis_distance",
-    "check_features",
-    "evaluate",
-    "fit_features",
-    "intersection_distance",
-    "measure",
-    "measurement_model",
-    "plane_axis_angle",
-    "radius",
-    "read_task",
-]
 
 Array = NDArray[np.float64]
 
@@ -193,46 +164,13 @@ def _resolved(feature: Feature, name: str, fits: Mapping[str, Any]) -> Any:
     return fits[name].on_moved_plane(fits[plane])
 
 
-def fit_features(
-    cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimum_points: int = 100
-) -> dict[str, Fit | FitError]:
-    """Fit every feature of a task except derived ones, seen from the origin of the cloud's grid.
-
-    Shapes are fitted to their points in the labelled cloud, without points too far from the nominal surface
-    (:func:`characterisation.features.fits.belonging`). Circles and points of edges are fitted to the places where the
-    points of their plane end (:mod:`characterisation.features.edges`).
-
-    A feature that cannot be fitted has a :class:`FitError` in place of a fit. This holds for a shape with fewer than
-    ``minimum_points`` points or less than a quarter of the recovered points near it, and for a fit that is not credible
-    (:mod:`characterisation.features.credibility`): undetermined, or farther from nominal than the surface could be.
-
-    Parameters
-    ----------
-    cloud
-        Organised cloud with the labels of the task's shapes.
-    task
-        Features and their nominal geometry.
-    sensor_from_part
-        (4, 4) places the nominal geometry, from which cylinders, cones and figures start.
-    minimum_points
-        Least number of points of a shape.
-
-    Raises
-    ------
-    InputError
-        If the cloud has no label with the name of a shape.
-
-    See Also
-    --------
-    measure : the measurements from these fits
-    """
-    return _fits(cloud, task, sensor_from_part, _selected(cloud, task, sensor_from_part, minimum_points))
-
-
 def _fits(
     cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, selected: Mapping[str, _Selected]
 ) -> dict[str, Fit | FitError]:
-    """Fit every feature of a task once: shapes to their selected points, then the figures in their planes."""
+    """Fit every feature of a task once: shapes to their selected points, then the figures in their planes.
+
+    A feature that cannot be fitted has a :class:`FitError` in place of a fit. Derived features have none.
+    """
     fits: dict[str, Fit | FitError] = {}
     for name, one in selected.items():
         try:
@@ -297,9 +235,13 @@ def _points(selected: _Selected) -> Array:
 def measure(
     cloud: PointCloud, task: Task, sensor_from_part: ArrayLike, minimum_points: int = 100, propagated: bool = True
 ) -> dict[str, Result]:
-    """Evaluate all measurements of a task in one labelled cloud.
+    """Evaluate all measurements of a task in one labelled cloud, seen from the origin of its grid.
 
-    Each feature is fitted once for all measurements, as by :func:`fit_features`.
+    Each feature is fitted once. Shapes are fitted to their points in the labelled cloud, without points too far from
+    the nominal surface (:func:`characterisation.features.fits.belonging`); circles and points of edges to the places
+    where the points of their plane end (:mod:`characterisation.features.edges`). A measurement has no value if a shape
+    has fewer than ``minimum_points`` points, or less than a quarter of the recovered points near it, or if a fit is not
+    credible (:mod:`characterisation.features.credibility`).
 
     Parameters
     ----------

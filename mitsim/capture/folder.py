@@ -35,7 +35,7 @@ from mitsim.capture.capture import DERIVED_UNITS, Capture
 from mitsim.capture.capture_document import SCHEMA_VERSION, CaptureDocument, FileEntry
 from mitsim.capture.decoding import read_settings
 from mitsim.capture.npy import decode_npy
-from mitsim.capture.packed_files import SAFE_NAME, check_image, files_of, packed
+from mitsim.capture.packed_files import SAFE_NAME, check_image, packed
 from mitsim.sensor.png import decode_png
 from mitsim.sensor.transforms import Transform
 
@@ -120,7 +120,7 @@ def is_written(capture: Capture, folder: str | Path, vendor: Mapping[str, bytes]
     folder = Path(folder).absolute()
     if not (folder / "capture.json").is_file():
         return False
-    files = files_of(capture, {("vendor", name): data for name, data in (vendor or {}).items()}, folder)
+    files = packed(capture, folder, vendor=vendor)
     own_index = json.loads(files["capture.json"])
     found_index = _read_index(folder)[0].model_dump(mode="json")
     paths = [{entry["path"]: entry["sha256"] for entry in index["files"]} for index in (own_index, found_index)]

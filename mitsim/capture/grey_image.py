@@ -55,18 +55,18 @@ def is_colour(path: Path) -> bool:
     return False
 
 
-def read_grey(path: Path, *, green: bool = False, channel: int | None = None) -> Image:
+def read_grey(path: Path, *, channel: int | None = None) -> Image:
     """Read a grey image (H, W), uint8 or uint16.
 
-    A colour image is read only if its colour channels are equal, or if one is selected. ``channel`` selects it by
-    number (:data:`CHANNELS`); ``green`` selects the green channel.
+    A colour image is read only if its colour channels are equal, or if ``channel`` selects one by its number
+    (:data:`CHANNELS`).
 
     Raises
     ------
     InputError
         If the file cannot be read, is not an image, or has channels that differ.
     """
-    return decode_grey(_bytes_of(path), path, green=green, channel=channel)
+    return decode_grey(_bytes_of(path), path, channel=channel)
 
 
 def read_depths(path: Path) -> NDArray[Any]:
@@ -89,7 +89,7 @@ def _bytes_of(path: Path) -> bytes:
     return data
 
 
-def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel: int | None = None) -> Image:
+def decode_grey(data: bytes, where: str | Path, *, channel: int | None = None) -> Image:
     """Read a grey image from the bytes of a file, as :func:`read_grey` does.
 
     Parameters
@@ -98,8 +98,6 @@ def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel:
         Content of the file.
     where
         Name of the file in messages.
-    green
-        Whether to take the green channel of a colour image.
     channel
         Number of the channel to take of a colour image (:data:`CHANNELS`).
 
@@ -112,7 +110,7 @@ def decode_grey(data: bytes, where: str | Path, *, green: bool = False, channel:
     --------
     read_grey : from a file
     """
-    return _checked(_decoded(data, where, CHANNELS["green"] if green else channel), where)
+    return _checked(_decoded(data, where, channel), where)
 
 
 def _decoded(data: bytes, where: str | Path, channel: int | None) -> NDArray[Any]:

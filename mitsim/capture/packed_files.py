@@ -40,7 +40,7 @@ def packed(
     vendor: Mapping[str, bytes] | None = None,
     truth: Mapping[str, bytes] | None = None,
 ) -> dict[str, bytes]:
-    """Return the bytes of every file of a capture's folder, by path in the folder.
+    """Return the bytes of every file of a capture's folder, by path in the folder, ``capture.json`` last.
 
     Parameters
     ----------
@@ -56,27 +56,11 @@ def packed(
     Raises
     ------
     InputError
-        If something in the capture cannot be written to a file.
-
-    See Also
-    --------
-    files_of : with further files by role and name
+        If something in the capture cannot be written to a file, or the file could not be read back.
     """
+    folder = Path(folder)
     extra = {("vendor", name): data for name, data in (vendor or {}).items()}
     extra |= {("truth", f"{camera}.exr"): data for camera, data in (truth or {}).items()}
-    return files_of(capture, extra, Path(folder))
-
-
-def files_of(capture: Capture, extra: Mapping[tuple[str, str], bytes], folder: Path) -> dict[str, bytes]:
-    """Return the bytes of every file of the folder, by path, ``capture.json`` last.
-
-    ``extra`` are further files by role and name.
-
-    Raises
-    ------
-    InputError
-        If a file could not be read back.
-    """
     calibration = calibration_table(capture.rig)
     pose = pose_table(capture.world_from_sensor, capture.pose_covariance)
     validate(folder / "calibration.json", calibration, CalibrationDocument)

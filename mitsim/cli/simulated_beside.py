@@ -17,8 +17,9 @@ from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
 from characterisation.tasks.result import Result, failed
-from mitsim.decoding.measured_document import aligned, number_with_decimals, uncertainty_text
+from mitsim.decoding.measured_document import number_with_decimals, uncertainty_text
 from mitsim.running.progress import say
+from mitsim.running.text_table import aligned
 
 
 @dataclass(frozen=True)
@@ -122,4 +123,4 @@ def beside_table(recorded: Sequence[Result], simulated: Sequence[Result], sensor
         )
         reason = one.reason or other.reason
         rows[-1] += [f"not possible: {reason}"] if reason else []
-    return aligned(rows)
+    return "\n".join(aligned(rows))

@@ -31,7 +31,7 @@ from mitsim.decoding.decoder_registry import (
     technology_of,
 )
 from mitsim.decoding.device_maps import DeviceMapGeometry, roi_of_other_grid
-from mitsim.decoding.exposures import merge_exposures
+from mitsim.decoding.exposures import MERGED_FULL_SCALE, merge_exposures
 from mitsim.decoding.grey_levels import MeasuredNoise
 from mitsim.decoding.grid_cloud import empty_cloud
 from mitsim.sensor.decoder_settings import DecoderSettings, DeviceMapSettings
@@ -322,19 +322,18 @@ def _merged_exposures(
     """Return merged images of each camera, 0 where they were not read out, and their full scale [DN]."""
     full_scale = 2**capture.bits - 1
     merged: dict[str, NDArray[np.unsignedinteger[Any]]] = {}
-    scale = 65535.0
     for name, stack in capture.images.items():
         if len(stack) % len(exposures):
             where = f"capture of {capture.sensor}"
             raise InputError(where, "images", f"{len(stack)} of {name}", f"a multiple of {len(exposures)} exposures")
         region = read_out.get(name, Roi.whole(stack.shape[2], stack.shape[1])).slices
-        result = merge_exposures(
+        levels = merge_exposures(
             stack.reshape(len(exposures), -1, *stack.shape[1:])[:, :, *region],
             exposures,
             capture.decoding.black_level_dn,
             full_scale,
             capture.decoding.gamma,
         )
-        merged[name] = np.zeros((len(stack) // len(exposures), *stack.shape[1:]), result.levels.dtype)
-        merged[name][:, *region], scale = result.levels, float(result.full_scale)
-    return merged, scale
+        merged[name] = np.zeros((len(stack) // len(exposures), *stack.shape[1:]), levels.dtype)
+        merged[name][:, *region] = levels
+    return merged, float(MERGED_FULL_SCALE)

@@ -22,8 +22,6 @@ that is saturated in the shortest exposure is saturated in the result.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,30 +32,8 @@ from characterisation.files.errors import InputError
 _FADE = (0.8, 0.95)
 
 
-@dataclass(frozen=True)
-class MergedExposures:
-    """Images with a linear 16-bit scale that ends where the shortest exposure saturates.
-
-    Attributes
-    ----------
-    levels
-        (P, H, W) [merged DN].
-    saturated
-        (P, H, W); in ``levels`` these pixels have the value ``full_scale``.
-    black_level, full_scale
-        Level without light, which is included in ``levels``, and level of saturation [merged DN].
-    scale
-        Merged DN per grey level of the shortest exposure's linear response.
-    exposure_s
-        The shortest exposure [s], to which the levels refer.
-    """
-
-    levels: NDArray[np.uint16]
-    saturated: NDArray[np.bool_]
-    black_level: float
-    full_scale: int
-    scale: float
-    exposure_s: float
+#: level of saturation of merged images [merged DN]
+MERGED_FULL_SCALE = 65535
 
 
 def merge_exposures(
@@ -66,8 +42,11 @@ def merge_exposures(
     black_level: float,
     full_scale: int,
     gamma: float = 1.0,
-) -> MergedExposures:
-    """Merge exposures of the same images.
+) -> NDArray[np.uint16]:
+    """Return images (P, H, W) [merged DN] merged from exposures, with the linear response of the shortest one.
+
+    A pixel that is saturated in the shortest exposure has :data:`MERGED_FULL_SCALE`. The level without light is in the
+    same ratio to it as ``black_level`` to ``full_scale``.
 
     Parameters
     ----------
@@ -101,10 +80,9 @@ def merge_exposures(
 
     shortest = int(np.argmin(times))
     signal, weight = _tables(largest, black_level, full_scale, gamma)
-    black = black_level * 65535 / full_scale
-    scale = (65535 - black) / (full_scale - black_level)
+    black = black_level * MERGED_FULL_SCALE / full_scale
+    scale = (MERGED_FULL_SCALE - black) / (full_scale - black_level)
     levels = np.empty(stack.shape[1:], np.uint16)
-    saturated = stack[shortest] >= full_scale
     weighted = weight * signal
     for image in range(stack.shape[1]):
         weighted_sum, weight_sum = signal[stack[shortest, image]], np.full(stack.shape[2:], times[shortest], np.float32)
@@ -116,10 +94,10 @@ def merge_exposures(
         weighted_sum /= weight_sum
         weighted_sum += np.float32(black)
         np.rint(weighted_sum, out=weighted_sum)
-        np.clip(weighted_sum, 0, 65535, out=weighted_sum)
+        np.clip(weighted_sum, 0, MERGED_FULL_SCALE, out=weighted_sum)
         levels[image] = weighted_sum
-        levels[image][saturated[image]] = 65535
-    return MergedExposures(levels, saturated, black, 65535, scale, float(times[shortest]))
+        levels[image][stack[shortest, image] >= full_scale] = MERGED_FULL_SCALE
+    return levels
 
 
 def _tables(

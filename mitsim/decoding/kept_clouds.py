@@ -1,6 +1,6 @@
 """Keep decoded clouds between commands, so that several measurements of one capture decode it once.
 
-Signal chain: files of the capture, settings of the decoder, source text of the decoder -> SHA-256 -> cloud file of that
+Signal chain: files of the capture, settings of the decoder, build of mitsim -> SHA-256 -> cloud file of that
 name in the user's cache folder, read if it is there and whole, else written after decoding.
 
 The folder is ``mitsim/clouds`` in ``$XDG_CACHE_HOME`` or ``~/.cache``. ``MITSIM_CACHE`` names another one; if it is
@@ -15,14 +15,13 @@ import os
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 
-import mitsim
 from characterisation.cloud_files import read_cloud, write_cloud
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud
 from mitsim.capture.recordings.recording_files import MOST_FILES
+from mitsim.running.build import own_build
 
 #: clouds that are kept
 MOST_CLOUDS = 20
@@ -75,7 +74,7 @@ def _folder() -> Path | None:
 
 def _digest(path: Path, settings: Iterable[object]) -> str | None:
     """Return the SHA-256 of everything that determines a cloud; None if the files are too many, too large or gone."""
-    sha = hashlib.sha256(_source_digest().encode())
+    sha = hashlib.sha256(repr(own_build()).encode())
     for one in settings:
         sha.update(repr(one).encode())
     files = [path] if path.is_file() else sorted(one for one in path.rglob("*") if one.is_file())
@@ -88,17 +87,6 @@ def _digest(path: Path, settings: Iterable[object]) -> str | None:
                 sha.update(hashlib.file_digest(stream, "sha256").digest())
     except OSError:
         return None
-    return sha.hexdigest()
-
-
-@cache
-def _source_digest() -> str:
-    """Return the SHA-256 of the source of mitsim that turns images into clouds."""
-    root = Path(mitsim.__file__).parent
-    sha = hashlib.sha256()
-    for room in ("capture", "decoding", "sensor"):
-        for file in sorted((root / room).rglob("*.py")):
-            sha.update(file.read_bytes())
     return sha.hexdigest()
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from characterisation.tasks.result import NOT_INCLUDED, Repeatability, Result
 from mitsim.running.numbers import or_none
+from mitsim.running.text_table import aligned
 from mitsim.running.version import __version__
 
 #: significant digits of an uncertainty. A value has as many decimals as its uncertainty, at least 3 and at most 6
@@ -28,7 +29,7 @@ def result_table(results: Sequence[Result]) -> str:
             row += [_number_text(one.nominal), number_with_decimals(one.error, one.uncertainty)]
         row += [points] + ([_number_text(one.bias)] if corrected else [])
         rows.append(row + ([f"not possible: {one.reason}"] if not one.possible else []))
-    return aligned(rows)
+    return "\n".join(aligned(rows))
 
 
 def repeatability_table(found: Sequence[Repeatability]) -> str:
@@ -49,7 +50,7 @@ def repeatability_table(found: Sequence[Repeatability]) -> str:
                 *([number_with_decimals(one.mean - one.nominal, one.deviation)] if nominal else []),
             ]
         )
-    return aligned(rows)
+    return "\n".join(aligned(rows))
 
 
 def result_tables(
@@ -149,15 +150,3 @@ def number_with_decimals(value: float, uncertainty: float) -> str:
 
 def _number_text(value: float) -> str:
     return f"{value:g}" if math.isfinite(value) else "-"
-
-
-def aligned(rows: list[list[str]]) -> str:
-    """Return rows of texts as a table; a last text beyond the columns of the first row is not aligned."""
-    columns = max(len(row) for row in rows)
-    widths = [
-        max((len(row[k]) for row in rows if k < len(row) - (len(row) > len(rows[0]))), default=0)
-        for k in range(columns)
-    ]
-    return "\n".join(
-        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=False)).rstrip() for row in rows
-    )

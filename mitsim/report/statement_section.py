@@ -10,7 +10,7 @@ import math
 from typing import Any
 
 from characterisation.plots.statements import GROUPS
-from characterisation.statements.losses import Loss, common_losses
+from characterisation.statements.losses import Loss, lost_features
 from characterisation.statements.statement import AT_THE_LIMIT, FAR_FROM_NOMINAL
 from mitsim.running.numbers import NONE, listed, percent, quantity, rounded
 from mitsim.study.statement_file import BudgetEntry, ExposureEntry, StatedMeasurement, StatementDocument
@@ -45,13 +45,10 @@ def statement_section(document: StatementDocument) -> dict[str, Any]:
             }.items()
         ],
         "missing": [one.model_dump() for one in document.influences if not one.included],
-        "losses": [
-            {"names": names, "count": count, "trials": trials, "reason": reason}
-            for names, count, trials, reason in common_losses(
-                (name, one.trials, [Loss(lost.reason, lost.count) for lost in one.losses])
-                for name, one in document.measurements.items()
-            )
-        ],
+        "losses": lost_features(
+            (name, one.trials, [Loss(lost.reason, lost.count) for lost in one.losses])
+            for name, one in document.measurements.items()
+        ),
         "at_limit": [name for name, one in document.measurements.items() if one.errors_of == AT_THE_LIMIT],
         "far": [name for name, one in document.measurements.items() if one.errors_of == FAR_FROM_NOMINAL],
         "unsettled": [name for name, one in document.measurements.items() if not one.settled],

@@ -8,7 +8,9 @@ from collections.abc import Sequence
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     """Return the lines of a table with columns as wide as their widest cell and two spaces between columns.
 
-    All ``rows`` have the same number of cells; the first row is the header.
+    The first row is the header. A cell beyond its columns, such as a reason, widens no column.
     """
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    widths = [max(len(row[k]) for row in rows if len(row) > k) for k in range(len(rows[0]))]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, [*widths, 0], strict=False)).rstrip() for row in rows
+    ]

@@ -18,7 +18,8 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.maps.samples import Samples
 from characterisation.maps.shipped import map_path, shipped_maps
 from characterisation.statements.decision import needed, tolerance_of
-from characterisation.tasks.evaluation import Task, check_features, read_task
+from characterisation.tasks.task_file import Task
+from characterisation.tasks.task_reading import check_features, read_task
 from mitsim.maps.campaign.missing_finishes import (
     Ask,
     NeededFinishes,

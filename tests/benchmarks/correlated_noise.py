@@ -75,7 +75,7 @@ def main(map_file: str = SENSOR, repeats: int = 6) -> None:
         "predicted, correlated": lambda seed: predictor.predict(characterised, POSE, np.random.default_rng(seed), True),
         "predicted, independent": lambda seed: predictor.predict(characterised, POSE, np.random.default_rng(seed)),
     }
-    print(f"{'':24s}{'points':>7s}{'sigma mm':>10s}{'length px':>11s}{'area px2':>10s}", end="")
+    print(f"{'':24s}{'points':>7s}{'sigma mm':>10s}{'length px':>11s}", end="")
     print("".join(f"{f'rho({lag})':>8s}" for lag in LAGS) + f"{'plane mm':>10s}")
     for name, cloud in ways.items():
         rows, rhos = [], []
@@ -84,12 +84,12 @@ def main(map_file: str = SENSOR, repeats: int = 6) -> None:
             rho = autocorrelation(field, 16)
             row, column = np.nonzero(np.isfinite(field))
             part = field[row.min() : row.max() + 1, column.min() : column.max() + 1]
-            rows.append([np.isfinite(part).sum(), np.nanstd(part), rho.length(), rho.area(), plane])
-            length, along, _ = rho.radial()
+            rows.append([np.isfinite(part).sum(), np.nanstd(part), rho.length(), plane])
+            length, along = rho.radial()
             rhos.append(np.interp(LAGS, length, along))
-        count, sigma, length, area, _ = np.mean(rows, axis=0)
-        off = np.sqrt(np.mean(np.array(rows)[:, 4] ** 2))
-        print(f"{name:24s}{count:7.0f}{sigma:10.3f}{length:11.2f}{area:10.1f}", end="")
+        count, sigma, length, _ = np.mean(rows, axis=0)
+        off = np.sqrt(np.mean(np.array(rows)[:, 3] ** 2))
+        print(f"{name:24s}{count:7.0f}{sigma:10.3f}{length:11.2f}", end="")
         print("".join(f"{value:8.2f}" for value in np.mean(rhos, axis=0)) + f"{off:10.3f}")
 
 

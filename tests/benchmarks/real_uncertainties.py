@@ -1,6 +1,7 @@
 """Stated uncertainties against real recordings: pitch of plates of dots, and noise that does not average out.
 
 python tests/benchmarks/real_uncertainties.py FOLDER_OF_RECORDINGS
+python tests/benchmarks/real_uncertainties.py --twin RECORDED_CAPTURE SIMULATED_CAPTURE
 
 Plates: rigs are drawn from the covariance of the preset's calibration and the default drift, about the rig of the
 recording; ideal dots go through the drawn rig and come back through the recorded one, as the decoder works. Their pitch
@@ -8,7 +9,8 @@ is the statement, with the scatter of the dots; the print of the plate is not in
 
 Planes: the mean of a square cell of n pixels scatters by sigma sqrt(A / n), and less the mean of its four neighbours by
 sqrt(5 / 4) as much; the difference knows nothing of a bend, and nothing of what neighbours share. Sigma and A are those
-of the map that comes with the preset, and once more with the sigma of the recording itself.
+of the map that comes with the preset, and once more with the sigma of the recording itself. With ``--twin``, the same
+of a recorded capture and its twin by ``mitsim compare``, decoded by the settings of the recording.
 """
 
 from __future__ import annotations
@@ -28,9 +30,10 @@ from characterisation.maps.shipped import map_path
 from characterisation.point_cloud import PointCloud
 from characterisation.region_of_interest import Roi
 from mitsim.capture.capture import Capture
+from mitsim.capture.folder import read_capture
 from mitsim.capture.recordings.ensenso import read_ensenso
 from mitsim.decoding.cloud import capture_cloud, decoder_settings
-from mitsim.decoding.plate import Plate, image_on_grid, plate_dots, plate_scale
+from mitsim.decoding.plate import Plate, PlateDots, image_on_grid, plate_dots, plate_scale
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.drift import Drift, drift_modes
 from mitsim.sensor.preset import load_sensor
@@ -51,6 +54,12 @@ PLATES = (
 )
 #: side of a cell [px]; degree of the smooth surface that the sheet may have
 CELLS, DEGREE = (10, 20, 40), 3
+PLANE_HEADS = (
+    "| plane | cell [px] | cells | scatter [mm] | from the preset's map "
+    "| from the map's A and the recording's sigma |\n| --- | --- | --- | --- | --- | --- |"
+)
+#: part of the sheet that the twin shows, too
+TWIN_WINDOW = Roi(400, 290, 480, 300)
 
 
 def main(data: Path) -> None:
@@ -65,15 +74,22 @@ def main(data: Path) -> None:
     print("| " + " | ".join(heads) + " |\n" + "| --- " * len(heads) + "|")
     for cells in plates:
         print("| " + " | ".join(cells.get(head, "-") for head in heads) + " |")
-    print(
-        "\n| plane | cell [px] | cells | scatter [mm] | from the preset's map "
-        "| from the map's A and the recording's sigma |"
-    )
-    print("| --- | --- | --- | --- | --- | --- |")
+    print(f"\n{PLANE_HEADS}")
     sheet = read_ensenso(data / "ensenso" / "colorized_point_cloud" / "stereo.zip")
     settings, imager = decoder_settings(sheet)
     cloud = capture_cloud(sheet, settings, imager=imager)
     plane_rows("N35-604, sheet", cloud, baseline(sheet.rig), Roi(360, 270, 560, 340), "ensenso-n35")
+
+
+def twins(recorded: Path, simulated: Path) -> None:
+    """Print the rows of a recorded sheet and of its twin, in a window that both fill."""
+    np.seterr(all="ignore")
+    real = read_capture(recorded)
+    settings, imager = decoder_settings(real)
+    print(PLANE_HEADS)
+    for name, capture in (("recorded", real), ("its twin", read_capture(simulated))):
+        cloud = capture_cloud(capture, settings, imager=imager)
+        plane_rows(name, cloud, baseline(capture.rig), TWIN_WINDOW, "ensenso-n35")
 
 
 def baseline(rig: Rig) -> Floats:
@@ -92,7 +108,7 @@ def plate_cells(
     where = Roi(*(window or (0, 0, cloud.grid.width, cloud.grid.height)))
     dots = plate_dots(name, Plate(where, PITCH), cloud, image_on_grid(capture, cloud.grid))
     scale, scatter, _ = plate_scale(dots, PITCH)
-    parts = contributions(capture, preset, dots.centres)
+    parts, (axes, shear) = contributions(capture, preset, dots.centres), axes_of(dots)
     total = PITCH * float(np.sqrt(scatter**2 + sum(part**2 for part in parts.values())))
     pitch = scale * PITCH
     low, high = pitch - 1.96 * total, pitch + 1.96 * total
@@ -100,12 +116,24 @@ def plate_cells(
         "plate": name,
         "pitch [mm]": f"{pitch:.3f}",
         "error": f"{1e3 * (scale - 1):+.2f} per mille",
+        "along the axes [per mille]": f"{1e3 * axes[0]:+.2f}, {1e3 * axes[1]:+.2f}",
+        "shear [mrad]": f"{1e3 * shear:+.2f}",
         "dots [ppm]": f"{1e6 * scatter:.0f}",
         **{f"{key} [ppm]": f"{1e6 * part:.0f}" for key, part in parts.items()},
         "u [mm]": f"{total:.3f}",
         "95 % interval": f"{low:.3f} to {high:.3f}",
         "verdict": "holds" if low <= PITCH <= high else "misses",
     }
+
+
+def axes_of(dots: PlateDots) -> tuple[Floats, float]:
+    """Return the scales along the two rows of a plate's dots, relative to the print, and the rows' shear [rad]."""
+    found = dots.centres - dots.centres.mean(axis=0)
+    plane = found @ np.linalg.svd(found, full_matrices=False)[2][:2].T
+    printed = (dots.indices - dots.indices.mean(axis=0)) * PITCH
+    along = np.linalg.lstsq(printed, plane, rcond=None)[0]
+    scale = np.linalg.norm(along, axis=1)
+    return scale - 1, float(along[0] @ along[1] / np.prod(scale))
 
 
 def contributions(capture: Capture, preset: str, dots: Floats) -> dict[str, float]:
@@ -191,4 +219,7 @@ def plane_rows(name: str, cloud: PointCloud, across: Floats, window: Roi, preset
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    if sys.argv[1] == "--twin":
+        twins(Path(sys.argv[2]), Path(sys.argv[3]))
+    else:
+        main(Path(sys.argv[1]))

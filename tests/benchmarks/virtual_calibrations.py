@@ -35,6 +35,10 @@ SENSORS = (
     "photoneo-phoxi-s",
     "david-sls-3",
     "zivid-2-m70",
+    "zivid-2-plus-m60",
+    "zivid-2-plus-l110",
+    "zivid-2-plus-m130",
+    "xema",
     "kinect-v2",
 )
 FIGURES = {

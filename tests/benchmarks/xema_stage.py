@@ -240,7 +240,8 @@ def compare(capture_folder: str, predictions: dict[str, Any]) -> None:
     print("| all pixels | predicted | measured |\n|---|---|---|")
     for row in rows:
         print(f"| {' | '.join(row)} |")
-    print("\n| part | F | measured | reason | measured | sigma [mm] | measured |\n|---|---|---|---|---|---|---|")
+    heads = ["part", *(f"{name} {how}" for name in ("F", "reason", "sigma") for how in ("predicted", "measured"))]
+    print(f"\n| {' | '.join(heads)} |\n{'|---' * len(heads)}|")
     for part in [*predictions["cells"], *predictions["top"]]:
         where = TOP[int(part["where"][-1])] if part["where"].startswith("top") else cell(part["where"])
         lost = {reason: (status[where] == Status[reason]).mean() for reason in REASONS}

@@ -66,3 +66,19 @@ def test_intervals_hold_the_rig():
 def test_two_poses_are_too_few():
     with pytest.raises(InputError, match="3 or more"):
         calibrate_recorded(recorded(1, 2), BOARD, SIZES, "simulated")
+
+
+def test_a_lens_beyond_the_model_is_refused():
+    """Corners of an equidistant lens, up to 80 deg off the axis: no five coefficients fit them."""
+    wide, boards = Board(9, 7, 20.0, "glass"), []
+    for turn, away in [*((k, 0.0) for k in range(4)), *((k, 70.0) for k in range(6))]:
+        out = np.array([np.cos(turn), np.sin(turn)])
+        turned = Rotation.from_rotvec([0.5 * out[1], -0.5 * out[0], 0.0]).as_matrix()
+        place = Transform(turned, np.array([*(away * out), 60.0]))
+        points = place.points(wide.corners)
+        radius = np.hypot(points[:, 0], points[:, 1])
+        shown = 2000 * (np.arctan2(radius, points[:, 2]) / radius)[:, None] * points[:, :2]
+        boards.append(RecordedBoard(np.arange(len(points)), {"camera": shown + np.array([2999.5, 1999.5])}))
+    with pytest.raises(InputError, match=r"residuals of .* px") as caught:
+        calibrate_recorded(boards, wide, {"camera": (6000, 4000)}, "simulated")
+    assert "nan" not in str(caught.value)

@@ -36,7 +36,7 @@ def known_fit():
     zero = np.diag([1.0, -1.0, -1.0, 1.0])  # its face to the sensor
     zero[:3, 3] = [1.0, -2.0, 500.0]
     covariance = np.diag([1e-4, 1e-4, 0.02, 0.02] * 2 + [1e-4] * 3 + [0.02] * 3) ** 2
-    return BoardCalibration(axes, zero, covariance, np.empty((0, 6)), 1.0, 0)
+    return BoardCalibration(axes, zero, covariance, np.empty((0, 6)))
 
 
 def standing(journal):

@@ -8,10 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from characterisation.features.surfaces import Plane
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
-from characterisation.stage.calibration import BoardCalibration, CouponCalibration
+from characterisation.stage.calibration import BoardCalibration
 from characterisation.stage.turning_axes import TurningAxes
 from mitsim.maps.campaign.stage_pose import StageTable, read_stage_calibration, write_stage_calibration
 from mitsim.sensor.transforms import Transform
@@ -29,7 +28,7 @@ ANGLES = np.radians([17.0, -23.0])
 def board(rng):
     zero = Transform.from_degrees([4.0, -6.0, 10.0], [-20.0, 30.0, 505.0]).matrix()
     spread = rng.normal(size=(14, 14)) * np.array([2e-4, 2e-4, 0.05, 0.05] * 2 + [3e-4] * 3 + [0.08] * 3)
-    return BoardCalibration(AXES, zero, spread.T @ spread, np.empty((0, 6)), 1.0, 30)
+    return BoardCalibration(AXES, zero, spread.T @ spread, np.empty((0, 6)))
 
 
 def table(**changes):
@@ -57,7 +56,7 @@ def test_the_covariance_of_the_pose_is_that_of_numbers(board, tmp_path):
         zero = board.zero_pose.copy()
         zero[:3, :3] = Rotation.from_rotvec(parameters[8:11]).as_matrix() @ zero[:3, :3]
         zero[:3, 3] += parameters[11:]
-        moved = BoardCalibration(AXES.moved(parameters[:8]), zero, board.covariance, board.residuals, 1.0, 1)
+        moved = BoardCalibration(AXES.moved(parameters[:8]), zero, board.covariance, board.residuals)
         return np.linalg.inv(moved.poses(ANGLES[None])[0] @ ON_BOARD.matrix())
 
     columns, at = [], world(np.zeros(14))
@@ -69,21 +68,6 @@ def test_the_covariance_of_the_pose_is_that_of_numbers(board, tmp_path):
     known = jacobian @ board.covariance @ jacobian.T
     scale = np.sqrt(np.outer(np.diag(known), np.diag(known)))
     assert (np.abs(stated - known) < 1e-5 * scale).all()
-
-
-def test_a_calibration_with_a_coupon_is_completed_by_its_middle(tmp_path):
-    normal = np.array([0.1, -0.05, -1.0]) / np.linalg.norm([0.1, -0.05, -1.0])
-    plane = Plane(np.array([0.0, 0.0, 500.0]), normal)
-    fit = CouponCalibration(AXES, plane, np.eye(11), np.empty((0, 3)), 1.0, 9)
-    with pytest.raises(InputError, match="only its plane was found"):
-        write_stage_calibration(tmp_path / "stage.json", fit, ["pan", "tilt"])
-    write_stage_calibration(tmp_path / "stage.json", fit, ["pan", "tilt"], centre=[12.0, 7.0, 503.0])
-    read = read_stage_calibration(tmp_path / "stage.json")
-    pose = read.sensor_from_coupon([0.0, 0.0])
-    assert np.allclose(pose.rotation[:, 2], normal)
-    assert abs((pose.translation - plane.point) @ normal) < 1e-9
-    assert np.allclose(np.cross(pose.translation - [12.0, 7.0, 503.0], normal), 0, atol=1e-9)
-    assert read.world_covariance(ANGLES) is None
 
 
 def test_the_planned_stage_shows_the_normals_that_the_calibrated_one_has(board, tmp_path):
@@ -141,7 +125,7 @@ def test_a_damaged_calibration_is_refused_or_read(data, tmp_path_factory):
     """Cut at any place, any byte changed: a message that names the file, or a calibration; never a
     traceback."""
     folder = tmp_path_factory.getbasetemp()
-    known = BoardCalibration(AXES, np.eye(4), np.eye(14), np.empty((0, 6)), 1.0, 1)
+    known = BoardCalibration(AXES, np.eye(4), np.eye(14), np.empty((0, 6)))
     file = folder / "fuzzed.json"
     write_stage_calibration(file, known, ["pan", "tilt"])
     text = bytearray(file.read_bytes())
@@ -169,7 +153,7 @@ def test_a_damaged_calibration_is_refused_or_read(data, tmp_path_factory):
     ],
 )
 def test_a_calibration_that_makes_no_sense_is_named(tmp_path, change, words):
-    known = BoardCalibration(AXES, np.eye(4), np.eye(14), np.empty((0, 6)), 1.0, 1)
+    known = BoardCalibration(AXES, np.eye(4), np.eye(14), np.empty((0, 6)))
     file = tmp_path / "stage.json"
     write_stage_calibration(file, known, ["pan", "tilt"])
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))

@@ -428,7 +428,8 @@ NPY = encode_npy(np.arange(24, dtype=np.float32).reshape(4, 2, 3))
 
 
 def test_an_array_comes_back():
-    for values in (np.arange(6, dtype=np.uint16).reshape(2, 3), np.full((3, 2, 3), np.nan, np.float32)):
+    by_columns = np.arange(6, dtype=np.int16).reshape(2, 3).T
+    for values in (np.arange(6, dtype=np.uint16).reshape(2, 3), np.full((3, 2, 3), np.nan, np.float32), by_columns):
         np.testing.assert_array_equal(decode_npy(encode_npy(values), "x"), values)
 
 
@@ -449,10 +450,9 @@ def test_a_damaged_array_is_refused_or_has_its_size(at, flip, cut):
     [
         (np.zeros((2, 2)), "dtype: found <f8"),
         (np.zeros((2, 2), ">u2"), "dtype: found >u2"),
-        (np.zeros((2, 3), np.float32).T, "C|by columns"),
         (np.zeros(4, np.float32), "shape"),
         (np.zeros((1, 0), np.uint8), "shape"),
-        (np.array([[None]]), r"dtype: found \|O"),
+        (np.array([[None]]), "unreadable.*Object arrays"),
     ],
 )
 def test_other_arrays_are_refused(values, message):

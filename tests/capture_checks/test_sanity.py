@@ -17,7 +17,8 @@ from mitsim.capture.decoding import Decoding
 from mitsim.decoding import coded_images
 from mitsim.decoding.checks import sanity
 from mitsim.decoding.checks.checked_cloud import checked_cloud
-from mitsim.decoding.checks.pair_sanity import Findings, measured_row_error, row_error_warnings
+from mitsim.decoding.checks.pair_sanity import Findings, row_error_warnings
+from mitsim.decoding.checks.row_texture import measured_row_error
 from mitsim.decoding.checks.sanity import code_findings, row_error_in_words, with_warnings
 from mitsim.decoding.cloud import capture_cloud
 from mitsim.decoding.coded_images import CodedImages

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from characterisation.statements.losses import Loss, common_losses, losses
+from characterisation.statements.losses import Loss, LostFeature, losses, lost_features
 
 
 def test_reasons_that_differ_in_numbers_are_one_kind_with_their_range():
@@ -34,11 +34,24 @@ def test_any_texts_are_counted_once_each(reasons):
     assert [one.count for one in found] == sorted((one.count for one in found), reverse=True)
 
 
-def test_measurements_that_are_lost_together_have_one_entry():
-    pin, plane = Loss("pin: 3 points", 5), Loss("plane: 7 points", 5)
-    found = common_losses([("radius", 20, [pin]), ("angle", 20, [pin, plane]), ("height", 30, [plane])])
-    assert found == [
-        (["radius", "angle"], 5, 20, "pin: 3 points"),
-        (["angle"], 5, 20, "plane: 7 points"),
-        (["height"], 5, 30, "plane: 7 points"),
+def test_a_feature_has_one_entry_with_all_its_measurements_and_reasons():
+    few, bent, plane = Loss("pin: 3 points", 5), Loss("pin: too far", 2), Loss("plane: 7 points", 4)
+    found = lost_features(
+        [
+            ("radius", 20, [few, bent]),
+            ("angle", 20, [few, plane]),
+            ("height", 30, [plane, Loss("an axis lies in a plane", 1)]),
+        ]
+    )
+    assert found == (
+        LostFeature("pin", ("radius", "angle"), 7, 20, (Loss("3 points", 5), Loss("too far", 2))),
+        LostFeature("plane", ("angle",), 4, 20, (Loss("7 points", 4),)),
+        LostFeature("plane", ("height",), 4, 30, (Loss("7 points", 4),)),
+        LostFeature("", ("height",), 1, 30, (Loss("an axis lies in a plane", 1),)),
+    )
+    assert [one.in_words() for one in found] == [
+        "7 of 20: pin (radius, angle): 3 points (5 times; 1 other reason)",
+        "4 of 20: plane (angle): 7 points",
+        "4 of 30: plane (height): 7 points",
+        "1 of 30 (height): an axis lies in a plane",
     ]

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.ndimage import gaussian_filter
 
 from characterisation.coupon.discs import disc_offsets
 from characterisation.coupon.metrics import density_fraction
@@ -236,31 +235,6 @@ def test_overlapping_patches_say_how_much_each_is_worth(rng):
     # what is independent is about the area that they cover, in discs; gaps between discs apart are 30 %
     assert 1 < dense.independent_share.sum() / apart.sizes["patch"] < 2.5
     assert dense.independent_share.max() < 0.5
-
-
-def test_the_columns_of_correlated_noise_give_sigma_back(rng):
-    """Noise with a correlation length of 2 px: n - 3 degrees understate sigma by 11 %, and its interval by half."""
-    coupon = coupon_at([0, 0, 600], tilted(30, 40), 220, 220)
-    impulse = np.zeros((65, 65))
-    impulse[32, 32] = 1
-    gain = np.sqrt((gaussian_filter(impulse, 1.0) ** 2).sum())
-    noise = 0.3 * gaussian_filter(rng.normal(size=(480, 752)), 1.0) / gain
-    ideal = ideal_cloud(coupon)
-    points = (ideal.points + noise[..., None] * GRID.rays()).astype(np.float32)
-    patches = measure_patches(PointCloud(points, ideal.status, GRID, "ideal", "simulated", BASELINE), coupon)
-    assert patches.sizes["patch"] > 150
-    # sigma of one patch is known to 1 / sqrt(2 x 21) = 15 %, the root mean square of 150 to 1.3 %; 3 of these. The
-    # length of one capture is known to 2 % (tests of the residual field)
-    assert np.isclose(np.sqrt((patches.ray_noise_corrected**2).mean()), 0.3, rtol=0.04)
-    assert np.sqrt((patches.ray_noise_std**2).mean()) < 0.28
-    assert np.allclose(patches.correlation_length_pooled, 2.0, rtol=0.08)
-    assert np.isclose(patches.correlation_length.median(), 2.0, rtol=0.1)
-    assert np.allclose(patches.correlation_area_pooled, 4 * np.pi, rtol=0.4)
-    assert np.isclose(patches.sigma_degrees.median(), 21.4, rtol=0.15)
-    covered = ((patches.sigma_low <= 0.3) & (patches.sigma_high >= 0.3)).mean()
-    assert covered > 0.95 - 3 * np.sqrt(0.05 * 0.95 / patches.sizes["patch"])
-    assert (patches.sigma_low < patches.ray_noise_corrected).all()
-    assert (patches.sigma_high > patches.ray_noise_corrected).all()
 
 
 def test_patches_stay_on_the_coupon_and_in_the_image():

@@ -13,8 +13,9 @@ from characterisation.features.surfaces import Cone
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.tasks.definitions import DEFINITIONS
-from characterisation.tasks.evaluation import check_features, measurement_model, read_task
+from characterisation.tasks.evaluation import measurement_model
 from characterisation.tasks.task_file import KEYS, Task
+from characterisation.tasks.task_reading import check_features, read_task
 
 #: zones of which the nominal geometry may be outside: what is asked need not be so on the model
 LOOSE = ("parallelism", "perpendicularity", "coaxiality", "symmetry")

@@ -11,8 +11,9 @@ from characterisation.features.surfaces import Cylinder, Plane
 from characterisation.files.documents import validate
 from characterisation.files.errors import InputError
 from characterisation.statements.decision import decide, tolerance_of
-from characterisation.tasks.evaluation import Task, evaluate, measurement_model
+from characterisation.tasks.evaluation import evaluate, measurement_model
 from characterisation.tasks.places import mid_plane
+from characterisation.tasks.task_file import Task
 from characterisation.tasks.task_reading import read_task
 from characterisation.tasks.zones import angularity, coaxiality, datum_motion, perpendicularity, position, symmetry
 

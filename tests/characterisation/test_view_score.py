@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from characterisation.scores.view_score import rank_views, score_table, score_views, view_statistics, write_scores
-from characterisation.tasks.evaluation import Feature, Measurement, Task
+from characterisation.tasks.task_file import Feature, Measurement, Task
 
 TASK = Task(
     features={

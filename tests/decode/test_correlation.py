@@ -11,7 +11,6 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from characterisation.files.errors import InputError
 from characterisation.region_of_interest import Roi
 from mitsim.decoding.image_context import ImageContext
-from mitsim.decoding.matching import correlation
 from mitsim.decoding.matching.correlation import correlate_both_ways
 from mitsim.decoding.matching.stereo import decode_stereo, stereo_geometry
 from mitsim.sensor.camera import Camera, Rectification, Rig
@@ -135,22 +134,6 @@ def test_a_window_is_a_part_of_the_whole():
     assert part.valid[25:65, 90:190].mean() > 0.98
     both = whole.valid & part.valid
     np.testing.assert_allclose(part.points[both], whole.points[both], rtol=1e-4)
-
-
-@pytest.mark.parametrize("frames", [3, 4])
-@pytest.mark.parametrize("block", [5, 9, 13])
-def test_matrix_products_find_what_a_search_disparity_by_disparity_finds(monkeypatch, frames, block):
-    """Up to rounding: the sub-pixel step of a match that hangs by a thread multiplies it, in one of 1000."""
-    images = drawn(frames, 20.4, 0.02, noise=4.0)
-    by_products = matched(images, block_size=block)
-    monkeypatch.setattr(correlation, "_PRODUCT_FRAMES", frames + 1)
-    by_disparity = matched(images, block_size=block)
-    both = np.isfinite(by_products.disparity) & np.isfinite(by_disparity.disparity)
-    assert both.mean() > 0.75
-    assert np.mean(np.isfinite(by_products.disparity) != np.isfinite(by_disparity.disparity)) < 1e-3
-    assert np.mean(by_products.matched_back != by_disparity.matched_back) < 1e-3
-    off = np.abs(by_products.disparity - by_disparity.disparity)[both]
-    assert np.quantile(off, 0.999) < 1e-4
 
 
 @pytest.mark.parametrize("frames", [1, 2, 4])

@@ -26,7 +26,7 @@ from characterisation.maps.performance_map import PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.scores.joining import POSE_KNOWN
 from characterisation.scores.view_score import score_table, score_views, view_statistics
-from characterisation.tasks.evaluation import Task
+from characterisation.tasks.task_file import Task
 from mitsim.capture.capture_document import CaptureDocument
 from mitsim.capture.devices.depthai_settings import DepthaiSettings
 from mitsim.cli.options import DefaultCommandGroup

@@ -1,9 +1,8 @@
-"""Stages whose axes are known: how far a calibration is from them, and how sure the poses of a board are."""
+"""Stages whose axes are known: how far a calibration is from them."""
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from characterisation.features.surfaces import tangents
 
@@ -21,16 +20,3 @@ def axes_error(true, fitted):
         foot = point + ((p - point) @ a) / (direction @ a) * direction
         out += [*basis @ direction / (direction @ a), *basis @ (foot - p)]
     return np.array(out)
-
-
-def pose_covariance(camera, board, pose, noise):
-    """Of rotation about the sensor's axes and position, from independent errors of the pixels."""
-    columns = []
-    for i, h in enumerate([1e-6] * 3 + [1e-4] * 3):
-        moved = []
-        for sign in (1, -1):
-            turn = Rotation.from_rotvec(sign * h * np.eye(6)[i, :3]).as_matrix() @ pose[:3, :3]
-            moved.append(camera.project(board @ turn.T + pose[:3, 3] + sign * h * np.eye(6)[i, 3:]).ravel())
-        columns.append((moved[0] - moved[1]) / (2 * h))
-    jacobian = np.stack(columns, axis=1)
-    return noise**2 * np.linalg.inv(jacobian.T @ jacobian)

@@ -21,12 +21,11 @@ from mitsim.capture.devices.depthai_camera import (
     disparity_of,
     fault_of,
     frame_settings,
-    grey_frame,
-    match_on_device,
     open_depthai,
     pixels,
     stereo_pipeline,
 )
+from mitsim.capture.devices.depthai_matching import grey_frame, match_on_device
 from mitsim.capture.devices.depthai_settings import SIZES, DepthaiSettings, configuration, configure
 from mitsim.capture.devices.device_error import DeviceError
 from mitsim.capture.devices.maker_captures import depthai_capture, depthai_rig

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from known_stage import axes_error, pose_covariance, unit
+from known_stage import axes_error, unit
 from scipy.spatial.transform import Rotation
 
 from characterisation.stage.calibration import axis_deviations, calibrate_with_board, calibration_angles
@@ -50,7 +50,7 @@ def test_the_axes_come_back_from_rendered_captures_of_a_board(n10):
         middle + np.array([[3, 0, 40], [0, -8, 25]]),
     )
     read = np.round(calibration_angles(np.radians([[-35, 35], [-30, 30]]), 3) / STEP) * STEP
-    poses, covariances = [], []
+    poses = []
     for pose in axes.motion(read) @ zero:
         light = trace(scene, rays, white, Transform.from_matrix(pose).inverse(), LightPaths(samples=16, seed=1))[0]
         light = gaussian_blur(light, n10.imager.blur_px)
@@ -63,11 +63,9 @@ def test_the_axes_come_back_from_rendered_captures_of_a_board(n10):
         _, turn, place = cv2.solvePnP(corners, pixels, camera.matrix, camera.distortion)
         found = np.eye(4)
         found[:3, :3], found[:3, 3] = cv2.Rodrigues(turn)[0], place.ravel()
-        missed = camera.project(corners @ found[:3, :3].T + found[:3, 3]) - pixels
-        noise = np.sqrt((missed**2).sum() / (missed.size - 6))
-        poses.append(found), covariances.append(pose_covariance(camera, corners, found, noise))
+        poses.append(found)
 
-    fit = calibrate_with_board(read, np.array(poses), np.array(covariances))
+    fit = calibrate_with_board(read, np.array(poses))
     tilts, shifts = axis_deviations(fit)
     errors = np.linalg.norm(axes_error(axes, fit.axes).reshape(2, 2, 2), axis=2)  # axis, (direction, point)
     # two standard deviations in one number: 1 in 3000 is over four of them
@@ -75,10 +73,9 @@ def test_the_axes_come_back_from_rendered_captures_of_a_board(n10):
     assert (errors[:, 1] < 4 * shifts).all()
     assert np.degrees(tilts).max() < 0.02
     assert shifts.max() < 0.06
-    assert 0.5 < fit.scale < 1.5
     place, stated = zero[:3, 3] - fit.zero_pose[:3, 3], np.sqrt(np.diag(fit.covariance)[-3:])
     print(
         f"directions off by {np.degrees(errors[:, 0]).round(4)} deg (stated {np.degrees(tilts).round(4)}), "
         f"points by {errors[:, 1].round(4)} mm ({shifts.round(4)}), "
-        f"the board at zero by {place.round(4)} mm ({stated.round(4)}), scale {fit.scale:.2f}"
+        f"the board at zero by {place.round(4)} mm ({stated.round(4)})"
     )

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from characterisation.point_cloud import Status
-from mitsim.capture.grey_image import read_grey
+from mitsim.capture.grey_image import CHANNELS, read_grey
 from mitsim.capture.recordings.image_folder import read_image_folder
 from mitsim.cli.program import app
 from mitsim.decoding.checks.image_sanity import image_warnings
@@ -232,7 +232,9 @@ def gray(axis, bits):
 @pytest.mark.parametrize("eye", ["left", "right"])
 def test_the_images_of_binocular_gray_are_right_and_their_finest_bits_are_lost(real_data, eye):
     """Twelve bits each way, of which the camera resolves nine."""
-    stack = np.stack([read_grey(real_data / f"binocular_gray/{n:02d}-{eye}.png", green=True) for n in range(51)])
+    stack = np.stack(
+        [read_grey(real_data / f"binocular_gray/{n:02d}-{eye}.png", channel=CHANNELS["green"]) for n in range(51)]
+    )
     settings, unused = DecoderSettings(near_mm=50, far_mm=20000), {"show": "unused"}
     begin = [unused, {"show": "white"}, {"show": "black"}]
 
@@ -252,7 +254,7 @@ def test_the_automatic_exposure_of_pi_fringe_is_said(real_data):
     """A bit and its complement together have 121 to 341 DN."""
     folder = real_data / "pi_fringe/pose_000"
     names = [f"{axis}_bit{bit:02d}_{state}.png" for axis in "xy" for bit in range(11) for state in ("on", "off")]
-    stack = np.stack([read_grey(folder / name, green=True) for name in names])
+    stack = np.stack([read_grey(folder / name, channel=CHANNELS["green"]) for name in names])
     groups = [gray(axis, 11) | {"first": "least_significant"} for axis in ("columns", "rows")]
     code = ImageSequence(kind="image_sequence", images=groups)
     said = warnings_of(stack, code, (1280, 720), DecoderSettings(near_mm=50, far_mm=20000), 255, "camera")

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from characterisation.files.errors import InputError
-from mitsim.capture.recordings.lzf import decode_lzf
-from mitsim.capture.recordings.pcd import decode_pcd
+from mitsim.capture.recordings.pcd import decode_lzf, decode_pcd
 from mitsim.capture.recordings.ply import decode_ply
 
 SMALL = pinhole_cloud(12, 9)

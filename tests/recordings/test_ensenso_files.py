@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from characterisation.files.errors import InputError
 from mitsim.capture.recordings.ensenso import ensenso_originals, read_ensenso
-from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of
+from mitsim.capture.recordings.nxlib_calibration import NxLibTree, link_of
 from mitsim.decoding.cloud import decoder_settings
 from mitsim.sensor.png import encode_png
 from mitsim.sensor.transforms import Transform

@@ -17,7 +17,7 @@ from characterisation.files.atomic_io import write_netcdf
 from characterisation.maps.performance_map import SCHEMA_VERSION, PerformanceMap
 from characterisation.point_cloud import PointCloud, Status, ViewGrid
 from characterisation.scores.view_score import score_views, view_statistics
-from characterisation.tasks.evaluation import Feature, Measurement, Task
+from characterisation.tasks.task_file import Feature, Measurement, Task
 from mitsim.capture.capture import Capture
 from mitsim.capture.folder import write_capture
 from mitsim.report import style

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from characterisation.point_cloud import PointCloud, Status
-from characterisation.tasks.evaluation import measure, read_task
+from characterisation.tasks.evaluation import measure
+from characterisation.tasks.task_reading import read_task
 from mitsim.decoding.cloud import sensor_geometry
 from mitsim.maps.prediction import Predictor
 from mitsim.scene import load

@@ -310,7 +310,8 @@ def test_prediction_hides_what_an_eye_cannot_see(small, scenes, n10):
 
 def test_a_rendered_part_is_measured(n10, simulated, scenes):
     """From XML to a measured pillar, in matt white: the talk's task works before any map."""
-    from characterisation.tasks.evaluation import measure, read_task
+    from characterisation.tasks.evaluation import measure
+    from characterisation.tasks.task_reading import read_task
 
     scene = load_scene(scenes / "two_pillars/two_pillars.xml", 850, {"plane_Ra": "0.74", "pillar_Ra": "0.74"})
     geometry = stereo_geometry(n10.rig)

@@ -11,7 +11,6 @@ in neither frame are kept only as the maker's file.
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -32,6 +31,7 @@ from mitsim.capture.devices.depthai_camera import DepthaiCamera, DepthaiShot, op
 from mitsim.capture.devices.depthai_settings import DepthaiSettings
 from mitsim.capture.devices.device_error import DeviceError
 from mitsim.capture.devices.ensenso import EnsensoCamera, EnsensoSettings, EnsensoShot, open_ensenso
+from mitsim.capture.npy import encode_npy
 from mitsim.capture.recordings.depthai_calibration import read_depthai_calibration
 from mitsim.capture.recordings.ensenso import read_ensenso
 from mitsim.sensor.camera import Rectification, Rig
@@ -73,6 +73,7 @@ class LiveDevice:
 
     def __init__(self, camera: EnsensoCamera | DepthaiCamera) -> None:
         self._camera = camera
+        self.close = camera.close
 
     def take(self) -> DeviceCapture:
         """Take one capture.
@@ -84,10 +85,6 @@ class LiveDevice:
         """
         shot = self._camera.take()
         return ensenso_capture(shot) if isinstance(shot, EnsensoShot) else depthai_capture(shot)
-
-    def close(self) -> None:
-        """Restore the former state of the camera."""
-        self._camera.close()
 
     def __enter__(self) -> LiveDevice:
         return self
@@ -125,13 +122,13 @@ def ensenso_capture(shot: EnsensoShot) -> DeviceCapture:
         if shot.disparity.shape == (pair.height, pair.width):
             derived["disparity"] = shot.disparity
         else:  # cropped or scaled by DisparityMap's parameters, so it does not match the rectified image
-            originals["disparity.npy"] = _npy(shot.disparity)
+            originals["disparity.npy"] = encode_npy(shot.disparity)
     if shot.points is not None:
         in_place = None
         if "disparity" in derived and shot.points.shape[:2] == shot.disparity.shape:  # type: ignore[union-attr]
             in_place = points_in_left_camera(shot.points, derived["disparity"], pair)
         if in_place is None:
-            originals["points.npy"] = _npy(shot.points)
+            originals["points.npy"] = encode_npy(shot.points)
         else:
             derived["points"] = in_place
     return DeviceCapture(replace(capture, source=shot.source, settings=settings, derived=derived), originals)
@@ -219,9 +216,3 @@ def _read_from(where: str) -> Iterator[None]:
 
 def _json(value: Any) -> bytes:
     return (json.dumps(value, indent=1) + "\n").encode()
-
-
-def _npy(values: NDArray[np.float32]) -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, values, allow_pickle=False)
-    return stream.getvalue()

@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
+from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.recording_files import chosen_frame
-
-#: first bytes of an ``.npy`` file
-NPY_MAGIC = b"\x93NUMPY"
 
 #: most values of a point: x, y, z, normal and colour
 _MOST_VALUES = 9

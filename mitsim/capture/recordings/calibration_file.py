@@ -26,8 +26,7 @@ from characterisation.files.errors import InputError
 from mitsim.capture.calibration import CalibrationDocument, rig_of
 from mitsim.capture.recordings.depthai_calibration import is_depthai_calibration, read_depthai_calibration
 from mitsim.capture.recordings.json_fields import parsed_json
-from mitsim.capture.recordings.nxlib_calibration import nxlib_rig
-from mitsim.capture.recordings.nxlib_tree import NxLibTree
+from mitsim.capture.recordings.nxlib_calibration import NxLibTree, nxlib_rig
 from mitsim.capture.recordings.recording_files import plain_name
 from mitsim.sensor.calibration_eyes import cameras_of
 from mitsim.sensor.calibration_qualifiers import check_camera

@@ -19,7 +19,8 @@ from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import read_depths
-from mitsim.capture.recordings.array_file import NPY_MAGIC, map_in
+from mitsim.capture.npy import NPY_MAGIC
+from mitsim.capture.recordings.array_file import map_in
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
 from mitsim.capture.recordings.organised_cloud import FARTHEST_MM, METRES_UNDER
 from mitsim.sensor.camera import Rig

@@ -28,8 +28,7 @@ from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import Image, decode_grey
-from mitsim.capture.recordings.nxlib_calibration import nxlib_rig, sensor_from_workspace
-from mitsim.capture.recordings.nxlib_tree import NxLibTree
+from mitsim.capture.recordings.nxlib_calibration import NxLibTree, nxlib_rig, sensor_from_workspace
 from mitsim.capture.recordings.recording_files import chosen_frame, plain_name, recorded_files, recorded_names
 
 _CALIB = "_calib.json"

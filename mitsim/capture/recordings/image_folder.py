@@ -9,6 +9,8 @@ the images; an ``image_sequence`` lists them in any order.
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,6 @@ from characterisation.files.errors import InputError
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
 from mitsim.capture.grey_image import CHANNELS, SUFFIXES, Image, channel_name, is_colour, read_grey
-from mitsim.capture.recordings.image_count import advice
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.light_code import LightCode, roles
@@ -61,9 +62,7 @@ def read_image_folder(folder: str | Path, sensor: Sensor, channel: int = CHANNEL
                 f"images of {name}",
                 f"{len(found)}{_ends(found)}",
                 f"{count}, as the pattern of {sensor.name}",
-                advice(found, name, code, projector_size, count)
-                if found and isinstance(code, LightCode)
-                else _content(folder, used),
+                advice(found, name, count, sensor.ambient_image) if found else _content(folder, used),
             )
         images[name] = _stack(found, rig.cameras[name], sensor.bits, channel)
         colour |= is_colour(found[0])
@@ -107,7 +106,7 @@ def size_of_images(folder: Path) -> tuple[int, int] | None:
         for path in sorted(folder.glob(pattern), key=counted):
             if path.suffix.lower() in SUFFIXES and path.is_file():
                 with suppress(InputError):
-                    image = read_grey(path, green=True)
+                    image = read_grey(path, channel=CHANNELS["green"])
                     return image.shape[1], image.shape[0]
     return None
 
@@ -161,6 +160,41 @@ def _stack(files: list[Path], camera: Camera, bits: int | None, channel: int) ->
         hint = "set imager.bits to 8, or save the images with 16 bits"
         raise InputError(files[0], "depth", "8 bits", f"more: imager.bits is {bits}", hint)
     return out
+
+
+def advice(found: list[Path], camera: str, count: int, ambient_image: bool) -> str:
+    """Return advice on images of a camera that are not ``count``: by their names, else on the pattern.
+
+    Parameters
+    ----------
+    found
+        Files of the images.
+    camera
+        Name of the camera, as in the sensor file.
+    count
+        Number of images that the pattern needs.
+    ambient_image
+        Whether the last of these is without the projector.
+    """
+    matches = [re.search(r"(\d+)(?=\D*$)", path.name) for path in found]
+    numbers = sorted({int(match.group(1)) for match in matches if match})
+    gaps = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers)) if numbers else []
+    if gaps and len(numbers) == len(found):
+        return f"number {', '.join(map(str, gaps[:5]))} is missing"
+    shapes = Counter(re.sub(r"\d+", "*", path.name) for path in found)
+    for shape, number in shapes.items():
+        if number == count < len(found) and "*" in shape:
+            others = [path.name for path in found if re.sub(r"\d+", "*", path.name) != shape]
+            return (
+                f"{', '.join(others[:4])} differs in name from the {count} images needed: write "
+                f"{camera} = {shape!r} in [images] of the sensor file, or --images {camera}={shape!r}"
+            )
+    last = (
+        "" if ambient_image or len(found) != count + 1 else "write ambient_image = true, if the last has no light; or "
+    )
+    return (
+        f"{last}correct [pattern], or name the files in [images] of the sensor file, or by --images {camera}='PATTERN'"
+    )
 
 
 def _ends(found: list[Path]) -> str:

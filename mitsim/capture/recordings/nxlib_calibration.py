@@ -1,4 +1,4 @@
-"""Read the calibration in a camera's node of Ensenso's NxLib tree: cameras, rectification, and workspace of ``Link``.
+"""Read a camera's node of Ensenso's NxLib tree: cameras, rectification, and workspace of ``Link``.
 
 Signal chain: node -> camera matrices, distortion, rectifying rotations, baseline -> rig in the sensor frame; and
 ``Link`` with the left rectifying rotation -> ``sensor_from_workspace``.
@@ -12,23 +12,49 @@ The sensor frame is that of the raw left camera. The files do not state the foll
   disparity map shrunk by ``Parameters/DisparityMap/Scaling``, so they are divided by it (all of fx, fy, cx, cy, without
   half-pixel shift).
 - The right camera follows from the rectifying rotations and the baseline B: its centre is rotation_left^T (B, 0, 0).
-- ``Link`` belongs to the *rectified* left frame, as do NxLib's point maps. In the recording ``locate_pattern`` of
-  ensenso/ros_driver, the vendor's own pose of a dot pattern is reproduced within 0.05 mm from there; from the raw left
-  frame the error is 52 mm.
+- ``Link`` is the pose of the camera: it takes coordinates of its target, a workspace or another camera, to those of the
+  *rectified* left camera, by a rotation about an axis and a translation [mm]. The manufacturer's manual (*Common Tree
+  Elements*) says that links go "from Target to object". NxLib's own point maps are in the target's frame. In the
+  recording ``locate_pattern`` of ensenso/ros_driver, the vendor's own pose of a dot pattern is reproduced within
+  0.05 mm from there; from the raw left frame the error is 52 mm.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of
+from characterisation.files.errors import InputError
+from mitsim.capture.recordings.json_fields import JsonFields, parsed_json
 from mitsim.sensor.calibration_qualifiers import check_camera
 from mitsim.sensor.camera import Camera, Rectification, Rig
 from mitsim.sensor.transforms import Transform
 
 #: longest side of an image [px], as in a capture folder
 LARGEST_IMAGE_PX = 16384
+
+
+class NxLibTree(JsonFields):
+    """A node of the NxLib tree, read by paths such as ``Calibration/Stereo/Baseline``."""
+
+    def __init__(self, text: bytes, where: str) -> None:
+        what = "the camera's node as NxLib saves it"
+        root = parsed_json(text, where, what)
+        if not isinstance(root, dict):
+            raise InputError(where, "", type(root).__name__, f"a JSON object: {what}")
+        super().__init__(root, where, separator="/")
+
+    def is_virtual(self) -> bool:
+        """Return whether the vendor's simulator made the images: a model or port contains "Virtual"."""
+        sensor = self.root.get("Sensor")
+        nodes = [self.root, sensor, *(sensor.values() if isinstance(sensor, dict) else ())]
+        for node in (node for node in nodes if isinstance(node, dict)):
+            port = node.get("Port")
+            named = [node.get("ModelName"), node.get("Type"), port.get("Type") if isinstance(port, dict) else None]
+            if any("virtual" in str(name).lower() for name in named):
+                return True
+        return False
 
 
 def nxlib_rig(tree: NxLibTree, size: tuple[int, int] | None = None, *, dynamic: bool = True) -> Rig:
@@ -114,6 +140,25 @@ def sensor_from_workspace(tree: NxLibTree, *, dynamic: bool = True) -> Transform
     """
     link = link_of(tree)
     return None if link is None else sensor_from_rectified(tree, dynamic=dynamic) @ link
+
+
+def link_of(tree: NxLibTree) -> Transform | None:
+    """Return ``rectified_from_target`` of the tree's ``Link`` [mm], target to rectified left camera; None without one.
+
+    Raises
+    ------
+    InputError
+        If the link is present but invalid.
+    """
+    if not tree.has("Link/Rotation") and not tree.has("Link/Translation"):
+        return None
+    translation = tree.numbers("Link/Translation", (3,))
+    angle, axis = float(tree.numbers("Link/Rotation/Angle", ())), tree.numbers("Link/Rotation/Axis", (3,))
+    length = float(np.linalg.norm(axis))
+    if angle != 0 and abs(length - 1) > 1e-3:
+        raise tree.fault("Link/Rotation/Axis", "a unit vector")
+    turn = Rotation.from_rotvec(angle * axis / length if length > 0 else np.zeros(3))
+    return Transform(turn.as_matrix(), translation)
 
 
 def _camera_matrix(tree: NxLibTree, path: str) -> NDArray[np.float64]:

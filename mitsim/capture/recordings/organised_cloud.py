@@ -25,14 +25,15 @@ from numpy.typing import NDArray
 
 from characterisation.files.checked_files import read_bounded
 from characterisation.files.errors import InputError
+from characterisation.pinhole_grid import LEAST_POINTS, PINHOLE_RMS_PX
 from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Decoding
-from mitsim.capture.recordings.array_file import NPY_MAGIC, map_in
+from mitsim.capture.npy import NPY_MAGIC
+from mitsim.capture.recordings.array_file import map_in
 from mitsim.capture.recordings.calibration_file import Calibrated, camera_of, read_calibration
-from mitsim.capture.recordings.nxlib_calibration import sensor_from_rectified
-from mitsim.capture.recordings.nxlib_tree import NxLibTree, link_of
+from mitsim.capture.recordings.nxlib_calibration import NxLibTree, link_of, sensor_from_rectified
 from mitsim.capture.recordings.pcd import decode_pcd
-from mitsim.capture.recordings.pinhole_fit import LEAST_POINTS, PINHOLE_RMS_PX, fit_pinhole, grid_of, off_the_rays
+from mitsim.capture.recordings.pinhole_fit import fit_pinhole, grid_of, off_the_rays
 from mitsim.capture.recordings.ply import decode_ply
 from mitsim.capture.recordings.zdf import HDF5_MAGIC, read_zdf
 from mitsim.sensor.calibration_qualifiers import LENGTHS_MM, check_camera

@@ -22,8 +22,6 @@ from characterisation.pinhole_grid import LEAST_POINTS, PINHOLE_RMS_PX, pinhole_
 from mitsim.sensor.camera import Camera
 from mitsim.sensor.png import LONGEST_SIDE_PX
 
-__all__ = ["LEAST_POINTS", "PINHOLE_RMS_PX", "fit_pinhole", "grid_of", "off_the_rays"]
-
 #: largest tangential coefficient that is fitted; those of lenses are under 1e-3, and a turn by 0.17 deg has as much
 _TANGENTIAL = 1e-3
 

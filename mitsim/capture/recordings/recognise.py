@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from characterisation.files.errors import InputError
-from mitsim.capture.recordings.array_file import NPY_MAGIC
+from mitsim.capture.npy import NPY_MAGIC
 from mitsim.capture.recordings.recording_files import BAG_MAGIC, MCAP_MAGIC, SQLITE_MAGIC
 from mitsim.capture.recordings.robi import is_robi
 from mitsim.capture.recordings.zdf import HDF5_MAGIC

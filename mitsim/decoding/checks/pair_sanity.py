@@ -1,8 +1,7 @@
 """Check whether the images of two cameras and their calibration belong together.
 
 Signal chain: coordinates along rectified rows of two cameras that see one code -> disparity, and row error by the other
-coordinate or by the texture of the surface. The pair of a matcher: patches of the images at the disparity of the cloud
--> row error.
+coordinate or by the texture of the surface (:mod:`mitsim.decoding.checks.row_texture`).
 """
 
 from __future__ import annotations
@@ -15,13 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from characterisation.point_cloud import PointCloud
 from mitsim.decoding.checks.rig_sanity import COARSE, half_stripe
 from mitsim.decoding.checks.row_texture import rectified, textured_row_error, uniform_light_mean
-from mitsim.decoding.checks.texture_matches import COMPARED_ROWS, LEAST_BLOCKS, texture_matches
 from mitsim.decoding.coded_images import CodedImages
-from mitsim.decoding.matching.row_error import row_error
 from mitsim.decoding.matching.stereo import StereoGeometry
+from mitsim.decoding.matching.texture_matches import LEAST_PAIRS, texture_matches
 from mitsim.decoding.structured_light.projector_coordinate import ProjectorCoordinate
 from mitsim.decoding.structured_light.two_cameras import find_coordinates
 from mitsim.sensor.camera import Rig
@@ -46,9 +43,6 @@ _SLOPE_ROWS = (2.0, 4.0, 8.0, 16.0, 32.0)
 
 #: parts of an image along either side for averaging rows, and least number of pixels of a mean
 _PARTS, _ENOUGH = 6, 30
-
-#: side of a patch for comparing rows [px]; largest and least number of patches
-_PATCH, _MOST, _LEAST = 40, 80, 8
 
 
 @dataclass(frozen=True)
@@ -93,16 +87,8 @@ def pair_findings(images: CodedImages, rig: Rig, geometry: StereoGeometry) -> Fi
         return Findings([f"{matches}: {doubt}"])
     offset, source = matches.row_error, "by the code of the rows"
     if textures is not None:
+        offset = textured_row_error((textures[0], textures[1]), columns, geometry)
         source = "by the texture of the surface"
-        offset, variation = textured_row_error((textures[0], textures[1]), columns, geometry)
-        if variation > _LARGEST_SPREAD + 0.5 * abs(offset if np.isfinite(offset) else 0.0):
-            swapped = textured_row_error((textures[1], textures[0]), columns[::-1], geometry) if exchangeable else None
-            if swapped is not None and abs(swapped[0]) < LARGEST_ROW_ERROR and not swapped[1] > _LARGEST_SPREAD:
-                return Findings([exchanged])
-            told = (
-                f"the rows of the two cameras vary by {variation:.1f} px over the image, by the texture of the surface"
-            )
-            return Findings([f"{told}: {doubt}"])
     return Findings(row_error_warnings(offset), offset, source) if np.isfinite(offset) else Findings()
 
 
@@ -114,26 +100,27 @@ def _texture_contradiction(
     "" if the texture agrees, or does not suffice.
     """
     pixels = texture_matches(textures, columns)
-    if len(pixels[0]) < LEAST_BLOCKS:
+    if len(pixels[0]) < LEAST_PAIRS:
         return "", False
-    step = max(1.0, textures[0].shape[0] / COMPARED_ROWS)  # rows are compared to a fraction of this
     found, other = (_row_errors(*order, rig, geometry) for order in (pixels, pixels[::-1]))
-    if found.fits(step):
+    if found.fits:
         return "", False
-    return f"{found}, by the texture of the surface", other.fits(step)
+    return f"{found}, by the texture of the surface", other.fits
 
 
 @dataclass(frozen=True)
 class _RowErrors:
-    """Row error [px] of matched texture: its ``median`` and ``spread``; share that lies ``behind`` the cameras."""
+    """Row error [px] of matched texture: its ``median`` and rms, ``spread``; share that lies ``behind`` the cameras."""
 
     median: float
     spread: float
     behind: float
 
-    def fits(self, step: float) -> bool:
-        """Return whether the calibration explains the matches, whose rows are accurate to a share of ``step`` [px]."""
-        return self.behind <= 0.5 and self.spread <= _LARGEST_SPREAD * step + 0.5 * min(abs(self.median), _MOVED)
+    @property
+    def fits(self) -> bool:
+        """Return whether the calibration, or that of a rig that has moved since, explains the matches."""
+        varying = np.sqrt(max(self.spread**2 - self.median**2, 0.0))
+        return self.behind <= 0.5 and abs(self.median) <= _MOVED and varying <= _LARGEST_SPREAD + 0.5 * abs(self.median)
 
     def __str__(self) -> str:
         if self.behind > 0.5:
@@ -262,31 +249,6 @@ def _row_by_code(
         if abs(usual) * half_distance >= 2 * half_stripe(found[1]["rows"]):
             break
     return ((v - at_right(0.0)) / usual if abs(usual) > 1e-3 else np.full(len(v), np.nan)), usual
-
-
-def measured_row_error(images: tuple[Levels, Levels], geometry: StereoGeometry, cloud: PointCloud) -> float:
-    """Return the median row error [px] of the right image of a decoded pair; NaN with too few patches.
-
-    ``images`` (H, W) raw left and right [DN], with texture; ``cloud`` on the rectified left grid.
-    """
-    left, right = (image.astype(float) for image in images)
-    local = (cloud.points.astype(float) - geometry.grid.origin) @ geometry.grid.rotation
-    disparity = geometry.rectification.disparity(local[..., 2])
-    height, width = cloud.status.shape
-    tops, sides = range(0, height - _PATCH + 1, _PATCH), range(0, width - _PATCH + 1, _PATCH)
-    corners = [
-        (row, column)
-        for row in tops
-        for column in sides
-        if cloud.valid[row : row + _PATCH, column : column + _PATCH].mean() >= 0.5
-    ]
-    errors = []
-    for row, column in corners[:: -(-len(corners) // _MOST) or 1]:
-        rows, columns = np.nonzero(cloud.valid[row : row + _PATCH, column : column + _PATCH])
-        rows, columns = rows + row, columns + column
-        errors.append(row_error(left, right, geometry, rows, columns, disparity[rows, columns]))
-    known = np.array(errors)[np.isfinite(errors)] if errors else np.empty(0)
-    return float(np.median(known)) if len(known) >= _LEAST else float("nan")
 
 
 def row_error_warnings(offset: float) -> list[str]:

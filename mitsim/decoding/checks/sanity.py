@@ -15,8 +15,9 @@ from mitsim.capture.capture import Capture
 from mitsim.capture.decoding import Settings
 from mitsim.decoding.checks.gray_origin import gray_origin_warning
 from mitsim.decoding.checks.image_sanity import image_warnings
-from mitsim.decoding.checks.pair_sanity import Findings, measured_row_error, pair_findings
+from mitsim.decoding.checks.pair_sanity import Findings, pair_findings
 from mitsim.decoding.checks.rig_sanity import baseline_warning, camera_warnings
+from mitsim.decoding.checks.row_texture import measured_row_error
 from mitsim.decoding.cloud import decoder_settings
 from mitsim.decoding.coded_images import CodedImages
 from mitsim.decoding.matching.stereo import StereoGeometry, stereo_geometry

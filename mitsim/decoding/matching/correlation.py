@@ -22,9 +22,6 @@ if both images are equally noisy. This correction is original to mitsim.
 
 A parabola through three values of rho would be biased toward whole pixels by 0.03 to 0.05 px. Without noise its error
 is three times as large.
-
-Many frames are correlated by matrix products (:mod:`mitsim.decoding.matching.correlation_products`). One or two frames
-are correlated disparity by disparity, where the cost is independent of the size of the block.
 """
 
 from __future__ import annotations
@@ -36,26 +33,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from characterisation.files.threads import in_threads
-from mitsim.decoding.matching.correlation_products import (
-    BLANK_VARIANCE,
-    Floats,
-    PreparedPair,
-    block_mean,
-    block_variance,
-    correlations,
-    lag_covariance,
-    prepare_pair,
-    right_correlations,
-)
 from mitsim.decoding.matching.sgbm import Matches, both_ways_disagreement, pixels_matched_back
 from mitsim.decoding.matching.sub_pixel import offset_of_minimum
 from mitsim.sensor.matcher import MatcherSettings
 
-#: bytes of the correlations that each thread holds at once, if they are computed disparity by disparity
+Floats = NDArray[np.float32]
+
+#: bytes of the correlations that each thread holds at once
 _VOLUME_BYTES = 24e6
 
-#: least number of frames for which matrix products are faster, and number of rows that they process at once
-_PRODUCT_FRAMES, _PRODUCT_ROWS = 3, 8
+#: added to the variance of a block for each frame [DN^2 of 8 bit], so that blocks without texture correlate with
+#: nothing
+_BLANK_VARIANCE = 0.02
 
 #: least peak correlation that is assumed when the share of noise is estimated
 _MINIMUM_PEAK = 0.1
@@ -90,49 +79,20 @@ def correlate_both_ways(
     """
     height = left.shape[1]
     width = columns[1] - columns[0]
-    if len(left) >= _PRODUCT_FRAMES:
-        pair, rows = prepare_pair(left, right, columns, first, count, settings.block_size), _PRODUCT_ROWS
-    else:
-        pair, rows = None, max(int(_VOLUME_BYTES / (4 * count * (width + 2 * count))), 4)
+    rows = max(int(_VOLUME_BYTES / (4 * count * (width + 2 * count))), 4)
 
     def match_rows(start: int) -> tuple[Floats, Floats]:
         chunk = slice(start, min(start + rows, height))
-        if pair is not None:
-            return _match_products(pair, chunk, settings, noisy_right)
         reach = settings.block_size // 2
         around = slice(max(chunk.start - reach, 0), min(chunk.stop + reach, height))
         inner = slice(chunk.start - around.start, chunk.stop - around.start)
         search = _Search(columns, first, count)
-        return _match_disparities(left[:, around], right[:, around], inner, search, settings, noisy_right)
+        return _matched(left[:, around], right[:, around], inner, search, settings, noisy_right)
 
     results = in_threads(match_rows, range(0, height, rows))
     found, back = (np.concatenate(each) for each in zip(*results, strict=True))
     disagreement, matched_back = both_ways_disagreement(found, back, count), pixels_matched_back(back)
     return Matches(found + np.float32(first), disagreement, matched_back[:, count : count + width])
-
-
-def _match_products(
-    pair: PreparedPair, rows: slice, settings: MatcherSettings, noisy_right: bool
-) -> tuple[Floats, Floats]:
-    """Match rows of a prepared pair.
-
-    Returns
-    -------
-    disparities
-        (h, w) of the left columns, less ``first``, with the sub-pixel step.
-    back
-        (h, w + 2 count) whole disparities of right columns. Left column begin + i sees right column i + count - k at
-        disparity first + k.
-    """
-    (begin, end), count = pair.columns, pair.count
-    score = correlations(pair, rows)
-    from_right = right_correlations(pair, score)
-    best = from_right.argmax(axis=2)
-    matched = np.take_along_axis(from_right, best[..., None], axis=2)[..., 0] > -1
-    back = np.full((len(score), end - begin + 2 * count), np.nan, np.float32)
-    back[:, 1 : end - begin + count] = np.where(matched, best, np.float32(np.nan))[:, ::-1]
-    from_left = score[:, begin - pair.start : end - pair.start]
-    return _best_disparities(from_left, 2, pair.variance[rows], pair.lag[rows], settings, noisy_right), back
 
 
 @dataclass(frozen=True)
@@ -144,22 +104,31 @@ class _Search:
     count: int
 
 
-def _match_disparities(
+def _matched(
     left: Floats, right: Floats, inner: slice, search: _Search, settings: MatcherSettings, noisy_right: bool
 ) -> tuple[Floats, Floats]:
-    """Return the same as :func:`_match_products` for the ``inner`` rows of strips (F, h, W), disparity by disparity."""
+    """Match the ``inner`` rows of strips (F, h, W), disparity by disparity.
+
+    Returns
+    -------
+    disparities
+        (h, w) of the left columns, less ``first``, with the sub-pixel step.
+    back
+        (h, w + 2 count) whole disparities of right columns. Left column begin + i sees right column i + count - k at
+        disparity first + k.
+    """
     (begin, end), first, count = search.columns, search.first, search.count
     block, frames = settings.block_size, len(left)
-    reach, blank = block // 2, np.float32(frames * BLANK_VARIANCE)
+    reach, blank = block // 2, np.float32(frames * _BLANK_VARIANCE)
     # right pixels also search left of `begin` and right of `end`
     low, high = max(begin - count, 0), min(end + count, left.shape[2])
     left = left[:, :, low:high]
     right_source = low - first - count - reach + np.arange(left.shape[2] + count + 1 + 2 * reach)
     exists = ((right_source >= 0) & (right_source < right.shape[2]))[reach:-reach]
     right = right[:, :, np.clip(right_source, 0, right.shape[2] - 1)]
-    mean_left, mean_right = block_mean(left, block), block_mean(right, block)
-    variance_left, variance_right = block_variance(left, mean_left, block), block_variance(right, mean_right, block)
-    lag = lag_covariance(right, mean_right, block)
+    mean_left, mean_right = _block_mean(left, block), _block_mean(right, block)
+    variance_left, variance_right = _block_variance(left, mean_left, block), _block_variance(right, mean_right, block)
+    lag = _lag_covariance(right, mean_right, block)
     right, mean_right, variance_right, lag = (
         each[..., reach:-reach] for each in (right, mean_right, variance_right, lag)
     )
@@ -192,22 +161,61 @@ def _match_disparities(
     known = min(back_requested.shape[1], back.shape[1] - shift)
     back_requested[:, :known] = back[:, shift : shift + known]
     right_statistics = (variance_right[inner, shift:], lag[inner, shift:])
-    found = _best_disparities(score[:, :, requested], 0, *right_statistics, settings, noisy_right)
+    found = _best_disparities(score[:, :, requested], *right_statistics, settings, noisy_right)
     return found, back_requested
 
 
+def _sliding_sums(values: Floats, count: int, length: int) -> Floats:
+    """Return ``length`` sums of ``count`` neighbours along the first axis, from sums of 1, 2, 4, ... of them."""
+    total, summed, power = None, 0, 1
+    while True:
+        if count & power:
+            part = values[summed : summed + length]
+            total = part if total is None else total + part
+            summed += power
+        if 2 * power > count:
+            break
+        values = values[:-power] + values[power:]
+        power *= 2
+    assert total is not None
+    return total
+
+
+def _block_mean(images: Floats, block: int) -> Floats:
+    """Return the mean (F, h, w) of a square block around each pixel; pixels beyond the edges repeat the edge."""
+    reach = block // 2
+    height, width = images.shape[1:]
+    padded = np.pad(images, ((0, 0), (reach, reach), (reach, reach)), mode="edge")
+    row_sums = _sliding_sums(np.moveaxis(padded, 1, 0), block, height)  # (h, F, w + 2r)
+    sums = _sliding_sums(np.moveaxis(row_sums, 2, 0), block, width)  # (w, h, F)
+    return np.ascontiguousarray(np.moveaxis(sums, (2, 1), (0, 1))) * np.float32(1 / block**2)
+
+
+def _block_variance(images: Floats, means: Floats, block: int) -> Floats:
+    """Return the variance of each block (h, w), summed over the frames."""
+    total = _block_mean((images * images).sum(axis=0)[None], block)[0]
+    return np.asarray(np.maximum(total - (means * means).sum(axis=0), 0))
+
+
+def _lag_covariance(images: Floats, means: Floats, block: int) -> Floats:
+    """Return the covariance of each block with that of the column before (h, w), summed over the frames."""
+    previous, mean_previous = (np.concatenate([each[:, :, :1], each[:, :, :-1]], axis=2) for each in (images, means))
+    total = _block_mean((images * previous).sum(axis=0)[None], block)[0]
+    return np.asarray(total - (means * mean_previous).sum(axis=0))
+
+
 def _best_disparities(
-    score: Floats, axis: int, variance: Floats, lag: Floats, settings: MatcherSettings, noisy_right: bool
+    score: Floats, variance: Floats, lag: Floats, settings: MatcherSettings, noisy_right: bool
 ) -> Floats:
     """Return the best disparities (h, w) less ``first``, NaN if not unique.
 
-    ``score`` holds the correlations of all disparities along ``axis``, and is overwritten. ``variance`` and ``lag`` are
+    ``score`` (count, h, w) holds the correlations of all disparities, and is overwritten. ``variance`` and ``lag`` are
     those of :func:`_sub_pixel`, for right columns i + count - k.
     """
-    count = score.shape[axis]
-    best = score.argmax(axis=axis)
-    beside = [np.expand_dims(np.clip(best + step, 0, count - 1), axis) for step in (-1, 0, 1)]
-    lower, peak, upper = (np.take_along_axis(score, k, axis=axis).squeeze(axis) for k in beside)
+    count = len(score)
+    best = score.argmax(axis=0)
+    beside = [np.clip(best + step, 0, count - 1)[None] for step in (-1, 0, 1)]
+    lower, peak, upper = (np.take_along_axis(score, k, axis=0)[0] for k in beside)
     fit = settings.sub_pixel
     if fit == "method" or fit == "opencv":
         step = _sub_pixel((lower, peak, upper), best, variance, lag, count, noisy_right)
@@ -215,8 +223,8 @@ def _best_disparities(
         inside = (best > 0) & (best < count - 1)
         step = np.where(inside, offset_of_minimum(-lower, -peak, -upper, fit), np.float32(0))
     for k in beside:
-        np.put_along_axis(score, k, -1.0, axis=axis)
-    unique = (1 - peak) * 100 <= (1 - score.max(axis=axis)) * (100 - settings.uniqueness_percent)
+        np.put_along_axis(score, k, -1.0, axis=0)
+    unique = (1 - peak) * 100 <= (1 - score.max(axis=0)) * (100 - settings.uniqueness_percent)
     return np.where(unique & (peak > 0), best + step, np.nan).astype(np.float32)
 
 

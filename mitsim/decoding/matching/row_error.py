@@ -17,7 +17,7 @@ from mitsim.decoding.matching.stereo import StereoGeometry
 
 Floats = NDArray[np.float64]
 
-#: largest offset that is tested, up and down [rows]
+#: largest offset that is tested, up and down [rows]: farther, a matcher finds hardly a point
 MAXIMUM_ROWS = 2
 
 
@@ -28,6 +28,7 @@ def row_error(
     rows: NDArray[np.intp],
     columns: NDArray[np.intp],
     disparity: Floats,
+    reach: int = MAXIMUM_ROWS,
 ) -> float:
     """Return by how many rows [px] a patch lies lower in the right image than in the left one.
 
@@ -41,25 +42,27 @@ def row_error(
         (n,) pixels of the patch in the rectified left image.
     disparity
         (n,) of these pixels [px].
+    reach
+        Largest offset that is tested, up and down [rows].
 
     Returns
     -------
     float
-        NaN if the best offset is not within :data:`MAXIMUM_ROWS`.
+        NaN if the best offset is not within ``reach``.
     """
     left_levels = _sampled(left, geometry.map_left[:, rows, columns])
-    steps = np.arange(-MAXIMUM_ROWS, MAXIMUM_ROWS + 1.0)[:, None]
+    steps = np.arange(-reach, reach + 1.0)[:, None]
     positions = np.broadcast_arrays(rows + steps, columns - disparity)
     raw = np.stack([map_coordinates(axis, positions, order=1, mode="nearest") for axis in geometry.map_right])
     right_levels = _sampled(right, raw)
     difference = left_levels - left_levels.mean() - (right_levels - right_levels.mean(axis=1, keepdims=True))
     costs = np.mean(difference**2, axis=1).tolist()
     best = int(np.argmin(costs))
-    if not 0 < best < 2 * MAXIMUM_ROWS:
+    if not 0 < best < 2 * reach:
         return float("nan")
     before, lowest, after = costs[best - 1 : best + 2]
     curvature = before - 2 * lowest + after
-    return best - MAXIMUM_ROWS + (0.5 * (before - after) / curvature if curvature > 0 else 0.0)
+    return best - reach + (0.5 * (before - after) / curvature if curvature > 0 else 0.0)
 
 
 def _sampled(image: Floats, raw: NDArray[np.floating]) -> Floats:

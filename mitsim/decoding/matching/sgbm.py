@@ -14,6 +14,7 @@ pixel. Modes of one pass have no paths from below: where the disparity changes f
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -22,14 +23,6 @@ from numpy.typing import NDArray
 
 from characterisation.files.errors import InputError
 from characterisation.files.threads import in_threads
-from mitsim.decoding.matching.sgbm_bands import (
-    Penalties,
-    bytes_by_opencv,
-    bytes_of_band,
-    fits_16_bits,
-    match_in_bands,
-    rows_in_budget,
-)
 from mitsim.sensor.camera import Rectification
 from mitsim.sensor.matcher import MatcherSettings
 
@@ -63,9 +56,11 @@ class Matches:
     matched_back: NDArray[np.bool_]
 
 
-#: memory for costs and sums of both directions [bytes]. With images, maps and the interpreter the process stays below
-#: 1.5 GB (1.3 GB for 1280 x 1024 pixels from 275 to 3878 mm)
-BUDGET_BYTES = 0.8e9
+#: memory for the costs of all paths [bytes]; beyond it, strips of rows are matched by themselves
+LARGEST_BYTES = 4e9
+
+#: rows that strips share: a path carries the effect of a cut over some 100 rows where the pattern is faint
+_SHARED_ROWS = 100
 
 #: grey levels [DN of 8 bit] to which a local standard deviation is scaled; the range holds +-2.6 of them
 _TARGET_DEVIATION_DN = 48.0
@@ -118,6 +113,19 @@ def search_range(rectification: Rectification, settings: MatcherSettings) -> tup
     return first, 16 * -(-(last - first + 1) // 16)
 
 
+def strips(height: int, width: int, count: int) -> Iterator[tuple[slice, slice]]:
+    """Yield strips of rows that fit into :data:`LARGEST_BYTES`, with the rows that they share, and their parts without.
+
+    ``height``, ``width`` [px] and the number of disparities, ``count``, have costs and sums of 16 bits. Images beyond
+    4 GB differ from those matched as a whole in some 1 % of the pixels beside a cut.
+    """
+    most = max(int(LARGEST_BYTES / (4 * width * count)), 1)
+    rows = height if most >= height else max(most - 2 * _SHARED_ROWS, _SHARED_ROWS)
+    for top in range(0, height, rows):
+        begin = max(top - _SHARED_ROWS, 0)
+        yield slice(begin, min(top + rows + _SHARED_ROWS, height)), slice(top - begin, min(top + rows, height) - begin)
+
+
 def match_both_ways(
     left: NDArray[np.uint8],
     right: NDArray[np.uint8],
@@ -125,7 +133,6 @@ def match_both_ways(
     first: int,
     count: int,
     settings: MatcherSettings,
-    budget: float = BUDGET_BYTES,
 ) -> Matches:
     """Match columns of the left strip to the right strip, and in the reverse direction.
 
@@ -139,9 +146,6 @@ def match_both_ways(
         Search range, from :func:`search_range`.
     settings
         Block size, penalties and uniqueness.
-    budget
-        Memory for costs and sums [bytes]; it does not affect the result. If OpenCV needs more, the directions are
-        matched one after the other, or in bands (:mod:`mitsim.decoding.matching.sgbm_bands`).
     """
     begin, end = columns
     width = end - begin
@@ -157,13 +161,13 @@ def match_both_ways(
     start = max(0, count - begin + first)
     stop = max(start, min(count + width, right.shape[1] + count - begin + first))
     mirrored_columns = slice(start, stop + count)
-    budget_each, workers = _memory_per_direction(settings, left.shape[0], max(width, stop - start), count, budget)
     pairs = [(padded_left[:, : count + width], padded_right[:, : count + width], settings.uniqueness_percent)]
     if start < stop:
         pairs.append((padded_right[:, mirrored_columns][:, ::-1], padded_left[:, mirrored_columns][:, ::-1], 0))
     # OpenCV's matcher uses one core, so both directions together take the time of one
+    workers = 1 if settings.mode == "hh" and 8 * left.shape[0] * width * count > LARGEST_BYTES else 2
     from_left, *from_right = in_threads(
-        lambda pair: _disparities(pair[0], pair[1], count, settings, pair[2], budget_each), pairs, workers
+        lambda pair: _disparities(pair[0], pair[1], count, settings, pair[2]), pairs, workers
     )
     found = from_left[:, count:]
     back = np.full((left.shape[0], padded_left.shape[1]), np.nan, np.float32)
@@ -174,48 +178,8 @@ def match_both_ways(
     return Matches(found + np.float32(first), both_ways_disagreement(found, back, count), matched_back)
 
 
-def _sgbm(count: int, penalties: Penalties, mode: int) -> cv2.StereoSGBM:
-    return cv2.StereoSGBM.create(
-        minDisparity=0,
-        numDisparities=count,
-        blockSize=penalties.block,
-        P1=penalties.p1,
-        P2=penalties.p2,
-        disp12MaxDiff=-1,
-        preFilterCap=penalties.cap,
-        uniquenessRatio=penalties.uniqueness,
-        speckleWindowSize=0,
-        speckleRange=0,
-        mode=mode,
-    )
-
-
-def _memory_per_direction(
-    settings: MatcherSettings, height: int, width: int, count: int, budget: float
-) -> tuple[float, int]:
-    """Return the memory [bytes] for each direction, and how many directions are matched at once."""
-    whole = bytes_by_opencv(height, width, count)
-    if settings.mode != "hh" or 2 * whole <= budget:
-        return budget, 2
-    if whole <= budget or not fits_16_bits(_penalties(settings, 0)):
-        return budget, 1
-    rows = rows_in_budget(budget / 2, height, width, count)
-    return (budget / 2, 2) if bytes_of_band(rows, height, width, count) <= budget / 2 else (budget, 1)
-
-
-def _penalties(settings: MatcherSettings, uniqueness: int) -> Penalties:
-    area = settings.block_size**2
-    p1, p2 = round(settings.p1 * area), round(settings.p2 * area)
-    return Penalties(settings.block_size, p1, p2, settings.prefilter_cap, uniqueness)
-
-
 def _disparities(
-    reference: NDArray[np.uint8],
-    other: NDArray[np.uint8],
-    count: int,
-    settings: MatcherSettings,
-    uniqueness: int,
-    budget: float,
+    reference: NDArray[np.uint8], other: NDArray[np.uint8], count: int, settings: MatcherSettings, uniqueness: int
 ) -> NDArray[np.float32]:
     """Return disparities from 0 on [px], NaN where the matcher found none (which it writes as -1).
 
@@ -224,13 +188,24 @@ def _disparities(
     Here each step becomes the middle of the interval that it represents, unless ``settings.sub_pixel`` is ``opencv``.
     """
     reference, other = np.ascontiguousarray(reference), np.ascontiguousarray(other)
-    height, width = reference.shape[0], reference.shape[1] - count
-    penalties = _penalties(settings, uniqueness)
-    if settings.mode != "hh" or bytes_by_opencv(height, width, count) <= budget or not fits_16_bits(penalties):
-        found = _sgbm(count, penalties, _MODES[settings.mode]).compute(reference, other)
-    else:
-        found = match_in_bands(reference, other, count, penalties, rows_in_budget(budget, height, width, count))
-    sixteenths = found.astype(np.float32)
+    height, width = reference.shape
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=0,
+        numDisparities=count,
+        blockSize=settings.block_size,
+        P1=round(settings.p1 * settings.block_size**2),
+        P2=round(settings.p2 * settings.block_size**2),
+        disp12MaxDiff=-1,
+        preFilterCap=settings.prefilter_cap,
+        uniquenessRatio=uniqueness,
+        speckleWindowSize=0,
+        speckleRange=0,
+        mode=_MODES[settings.mode],
+    )
+    # the other modes hold the costs of one row
+    parts = strips(height, width - count, count) if settings.mode == "hh" else [(slice(None), slice(None))]
+    found = [matcher.compute(reference[shared], other[shared])[inner] for shared, inner in parts]
+    sixteenths = np.concatenate(found).astype(np.float32)
     if settings.sub_pixel == "opencv":
         return np.where(sixteenths < 0, np.float32(np.nan), sixteenths / 16)
     offset = np.mod(sixteenths, 16)  # 0 to 8 are not negative; 9 to 15 are -7 to -1

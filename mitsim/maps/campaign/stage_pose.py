@@ -28,7 +28,7 @@ from characterisation.files.checked_files import read_json_object
 from characterisation.files.documents import Document, Name, validate
 from characterisation.files.errors import InputError
 from characterisation.stage.angles import Stage
-from characterisation.stage.calibration import BoardCalibration, CouponCalibration
+from characterisation.stage.calibration import BoardCalibration
 from characterisation.stage.turning_axes import LINE_PARAMETERS, TurningAxes, cross_matrix
 from mitsim.capture.calibration import RigidRows, Row3
 from mitsim.capture.devices.stage_connection import StageConnection
@@ -158,12 +158,7 @@ class StageCalibration:
 
 
 def write_stage_calibration(
-    path: str | Path,
-    calibration: BoardCalibration | CouponCalibration,
-    names: Sequence[str],
-    *,
-    board_from_coupon: Transform | None = None,
-    centre: ArrayLike | None = None,
+    path: str | Path, fit: BoardCalibration, names: Sequence[str], board_from_coupon: Transform | None = None
 ) -> None:
     """Write a calibration for campaigns, with the coupon's pose at zero.
 
@@ -171,45 +166,27 @@ def write_stage_calibration(
     ----------
     path
         File to write.
-    calibration
-        Calibrated axes, by a board or by the coupon itself.
+    fit
+        Calibrated axes.
     names
         Names of the axes, as in the campaign's ``[stage]``.
     board_from_coupon
-        For a calibration with a board: the coupon's middle and axes on the board, z out of the face toward the sensor.
-        Default: the coupon's frame is that of the board.
-    centre
-        For a calibration with a coupon, (3,): its middle at zero in the sensor's frame [mm]. The calibration determines
-        only its plane. The full covariance is unknown and is not written.
+        The coupon's middle and axes on the board, z out of the face toward the sensor. Default: the coupon's frame is
+        that of the board.
 
     See Also
     --------
     read_stage_calibration : the inverse
     """
-    covariance: list[list[float]] | None = None
-    if isinstance(calibration, CouponCalibration):
-        if centre is None:
-            allowed = "the coupon's middle at zero [mm]"
-            raise InputError("stage calibration", "centre", "none", allowed, "only its plane was found")
-        plane = calibration.zero_plane
-        place = np.asarray(centre, float)
-        place = place - ((place - plane.point) @ plane.normal) * plane.normal
-        x = np.cross([0.0, 1.0, 0.0], plane.normal)
-        x /= np.linalg.norm(x)
-        zero = Transform(np.stack([x, np.cross(plane.normal, x), plane.normal], axis=1), place)
-    else:
-        board = Transform.from_matrix(calibration.zero_pose)
-        on_board = board_from_coupon or Transform.identity()
-        zero = board @ on_board
-        carried = np.eye(len(calibration.covariance))
-        carried[-3:, -6:-3] = -cross_matrix(board.rotation @ on_board.translation)
-        covariance = (carried @ calibration.covariance @ carried.T).tolist()
-    lines = zip(names, calibration.axes.directions, calibration.axes.points, strict=True)
+    board, on_board = Transform.from_matrix(fit.zero_pose), board_from_coupon or Transform.identity()
+    carried = np.eye(len(fit.covariance))
+    carried[-3:, -6:-3] = -cross_matrix(board.rotation @ on_board.translation)
+    lines = zip(names, fit.axes.directions, fit.axes.points, strict=True)
     table: dict[str, Any] = {
         "schema_version": 1,
         "axes": [{"name": n, "direction": d.tolist(), "point_mm": p.tolist()} for n, d, p in lines],
-        "sensor_from_coupon": zero.matrix().tolist(),
-        "covariance": covariance,
+        "sensor_from_coupon": (board @ on_board).matrix().tolist(),
+        "covariance": (carried @ fit.covariance @ carried.T).tolist(),
     }
     validate(path, json.loads(json.dumps(table)), StageCalibrationFile)
     write_json(path, table)
@@ -230,6 +207,6 @@ def read_stage_calibration(path: str | Path) -> StageCalibration:
     axes = TurningAxes(directions, np.array([axis.point_mm for axis in read.axes]))
     size = LINE_PARAMETERS * axes.count + 6
     covariance = np.full((size, size), np.nan) if read.covariance is None else np.array(read.covariance)
-    fit = BoardCalibration(axes, np.array(read.sensor_from_coupon), covariance, np.empty((0, 6)), 1.0, 0)
+    fit = BoardCalibration(axes, np.array(read.sensor_from_coupon), covariance, np.empty((0, 6)))
     checksum = hashlib.sha256(read.model_dump_json().encode()).hexdigest()[:12]
     return StageCalibration(tuple(axis.name for axis in read.axes), fit, str(path), checksum)

@@ -25,7 +25,8 @@ from scipy.spatial import cKDTree
 from characterisation.files.documents import Document, read_toml
 from characterisation.files.errors import nearest
 from characterisation.tasks.decision_table import Decision
-from characterisation.tasks.evaluation import Feature, Measurement, read_task
+from characterisation.tasks.task_file import Feature, Measurement
+from characterisation.tasks.task_reading import read_task
 from mitsim.scene.authoring.face import surface_distance
 from mitsim.scene.first_hits import VisibleSurfaces
 from mitsim.scene.inspect import SceneFacts, ShapeFacts

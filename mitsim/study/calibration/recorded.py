@@ -49,6 +49,9 @@ _MOST_STEPS = 300
 _SMALL_STEP, _SMALL_GAIN = 1e-4, 1e-9
 #: damping with which the adjustment cannot go on
 _STUCK = 1e9
+#: residuals of corners [px], median of the poses, above which the model of the lens is wrong; *assumed*: corners of
+#: real boards scatter by 0.05 to 1 px
+_MOST_NOISE_PX = 3.0
 #: least angle [deg] between board normals for which a missing tilt is not named as the cause of a failure; *assumed*
 _TILTED_DEG = 15.0
 #: least number of poses: two views of a plane leave the focal length to the prior
@@ -108,7 +111,7 @@ def calibrate_recorded(
     Raises
     ------
     InputError
-        If there are too few poses, or the adjustment does not converge.
+        If there are too few poses, the adjustment does not converge, or the model of the lens does not fit.
     """
     if len(boards) < LEAST_POSES:
         raise InputError("boards", "", f"{len(boards)} poses", f"{LEAST_POSES} or more, tilted against one another")
@@ -117,6 +120,12 @@ def calibrate_recorded(
     for _ in range(_ROUNDS):
         rig, places, normal = observed.adjusted(rig, places, noise, rig_prior(rig, sizes))
         noise = observed.noise(rig, places, normal)
+    if (typical := float(np.median(noise[:, 0]))) > _MOST_NOISE_PX:
+        hint = (
+            "a lens of more than about 90 deg needs another model; leave out corners far from the middle of the image"
+        )
+        found = f"residuals of {typical:.1f} px of the corners"
+        raise InputError("boards", "", found, f"{_MOST_NOISE_PX:g} px or less, of a lens with k1, k2, p1, p2, k3", hint)
     matrix, effect = observed.covariance(rig, places, noise, normal, own_units)
     details: dict[str, str | float] = {
         "board": str(board),
@@ -226,7 +235,7 @@ class _Observations:
             step = scale * np.linalg.solve(scaled + damping * np.eye(len(scale)), scale * gradient)
             tried_rig, tried = bundle.stepped(rig, places, prior.names, step)
             new = self._normal(tried_rig, tried, noise, prior)
-            if new[0] > cost * (1 + 1e-12):
+            if not new[0] <= cost * (1 + 1e-12):  # a lens that folds projects to NaN
                 damping *= 4
                 if damping > _STUCK:
                     return rig, places, normal

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from characterisation.files.atomic_io import json_values
 from characterisation.statements.budget import budget
 from characterisation.statements.decision import tolerance_of
-from characterisation.statements.losses import common_losses, losses
+from characterisation.statements.losses import losses, lost_features
 from characterisation.statements.statement import Statement, statement
 from characterisation.statements.verdict_words import Judged
 from mitsim.running.text_table import aligned
@@ -224,8 +224,8 @@ def statement_table(stated: Sequence[Statement]) -> str:
                 one.verdict,
             )
         )
-    lost = common_losses((one.measurement, one.trials, one.losses) for one in stated)
-    lines = [f"no value in {count} of {trials}: {', '.join(names)}: {reason}" for names, count, trials, reason in lost]
+    lost = lost_features((one.measurement, one.trials, one.losses) for one in stated)
+    lines = [f"no value in {one.in_words()}" for one in lost]
     return "\n".join([*aligned(rows), *lines])
 
 
