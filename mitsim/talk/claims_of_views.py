@@ -159,7 +159,7 @@ def _example(judged: Judged, one: ExampleEntry) -> Claim:
     values, views, share = cell["error"].values, cell["views"].values, cell["share"].values
     unit = unit_symbol(str(judged.scores[one.sample]["unit"].sel(measurement=one.measurement).item()))
     possible = int(views[1:].sum())
-    trials = errors["error"].sel(measurement=one.measurement).values
+    trials = errors["error"].sel(measurement=one.measurement).values[errors["tried"].values > 0]
     measurable = int((np.isfinite(trials).mean(axis=1) >= 0.5).sum())
     if not possible:
         return _nothing_possible(judged, one, measurable, float(share[0]))

@@ -180,7 +180,8 @@ def _markdown(
 ) -> str:
     lines = [f"# {TITLE}", "", *(line for part in intro for line in (part, ""))]
     lines += [
-        f"`{command}` draws this page from the kept results in a minute; without `--kept` it makes missing ones.",
+        f"`{command}` draws this page from the kept results in a minute; without `--kept` it makes missing ones. "
+        "`--measured FOLDER` puts the errors of real captures in the place of simulated ones.",
         "",
     ]
     if missing:
