@@ -27,6 +27,7 @@ _NAMES = {
     "SphereFit": "characterisation.features.fitted",
     "Status": "characterisation.point_cloud",
     "ViewGrid": "characterisation.point_cloud",
+    "deciles": "characterisation.scores.deciles",
     "fit_cylinder": "characterisation.features.fits",
     "fit_plane": "characterisation.features.fits",
     "fit_sphere": "characterisation.features.fits",
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
     from characterisation.files.errors import InputError, MissingEnvironmentError
     from characterisation.maps.performance_map import PerformanceMap
     from characterisation.point_cloud import PointCloud, Status, ViewGrid
+    from characterisation.scores.deciles import deciles
 
 __all__ = [
     "Coupon",
@@ -64,6 +66,7 @@ __all__ = [
     "SphereFit",
     "Status",
     "ViewGrid",
+    "deciles",
     "fit_cylinder",
     "fit_plane",
     "fit_sphere",

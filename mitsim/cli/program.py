@@ -37,6 +37,7 @@ from mitsim.cli import (
     parts,
     render,
     studies,
+    talk,
 )
 from mitsim.cli.options import Group, command_group, release_folders
 from mitsim.running.progress import be_quiet
@@ -94,11 +95,12 @@ for command in (
     app.command(name=command.__name__.rstrip("_"))(command)
 for name, group in {
     "study": command_group(
-        "Take single steps of a study: predict, compare sensors, state one view, plan its exposures.",
+        "Take single steps of a study: predict, compare sensors, state a view, plan exposures; make the talk again.",
         studies.score,
         studies.choose,
         studies.state,
         studies.exposures,
+        talk.talk,
     ),
     "calibrate": command_group(
         "Calibrate virtually or from the corners of a board, or verify a calibration by one capture.",

@@ -109,10 +109,10 @@ class Recovery:
 class Residuals:
     """Residuals along V about the fitted plane.
 
-    ``values`` (n,) are in mm. ``correlation_px`` is the lag along a row at which their autocorrelation falls below 1/e.
-    ``independent`` is the number of points at that spacing. ``skewness`` and ``excess_kurtosis`` are those of all
-    values. ``p_normal`` is the p-value of the test of D'Agostino and Pearson on the independent points (Biometrika 60,
-    1973).
+    ``values`` (n,) are in mm, and ``image`` (H, W) has them at their pixels, NaN elsewhere. ``correlation_px`` is the
+    lag along a row at which their autocorrelation falls below 1/e. ``independent`` is the number of points at that
+    spacing. ``skewness`` and ``excess_kurtosis`` are those of all values. ``p_normal`` is the p-value of the test of
+    D'Agostino and Pearson on the independent points (Biometrika 60, 1973).
     """
 
     distance: float
@@ -122,6 +122,7 @@ class Residuals:
     skewness: float
     excess_kurtosis: float
     p_normal: float
+    image: Floats
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ class DataSheet:
 
     def numbers(self) -> dict[str, Any]:
         """Return the values for JSON, without the single residuals."""
-        residuals = {name: value for name, value in asdict(self.residuals).items() if name != "values"}
+        residuals = {name: value for name, value in asdict(self.residuals).items() if name not in ("values", "image")}
         return {
             "sensor": self.sensor.name,
             "mid_mm": self.mid_mm,
@@ -269,7 +270,14 @@ class _SimulatedTargets:
         apart = apart[np.isfinite(apart)]
         p_normal = float(stats.normaltest(apart).pvalue) if len(apart) >= 20 else math.nan
         return Residuals(
-            distance, values, length, len(apart), float(stats.skew(values)), float(stats.kurtosis(values)), p_normal
+            distance,
+            values,
+            length,
+            len(apart),
+            float(stats.skew(values)),
+            float(stats.kurtosis(values)),
+            p_normal,
+            image,
         )
 
     def _plate(self, finish: str, distance: float, tilt_deg: float, noise: Noise) -> tuple[PointCloud, Coupon]:

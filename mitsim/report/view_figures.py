@@ -83,7 +83,7 @@ def uncertainty_figure(scores: xr.Dataset, measurement: str, unit: str, checked:
         grid = np.asarray(figure.subplots(1, len(every), squeeze=False))
         for axes, roll in zip(grid[0], every, strict=True):
             disc(axes, reach)
-            _sphere(axes, reach)
+            sphere_of_views(axes, reach)
             at, no = (rolls == roll) & possible, (rolls == roll) & ~possible
             axes.scatter(*places[no].T, marker="x", s=size * 0.3, c=MUTED, lw=0.8, zorder=3)
             axes.scatter(*places[at].T, c=u[at], norm=norm, cmap=colours, s=size, lw=0.4, ec=MUTED, zorder=4)
@@ -104,8 +104,8 @@ def uncertainty_figure(scores: xr.Dataset, measurement: str, unit: str, checked:
     return figure
 
 
-def _sphere(axes: Axes, reach: float) -> None:
-    """Draw rings of elevation and directions of azimuth."""
+def sphere_of_views(axes: Axes, reach: float) -> None:
+    """Draw rings of elevation and directions of azimuth into the disc of a sphere of views, as far as ``reach``."""
     angle = np.linspace(0, 2 * math.pi, 181)
     for elevation in _RINGS_DEG:
         radius = 2 * math.sin(math.radians(90 - elevation) / 2)

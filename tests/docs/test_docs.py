@@ -43,6 +43,7 @@ from mitsim.study.many_captures import ManyFile
 from mitsim.study.run_folder import RunDocument
 from mitsim.study.scoring import pose_columns
 from mitsim.study.statement_file import StatementDocument
+from mitsim.talk.talk_file import TalkFile
 from tests.proofs.laboratory.cases import LaboratoryFile
 from tests.proofs.part_cases import PartCasesFile
 
@@ -70,6 +71,7 @@ TOML_MODELS = {
     "validation": PartCasesFile,
     "laboratory": LaboratoryFile,
     "many": ManyFile,
+    "talk": TalkFile,
     "covariance": CovarianceFile,
     "depthai": DepthaiSettings,
     "unknowns": UnknownsOfFile,

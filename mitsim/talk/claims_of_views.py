@@ -1,0 +1,295 @@
+"""State the claims of the talk's slides on views, with the figures that were found."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import numpy as np
+import xarray as xr
+
+from characterisation.scores.rank_agreement import spearman
+from characterisation.tasks.task_reading import read_task
+from mitsim.running.numbers import listed, two_digits, unit_symbol
+from mitsim.study import MINIMUM_POINTS
+from mitsim.talk import view_figures as figures
+from mitsim.talk.judged_views import QUANTITIES, SCORES, Judged, true_error
+from mitsim.talk.make import trials_name
+from mitsim.talk.results import Results
+from mitsim.talk.slides import Claim, Slide, collected, largest_of, mean_of, verdict
+from mitsim.talk.talk_file import ExampleEntry, Talk
+
+#: mean rank correlation of bins from which agreement is very good, and good
+_VERY_GOOD, _GOOD = -0.8, -0.5
+
+#: R_m below which a view lacks a feature, and S_m of such a view, over the largest, from which it misleads
+_HIDDEN, _BIASED = 0.1, 0.25
+
+#: number of bins at each end that are called bad and good views
+_END = 3
+
+
+def judged_of(talk: Talk, results: Results, measured: dict[str, xr.Dataset], slide: Slide) -> Judged:
+    """Return scores and errors of all samples that have them.
+
+    Parameters
+    ----------
+    talk, results
+        The talk, and the results that there are.
+    measured
+        Errors of real captures by the key of their sample, in place of virtual ones.
+    slide
+        Takes the names of missing results.
+    """
+    names = {one.name: one.key for one in talk.file.samples}
+    scores = collected(results, {name: f"scores_{key}" for name, key in names.items()}, slide)
+    wanted = {one.name: trials_name(one) for one in talk.file.samples if one.key not in measured}
+    errors = collected(results, wanted, slide)
+    errors |= {name: measured[key] for name, key in names.items() if key in measured}
+    both = [name for name in names if name in scores and name in errors]
+    task = read_task(talk.folder / talk.file.task)
+    return Judged(task, scores, {name: errors[name] for name in both})
+
+
+def scoring(talk: Talk, judged: Judged) -> Slide:
+    """Return slide *Viewpoint Scoring*."""
+    slide = Slide("Viewpoint Scoring")
+    name = talk.file.sphere.sample
+    if name not in judged.scores:
+        slide.missing.append(f"scores_{talk.sample(name).key}")
+        return slide
+    scores, feature = judged.scores[name], talk.file.shown_feature
+    words = f"Number of points on {feature} ({name}) over the views that the stage reaches"
+    slide.pictures["reach"] = (figures.reach_figure(scores, feature), words)
+    points = scores["n"].sel(feature=feature).values
+    reached, outside = scores.sizes["view"], scores.sizes["outside"]
+    reasons = Counter(_reason(str(words)) for words in scores["reason"].values)
+    others = f" Of the others {listed([f'{count} {why}' for why, count in reasons.most_common()])}." if reasons else ""
+    moved = scores.attrs["moved_out"] or "No"
+    slide.claims.append(
+        Claim(
+            "Sub divide icosahedron to sample a sphere. Ensure reachability by the tilt table.",
+            f"The three-axis table reaches {reached} of {reached + outside} directions.{others} {moved} views were "
+            f"moved away to keep the sensor clear of the part. {feature} has {points.min():.0f} to {points.max():.0f} "
+            "points.",
+            f"{reached} of {reached + outside} directions",
+            "shown",
+        )
+    )
+    return slide
+
+
+def _reason(words: str) -> str:
+    """Return why a direction is left out, without the numbers of the single case."""
+    kind, _, rest = words.partition(": ")
+    return f"need a {rest.split()[0]} beyond its limits" if kind == "stage" and " beyond " in rest else words
+
+
+def view_score(talk: Talk, judged: Judged) -> Slide:
+    """Return slide *The View Score*."""
+    slide, shown = Slide("The View Score"), talk.file.sphere
+    if shown.sample not in judged.scores:
+        slide.missing.append(f"scores_{talk.sample(shown.sample).key}")
+        return slide
+    scores = judged.scores[shown.sample]
+    shapes = list(judged.task.shapes_for(shown.measurement))
+    words = f"S_f, R_f, S_m, R_m and V_m over the views: {shown.measurement}, {shown.sample}"
+    slide.pictures["scores"] = (figures.scores_figure(scores, shown.measurement, shapes), words)
+    here = scores.sel(measurement=shown.measurement)
+    sums, product = here["S_m"].values.astype(float), here["R_m"].values.astype(float)
+    blocked = product < _HIDDEN
+    reach = largest_of(sums[blocked]) / sums.max() if blocked.any() else 0.0
+    figure = f"S_m up to {100 * reach:.0f} % of the largest with a feature out of sight"
+    found = (
+        f"{int(blocked.sum())} views see little of a feature (R_m below {_HIDDEN:g}). Their S_m is up to "
+        f"{100 * reach:.0f} % of the largest."
+    )
+    better = reach > _BIASED
+    if shown.sample in judged.errors:
+        error = true_error(judged.errors[shown.sample], shown.measurement)
+        known = np.isfinite(error)
+        alone = spearman(sums[known], error[known])
+        together = spearman(np.where(here["possible"].values > 0, here["V_m"].values, 0)[known], error[known])
+        found += f" Rank correlation with the true error of views: S_m alone {_signed(alone)}, V_m {_signed(together)}."
+        better = better and together < alone
+        figure = f"rank correlation with error: S_m alone {_signed(alone)}, V_m {_signed(together)}"
+    slide.claims.append(
+        Claim(
+            "[S_m] is susceptible to bias. Doesn't take into account if all features are actually visible.",
+            found,
+            figure,
+            verdict(better, reach > _BIASED),
+        )
+    )
+    return slide
+
+
+def examples(talk: Talk, judged: Judged) -> Slide:
+    """Return slides *Example Result*."""
+    slide = Slide("Example Results")
+    for one in talk.file.examples:
+        if one.sample not in judged.errors or one.sample not in judged.scores:
+            slide.missing.append(trials_name(talk.sample(one.sample)))
+            continue
+        words = f"Deciles of V_m for {one.measurement} ({one.sample}), and spheres of V_m and of the true error"
+        picture = figures.example_figure(judged, one.sample, one.measurement)
+        slide.pictures[_picture(one)] = (picture, words)
+        slide.claims.append(_example(judged, one))
+    return slide
+
+
+_WORDS = {
+    "18": "Only very small number of views have measurable data, which are accurately predicted by the view score. We "
+    "see good correlation between the view score and measurement accuracy and uncertainty.",
+    "19": "Good correlation. Regions of poor accuracy and impossible measurements due to occlusion are accurately "
+    "predicted. Less distinction between top 30% of views.",
+    "20": "Despite ideal conditions the view angle is still very important and significant benefits can be had.",
+}
+
+
+#: why errors alone say little where many trials have no value
+_SURVIVORS = (
+    "A fit that its points do not determine is rejected, so a poor view shows the errors of its best trials alone; the "
+    "score predicts which views give a value."
+)
+
+
+def _example(judged: Judged, one: ExampleEntry) -> Claim:
+    cell, errors = judged.cell(one.sample, one.measurement, "V_m"), judged.errors[one.sample]
+    values, views, share = cell["error"].values, cell["views"].values, cell["share"].values
+    unit = unit_symbol(str(judged.scores[one.sample]["unit"].sel(measurement=one.measurement).item()))
+    possible = int(views[1:].sum())
+    trials = errors["error"].sel(measurement=one.measurement).values[errors["tried"].values > 0]
+    measurable = int((np.isfinite(trials).mean(axis=1) >= 0.5).sum())
+    if not possible:
+        return _nothing_possible(judged, one, measurable, float(share[0]))
+    known = np.flatnonzero(np.isfinite(values[1:])) + 1
+    correlations = [cell.attrs[f"{name}_correlation"] for name in QUANTITIES]
+    ratio = float(values[known[0]] / values[known[-1]]) if len(known) > 1 else math.nan
+    best = [values[number] for number in known[-3:]]
+    top = max(best) / min(best) if len(best) > 1 else math.nan
+    ends = "" if math.isnan(ratio) else f" ({two_digits(values[known[0]])} to {two_digits(values[known[-1]])} {unit})"
+    found = (
+        f"{one.measurement}, {one.sample}: {possible} of {int(views.sum())} views are possible by V_m; {measurable} "
+        f"have a value in at least half of the trials. Trials with a value: {_percent(share[0])} where V_m says "
+        f"impossible, {_percent(_mean_share(cell))} elsewhere. Rank correlation of bins with error "
+        f"{_signed(correlations[0])}, with standard deviation {_signed(correlations[1])}, with missing values "
+        f"{_signed(correlations[2])}. Error of the worst over the best bin: {_ratio(ratio)}{ends}. "
+        f"The errors of the best three bins differ by the factor {_ratio(top)}."
+    )
+    good = [correlation < _GOOD for correlation in correlations[:2] if not math.isnan(correlation)]
+    predicts = correlations[2] < _GOOD
+    figure = f"rank correlation {_signed(correlations[0])} with error, {_signed(correlations[1])} with deviation"
+    why = _SURVIVORS if predicts and not all(good) else ""
+    return Claim(
+        _WORDS.get(one.slide, one.measurement),
+        found,
+        figure,
+        verdict(bool(good) and all(good), any(good) or predicts),
+        why,
+        _picture(one),
+    )
+
+
+def _nothing_possible(judged: Judged, one: ExampleEntry, measurable: int, share: float) -> Claim:
+    """Return the claim of an example without views that are possible by V_m."""
+    points, shapes = judged.scores[one.sample]["n"], list(judged.task.shapes_for(one.measurement))
+    most = listed([f"{float(points.sel(feature=name).max()):.0f} points of {name}" for name in shapes])
+    views = points.sizes["view"]
+    return Claim(
+        _WORDS.get(one.slide, one.measurement),
+        f"{one.measurement}, {one.sample}: V_m calls all {views} views impossible. Some are expected to show up to "
+        f"{most}, but none to show {MINIMUM_POINTS} of each. Of the trials {_percent(share)} have a value nonetheless, "
+        f"since they also render light from other faces. {measurable or 'No'} views have one in at least half of their "
+        "trials.",
+        f"0 of {views} views possible by V_m, {measurable} measurable in half of the trials",
+        verdict(False, not measurable),
+        "The prediction that this cannot be measured holds. Without possible views there is no correlation to test.",
+        _picture(one),
+    )
+
+
+def _picture(one: ExampleEntry) -> str:
+    return f"example_{one.measurement}"
+
+
+def _mean_share(cell: xr.Dataset) -> float:
+    views, share = cell["views"].values[1:], cell["share"].values[1:]
+    return float((views * np.nan_to_num(share)).sum() / views.sum()) if views.sum() else math.nan
+
+
+def _percent(share: float) -> str:
+    return "no views" if math.isnan(share) else f"{100 * share:.0f} %"
+
+
+def _signed(value: float) -> str:
+    return "unknown" if math.isnan(value) else f"{value:+.2f}".replace("-", "−")
+
+
+def _ratio(value: float) -> str:
+    return "unknown" if math.isnan(value) else f"{value:.1f}"
+
+
+def accuracy(judged: Judged) -> Slide:
+    """Return slide *View Score Accuracy*."""
+    slide = Slide("View Score Accuracy")
+    if not judged.errors:
+        return slide
+    words = (
+        "Mean rank of the ten bins by error, standard deviation and share of trials with a value, for V_m, predicted "
+        "risk and number of points"
+    )
+    found = {kind: judged.ranks(kind) for kind in SCORES}
+    slide.pictures["accuracy"] = (figures.ranks_figure(found), words)
+    count = len(judged.task.measurements) * len(judged.errors)
+
+    def correlations(kind: str) -> str:
+        return listed([_signed(found[kind][quantity].attrs["correlation"]) for quantity in QUANTITIES])
+
+    talks = [found["V_m"][quantity].attrs["correlation"] for quantity in ("error", "deviation")]
+    good = max(talks) <= _VERY_GOOD
+    trend = spearman(found["V_m"]["error"]["bin"].values, found["V_m"]["error"]["rank"].values)
+    why = f"{_SURVIVORS} The predicted risk also knows how the points constrain a fit."
+    slide.claims.append(
+        Claim(
+            "Comparison of our predicted bin rank based on the view score and actual bin ranking are very good.",
+            f"Over {count} cells, {len(judged.task.measurements)} measurements of {len(judged.errors)} samples, the "
+            "mean rank correlations of bins with error, with standard deviation and with missing values are "
+            + "; ".join(f"{correlations(kind)} for {name}" for kind, name in SCORES.items())
+            + f". Of V_m with error, by sample: {'; '.join(_by_sample(judged))}. The mean ranks of the bins over all "
+            f"cells, as the talk shows them, have the rank correlation {_signed(trend)} with the bins.",
+            f"rank correlation {_signed(talks[0])} of a cell, {_signed(trend)} of the mean ranks",
+            verdict(good, trend <= _VERY_GOOD),
+            "" if good else why,
+        )
+    )
+    misses = np.abs(found["V_m"]["error"]["rank"].values - np.arange(10, 0, -1))
+    bad, best = mean_of(misses[:_END]), mean_of(misses[-_END:])
+    cells = [judged.cell(sample, name, "V_m") for sample in judged.errors for name in judged.task.measurements]
+    impossible = mean_of([cell["share"].values[0] for cell in cells])
+    possible = mean_of([_mean_share(cell) for cell in cells])
+    slide.claims.append(
+        Claim(
+            "Especially good at predicting bad views.",
+            f"The mean rank by error misses the predicted one by {_ratio(bad)} for the three worst bins, and by "
+            f"{_ratio(best)} for the three best. Of the trials of views that V_m calls impossible "
+            f"{_percent(impossible)} have a value, of the others {_percent(possible)}. Mean ranks from the worst "
+            "bin to the best: "
+            f"{', '.join(_ratio(rank) for rank in found['V_m']['error']['rank'].values)}.",
+            f"ranks missed by {_ratio(bad)} for bad views, {_ratio(best)} for good ones",
+            verdict(bad < best, impossible < possible / 2),
+        )
+    )
+    return slide
+
+
+def _by_sample(judged: Judged) -> list[str]:
+    """Return, for each sample, the mean rank correlation of the bins of V_m, and the share of trials with a value."""
+    out = []
+    for sample, errors in judged.errors.items():
+        cells = [judged.cell(sample, name, "V_m") for name in judged.task.measurements]
+        middle = mean_of([cell.attrs["error_correlation"] for cell in cells])
+        tried = errors["error"].values[:, errors["tried"].values > 0]
+        share = float(np.isfinite(tried).mean()) if tried.size else math.nan
+        out.append(f"{sample} {_signed(middle)} ({_percent(share)} of the trials have a value)")
+    return out

@@ -1,0 +1,282 @@
+"""Measure flat coupons: patches, their metrics over the tilt, and the sensor against its map.
+
+Slides *Data Collection*, *Point Cloud Processing*, *Results* and *Simulation Validation*.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from characterisation.coupon.patch_table import PATCHES, overall
+from characterisation.coupon.patches import Coupon, measure_patches
+from characterisation.files.datasets import read_dataset
+from characterisation.files.documents import read_toml
+from characterisation.files.errors import InputError
+from characterisation.maps.validation import residual_table
+from characterisation.point_cloud import PointCloud
+from mitsim.maps.campaign.acquire import coupon_cloud, in_turn, simulated_source
+from mitsim.maps.campaign.hold_out import compared, random_normals
+from mitsim.maps.campaign.orders import PreparedSensor, prepared_sensor
+from mitsim.maps.campaign.plan import Band, Campaign, CampaignFile, SampleEntry, Series, Shot, plan_campaign
+from mitsim.maps.campaign.run import run_campaign
+from mitsim.maps.campaign.store import Finished
+from mitsim.maps.prediction import CharacterisedScene
+from mitsim.talk.talk_file import map_in, sensor_in
+
+Floats = NDArray[np.float64]
+
+#: azimuth of the tilts from the baseline: between it and the direction across
+_AZIMUTH_DEG = 45.0
+
+#: columns of patches that are drawn
+_DRAWN = ("row", "column", "semi_major", "semi_minor", "recovered_fraction", "incidence", "distance", "included_angle")
+
+#: largest number of patches of a campaign that are kept for drawing
+_MOST_PATCHES = 4000
+
+#: steps of residuals that are kept [mm], the number that stands for no point, and the largest side of a picture [px]
+STEP_MM, NO_POINT, _SIDE_PX = 0.02, -32768, 300
+
+#: largest incidence of poses of the validation [deg]
+_LARGEST_DEG = 70.0
+
+
+@dataclass(frozen=True)
+class CouponPlace:
+    """One sample of a campaign file before a sensor: its Ra [um], None for matt white, and its distance [mm]."""
+
+    campaign: str
+    sensor: str
+    distance: float
+    roughness: float | None
+
+
+def campaign_of(folder: str, place: CouponPlace, **changes: object) -> Campaign:
+    """Return the campaign of one sample at one distance."""
+    path, roughness, distance = Path(folder) / place.campaign, place.roughness, place.distance
+    content = read_toml(path, CampaignFile)
+    entries = [one for one in content.samples if roughness_of(one) == roughness]
+    if not entries:
+        named = "matt white" if roughness is None else f"Ra {roughness:g}"
+        raise InputError(path, "samples", "no such sample", f"one of {named}", "the talk shows it")
+    updated = content.model_copy(update={"distances_mm": [distance], "samples": entries, **changes})
+    return plan_campaign(path, updated, sensor_in(folder, place.sensor))
+
+
+def roughness_of(entry: SampleEntry) -> float | None:
+    """Return the Ra [um] of a sample of a campaign, None if its scene has no such parameter."""
+    return None if "Ra" not in entry.parameters else float(entry.parameters["Ra"])
+
+
+def tilted(angle_deg: float) -> Floats:
+    """Return the unit normal (3,) in the view frame at an incidence, halfway between baseline and across."""
+    tilt, azimuth = math.radians(angle_deg), math.radians(_AZIMUTH_DEG)
+    return np.array([math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)])
+
+
+def characterised(folder: str, place: CouponPlace, subdivisions: int, refined: int, seed: int) -> xr.Dataset:
+    """Return the samples of a coupon at one distance and their map: orientations refined where F or sigma changes.
+
+    Over ``shot``: the normal ``shot_x`` and ``shot_y`` of each capture, in the order in which they were taken, and its
+    ``level``, 0 for the planned ones and 1 for those between them. Over ``patch``, at most 4000 of them: ``patch_x``,
+    ``patch_y``, F and sigma. Over (b, a): the fields of the map.
+
+    Parameters
+    ----------
+    folder
+        Folder of the talk.
+    place
+        The coupon and its distance.
+    subdivisions, refined
+        Density of the planned orientations, and the largest one of those added.
+    seed
+        Of the choice of patches.
+    """
+    bands = [Band(up_to_deg=20, subdivisions=subdivisions), Band(up_to_deg=80, subdivisions=max(subdivisions - 1, 0))]
+    plan = campaign_of(folder, place, orientations=bands)
+    if plan.file.refine is not None:
+        changed = plan.file.refine.model_copy(update={"subdivisions": refined})
+        plan = replace(plan, file=plan.file.model_copy(update={"refine": changed}))
+    source = in_turn(simulated_source(prepared_sensor(plan.sensor).simulated, plan.file.samples_per_pixel), plan)
+    shots: list[Shot] = []
+
+    def noted(some: Sequence[Shot]) -> Iterator[tuple[Shot, Finished]]:
+        for shot, finished in source(some):
+            shots.append(shot)
+            yield shot, finished
+
+    with TemporaryDirectory() as kept:
+        performance_map = run_campaign(plan, noted, kept)
+        patches = read_dataset(Path(kept) / "samples.nc", PATCHES)
+    chosen = np.random.default_rng(seed).permutation(patches.sizes["patch"])[:_MOST_PATCHES]
+    here = patches.isel(patch=np.sort(chosen))
+    planned = len(plan.file.normals())
+    normals = np.array([shot.normal for shot in shots])
+    count = patches.sizes["patch"]
+    data = xr.Dataset(attrs={"distance_mm": place.distance, "Ra_um": place.roughness, "patches": count})
+    data["shot_x"], data["shot_y"] = ("shot", normals[:, 0]), ("shot", normals[:, 1])
+    data["level"] = ("shot", (np.arange(len(shots)) >= planned).astype(np.int8))
+    for name, column in (
+        ("patch_x", "normal_x"),
+        ("patch_y", "normal_y"),
+        ("patch_fraction", "recovered_fraction"),
+        ("patch_sigma", "ray_noise_inliers"),
+    ):
+        data[name] = ("patch", here[column].values.astype(np.float32))
+    whole = performance_map.data.isel(sample=0, distance=0)
+    for name in ("recovered_fraction", "ray_noise_std"):
+        data[name] = (("b", "a"), whole[name].transpose("b", "a").values.astype(np.float32))
+    return data.assign_coords(a=("a", whole["a"].values), b=("b", whole["b"].values))
+
+
+def tilts(folder: str, place: CouponPlace, angles: tuple[float, ...]) -> xr.Dataset:
+    """Return F by three definitions, sigma along V and along N, and the sizes of patches, over the tilt.
+
+    The coupon and a matt-white one stand at the same pose; the second is the reference of ``fraction_reference``.
+    ``fraction_density`` is the talk's rho. ``along_ray`` and ``along_normal`` [mm] are of matt white, whose finish
+    looks the same at every tilt, and ``metal_along_ray`` is of the coupon.
+    """
+    prepared = prepared_sensor(sensor_in(folder, place.sensor))
+    plans = {
+        "metal": campaign_of(folder, place),
+        "white": campaign_of(folder, replace(place, roughness=None)),
+    }
+    rows: list[dict[str, float]] = []
+    for angle in angles:
+        clouds = {name: _taken(prepared, plan, tilted(angle)) for name, plan in plans.items()}
+        (metal, coupon), (white, _) = clouds["metal"], clouds["white"]
+        pitch = metal.grid.angular_pitch
+        by_pixels = measure_patches(metal, coupon)
+        by_density = measure_patches(metal, coupon, angular_pitch=pitch)
+        by_reference = measure_patches(metal, coupon, reference=white)
+        of_white = measure_patches(white, coupon)
+        sigma, cosine = overall(of_white).sigma, np.cos(of_white["incidence"].values)
+        area = np.pi * by_pixels["semi_major"].values * by_pixels["semi_minor"].values
+        seen = area * np.cos(by_pixels["incidence"].values) / by_pixels["distance"].values ** 2
+        rows.append(
+            {
+                "fraction_pixels": float(by_pixels["recovered_fraction"].mean()),
+                "fraction_density": float(by_density["recovered_fraction"].mean()),
+                "fraction_reference": float(by_reference["recovered_fraction"].mean()),
+                "along_ray": sigma,
+                "along_normal": sigma * float(np.sqrt(np.mean(cosine**2))),
+                "metal_along_ray": overall(by_pixels).sigma,
+                "solid_angle": float(seen.mean()) if len(seen) else math.nan,
+                "included_deg": math.degrees(float(by_pixels["included_angle"].mean())) if len(seen) else math.nan,
+                "patches": by_pixels.sizes["patch"],
+            }
+        )
+    columns = {name: ("tilt", np.array([row[name] for row in rows], float)) for name in rows[0]}
+    return xr.Dataset(columns, {"tilt": ("tilt", np.array(angles, float), {"units": "deg"})})
+
+
+def sub_clouds(folder: str, place: CouponPlace, angle: float) -> xr.Dataset:
+    """Return the cloud of a tilted coupon with its patches: status (row, column), and the ellipses (patch,)."""
+    prepared = prepared_sensor(sensor_in(folder, place.sensor))
+    plan = campaign_of(folder, place)
+    cloud, coupon = _taken(prepared, plan, tilted(angle))
+    patches = measure_patches(cloud, coupon)
+    window, corner = _window(cloud, coupon)
+    data = xr.Dataset({name: ("patch", patches[name].values.astype(np.float32)) for name in _DRAWN})
+    data["row"], data["column"] = data["row"] - corner[0], data["column"] - corner[1]
+    depth = np.where(cloud.valid, cloud.points[..., 2], np.nan)[window]
+    data["depth"] = (("y", "x"), depth.astype(np.float32), {"units": "mm"})
+    data["status"] = (("y", "x"), cloud.status[window])
+    return data.assign_attrs(tilt_deg=angle, distance_mm=place.distance)
+
+
+def hold_out(folder: str, place: CouponPlace, map_name: str, count: int, seed: int) -> xr.Dataset:
+    """Return F and sigma of one sample at one distance, captured and predicted, over poses no map was made from.
+
+    Over ``pose``: ``incidence`` [rad], and ``fraction`` and ``sigma`` [mm] as ``..._measured`` and ``..._predicted``.
+    The other variables are those of :func:`characterisation.maps.validation.residual_table`, of this one row.
+
+    Parameters
+    ----------
+    folder
+        Folder of the talk.
+    place
+        The coupon and its distance.
+    map_name
+        Map that predicts.
+    count
+        Number of poses.
+    seed
+        Of poses and noise.
+    """
+    prepared, plan = prepared_sensor(sensor_in(folder, place.sensor)), campaign_of(folder, place)
+    series = replace(plan.series[0], seed=plan.series[0].seed ^ (seed + 1))
+    rng = np.random.default_rng([seed, round(place.distance), round(1000 * (place.roughness or 0.0))])
+    normals = random_normals(count, min(_LARGEST_DEG, plan.file.largest_deg), rng)
+    performance_map = map_in(folder, map_name)
+    take = simulated_source(prepared.simulated, plan.file.samples_per_pixel)
+    pairs = [compared(plan.shot(series, normal), prepared, performance_map, take, 1) for normal in normals]
+    table = residual_table(pairs).isel(row=0)
+    data = xr.Dataset({str(name): ((), values.values) for name, values in table.data_vars.items()})
+    data["incidence"] = ("pose", [pair.incidence for pair in pairs], {"units": "rad"})
+    for name in ("fraction", "sigma"):
+        for side in ("measured", "predicted"):
+            data[f"{name}_{side}"] = ("pose", [float(getattr(getattr(pair, side), name)) for pair in pairs])
+    return data
+
+
+def clouds_of_coupon(folder: str, place: CouponPlace, map_name: str, angle: float, seed: int) -> xr.Dataset:
+    """Return the captured cloud of a large coupon and one drawn from the map, as residuals along V from the true plane.
+
+    ``captured`` and ``drawn`` (row, column), thinned, are in steps of :data:`STEP_MM`; :data:`NO_POINT` is no point.
+
+    Parameters
+    ----------
+    folder
+        Folder of the talk.
+    place
+        The coupon and its distance.
+    map_name
+        Map from which the second cloud is drawn.
+    angle
+        Tilt of the coupon [deg].
+    seed
+        Of the drawn cloud.
+    """
+    prepared = prepared_sensor(sensor_in(folder, place.sensor))
+    plan = campaign_of(folder, place, coupon_px=5000.0)  # as large as the field of view
+    cloud, coupon = _taken(prepared, plan, tilted(angle))
+    scene, pose = plan.series[0].sample.scene, plan.shot(plan.series[0], tilted(angle)).sensor_from_coupon
+    known = CharacterisedScene(scene, map_in(folder, map_name))
+    drawn = prepared.predictor.predict(known, pose.inverse(), np.random.default_rng(seed), correlated=True)
+    window, _ = _window(cloud, coupon)
+    data = xr.Dataset(attrs={"distance_mm": place.distance, "Ra_um": place.roughness, "tilt_deg": angle})
+    for name, one in (("captured", cloud), ("drawn", drawn)):
+        rays = one.grid.rays()
+        reach = ((coupon.centre - one.grid.origin) @ coupon.normal) / (rays @ coupon.normal)
+        off = np.linalg.norm(one.points - one.grid.origin, axis=-1) - reach
+        cut = np.where(one.valid, off, np.nan)[window]
+        step = max(1, -(-max(cut.shape) // _SIDE_PX))
+        steps = np.nan_to_num(np.clip(cut[::step, ::step] / STEP_MM, -30_000, 30_000), nan=NO_POINT)
+        data[name] = (("row", "column"), steps.round().astype(np.int16), {"units": f"{STEP_MM:g} mm"})
+        data.attrs[f"share_{name}"] = float(one.valid[window].mean())
+    return data
+
+
+def _taken(prepared: PreparedSensor, plan: Campaign, normal: Floats) -> tuple[PointCloud, Coupon]:
+    series: Series = plan.series[0]
+    shot: Shot = plan.shot(series, normal)
+    coupon = series.sample.at(shot.sensor_from_coupon)
+    capture = simulated_source(prepared.simulated, plan.file.samples_per_pixel)(shot)
+    return coupon_cloud(capture, coupon, prepared.geometry, plan.sensor), coupon
+
+
+def _window(cloud: PointCloud, coupon: Coupon) -> tuple[tuple[slice, slice], tuple[int, int]]:
+    """Return the rows and columns that show the coupon, and their first ones."""
+    corners = cloud.grid.project(coupon.corners())
+    low = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 4, 0)
+    high = np.ceil(corners.max(axis=0)).astype(int) + 5
+    return (slice(low[1], high[1]), slice(low[0], high[0])), (int(low[1]), int(low[0]))

@@ -1,0 +1,174 @@
+"""Make the results of a talk that are missing: pieces of work and virtual measurements, here or by workers.
+
+Signal chain: plan -> results that are kept -> orders of the others, pieces first, then the virtual measurements of one
+view of one sample each -> results, each kept as soon as it is made. A stopped command therefore goes on where it ended.
+Virtual measurements are kept one by one, as in every run (:mod:`mitsim.study.virtual.trials`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from mitsim.running.executor import Executor
+from mitsim.running.numbers import time_in_words
+from mitsim.running.progress import say_progress, track
+from mitsim.running.time_limit import TimeLimit
+from mitsim.study.session import Session
+from mitsim.study.virtual.race import Job
+from mitsim.study.virtual.spread_out import TrialOrder, make_trials
+from mitsim.study.virtual.trials import Outcome
+from mitsim.study.virtual.world import Trial
+from mitsim.talk.plan import Piece, make_piece, pieces_of
+from mitsim.talk.results import Results
+from mitsim.talk.talk_file import SampleEntry, Talk
+from mitsim.talk.view_pieces import errors_of
+
+#: time of a piece and of a virtual measurement on one quiet core [s], for the announcement; measured
+_PIECE_S, _TRIAL_S = 8.0, 0.7
+
+
+@dataclass(frozen=True)
+class _Unfinished:
+    """The virtual measurements of a sample: its session, and the views that lack some."""
+
+    sample: SampleEntry
+    session: Session
+    missing: dict[int, tuple[Job, ...]]
+
+
+@dataclass(frozen=True)
+class _Order:
+    """One order for a worker: a piece, or the trials of a view."""
+
+    folder: str
+    piece: Piece | None = None
+    trials: TrialOrder | None = None
+
+
+def work(order: _Order) -> Any:
+    """Work on one order; workers call this function."""
+    if order.piece is not None:
+        return make_piece(order.folder, order.piece)
+    assert order.trials is not None
+    return make_trials(order.trials)
+
+
+def trials_name(sample: SampleEntry) -> str:
+    """Return the name of the result with the errors of a sample's virtual measurements."""
+    return f"trials_{sample.key}"
+
+
+def results_known(talk: Talk, results: Results, measured: tuple[str, ...] = ()) -> list[str]:
+    """Return the names of all results of a talk that are missing; ``measured`` samples need no virtual measurements."""
+    names = [piece.name for piece in pieces_of(talk)]
+    names += [trials_name(sample) for sample in talk.file.samples if sample.key not in measured]
+    return [name for name in names if results.get(name) is None]
+
+
+def make(
+    talk: Talk,
+    results: Results,
+    folder: Path,
+    workers: Executor | None = None,
+    limit: TimeLimit | None = None,
+    measured: tuple[str, ...] = (),
+) -> list[str]:
+    """Make all missing results of a talk, and return the names of those that are still missing.
+
+    Parameters
+    ----------
+    talk
+        The talk.
+    results
+        Those that are kept; new ones are added.
+    folder
+        Output folder, where single virtual measurements are kept.
+    workers
+        Processes or cluster; None for this process.
+    limit
+        Time; None for no limit.
+    measured
+        Keys of samples that were captured, and need no virtual measurements.
+    """
+    limit = TimeLimit() if limit is None else limit
+    pieces = pieces_of(talk)
+    for piece in pieces:
+        results.digests[piece.name] = piece.digest(talk.folder)
+    missing = [piece for piece in pieces if results.get(piece.name) is None]
+    shown = [one.sample for one in talk.file.examples]
+    wanted = [sample for sample in talk.file.samples if sample.key not in measured]
+    wanted.sort(key=lambda sample: sample.name not in shown)  # those of the examples first
+    samples = [_unfinished(talk, results, sample, folder) for sample in wanted]
+    unfinished = [one for one in samples if one is not None]
+    place = str(talk.folder)
+    orders: list[_Order] = [_Order(place, piece) for piece in missing]
+    orders += [_Order(place, trials=one) for found in unfinished for one in _trial_orders(talk, found)]
+    if orders:
+        trials = sum(len(one.trials.jobs) for one in orders if one.trials is not None)
+        seconds = _PIECE_S * len(missing) + _TRIAL_S * trials
+        say_progress(
+            f"{len(missing)} pieces of work and {trials} virtual measurements to make: about "
+            f"{time_in_words(seconds)} of one quiet core"
+        )
+    for order, result in track(_made(orders, workers), "the talk", len(orders)):
+        if order.piece is not None:
+            results.add(order.piece.name, result)
+        elif order.trials is not None:
+            _keep(unfinished, order.trials, result)
+        if limit.over():
+            break
+    for found in unfinished:
+        _finish(talk, results, found)
+    return results_known(talk, results, measured)
+
+
+def _unfinished(talk: Talk, results: Results, sample: SampleEntry, folder: Path) -> _Unfinished | None:
+    """Return the virtual measurements that a sample lacks; None if all of them are kept."""
+    session = Session(talk.study(sample), folder / "views" / sample.key)
+    name = trials_name(sample)
+    results.digests[name] = f"{session.digest}, {talk.file.trials} trials"
+    if results.get(name) is not None:
+        return None
+    days = [Trial(day) for day in range(talk.file.trials)]
+    missing = {}
+    for view in session.study.views:
+        known = session.trials.known(view.number)
+        if jobs := tuple(Job(view, trial) for trial in days if trial not in known):
+            missing[view.number] = jobs
+    return _Unfinished(sample, session, missing)
+
+
+def _trial_orders(talk: Talk, found: _Unfinished) -> Iterator[TrialOrder]:
+    session = found.session
+    for jobs in found.missing.values():
+        path = str(talk.path.absolute())
+        yield TrialOrder(path, session.study.file, session.unknowns, False, session.digest, jobs)
+
+
+def _made(orders: Sequence[_Order], workers: Executor | None) -> Iterator[tuple[_Order, Any]]:
+    if workers is None:
+        return ((order, work(order)) for order in orders)
+    return workers.distribute(orders, _itself, work)
+
+
+def _itself(order: _Order) -> _Order:
+    return order
+
+
+def _keep(unfinished: Sequence[_Unfinished], order: TrialOrder, outcomes: Sequence[Outcome]) -> None:
+    found = next(one for one in unfinished if one.session.digest == order.digest)
+    for job, outcome in zip(order.jobs, outcomes, strict=True):
+        found.session.trials.add(job.view.number, job.trial, outcome)
+
+
+def _finish(talk: Talk, results: Results, found: _Unfinished) -> None:
+    """Keep the errors of a sample once all of its views are measured."""
+    views = [view.number for view in found.session.study.views]
+    data: xr.Dataset = errors_of(found.session.trials, views, talk.file.trials)
+    if (data["tried"].values >= talk.file.trials).all():
+        results.add(trials_name(found.sample), data)

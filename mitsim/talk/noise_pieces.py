@@ -1,0 +1,131 @@
+"""Measure the noise of a sensor on a matt-white plate: residuals along V as a picture, and their distribution.
+
+Slide *Noise Distributions*: residuals are "predominantly gaussian, although some fringe projection sensors can be sums
+of gaussians". Each sensor's residuals are described by one normal distribution, and by a sum of two with one mean. The
+second has two parameters more; it is needed if Bayes's information criterion prefers it, with as many observations as
+there are independent points, and if it also halves the distance of the distribution from the measured one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy import stats
+
+from mitsim.maps.data_sheet import Piece, Residuals, measure_piece
+from mitsim.talk.talk_file import sensor_in
+
+Floats = NDArray[np.float64]
+
+#: bins of the histogram, over this many standard deviations
+_BINS, _REACH = 61, 4.5
+
+#: largest side of the picture of residuals [px]
+_SIDE_PX = 150
+
+#: steps of the expectation maximisation, and points it uses at most
+_STEPS, _MOST_POINTS = 200, 40_000
+
+
+@dataclass(frozen=True)
+class TwoNormals:
+    """Sum of two normal distributions about 0: standard deviations [mm], the smaller first, and the second's share."""
+
+    narrow: float
+    wide: float
+    share: float
+
+    def density(self, values: Floats) -> Floats:
+        """Return the density [1/mm] at values [mm]."""
+        return np.asarray(
+            (1 - self.share) * stats.norm.pdf(values, 0, self.narrow)
+            + self.share * stats.norm.pdf(values, 0, self.wide)
+        )
+
+    def distribution(self, values: Floats) -> Floats:
+        """Return the distribution function at values [mm]."""
+        return np.asarray(
+            (1 - self.share) * stats.norm.cdf(values, 0, self.narrow)
+            + self.share * stats.norm.cdf(values, 0, self.wide)
+        )
+
+
+def two_normals(values: Floats) -> TwoNormals:
+    """Return the sum of two normal distributions about 0 that fits values best, by expectation maximisation.
+
+    (Dempster, Laird and Rubin, J. R. Stat. Soc. B 39 (1977) 1-38.)
+    """
+    square = np.asarray(values, float) ** 2
+    spread = math.sqrt(float(square.mean()))
+    found = TwoNormals(0.7 * spread, 1.6 * spread, 0.3)
+    for _ in range(_STEPS):
+        wide = found.share * stats.norm.pdf(np.sqrt(square), 0, found.wide)
+        odds = wide / np.maximum(wide + (1 - found.share) * stats.norm.pdf(np.sqrt(square), 0, found.narrow), 1e-300)
+        share = float(odds.mean())
+        if not 1e-6 < share < 1 - 1e-6:
+            break
+        narrow = math.sqrt(float(((1 - odds) * square).sum() / (1 - odds).sum()))
+        found = TwoNormals(narrow, math.sqrt(float((odds * square).sum() / odds.sum())), share)
+    return found
+
+
+def noise_of(folder: str, sensor: str, seed: int) -> xr.Dataset:
+    """Return the residuals of a sensor on matt white at the middle of its range.
+
+    ``image`` (row, column) [mm], thinned; ``histogram`` (edge to edge) as density [mm^-1]. Attributes: ``sigma`` [mm],
+    ``kurtosis`` (excess), ``skewness``, ``independent`` points, ``narrow``, ``wide`` [mm] and ``share`` of the sum of
+    two normals, ``distance_one`` and ``distance_two``, largest differences of the distribution functions, and ``two``,
+    whether the sum is needed.
+    """
+    chosen = sensor_in(folder, sensor)
+    near, far = chosen.working_range_mm
+    found: Residuals = measure_piece(Piece(chosen, seed, "residuals", (math.sqrt(near * far),)))
+    return described(found)
+
+
+def described(found: Residuals) -> xr.Dataset:
+    """Return the description of residuals that :func:`noise_of` returns."""
+    values = found.values - found.values.mean()
+    sigma = float(values.std())
+    edges = np.linspace(-_REACH * sigma, _REACH * sigma, _BINS + 1)
+    density, _ = np.histogram(values, edges)
+    two = two_normals(values[:: max(1, len(values) // _MOST_POINTS)])
+    ordered = np.sort(values)
+    measured = (np.arange(len(ordered)) + 0.5) / len(ordered)
+    apart = [
+        float(np.abs(measured - model).max())
+        for model in (stats.norm.cdf(ordered, 0, sigma), two.distribution(ordered))
+    ]
+    likelihoods = [
+        float(np.log(np.maximum(one, 1e-300)).mean()) for one in (stats.norm.pdf(values, 0, sigma), two.density(values))
+    ]
+    gain = 2 * found.independent * (likelihoods[1] - likelihoods[0]) - 2 * math.log(max(found.independent, 1))
+    rows, columns = np.nonzero(np.isfinite(found.image))
+    cut = found.image[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    step = max(1, -(-max(cut.shape) // _SIDE_PX))
+    width = edges[1] - edges[0]
+    return xr.Dataset(
+        {
+            "image": (("row", "column"), cut[::step, ::step].astype(np.float32), {"units": "mm"}),
+            "histogram": ("interval", density / (len(values) * width), {"units": "1/mm"}),
+            "middle": ("interval", (edges[1:] + edges[:-1]) / 2, {"units": "mm"}),
+        },
+        attrs={
+            "distance_mm": found.distance,
+            "sigma": sigma,
+            "kurtosis": found.excess_kurtosis,
+            "skewness": found.skewness,
+            "correlation_px": found.correlation_px,
+            "independent": found.independent,
+            "narrow": two.narrow,
+            "wide": two.wide,
+            "share": two.share,
+            "distance_one": apart[0],
+            "distance_two": apart[1],
+            "two": int(gain > 0 and apart[1] < apart[0] / 2),
+        },
+    )

@@ -1,0 +1,172 @@
+"""Plan the pieces of work of a talk: plain values that any process can work on, and the digest of each.
+
+A piece is a function of this package's ``..._pieces`` modules with its arguments. Files that it reads are named by
+paths relative to the talk's folder, so a digest does not depend on where the talk lies.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, is_dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+from pydantic import BaseModel
+
+from characterisation.files.checked_files import read_bounded
+from characterisation.files.documents import read_toml
+from characterisation.maps.shipped import map_path
+from mitsim.maps.campaign.plan import CampaignFile, sensor_checksum
+from mitsim.scene import backend
+from mitsim.scene.xml_check import named_digests
+from mitsim.talk import coupon_pieces, noise_pieces, opening_pieces, pictured, view_pieces
+from mitsim.talk.coupon_pieces import CouponPlace
+from mitsim.talk.results import VERSION
+from mitsim.talk.talk_file import SampleEntry, Talk, sensor_in, sensor_key
+
+#: functions of pieces: each takes the talk's folder and its arguments
+FUNCTIONS: dict[str, Callable[..., xr.Dataset]] = {
+    "opening": opening_pieces.projected_frames,
+    "finish": pictured.picture_of_finish,
+    "light": pictured.features_in_light,
+    "characterised": coupon_pieces.characterised,
+    "tilts": coupon_pieces.tilts,
+    "sub_clouds": coupon_pieces.sub_clouds,
+    "clouds": coupon_pieces.clouds_of_coupon,
+    "validation": coupon_pieces.hold_out,
+    "noise": noise_pieces.noise_of,
+    "scores": view_pieces.scores_of,
+}
+
+#: number of poses of the sample whose clouds are compared, over that of the others: it returns points in few of them
+_SHOWN_POSES = 3
+
+#: elevation, and azimuth from the part's x axis, of the view in which finishes are pictured [deg]
+_PICTURED = (50.0, -70.0)
+
+#: views in which direct light alone is compared with all light
+_COMPARED_VIEWS = 6
+
+#: tilt of the coupon whose clouds are compared, and of the one whose sub-clouds are drawn [deg]
+_CLOUDS_TILT_DEG, _SUB_CLOUDS_TILT_DEG = 6.0, 50.0
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One piece of work: a key of :data:`FUNCTIONS` with its arguments, and the files and sensors that these name."""
+
+    name: str
+    function: str
+    arguments: tuple[Any, ...]
+    sensors: tuple[str, ...] = ()
+    scenes: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = ()
+    map_name: str = ""
+    files: tuple[str, ...] = ()
+
+    def digest(self, folder: Path) -> str:
+        """Return the digest of everything that determines the result."""
+        content = {
+            "version": VERSION,
+            "function": self.function,
+            "arguments": [_as_plain(one) for one in self.arguments],
+            "sensors": [sensor_checksum(sensor_in(folder, name)) for name in self.sensors],
+            "scenes": [_scene_digest(folder / path, parameters) for path, parameters in self.scenes],
+            "files": [_file_digest(folder / name) for name in self.files],
+            "map": _file_digest(map_path(self.map_name, folder)) if self.map_name else "",
+        }
+        return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def make_piece(folder: str, piece: Piece) -> xr.Dataset:
+    """Make one piece of work; workers call this function."""
+    backend.activate(None)
+    return FUNCTIONS[piece.function](folder, *piece.arguments)
+
+
+def pieces_of(talk: Talk) -> list[Piece]:
+    """Return all pieces of a talk but its virtual measurements, those of the first slides first."""
+    file, coupons = talk.file, talk.file.coupons
+    number = pictured_view(talk)
+    sensor, known = (file.sensor,), talk.map_name
+    pieces = [
+        Piece(f"opening_{sensor_key(name)}", "opening", (one.scene, _plain(one), name), (name,), (_scene(one),))
+        for name in file.opening_sensors
+        for one in (file.finishes or file.samples)[:1]
+    ]
+    pieces += [
+        Piece(f"finish_{one.key}", "finish", (talk.study_file(one), number), sensor, (_scene(one),))
+        for one in file.finishes
+    ]
+    place = CouponPlace(coupons.campaign, file.sensor, coupons.distance_mm, coupons.roughness_um)
+    campaign = read_toml(talk.folder / coupons.campaign, CampaignFile)
+    of_coupons = tuple((str(Path(coupons.campaign).parent / one.scene), ()) for one in campaign.samples)
+    refined = (coupons.subdivisions, coupons.refined, file.seed)
+    pieces.append(Piece("characterised", "characterised", (place, *refined), sensor, of_coupons))
+    pieces.append(Piece("tilts", "tilts", (place, tuple(coupons.tilts_deg)), sensor, of_coupons))
+    pieces.append(Piece("sub_clouds", "sub_clouds", (place, _SUB_CLOUDS_TILT_DEG), sensor, of_coupons))
+    pieces += [Piece(f"noise_{sensor_key(name)}", "noise", (name, file.seed), (name,)) for name in file.noise_sensors]
+    shown = CouponPlace(coupons.campaign, file.sensor, coupons.shown_distance_mm, coupons.shown_roughness_um)
+    pieces.append(Piece("clouds", "clouds", (shown, known, _CLOUDS_TILT_DEG, file.seed), sensor, of_coupons, known))
+    for sample in campaign.samples:
+        rough = coupon_pieces.roughness_of(sample)
+        for distance in coupons.validated_distances_mm:
+            there = CouponPlace(coupons.campaign, file.sensor, distance, rough)
+            poses = coupons.poses * (_SHOWN_POSES if rough == coupons.shown_roughness_um else 1)
+            arguments = (there, known, poses, file.seed)
+            pieces.append(Piece(validation_name(rough, distance), "validation", arguments, sensor, of_coupons, known))
+    for one in file.samples:
+        study = (talk.study_file(one),)
+        pieces.append(Piece(f"scores_{one.key}", "scores", study, sensor, (_scene(one),), known, (file.task,)))
+    numbers = compared_views(talk)
+    for one in file.samples:
+        for name, depth in (("direct", 1), ("all", file.light_path_depth)):
+            seen = (talk.study_file(one, depth), numbers)
+            pieces.append(Piece(f"light_{name}_{one.key}", "light", seen, sensor, (_scene(one),), known))
+    return pieces
+
+
+def validation_name(roughness: float | None, distance: float) -> str:
+    """Return the name of the piece that validates a sample at a distance [mm]."""
+    return f"validation_{'white' if roughness is None else f'Ra{roughness:g}'}_{distance:g}mm"
+
+
+def pictured_view(talk: Talk) -> int:
+    """Return the number of the candidate view nearest to the one in which finishes are pictured."""
+    elevation, azimuth = map(math.radians, _PICTURED)
+    wanted = (math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation))
+    return max(talk.views, key=lambda view: float(view.direction @ wanted)).number
+
+
+def compared_views(talk: Talk) -> tuple[int, ...]:
+    """Return the numbers of views, evenly chosen from all candidates, for the comparison of light."""
+    numbers = [view.number for view in talk.views]
+    return tuple(numbers[:: max(1, -(-len(numbers) // _COMPARED_VIEWS))])
+
+
+def _as_plain(argument: Any) -> Any:
+    if isinstance(argument, BaseModel):
+        return argument.model_dump(mode="json")
+    return asdict(argument) if is_dataclass(argument) and not isinstance(argument, type) else argument
+
+
+def _scene(one: SampleEntry) -> tuple[str, tuple[tuple[str, str], ...]]:
+    return one.scene, _plain(one)
+
+
+def _plain(one: SampleEntry) -> tuple[tuple[str, str], ...]:
+    return tuple((name, str(value)) for name, value in sorted(one.parameters.items()))
+
+
+@lru_cache(maxsize=64)
+def _scene_digest(path: Path, parameters: tuple[tuple[str, str], ...]) -> str:
+    return _file_digest(path) + json.dumps(named_digests(path, dict(parameters)), sort_keys=True)
+
+
+@lru_cache(maxsize=64)
+def _file_digest(path: Path) -> str:
+    return hashlib.sha256(read_bounded(path, "a file of the talk")).hexdigest()

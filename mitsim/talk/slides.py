@@ -1,0 +1,80 @@
+"""A slide of the talk as it was made again: its claim, its figure, the figures found, and the verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from mitsim.talk.results import Results
+
+Verdict = Literal["holds", "holds in part", "does not hold", "shown", "missing"]
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One claim of a slide, word for word, and what was found.
+
+    ``found`` has the numbers in sentences, ``figure`` those that decide. ``why`` explains a claim that does not hold.
+    ``picture`` names the picture of the slide that shows it; by default all do.
+    """
+
+    words: str
+    found: str
+    figure: str
+    verdict: Verdict
+    why: str = ""
+    picture: str = ""
+
+
+@dataclass(frozen=True)
+class Slide:
+    """A slide made again.
+
+    ``pictures`` are figures by the stem of their files, each with its alternative text. ``missing`` names the results
+    without which the slide could not be made.
+    """
+
+    title: str
+    claims: list[Claim] = field(default_factory=list)
+    pictures: dict[str, tuple[Figure, str]] = field(default_factory=dict)
+    missing: list[str] = field(default_factory=list)
+
+
+def verdict(holds: bool, in_part: bool = False) -> Verdict:
+    """Return the verdict on a claim."""
+    return "holds" if holds else "holds in part" if in_part else "does not hold"
+
+
+def collected(results: Results, names: Mapping[str, str], slide: Slide) -> dict[str, xr.Dataset]:
+    """Return the results of pieces by the keys of ``names``; missing ones are noted in the slide."""
+    found = {key: results.get(name) for key, name in names.items()}
+    slide.missing.extend(names[key] for key, one in found.items() if one is None)
+    return {key: one for key, one in found.items() if one is not None}
+
+
+def mean_of(values: ArrayLike) -> float:
+    """Return the mean of the finite values, NaN without any."""
+    known = np.asarray(values, float)
+    known = known[np.isfinite(known)]
+    return float(known.mean()) if len(known) else math.nan
+
+
+def median_of(values: ArrayLike) -> float:
+    """Return the median of the finite values, NaN without any."""
+    known = np.asarray(values, float)
+    known = known[np.isfinite(known)]
+    return float(np.median(known)) if len(known) else math.nan
+
+
+def largest_of(values: ArrayLike) -> float:
+    """Return the largest of the finite values, NaN without any."""
+    known = np.asarray(values, float)
+    known = known[np.isfinite(known)]
+    return float(known.max()) if len(known) else math.nan
