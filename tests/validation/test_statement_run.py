@@ -139,7 +139,7 @@ def test_the_truth_may_have_light_that_the_tool_leaves_out(cases, tmp_path):
     (case,) = read_part_cases(cases)
     found = case_trials.trials_by_kind(case, case.open(), tmp_path / "run")
     depth = {kind: bench.study.file.measure.light_path_depth for kind, bench in found.items()}
-    assert depth == {"tool": 2, "truth": 5, "apart": 5, "choice": 5}
+    assert depth == {"tool": 4, "truth": 5, "apart": 5, "choice": 5}
     assert found["truth"].trials.digest != found["tool"].trials.digest
 
 
