@@ -104,7 +104,8 @@ def exposure_policy(
         )
     radiance = rule.reflectance / np.pi * projector.plane_irradiance / rule.distance_mm**2
     wanted = rule.level * imager.full_well
-    exposure = float(wanted / (radiance * electrons_per_radiance(imager, wavelength_nm, 1.0)))
+    rate = float(radiance * electrons_per_radiance(imager, wavelength_nm, 1.0))  # of tiny factors it may be 0
+    exposure = math.inf if rate == 0 else float(wanted / rate)
     if math.isnan(exposure):
         return ExposurePolicy("unknown", None, None, rule.bracket, rule.limits_s)
     if not shortest <= exposure <= longest:

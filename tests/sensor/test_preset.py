@@ -52,6 +52,7 @@ def test_every_preset_loads():
         ("wavelength_nm = 850", "wavelength_nm = 0.85", "wavelength_nm", "400"),
         ("block_size = 5", "block_size = 4", "matcher.block_size", "odd"),
         ("limits_s = [1e-5, 1e-2]", "limits_s = [1e-5, 1e-4]", "exposure.limits_s", "flux_w"),
+        ("flux_w = 1.0", "flux_w = 1e-320", "exposure.limits_s", "inf s: change projector.flux_w"),
         ("working_range_mm = [400, 800]", "working_range_mm = [800, 400]", "working_range_mm", "near before far"),
         ('technology = "active_stereo"', "", "technology", "required"),
     ],
