@@ -54,10 +54,10 @@ from mitsim.sensor.vignetting import camera_illumination
 
 Floats = NDArray[np.float64]
 
-#: number of pixels of the coarse camera. With three times the pixels, paths and photons screening takes 1.3 to 1.7 times
-#: as long. Least rank correlation with twelve times the paths, here and there: ensenso-n10 0.99 and 1.00, realsense-d435
-#: 0.98 and 1.00, photoneo-phoxi-s 0.65 and 0.74, zivid-2-m70 0.71 and 0.60 (32 views of two pillars). Command:
-#: python tests/benchmarks/screening_light.py SENSOR
+#: number of pixels of the coarse camera. With three times the pixels, paths and photons screening takes 1.3 to 1.7
+#: times as long. Least rank correlation with twelve times the paths, here and there: ensenso-n10 0.99 and 1.00,
+#: realsense-d435 0.98 and 1.00, photoneo-phoxi-s 0.65 and 0.74, zivid-2-m70 0.71 and 0.60 (32 views of two pillars).
+#: Command: python tests/benchmarks/screening_light.py SENSOR
 PIXELS = 7_000
 
 #: least number of its pixels that a fringe covers
