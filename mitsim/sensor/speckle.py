@@ -14,12 +14,23 @@ holds for independent averaging:
     roughness        sqrt(1 + 2 r) / (1 + r),  r = A / (1 - A)       A coherent share of the reflected light
     bandwidth        (1 + 16 Rq^2 s_k^2)^(-1/4),  s_k = 2 pi s_lambda / lambda^2,  s_lambda = FWHM / 2.355
     illumination     1 / sqrt(1 + (u_ill / u_obs)^2)                 u half-angles of the two apertures
-    pixel            1 / sqrt(1 + A_pixel / A_speckle)               speckle size lambda / (2 sin u') on the imager
+    pixel            1 / sqrt(M)                                     M speckles in a pixel, see below
     polarisation     1 / sqrt(2)                                     of a surface that depolarises
 
 The bandwidth term assumes Gaussian heights, a Gaussian spectrum and normal incidence. Light reflected at height h has
 the phase 2 k h, so two wave numbers decorrelate by |mu|^2 = exp(-4 Rq^2 (k - k')^2), and C^2 is its mean over two draws
-from the spectrum. Not modelled: oblique incidence, movement during the exposure, speckle of a laser line's own optics.
+from the spectrum.
+
+A round pupil correlates the intensities of two places at distance r on the imager by |mu|^2 = (2 J1(x) / x)^2, with
+x = pi r / (lambda N) and N the f-number. A speckle has its area A = 4 (lambda N)^2 / pi. A square pixel of width a
+averages over
+
+    1 / M = (4 / a^2) * integral from 0 to a of (1 - x / a) (1 - y / a) |mu|^2 dx dy
+
+The sum of the correlations of a pixel with all pixels is then M A / a^2: pixels larger than a speckle correlate, since
+speckles lie on their edges. That sum is what the noise of a block of pixels follows from.
+
+Not modelled: oblique incidence, movement during the exposure, speckle of a laser line's own optics.
 """
 
 from __future__ import annotations
@@ -30,13 +41,20 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv, ndtr
+from scipy.optimize import brentq
+from scipy.special import gammaincinv, j1, ndtr
 
 from characterisation.files.errors import InputError
 
 #: full width at half maximum of a Gaussian over its standard deviation
 _FWHM_PER_SIGMA = float(np.sqrt(8 * np.log(2)))
-#: speckles smaller than this [px] leave neighbouring pixels independent (correlation under 0.2 %)
+#: square root of the area of a speckle of a round pupil, over lambda N
+_SIZE_OF_ROUND_PUPIL = 2 / float(np.sqrt(np.pi))
+#: nodes of the quadrature over a pixel, for pixels smaller than a speckle; each lambda N needs some more
+_NODES = 24
+#: widest pixel [lambda N] of which the quadrature is made
+_WIDEST = 100.0
+#: sizes below this [px] leave neighbouring pixels independent (correlation under 0.2 %)
 _INDEPENDENT_PX = 0.7
 #: the normal variable of the gamma tables spans +-_REACH: beyond it lie 2e-9 of all pixels
 _REACH = 6.0
@@ -65,8 +83,44 @@ def bandwidth_contrast(height_um: float, wavelength_nm: float, linewidth_nm: flo
 
 
 def speckle_size_um(wavelength_nm: float, f_number: float) -> float:
-    """Return the size lambda / (2 sin u') = lambda f_number of a speckle on the imager [um]."""
-    return wavelength_nm * 1e-3 * f_number
+    """Return the square root of the area 4 (lambda N)^2 / pi of a speckle on the imager, for a round pupil [um]."""
+    return wavelength_nm * 1e-3 * f_number * _SIZE_OF_ROUND_PUPIL
+
+
+def speckles_in_pixel(pixel_um: float, wavelength_nm: float, f_number: float) -> float:
+    """Return M, the number of independent speckles that a square pixel averages over [1], at least 1."""
+    return _speckles_in_square(pixel_um / (wavelength_nm * 1e-3 * f_number))
+
+
+@lru_cache(maxsize=256)
+def _speckles_in_square(width: float) -> float:
+    """Return M of a square whose width is given in lambda N; beyond :data:`_WIDEST` by its area alone, to 2 %."""
+    if width > _WIDEST:
+        return _speckles_in_square(_WIDEST) * (width / _WIDEST) ** 2
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES + 4 * int(width))
+    places = (nodes + 1) / 2
+    shares = weights / 2 * (1 - places)  # of pairs of points of the pixel, by their distance along an axis
+    argument = np.maximum(np.pi * width * np.hypot(places, places[:, None]), 1e-9)
+    return float(1 / (4 * shares @ (2 * j1(argument) / argument) ** 2 @ shares))
+
+
+def correlation_size_px(pixel_um: float, wavelength_nm: float, f_number: float) -> float:
+    """Return the size [px] for :func:`speckle_field`, with which the correlations of a pixel add up to M A / a^2."""
+    share = speckle_size_um(wavelength_nm, f_number) / pixel_um
+    along = np.sqrt(speckles_in_pixel(pixel_um, wavelength_nm, f_number)) * share
+    return _size_of_sum(float(along))
+
+
+@lru_cache(maxsize=256)
+def _size_of_sum(along: float) -> float:
+    """Return the size whose correlations exp(-pi d^2 / size^2) add up to this number along a row of pixels."""
+    steps = np.arange(1, 2 + int(3 * along))
+
+    def excess(size: float) -> float:
+        return float(1 + 2 * np.exp(-np.pi * (steps / size) ** 2).sum() - along)
+
+    smallest = 0.1
+    return smallest if excess(smallest) >= 0 else float(brentq(excess, smallest, along + 1, xtol=1e-9))
 
 
 @dataclass(frozen=True)
@@ -107,7 +161,7 @@ def contrast(surface: SpeckleSurface, optics: SpeckleOptics) -> float:
     roughness = np.sqrt(1 - surface.coherent_share**2)
     bandwidth = bandwidth_contrast(surface.height_um, optics.wavelength_nm, optics.linewidth_nm)
     illumination = 1 / np.sqrt(1 + (optics.u_illumination / optics.u_observation) ** 2)
-    pixel = 1 / np.sqrt(1 + (optics.pixel_um / speckle_size_um(optics.wavelength_nm, optics.f_number)) ** 2)
+    pixel = speckles_in_pixel(optics.pixel_um, optics.wavelength_nm, optics.f_number) ** -0.5
     polarisation = np.sqrt(0.5) if surface.depolarising else 1.0
     return float(roughness * bandwidth * illumination * pixel * polarisation)
 
@@ -134,8 +188,8 @@ def speckle_field(
         C [1], 0 to 1, of the image or of each of its pixels (H, W). The gain is gamma-distributed with mean 1 and this
         standard deviation: exactly 1 for C = 0, exponential for C = 1.
     size_px
-        Speckle size on the imager [px]. Two pixels at distance d have the correlation exp(-pi d^2 / size^2), whose area
-        is size^2; below 0.7 px all pixels are independent.
+        Size [px] over which pixels correlate, from :func:`correlation_size_px`. Two pixels at distance d have the
+        correlation exp(-pi d^2 / size^2), whose area is size^2; below 0.7 px all pixels are independent.
     rng
         Generator of the draws.
 

@@ -58,12 +58,17 @@ def test_the_fixed_pattern_belongs_to_the_unit():
     assert abs(np.corrcoef(image(1, 1), image(2, 1))[0, 1]) < 0.3  # the lens's loss is the same
 
 
-def test_speckle_has_mean_one_and_its_contrast():
+def test_speckle_has_mean_one_and_the_variance_of_its_cells():
     contrast = np.full((300, 400), 0.2, np.float32)
-    gain = speckle(contrast, np.random.default_rng(1))
-    assert gain.mean() == pytest.approx(1, abs=5 * 0.2 / np.sqrt(gain.size))
-    assert gain.std() == pytest.approx(0.2, rel=0.02)
-    assert (speckle(0 * contrast, np.random.default_rng(1)) == 1).all()
+    gain = speckle(contrast, 0.25, np.random.default_rng(1))
+    # a pixel is the mean of 16 whole cells
+    assert gain.mean() == pytest.approx(1, abs=5 * 0.05 / np.sqrt(gain.size))
+    assert gain.std() == pytest.approx(0.05, rel=0.02)
+    # of any size: blocks that are large against a cell have the variance of their number of cells
+    gain = speckle(np.full((600, 600), 0.2, np.float32), 0.37, np.random.default_rng(1))
+    blocks = gain.reshape(60, 10, 60, 10).mean((1, 3))
+    assert blocks.var() == pytest.approx((0.2 * 0.37 / 10) ** 2, rel=0.12)
+    assert (speckle(0 * contrast, 0.25, np.random.default_rng(1)) == 1).all()
 
 
 def test_white_paint_has_less_speckle_than_metal_and_a_wide_spectrum_less_than_a_narrow_one():

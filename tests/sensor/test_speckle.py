@@ -13,9 +13,11 @@ from mitsim.sensor.speckle import (
     SpeckleSurface,
     bandwidth_contrast,
     contrast,
+    correlation_size_px,
     lateral_shift_std,
     speckle_field,
     speckle_size_um,
+    speckles_in_pixel,
 )
 
 RQ_PER_RA = np.sqrt(np.pi / 2)
@@ -48,10 +50,50 @@ def test_every_term_is_its_closed_form():
     assert contrast_of(**LASER | {"coherent_share": 0.3}) == pytest.approx(np.sqrt(1 + 2 * r) / (1 + r), rel=1e-6)
     assert contrast_of(**LASER | {"coherent_share": 1.0}) == 0
     assert contrast_of(**LASER | {"u_illumination": 0.02}) == pytest.approx(1 / np.sqrt(5), rel=1e-6)
-    # a pixel as large as a speckle, 633 nm at f/8
-    assert speckle_size_um(633, 8) == pytest.approx(5.064)
-    assert contrast_of(**LASER | {"pixel_um": 5.064}) == pytest.approx(np.sqrt(0.5), rel=1e-6)
+    assert contrast_of(**LASER | {"pixel_um": 5.0}) == pytest.approx(speckles_in_pixel(5.0, 633, 8) ** -0.5, rel=1e-6)
     assert contrast_of(**LASER | {"depolarising": True}) == pytest.approx(np.sqrt(0.5), rel=1e-6)
+
+
+def test_the_area_of_a_speckle_is_that_of_a_round_pupil():
+    # the integral of (2 J1(x) / x)^2 over the plane, in rings: 4 / pi (lambda N)^2. Beyond R it is 8 / (pi^3 R)
+    radius = np.linspace(1e-6, 400, 400_001)
+    rings = 2 * np.pi * radius * (2 * j1(np.pi * radius) / (np.pi * radius)) ** 2
+    area = np.trapezoid(rings, radius) + 8 / (np.pi**3 * 400)
+    assert speckle_size_um(633, 8) ** 2 == pytest.approx(area * (0.633 * 8) ** 2, rel=1e-4)
+
+
+@pytest.mark.parametrize("width", [1.0, 2.0, 4.0])
+def test_pixels_average_speckle_as_light_through_a_round_pupil(width, rng):
+    # coherent light through a round pupil, 8 samples to lambda N, added up over square pixels and blocks of 6 x 6
+    samples, n = 8, 1024
+    frequency = np.fft.fftfreq(n)
+    pupil = np.hypot(frequency, frequency[:, None]) <= 0.5 / samples
+    edge = int(samples * width)
+    variances, blocks = [], []
+    for _ in range(12):
+        field = np.fft.ifft2(np.fft.fft2(rng.standard_normal((n, n)) + 1j * rng.standard_normal((n, n))) * pupil)
+        light = np.abs(field) ** 2
+        light /= light.mean()
+        for found, side in ((variances, edge), (blocks, 6 * edge)):
+            count = n // side
+            found.append(light[: count * side, : count * side].reshape(count, side, count, side).mean((1, 3)).var())
+    pixel = np.array(variances) * speckles_in_pixel(width, 1000, 1.0)
+    # the samples inside a pixel stand for its area: at width 1 they lose 1 / (8 width)^2 of it
+    assert abs(pixel.mean() - 1) < 4 * pixel.std() / np.sqrt(12) + 1 / edge**2
+    model = [speckle_field((600, 600), 0.1, correlation_size_px(width, 1000, 1.0), rng).shift for _ in range(2)]
+    averaged = np.mean([each.reshape(2, 100, 6, 100, 6).mean((2, 4)).var() for each in model])
+    block = np.array(blocks) * speckles_in_pixel(width, 1000, 1.0) / averaged
+    # correlation of a Gaussian form ends sooner than that of a pupil with sharp edges: 6 % of a block's variance
+    assert abs(block.mean() - 1) < 4 * block.std() / np.sqrt(12) + 0.06
+
+
+def test_large_speckle_is_not_averaged_and_small_speckle_by_its_area():
+    assert speckles_in_pixel(0.01, 633, 8) == pytest.approx(1, abs=1e-5)
+    assert correlation_size_px(0.5, 633, 8) == pytest.approx(speckle_size_um(633, 8) / 0.5, rel=0.01)
+    # of the speckles of a large pixel only those on its edges, a share of about 1 / width, are more than its area holds
+    over = np.array([speckles_in_pixel(width, 1000, 1.0) / (np.pi / 4 * width**2) - 1 for width in (20, 40, 80)])
+    assert np.all(over > 0)
+    assert np.all(over[1:] < 0.6 * over[:-1])
 
 
 def test_the_terms_multiply():

@@ -27,9 +27,9 @@ from mitsim.sensor.speckle import (
     SpeckleOptics,
     SpeckleSurface,
     contrast,
+    correlation_size_px,
     lateral_shift_std,
     speckle_field,
-    speckle_size_um,
 )
 from mitsim.sensor.transforms import Transform
 
@@ -134,7 +134,8 @@ def draw_speckle(
         return None
     if isinstance(values, np.ndarray):
         values = values[roi.slices]
-    size_px = speckle_size_um(sensor.wavelength_nm, sensor.imager.f_number) / sensor.imager.pixel_um
+    imager = sensor.imager
+    size_px = correlation_size_px(imager.pixel_um, sensor.wavelength_nm, imager.f_number)
     field = speckle_field((roi.height, roi.width), values, size_px, rng)
     angle = np.asarray(values * shift_angle(sensor, camera), np.float32)
     return SpeckleField(field.gain, field.shift * angle)

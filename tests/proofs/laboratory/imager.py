@@ -4,10 +4,11 @@ Signal chain: radiance -> lens (Gaussian integrated over each pixel, cos^4) -> s
 light -> electrons -> PRNU -> Poisson -> read and row noise, DSNU, columns -> full well -> companding or gain ->
 rounding.
 
-Speckle, by Goodman (Speckle Phenomena in Optics, 2007): contrast C = (1 + 8 pi^2 (dl h / l^2)^2)^(-1/4) / sqrt(M) for
-a linewidth dl on a surface of rms height h (section 6.2, reflection at normal incidence). M = (1 + pixel area /
-correlation area) (1 + (D_projector / D_camera)^2) is the mean over the pixel, with 4 (l N)^2 / pi of a circular pupil,
-and over the pupil of the projector. Paint depolarises, which doubles M. The gain of a pixel is gamma distributed.
+Speckle, by Goodman (Speckle Phenomena in Optics, 2007): contrast C = (1 + 8 pi^2 (dl h / l^2)^2)^(-1/4) / sqrt(M) on a
+surface of rms height h (section 6.2, reflection at normal incidence). dl is the full width of the spectrum at 1 / e,
+1.201 times that at half maximum. M = 1 + (D_projector / D_camera)^2 is the mean over the pupil of the projector. Paint
+depolarises, which doubles M. The light of a pixel is the mean over independent cells of the correlation area
+4 (l N)^2 / pi of a circular pupil, with gamma distributed light: a cell on an edge gives to both of its pixels.
 Positions do not shift.
 """
 
@@ -49,14 +50,14 @@ def grey_levels(
 ) -> NDArray[np.unsignedinteger]:
     """Return the images (P, H, W) of a camera from the light (P, h, w) and the room's (h, w) [W / (mm^2 sr)].
 
-    ``contrast`` (h, w) is that of the speckle. Pixels outside the region are 0.
+    ``contrast`` (h, w) is that of the speckle at a point. Pixels outside the region are 0.
     """
     imager, camera, roi = sensor.imager, how.camera, how.roi
     if imager.corner_blur_px is not None or imager.gamma != 1:
         raise ValueError("the laboratory's imager has an even blur and no gamma")
     fixed, moving = np.random.default_rng([how.unit, 1]), np.random.default_rng([how.noise, 2])
     shape = projected.shape[1:]
-    gain = speckle(contrast, moving)
+    gain = speckle(contrast, grain_px(sensor), moving)
     loss = corner_loss(imager, camera, roi)
     response = 1 + imager.prnu * fixed.standard_normal(shape)
     offset = imager.dsnu * fixed.standard_normal(shape) + imager.column_pattern * fixed.standard_normal(shape[1])
@@ -106,23 +107,43 @@ def corner_loss(imager: Imager, camera: Camera, roi: Roi) -> NDArray[np.float64]
 
 
 def speckle_contrast(sensor: Sensor, camera: Camera, height_um: float) -> float:
-    """Return the contrast [1] of the speckle of a surface; a height that is not a number is white paint."""
+    """Return the contrast [1] of the speckle of a surface at a point; a height that is not a number is white paint."""
     if sensor.linewidth_nm is None:
         return 0.0
     imager, wavelength = sensor.imager, sensor.wavelength_nm * 1e-3
     paint = not np.isfinite(height_um)
     height = _PAINT_DEPTH_UM if paint else height_um
-    coherence = (1 + 8 * np.pi**2 * (sensor.linewidth_nm * 1e-3 * height / wavelength**2) ** 2) ** -0.25
-    grain = 4 / np.pi * (wavelength * imager.f_number) ** 2
+    linewidth = sensor.linewidth_nm * 1e-3 / np.sqrt(np.log(2))
+    coherence = (1 + 8 * np.pi**2 * (linewidth * height / wavelength**2) ** 2) ** -0.25
     pupil = np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]) * imager.pixel_um * 1e-3 / imager.f_number
-    averaged = (1 + imager.pixel_um**2 / grain) * (1 + (sensor.projector.aperture_mm / pupil) ** 2) * (1 + paint)
+    averaged = (1 + (sensor.projector.aperture_mm / pupil) ** 2) * (1 + paint)
     return float(coherence / np.sqrt(averaged))
 
 
-def speckle(contrast: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw the gain (h, w) of each pixel: mean 1, this standard deviation, gamma distributed."""
-    variance = np.maximum(contrast.astype(float) ** 2, 1e-12)
-    return np.asarray(np.where(contrast > 0, rng.gamma(1 / variance, variance), 1.0))
+def grain_px(sensor: Sensor) -> float:
+    """Return the side [px] of a square of the correlation area 4 (lambda N)^2 / pi of the speckle."""
+    return float(np.sqrt(4 / np.pi) * sensor.wavelength_nm * 1e-3 * sensor.imager.f_number / sensor.imager.pixel_um)
+
+
+def speckle(contrast: NDArray[np.float32], grain: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Draw the gain (h, w) of each pixel: the mean of cells of the side ``grain`` [px], gamma distributed of mean 1."""
+    if not contrast.any():
+        return np.ones(contrast.shape)
+    counts = [int(np.ceil(size / grain)) + 1 for size in contrast.shape]
+    rows, columns = (
+        np.minimum(((np.arange(count) + 0.5) * grain).astype(int), size - 1)
+        for count, size in zip(counts, contrast.shape, strict=True)
+    )
+    variance = np.maximum(contrast[np.ix_(rows, columns)].astype(float) ** 2, 1e-12)
+    light = np.where(variance > 1e-12, rng.gamma(1 / variance, variance), 1.0)
+    for axis, size in enumerate(contrast.shape):
+        light = np.moveaxis(light, axis, 0)
+        total = np.concatenate([np.zeros_like(light[:1]), np.cumsum(light, axis=0)])
+        edges = np.arange(size + 1) / grain
+        whole = np.minimum(edges.astype(int), len(light) - 1)
+        at = total[whole] + (edges - whole)[:, None] * light[whole]
+        light = np.moveaxis(np.diff(at, axis=0) * grain, 0, axis)
+    return np.asarray(light)
 
 
 def converted(charge: NDArray[np.float64], imager: Imager) -> NDArray[np.float64]:
