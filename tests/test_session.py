@@ -14,7 +14,9 @@ from mitsim.study import RaceTable, StatementTable, StudyFile, open_study, sessi
 from mitsim.study.run import run_study, run_within
 from mitsim.study.run_folder import read_run
 from mitsim.study.session import Session
-from mitsim.study.virtual.stated import BATCH, batches, statement_document
+from mitsim.study.virtual import stated as state
+from mitsim.study.virtual.stated import BATCH, MOST, batches, statement_document
+from mitsim.study.virtual.trials import Outcome
 from tests.smaller_sensors import coarse_sensor
 
 SCENES = Path(__file__).parents[1] / "scenes" / "two_pillars"
@@ -78,7 +80,38 @@ def test_a_settled_statement_needs_no_more_trials():
     table, limit = StatementTable(trials=500), TimeLimit(1.0)
     assert batches(table, True, TimeLimit())[-1] == batches(table, True, limit)[-1] == 500
     assert batches(table, False, limit) == [500]
-    assert batches(StatementTable(), True, limit)[-1] > batches(StatementTable(), True, TimeLimit())[-1] == 200
+    assert batches(StatementTable(), True, limit)[-1] > batches(StatementTable(), True, TimeLimit())[-1]
+
+
+class NormalErrors:
+    """Virtual measurements whose errors are normal, or have a long tail."""
+
+    source = "render"
+
+    def __init__(self, names, long_tail):
+        self.names, self.long_tail = list(names), long_tail
+
+    def in_order(self, jobs):
+        return list(jobs)
+
+    def run(self, jobs):
+        for job in jobs:
+            rng = np.random.default_rng([job.trial.day, job.trial.capture])
+            tail = 12.0 if self.long_tail and rng.random() < 0.03 else 1.0
+            yield job, Outcome({name: float(rng.normal(0.0, 1.9 * tail)) for name in self.names})
+
+
+@pytest.mark.parametrize("long_tail", [False, True])
+def test_a_statement_goes_on_until_its_uncertainties_are_known(study, tmp_path, monkeypatch, long_tail):
+    """Trials beyond the default are made where tails are long, and no more than the standard error needs."""
+    runner = NormalErrors(study.task.measurements, long_tail)
+    monkeypatch.setattr(state, "source_of_trials", lambda session, _: (runner, session.trials, None))
+    monkeypatch.setattr(state, "_settled", lambda _: False)
+    stated = Session(study, tmp_path).state(study.views[4]).statements
+    known_to = max(one.moved[1] / one.standard_uncertainty for one in stated)
+    default = StatementTable()
+    assert stated[0].trials > default.trials if long_tail else stated[0].trials == default.trials
+    assert known_to <= default.known_to or stated[0].trials == MOST
 
 
 def test_a_run_within_a_limit_says_what_it_lacks_and_goes_on_without_one(study, tmp_path):
@@ -90,8 +123,8 @@ def test_a_run_within_a_limit_says_what_it_lacks_and_goes_on_without_one(study, 
     rules = {"race": RaceTable(shortlist=1, trials=4), "statement": StatementTable(trials=2)}
     keep_finished(tmp_path, False, "run.json")
     assert not (tmp_path / "run.json").exists()
-    stated = run_study(replace(study, file=study.file.model_copy(update=rules)), tmp_path / "other")
+    whole = run_study(replace(study, file=study.file.model_copy(update=rules)), tmp_path / "other")
     about = read_run(tmp_path / "other").about
-    assert stated[0].trials == 2 and about.finished and not about.lacks
+    assert whole[0].trials == 2 and about.finished and not about.lacks
     with pytest.raises(InputError, match="finished run"):
         keep_finished(tmp_path / "other", False, "run.json")

@@ -33,8 +33,8 @@ Floats = NDArray[np.float64]
 #: name of the component of what no other explains: independent from trial to trial
 RESIDUAL = "residual"
 
-#: largest number of trials that are decomposed at once, which bounds time and memory
-AT_ONCE = 400
+#: number of trials that are decomposed at once, to a half more or less: time grows with its cube
+AT_ONCE = 200
 
 #: largest number of iterations, and the change of the likelihood that ends them
 _ITERATIONS, _CONVERGED = 60, 1e-6
@@ -87,7 +87,7 @@ def components(
     """
     values = np.asarray(errors, float)
     count = len(values)
-    parts = np.array_split(np.arange(count), max(1, math.ceil(count / AT_ONCE)))
+    parts = np.array_split(np.arange(count), max(1, round(count / AT_ONCE)))
     scale = float(values.std()) or 1.0
     along = None if directions is None else np.asarray(directions, float)
     by_group = {name: _standard(np.asarray(one, float)) for name, one in numbers.items()}

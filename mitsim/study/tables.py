@@ -80,10 +80,12 @@ class RaceTable(Document):
 class StatementTable(Document):
     """How the uncertainty of the chosen view is stated.
 
-    ``trials`` are made with draws that no race uses.
+    ``trials`` are made with draws that no race uses. A study that names no number makes as many again, up to five times
+    as many, until every standard uncertainty has at most the relative standard error ``known_to``.
     """
 
     trials: int = Field(default=200, ge=2, le=1_000_000)
+    known_to: Annotated[float, Field(gt=0, le=1)] = 0.1
 
 
 class ExposureTable(Document):

@@ -43,7 +43,7 @@ def test_shares_are_right_on_average_and_as_often_inside_their_intervals_as_is_s
 
 
 def test_many_trials_find_the_truth():
-    errors, numbers, seeds = drawn(2, 4 * AT_ONCE)
+    errors, numbers, seeds = drawn(2, 8 * AT_ONCE)
     for line in budget(errors, numbers, seeds):
         assert line.share == pytest.approx(TRUTH[line.group], abs=0.03), line.group
         assert line.settled

@@ -48,8 +48,8 @@ BATCH = 40
 #: fewest trials of a statement with which views are compared
 LEAST_COMPARED = 20
 
-#: largest number of trials of a statement within a time limit, if the study names none
-MOST_WITHIN_A_LIMIT = 4000
+#: largest number of trials of a statement, if the study names none: without a time limit, and within one
+MOST, MOST_WITHIN_A_LIMIT = 1000, 4000
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,9 @@ def state_view(
     """State every measurement from one view at its exposures, and reuse trials in the folder of the session.
 
     Draws of the race are not used: they selected the view, and are biased in its favour. Trials end when every
-    measurement is settled (JCGM 101:2008, 7.9), when they have the number of the study, or when time is over.
+    measurement is settled (JCGM 101:2008, 7.9), when they have the number of the study, or when time is over. If the
+    study names no number, they also end when every standard uncertainty is known well enough, but not before the
+    default number: few trials of errors with long tails show too little of the tails.
 
     Parameters
     ----------
@@ -85,21 +87,24 @@ def state_view(
     table
         Replaces the study's number of trials, which are then made whether or not fewer would settle the statement.
     limit
-        Time of the statement. Within it, a study that names no number of trials may make
-        :data:`MOST_WITHIN_A_LIMIT`.
+        Time of the statement. A study that names no number of trials may make :data:`MOST_WITHIN_A_LIMIT` within it,
+        and ends when it is settled; without a limit, :data:`MOST`.
     after_batch
         Receives the statement, without a budget, after every :data:`BATCH` trials but the last.
     """
     study, (runner, trials, planned) = session.study, source_of_trials(session, view)
     limit = TimeLimit() if limit is None else limit
     label = f"state view {view.number}"
-    made = list[Trial]()
-    for count in batches(table or study.file.statement, table is None, limit):
+    made, rules = list[Trial](), table or study.file.statement
+    by_known = table is None and limit.end is None and "trials" not in rules.model_fields_set
+    for count in batches(rules, table is None, limit):
         wanted = statement_trials(count)
         complete(trials, runner, [Job(view, trial) for trial in wanted], label, limit.over)
         made = [trial for trial in wanted if trial in trials.known(view.number)]
         so_far = StatedView(view, _statements(study, trials, view, made), planned)
         if limit.over() or (table is None and count > BATCH and _settled(so_far.statements)):
+            break
+        if by_known and count >= rules.trials and _known_to(so_far.statements, rules.known_to):
             break
         if after_batch is not None:
             after_batch(so_far)
@@ -150,8 +155,8 @@ def batches(table: StatementTable, by_settled: bool, limit: TimeLimit) -> list[i
     A limit replaces the largest number of a table that names none.
     """
     most = table.trials
-    if by_settled and limit.end is not None and "trials" not in table.model_fields_set:
-        most = MOST_WITHIN_A_LIMIT
+    if by_settled and "trials" not in table.model_fields_set:
+        most = MOST if limit.end is None else MOST_WITHIN_A_LIMIT
     return [*range(BATCH, most, BATCH), most] if by_settled else [most]
 
 
@@ -175,6 +180,13 @@ def _statements(
 def _settled(stated: Sequence[Statement]) -> bool:
     """Return whether all statements are settled but those without values."""
     return all(one.settled or not math.isfinite(one.standard_uncertainty) for one in stated)
+
+
+def _known_to(stated: Sequence[Statement], share: float) -> bool:
+    """Return whether the standard error of every standard uncertainty is at most this share of it."""
+    return all(
+        one.moved[1] <= share * one.standard_uncertainty for one in stated if math.isfinite(one.standard_uncertainty)
+    )
 
 
 def budget_groups(unknowns: Unknowns, source: str, sensor: Sensor) -> list[str]:
