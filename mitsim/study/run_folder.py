@@ -246,7 +246,8 @@ class Run:
         """
         return name in self.about.files if self.about.files else (self.folder / name).exists()
 
-    def _cloud(self, kind: str, view: int) -> PointCloud:
+    def cloud(self, kind: str, view: int) -> PointCloud:
+        """Return the ``predicted`` or ``rendered`` cloud of a view."""
         name = f"clouds/{kind}_{view:04d}.ply"
         self.check(name)
         return read_cloud(self.folder / name)
@@ -275,11 +276,11 @@ class Run:
 
     def predicted(self, view: int) -> PointCloud:
         """Return the cloud of a view that the map predicts."""
-        return self._cloud("predicted", view)
+        return self.cloud("predicted", view)
 
     def decoded(self, view: int) -> PointCloud:
         """Return the cloud of a checked view, decoded from its rendered images."""
-        cloud, grid = self._cloud("rendered", view), self.predicted(view).grid
+        cloud, grid = self.cloud("rendered", view), self.predicted(view).grid
         if (cloud.grid.height, cloud.grid.width) != (grid.height, grid.width):
             found, path = (
                 f"{cloud.grid.height} x {cloud.grid.width} pixels",
