@@ -339,6 +339,9 @@ def read_run(folder: str | Path) -> Run:
         scores[name] = scores[name].astype(bool)  # netCDF has no booleans
     stated = "statement.json" in own or not own
     statement = read_statement(folder / "statement.json") if stated else None
+    if statement is not None and not set(statement.measurements) <= set(about.measurements):
+        found, allowed = ", ".join(statement.measurements), f"{', '.join(about.measurements)}, as in run.json"
+        raise InputError(folder / "statement.json", "measurements", found, allowed)
     return Run(folder, about, performance_map, patches, scores, checks, statement)
 
 
