@@ -27,7 +27,7 @@ from mitsim.running.version import __version__
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.preset import Sensor
 from mitsim.study import StatementTable, Study
-from mitsim.study.exposures.planned import with_exposure
+from mitsim.study.exposures.planned import planned_for, with_exposure
 from mitsim.study.maker_accuracy import maker_sigma
 from mitsim.study.virtual.drawn_decoder import decoder_is_drawn
 from mitsim.study.virtual.drawn_numbers import drawn_numbers, related, seeds, statement_trials
@@ -99,7 +99,8 @@ def state_view(
         complete(trials, runner, [Job(view, trial) for trial in wanted], label, limit.over)
         made = [trial for trial in wanted if trial in trials.known(view.number)]
         so_far = StatedView(view, _statements(study, trials, view, made), planned)
-        if limit.over() or (table is None and count > BATCH and _settled(so_far.statements)):
+        settled = all(one.settled or not math.isfinite(one.standard_uncertainty) for one in so_far.statements)
+        if limit.over() or (table is None and count > BATCH and settled):
             break
         if after_batch is not None:
             after_batch(so_far)
@@ -110,10 +111,10 @@ def state_view(
 
 def source_of_trials(session: Session, view: View) -> tuple[TrialRunner, TrialFolder, PlannedExposure | None]:
     """Return what makes the trials of a statement of a view, where they are kept, and their planned exposures."""
-    runner, planned = session.runner, session.exposures(view)
+    runner, planned = session.runner, planned_for(session, view)
     if planned is None:
         return runner, session.trials, None
-    assert not isinstance(runner, MappedMeasurements)  # exposures() rejects a map
+    assert not isinstance(runner, MappedMeasurements)  # planned_for rejects a map
     digest = with_exposure(session.digest, planned)
     return (
         runner.exposed_as(planned),
@@ -170,11 +171,6 @@ def _statements(
         stated = statement(name, asked.unit, errors[m], tolerance_of(study.task, name), lines, days, common)
         out.append(replace(stated, losses=losses(trials.reasons(view.number, made, name))))
     return out
-
-
-def _settled(stated: Sequence[Statement]) -> bool:
-    """Return whether all statements are settled but those without values."""
-    return all(one.settled or not math.isfinite(one.standard_uncertainty) for one in stated)
 
 
 def budget_groups(unknowns: Unknowns, source: str, sensor: Sensor) -> list[str]:
