@@ -340,8 +340,8 @@ def read_run(folder: str | Path) -> Run:
     stated = "statement.json" in own or not own
     statement = read_statement(folder / "statement.json") if stated else None
     if statement is not None and not set(statement.measurements) <= set(about.measurements):
-        found, allowed = ", ".join(statement.measurements), f"{', '.join(about.measurements)}, as in run.json"
-        raise InputError(folder / "statement.json", "measurements", found, allowed)
+        names, allowed = ", ".join(statement.measurements), f"{', '.join(about.measurements)}, as in run.json"
+        raise InputError(folder / "statement.json", "measurements", names, allowed)
     return Run(folder, about, performance_map, patches, scores, checks, statement)
 
 
