@@ -170,8 +170,10 @@ def predict(
     """
     start(variant)
     from mitsim.decoding.captures import load_scene, load_sensor, write_cloud
+    from mitsim.decoding.cloud import sensor_geometry
     from mitsim.maps import use as maps
-    from mitsim.maps.prediction.faces_in_sight import in_words
+    from mitsim.maps.prediction import Predictor
+    from mitsim.maps.prediction.faces_in_sight import faces_in_sight, in_words
     from mitsim.running.progress import say
     from mitsim.study import read_map
 
@@ -184,7 +186,8 @@ def predict(
     check_file(output)
     write_cloud(cloud, output)
     print_reasons(cloud)
-    if lit := in_words(maps.faces_that_see_others(loaded, chosen, pose)):
+    predictor = Predictor.of_sensor(chosen, sensor_geometry(chosen))
+    if lit := in_words(faces_in_sight(predictor, loaded, pose)):
         say(f"{lit}; their F can be far lower: mitsim study score predicts it")
 
 

@@ -21,7 +21,6 @@ from mitsim.maps.campaign.orders import worker_source
 from mitsim.maps.campaign.plan import Campaign, CampaignFile, plan_campaign
 from mitsim.maps.campaign.run import run_campaign
 from mitsim.maps.prediction import CharacterisedScene, Predictor
-from mitsim.maps.prediction.faces_in_sight import faces_in_sight
 from mitsim.running.executor import Executor
 from mitsim.scene.load import Scene
 from mitsim.sensor.poses import as_pose
@@ -192,12 +191,3 @@ def predict(
     needed = NeededFinishes(sensor, scene.where, seen_finishes(scene), (max(distance - radius, 1.0), distance + radius))
     characterised = CharacterisedScene(scene, map_with_finishes(performance_map, needed, ask))
     return predictor.predict(characterised, world_from_sensor, np.random.default_rng(seed), correlated)
-
-
-def faces_that_see_others(scene: Scene, sensor: Sensor, pose: Transform) -> dict[str, float]:
-    """Return the features of a view that see other faces, whose F therefore differs from that of a map.
-
-    The values are the shares of directions in which the other faces lie
-    (:mod:`mitsim.maps.prediction.faces_in_sight`).
-    """
-    return faces_in_sight(Predictor.of_sensor(sensor, sensor_geometry(sensor)), scene, pose)

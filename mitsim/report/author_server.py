@@ -113,7 +113,8 @@ class AuthorServer:
             self._check_texts(texts)
         except InputError as error:
             return 422, {"fault": str(error)}
-        before = {name: _bytes(self.folder / name) for name in texts}
+        paths = {name: self.folder / name for name in texts}
+        before = {name: path.read_bytes() if path.exists() else None for name, path in paths.items()}
         try:
             for name, text in texts.items():
                 write_text(self.folder / name, text)
@@ -139,10 +140,6 @@ class AuthorServer:
                     read_features(path)
                 else:
                     read_toml(path, StudyFile)
-
-
-def _bytes(path: Path) -> bytes | None:
-    return path.read_bytes() if path.exists() else None
 
 
 def _restore(path: Path, data: bytes | None) -> None:

@@ -108,11 +108,7 @@ def of_run(run: Run, geometry: SceneGeometry | None) -> FirstScreen:
         return _without_statement(run, geometry)
     results = [_judged(name, one) for name, one in document.measurements.items()]
     view_scores = run.scores.sel(view=document.view)
-    asked = {
-        name: (run.about.measurements[name].faces, one.verdict)
-        for name, one in document.measurements.items()
-        if name in run.about.measurements
-    }
+    asked = {name: (run.about.measurements[name].faces, one.verdict) for name, one in document.measurements.items()}
     poses: list[tuple[str, ArrayLike]] = [(f"view {document.view}", view_scores["world_from_sensor"].values)]
     verdicts = face_verdicts(asked)
     result = with_sets(result_in_words(results), fits_all(results), run.about.view_sets)
@@ -222,19 +218,15 @@ def sensor_rows(choice: ChoiceDocument, one: SensorEntry) -> list[ResultRow]:
 
 def _run_row(run: Run, view_scores: xr.Dataset, name: str, one: StatedMeasurement) -> ResultRow:
     """Return the row of a measurement of a run; ``view_scores`` are the scores of the stated view."""
-    entry, decision, largest = run.about.measurements.get(name), one.decision, largest_line(one.budget)
-    limit = feature = ""
-    points = None
-    if entry is not None:
-        limit, feature = (str(view_scores[key].sel(measurement=name).values) for key in ("limit", "limiting_feature"))
-        points = float(view_scores["n"].sel(feature=feature)) if feature in view_scores["feature"].values else None
-    tolerance = one.tolerance if entry is None or entry.tolerance is None else entry.tolerance
+    entry, decision, largest = run.about.measurements[name], one.decision, largest_line(one.budget)
+    limit, feature = (str(view_scores[key].sel(measurement=name).values) for key in ("limit", "limiting_feature"))
+    points = float(view_scores["n"].sel(feature=feature)) if feature in view_scores["feature"].values else None
     return RowValues(
         name=name,
-        about="" if entry is None else measured_words(entry.kind, entry.features),
+        about=measured_words(entry.kind, entry.features),
         unit=one.unit,
-        nominal=math.nan if entry is None else entry.nominal,
-        tolerance=tolerance,
+        nominal=entry.nominal,
+        tolerance=one.tolerance if entry.tolerance is None else entry.tolerance,
         uncertainty=one.standard_uncertainty,
         share=one.share_of_tolerance,
         **_same_names(one, _MEASURED),

@@ -150,7 +150,5 @@ def sensor_name(one: PerformanceMap) -> str:
 
 
 def _index(one: PerformanceMap, sample: Sample) -> int | None:
-    for index, (name, roughness) in enumerate(one.samples):
-        if name == sample[0] and (roughness == sample[1] or (math.isnan(roughness) and math.isnan(sample[1]))):
-            return index
-    return None
+    known = [(name, f"{roughness}") for name, roughness in one.samples]  # as texts, NaN equals NaN
+    return known.index(own) if (own := (sample[0], f"{sample[1]}")) in known else None

@@ -27,7 +27,7 @@ from mitsim.report.agreement import Agreement, agreement, chance_level
 from mitsim.report.cloud_figures import REASONS
 from mitsim.report.first_screen import of_run
 from mitsim.report.page_pictures import camera_view, cloud_picture, map_pictures, measurement_pictures
-from mitsim.report.pose_texts import pose_of_view, pose_texts
+from mitsim.report.pose_texts import expected_texts, pose_of_view, pose_texts
 from mitsim.report.statement_section import statement_section
 from mitsim.report.templates import write_page
 from mitsim.report.view_sphere import view_sphere
@@ -171,7 +171,7 @@ def _answer(run: Run, name: str) -> dict[str, Any]:
         "trials": count(trials),
         "confidence": percent(run.about.confidence.get(name, 0.0)),
     }
-    return row | pose_texts(pose_of_view(run, best)) | _expected(run, name, best) | measured
+    return row | pose_texts(pose_of_view(run, best)) | expected_texts(run, name, best) | measured
 
 
 def _runner_up(run: Run, one: RunnerUp) -> dict[str, Any]:
@@ -179,20 +179,6 @@ def _runner_up(run: Run, one: RunnerUp) -> dict[str, Any]:
     stated = NONE if one.stated_ratio is None else rounded(one.stated_ratio, 2)
     texts = {"ratio": rounded(one.ratio, 2), "near": percent(one.near), "trials": count(one.trials), "stated": stated}
     return pose_texts(pose_of_view(run, one.view)) | texts
-
-
-def _expected(run: Run, name: str, view: int) -> dict[str, str]:
-    """Return the predicted figures of a view and a measurement that it can make, as texts."""
-    here = run.scores.sel(measurement=name, view=view)
-    u, tolerance = float(here["predicted_uncertainty"]), float(here["tolerance"])
-    limit, feature = str(here["limit"].values), str(here["limiting_feature"].values)
-    return {
-        "uncertainty": quantity(u, run.about.measurements[name].unit),
-        "margin": two_digits(tolerance / u) if u > 0 else NONE,
-        "limit": f"{limit} on {feature}" if limit and feature else limit,
-        "score": rounded(float(here["V_m"]), 2),
-        "score_rank": count(int(here["rank"])),
-    }
 
 
 def _agreement_row(name: str, found: Agreement) -> dict[str, str]:
@@ -233,7 +219,7 @@ def _table(run: Run, name: str) -> dict[str, Any]:
         view, points = int(numbers[i]), run.scores["n"].isel(view=int(i))
         rows.append(
             pose_texts(pose_of_view(run, view))
-            | _expected(run, name, view)
+            | expected_texts(run, name, view)
             | {
                 "rank": rank,
                 "points": [count(round(float(points.sel(feature=feature)))) for feature in entry.faces],

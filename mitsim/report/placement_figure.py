@@ -218,10 +218,7 @@ def _sensor(
     label: str,
     strong: bool,
 ) -> None:
-    """Draw the eyes, the body between them, and the reference camera's frustum down to the centre of the part.
-
-    A view that is not ``strong`` is drawn as its axis alone.
-    """
+    """Draw the eyes, the body between them, and the reference camera's frustum, or its axis alone if not ``strong``."""
     centres = geometry.centres @ part_from_sensor[:3, :3].T + part_from_sensor[:3, 3] - middle
     rays = geometry.rays[0] @ part_from_sensor[:3, :3].T
     axis = rays.mean(axis=0)

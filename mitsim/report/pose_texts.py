@@ -1,10 +1,10 @@
-"""Describe the pose of a view: angles in deg, lengths in mm, in the part frame."""
+"""Describe a view: its pose, angles in deg and lengths in mm in the part frame, and what is predicted for it."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from mitsim.running.numbers import SPACE, rounded
+from mitsim.running.numbers import NONE, SPACE, count, percent, quantity, rounded, two_digits
 from mitsim.study.choice_document import PoseEntry
 from mitsim.study.run_folder import Run
 
@@ -48,3 +48,18 @@ def pose_words(pose: PoseEntry) -> str:
         f"elevation {angles['elevation']} (above the plane z = 0), "
         f"roll {angles['roll']} (about the line of sight, clockwise as the sensor sees)"
     )
+
+
+def expected_texts(run: Run, name: str, view: int) -> dict[str, str]:
+    """Return the predicted figures of a view and a measurement that it can make, as texts."""
+    here = run.scores.sel(measurement=name, view=view)
+    u, tolerance = float(here["predicted_uncertainty"]), float(here["tolerance"])
+    limit, feature = str(here["limit"].values), str(here["limiting_feature"].values)
+    return {
+        "chance": percent(float(here["chance"])),
+        "uncertainty": quantity(u, run.about.measurements[name].unit),
+        "margin": two_digits(tolerance / u) if u > 0 else NONE,
+        "limit": f"{limit} on {feature}" if limit and feature else limit,
+        "score": rounded(float(here["V_m"]), 2),
+        "score_rank": count(int(here["rank"])),
+    }

@@ -120,9 +120,7 @@ def _colours(facts: SceneFacts, first: Sequence[str], measured: Collection[str])
 def _painted(
     shape: NDArray[np.int16], front: NDArray[np.bool_], lit: Floats, colours: list[str], clear: NDArray[np.bool_]
 ) -> Floats:
-    """Return an image (H, W, 3): colour by shape, shaded by ``lit`` 0..1, pale where not ``clear``, dark backs and
-    edges.
-    """
+    """Return an image (H, W, 3): colour by shape, shaded by ``lit`` 0..1, pale where not ``clear``."""
     palette = np.array([to_rgb(colour) for colour in [*colours, "#ffffff"]])
     colour = np.where(front[..., None] | (shape < 0)[..., None], palette[shape], to_rgb(_BACK))
     shade = np.where(shape >= 0, 0.45 + 0.55 * np.nan_to_num(lit), 1.0)

@@ -7,7 +7,6 @@ import textwrap
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
@@ -48,13 +47,14 @@ def noise_figure(sheets: Sequence[DataSheet]) -> Figure:
             axes.loglog(distance, sigma, "o", color=BLUE, ms=4, mfc="white", label="simulated, in discs of 113 px")
             for style, known in zip(_LINES, sheet.sensor.published_noise, strict=False):
                 mark = {"marker": "D", "ls": "none", "ms": 5} if len(known.distance_mm) == 1 else {"ls": style}
-                axes.loglog(
-                    known.distance_mm, known.sigma_mm, color=VERMILION, lw=1.1, label=_short(known.source), **mark
-                )  # type: ignore[arg-type]
+                source = textwrap.shorten(known.source.split(":")[0].split(" (")[0], 48, placeholder=" ...")
+                axes.loglog(known.distance_mm, known.sigma_mm, color=VERMILION, lw=1.1, label=source, **mark)  # type: ignore[arg-type]
             axes.set(title=sheet.sensor.name, xlabel="distance [mm]", ylabel="sigma along V [mm]")
             largest = np.nanmax([*spread, *(s for known in sheet.sensor.published_noise for s in known.sigma_mm)])
             axes.set_ylim(max(axes.get_ylim()[0], largest / 300), 2.5 * largest)
-            _plain_ticks(axes, distance)
+            axes.set_xticks([round(float(d)) for d in distance[::2]], [f"{d:.0f}" for d in distance[::2]])
+            axes.minorticks_off()
+            plain_log(axes.yaxis)
             axes.legend(loc="best", fontsize=6.5)
     return figure
 
@@ -207,16 +207,6 @@ def _panels(count: int, width: float, height: float) -> tuple[Figure, NDArray[np
     for spare in panels[count:]:
         spare.set_visible(False)
     return figure, panels
-
-
-def _plain_ticks(axes: Axes, distance: NDArray[np.floating]) -> None:
-    axes.set_xticks([round(float(d)) for d in distance[::2]], [f"{d:.0f}" for d in distance[::2]])
-    axes.minorticks_off()
-    plain_log(axes.yaxis)
-
-
-def _short(source: str) -> str:
-    return textwrap.shorten(source.split(":")[0].split(" (")[0], 48, placeholder=" ...")
 
 
 def _window_around(cloud: PointCloud) -> tuple[slice, slice]:

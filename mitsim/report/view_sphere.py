@@ -20,10 +20,10 @@ from typing import Any
 
 from characterisation.tasks.covariance import LEAST_CHANCE
 from mitsim.report import findings
-from mitsim.report.pose_texts import angle_texts, pose_of_view
+from mitsim.report.pose_texts import expected_texts, pose_of_view, pose_texts
 from mitsim.report.templates import joined_script, script_content
 from mitsim.report.view_data import as_json, solids, view_data
-from mitsim.running.numbers import NONE, count, percent, quantity, rounded, two_digits
+from mitsim.running.numbers import count, percent, quantity, rounded, two_digits
 from mitsim.study.run_folder import Run, TriedEntry, ViewSetEntry
 
 #: views in the table that replaces the sphere
@@ -62,24 +62,12 @@ def _rows(run: Run, name: str) -> list[dict[str, str]]:
     """Return the best views of a measurement, for readers without scripts; the script writes all others."""
     if not name:
         return []
-    here, entry = run.scores.sel(measurement=name), run.about.measurements[name]
-    tolerance = float(here["tolerance"])
+    numbers = run.scores["view"].values
     rows = list[dict[str, str]]()
-    for i in findings.ranked_views(run.scores, name)[:TOP]:
-        one = here.isel(view=int(i))
-        u, pose = float(one["predicted_uncertainty"]), pose_of_view(run, int(one["view"]))
-        rows.append(
-            {
-                "rank": str(len(rows) + 1),
-                "view": str(pose.view),
-                "uncertainty": quantity(u, entry.unit),
-                "ratio": two_digits(tolerance / u) if u > 0 else NONE,
-                "chance": percent(float(one["chance"])),
-                "score": rounded(float(one["V_m"]), 2),
-                "standoff": rounded(pose.standoff_mm),
-                **angle_texts(pose),
-            }
-        )
+    for rank, i in enumerate(findings.ranked_views(run.scores, name)[:TOP], 1):
+        pose = pose_of_view(run, int(numbers[i]))
+        own = {"rank": str(rank), "standoff": rounded(pose.standoff_mm)}
+        rows.append(pose_texts(pose) | expected_texts(run, name, pose.view) | own)
     return rows
 
 

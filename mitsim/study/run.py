@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -39,11 +40,10 @@ from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import Study
 from mitsim.study.remedies.change import Shortfall
 from mitsim.study.remedies.confirm import all_changes, find_remedies, remedies_document
-from mitsim.study.run_files import digests_of
-from mitsim.study.run_record import draw_clouds, own_files, run_record, runners_up
+from mitsim.study.run_record import draw_clouds, write_record
 from mitsim.study.scoring import score_study, write_raced
 from mitsim.study.session import Session
-from mitsim.study.time_plan import TimePlan, time_plan
+from mitsim.study.time_plan import time_plan
 from mitsim.study.view_sets.confirmed_set import (
     Search,
     TriedSet,
@@ -168,7 +168,9 @@ def run_within(
     remedies = None
     if stated is not None and not limit.over():
         twin = None  # its memory is for the changed studies
-        remedies = _remedies(session, stated, scores, raced, search, _time_of_remedies(study, plan, limit))
+        own = study.file.remedies.minutes
+        allowed = TimeLimit(60 * own) if limit.end is None else plan.remedies_limit(limit)
+        remedies = _remedies(session, stated, scores, raced, search, allowed)
         twin = session.renderer
     clock.lap("remedies")
     tried = [] if limit.over() else _confirm(session, chosen, search)
@@ -184,22 +186,29 @@ def run_within(
         each = (time.monotonic() - began) / max(1, len(shown))
         residuals += [_residual(twin, number) for number in shown[:1] if pictured.left > _RESIDUAL_PICTURES * each]
     clock.lap("pictures")
-    about = run_record(study, performance_map, raced, shown, largest_residual(residuals))
+    largest = largest_residual(residuals)
     reported = leaders[:1] or _best(scores)[:1]
-    about["faces_in_sight"] = {
+    in_sight = {
         name: share
         for number in reported
         for name, share in faces_in_sight(session.predictor, study.scene, study.view(number).world_from_sensor).items()
         if name in study.task.shapes
     }
-    about["view_sets"] = [] if chosen is None else [_set_record(study, chosen, tried)]
-    about["remedies"] = remedies
-    about["seconds"] = clock.steps
-    about["runners_up"] = runners_up(session, raced)
-    about["lacks"] = lacking(study, raced, stated, limit)
-    about["finished"] = not limit.over()
-    about["files"] = digests_of(folder, own_files(study, drawn, shown, stated is not None))
-    write_json(folder / "run.json", about)
+    write_record(
+        session,
+        performance_map,
+        raced,
+        drawn,
+        shown,
+        stated=stated is not None,
+        render_residual=None if largest is None else asdict(largest),
+        faces_in_sight=in_sight,
+        view_sets=[] if chosen is None else [_set_record(study, chosen, tried)],
+        remedies=remedies,
+        seconds=clock.steps,
+        lacks=lacking(study, raced, stated, limit),
+        finished=not limit.over(),
+    )
     return [] if stated is None else stated.statements
 
 
@@ -259,7 +268,7 @@ class _Answers:
         if self.report is None or self.limit.elapsed < self.next_s or self.limit.over():
             return
         began = time.monotonic()
-        session, study, folder = self.session, self.session.study, self.session.folder
+        session, folder = self.session, self.session.folder
         write_raced(session, self.scores, raced)
         if stated is not None:
             write_json(folder / "statement.json", statement_document(session, stated))
@@ -267,11 +276,9 @@ class _Answers:
         if leader not in self.drawn:
             draw_clouds(session, self.map, [leader])
             self.drawn.add(leader)
-        about = run_record(study, self.map, raced, [], None)
-        about |= {"seconds": self.clock.steps, "finished": False, "runners_up": runners_up(session, raced)}
-        about["lacks"] = ["the run goes on", *([] if stated is not None else ["no statement of uncertainty yet"])]
-        about["files"] = digests_of(folder, own_files(study, [leader], [], stated is not None))
-        write_json(folder / "run.json", about)
+        lacks = ["the run goes on", *([] if stated is not None else ["no statement of uncertainty yet"])]
+        record: dict[str, Any] = {"seconds": self.clock.steps, "lacks": lacks, "finished": False}
+        write_record(session, self.map, raced, [leader], [], stated=stated is not None, **record)
         self.report()
         first = self.next_s == FIRST_ANSWER_S
         say(f"{'first answer' if first else 'answer'} after {self.limit.elapsed:.0f} s: view {leader}, report.html")
@@ -279,10 +286,7 @@ class _Answers:
 
 
 def _confirm(session: Session, chosen: ViewSet | None, search: Search) -> list[TriedSet]:
-    """Measure sets of views virtually until one keeps its limits; the best set comes last.
-
-    The list is empty without a set, or if measurements are drawn from a map.
-    """
+    """Measure sets of views virtually, if there are any, until one keeps its limits; the best set comes last."""
     table = session.study.file.set
     if table is None or chosen is None or not chosen.views or table.trials < 2:
         return []
@@ -306,11 +310,6 @@ def _seeks_remedies(study: Study) -> bool:
     """Return whether a run looks for changes that make measurements fit: the study allows it, and has tolerances."""
     tolerances = (one.tolerance for one in study.task.measurements.values())
     return study.file.remedies.minutes > 0 and any(one is not None for one in tolerances)
-
-
-def _time_of_remedies(study: Study, plan: TimePlan, limit: TimeLimit) -> TimeLimit:
-    """Return the limit of the search for changes: that of the study, or what pictures and report leave of a limit."""
-    return TimeLimit(60 * study.file.remedies.minutes) if limit.end is None else plan.remedies_limit(limit)
 
 
 def _remedies(
@@ -357,10 +356,7 @@ def _show(
     planned: dict[int, PlannedExposure | None],
     limit: TimeLimit,
 ) -> list[int]:
-    """Write image and cloud of some views, with best estimates of all unknowns and planned exposures, within a limit.
-
-    Returns the views that were written.
-    """
+    """Write image and cloud of views, with best estimates of all unknowns, within a limit; return those written."""
     shown = []
     for number in track(numbers, "render pictures"):
         if limit.over():

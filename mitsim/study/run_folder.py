@@ -246,7 +246,8 @@ class Run:
         """
         return name in self.about.files if self.about.files else (self.folder / name).exists()
 
-    def _cloud(self, kind: str, view: int) -> PointCloud:
+    def cloud(self, kind: str, view: int) -> PointCloud:
+        """Return the ``predicted`` or ``rendered`` cloud of a view."""
         name = f"clouds/{kind}_{view:04d}.ply"
         self.check(name)
         return read_cloud(self.folder / name)
@@ -275,11 +276,11 @@ class Run:
 
     def predicted(self, view: int) -> PointCloud:
         """Return the cloud of a view that the map predicts."""
-        return self._cloud("predicted", view)
+        return self.cloud("predicted", view)
 
     def decoded(self, view: int) -> PointCloud:
         """Return the cloud of a checked view, decoded from its rendered images."""
-        cloud, grid = self._cloud("rendered", view), self.predicted(view).grid
+        cloud, grid = self.cloud("rendered", view), self.predicted(view).grid
         if (cloud.grid.height, cloud.grid.width) != (grid.height, grid.width):
             found, path = (
                 f"{cloud.grid.height} x {cloud.grid.width} pixels",
@@ -338,6 +339,9 @@ def read_run(folder: str | Path) -> Run:
         scores[name] = scores[name].astype(bool)  # netCDF has no booleans
     stated = "statement.json" in own or not own
     statement = read_statement(folder / "statement.json") if stated else None
+    if statement is not None and not set(statement.measurements) <= set(about.measurements):
+        names, allowed = ", ".join(statement.measurements), f"{', '.join(about.measurements)}, as in run.json"
+        raise InputError(folder / "statement.json", "measurements", names, allowed)
     return Run(folder, about, performance_map, patches, scores, checks, statement)
 
 

@@ -7,21 +7,22 @@ from __future__ import annotations
 
 import os
 import platform
-from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from characterisation.cloud_files import write_cloud
+from characterisation.files.atomic_io import write_json
 from characterisation.maps.performance_map import PerformanceMap
-from mitsim.capture.simulated.render_residual import RenderResidual
 from mitsim.maps.prediction import performance
 from mitsim.running.progress import track
 from mitsim.running.version import __version__
 from mitsim.scene.surface.lay import lay_left_out
-from mitsim.study import Study, finishes_of_features
-from mitsim.study.run_files import TASK
+from mitsim.study import finishes_of_features
+from mitsim.study.run_files import TASK, digests_of
+from mitsim.study.scoring import write_inputs, write_raced
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import ALL, Raced
 from mitsim.study.virtual.stated import compared
@@ -43,31 +44,7 @@ def draw_clouds(session: Session, performance_map: PerformanceMap, numbers: list
         write_cloud(cloud, session.folder / "clouds" / f"predicted_{number:04d}.ply")
 
 
-def own_files(study: Study, drawn: list[int], shown: list[int], stated: bool) -> list[str]:
-    """Return the paths of the files that a report or an export of the run reads.
-
-    The index of a capture has the digests of its other files.
-
-    Parameters
-    ----------
-    study
-        Study of the run.
-    drawn
-        Numbers of the views with a predicted cloud.
-    shown
-        Numbers of the views with images and a decoded cloud.
-    stated
-        Whether the run has a statement.
-    """
-    names = ["map.nc", "scores.csv", "scores.nc", "checks.nc", "part.ply", "stand.npz", TASK]
-    names += ["samples.nc"] if study.campaign is not None else []
-    names += ["statement.json"] if stated else []
-    names += [f"clouds/predicted_{view:04d}.ply" for view in drawn]
-    names += [f"clouds/rendered_{view:04d}.ply" for view in shown]
-    return names + [f"captures/view_{view:04d}/capture.json" for view in shown]
-
-
-def runners_up(session: Session, raced: Raced) -> list[dict[str, Any]]:
+def _runners_up(session: Session, raced: Raced) -> list[dict[str, Any]]:
     """Return the views that come next for all measurements together, best first, relative to the leading view.
 
     ``ratio`` is the risk by the race over the leader's; ``near`` the probability of being the best or within the margin
@@ -93,27 +70,41 @@ def runners_up(session: Session, raced: Raced) -> list[dict[str, Any]]:
     return out
 
 
-def run_record(
-    study: Study, performance_map: PerformanceMap, raced: Raced, shown: list[int], residual: RenderResidual | None
-) -> dict[str, Any]:
-    """Return the record of a run, ``run.json``, without its sets of views, its times and the digests of its files.
+def write_record(
+    session: Session,
+    performance_map: PerformanceMap,
+    raced: Raced,
+    drawn: list[int],
+    shown: list[int],
+    *,
+    stated: bool,
+    **more: Any,
+) -> None:
+    """Write ``run.json``, with the digests of the files that a report or an export of the run reads.
+
+    The index of a capture has the digests of its other files.
 
     Parameters
     ----------
-    study
-        Study of the run.
+    session
+        Session of the study, with the folder.
     performance_map
         Map that screened the views.
     raced
         Race of the promising views.
+    drawn
+        Numbers of the views with a predicted cloud.
     shown
         Numbers of the views with images and a decoded cloud.
-    residual
-        Largest render noise; None if nothing was rendered for it.
+    stated
+        Whether the run has a statement.
+    more
+        Other entries, and other values of those that this function writes.
     """
+    study = session.study
     finishes = finishes_of_features(study)
     lays = {name: lay_left_out(one.scatter) for name, one in finishes.items() if one is not None}
-    return {
+    about = {
         "schema_version": 1,
         "mitsim": __version__,
         "date": datetime.now(UTC).date().isoformat(),
@@ -138,7 +129,7 @@ def run_record(
         "losses": {name: one.loss for name, one in raced.standings.items()},
         "light_path_depth": study.file.measure.light_path_depth,
         "score_light_path_depth": study.file.score.light_path_depth,
-        "render_residual": None if residual is None else asdict(residual),
+        "render_residual": None,
         "features": {name: str(one) for name, one in finishes.items()},
         "lay": {name: left_out for name, left_out in lays.items() if left_out is not None},
         "measurements": {
@@ -151,3 +142,37 @@ def run_record(
         "machine": platform.machine(),
         "cores": os.cpu_count(),
     }
+    names = ["map.nc", "scores.csv", "scores.nc", "checks.nc", "part.ply", "stand.npz", TASK]
+    names += ["samples.nc"] if study.campaign is not None else []
+    names += ["statement.json"] if stated else []
+    names += [f"clouds/predicted_{view:04d}.ply" for view in drawn]
+    names += [f"clouds/rendered_{view:04d}.ply" for view in shown]
+    names += [f"captures/view_{view:04d}/capture.json" for view in shown]
+    about |= more | {"runners_up": _runners_up(session, raced), "files": digests_of(session.folder, names)}
+    write_json(session.folder / "run.json", about)
+
+
+def complete_winner(session: Session, scores: xr.Dataset, raced: Raced, leaders: dict[str, int]) -> None:
+    """Write everything of a run into the folder of a sensor that has its statement; ``run.json`` last.
+
+    Parameters
+    ----------
+    session
+        The sensor's, with the folder.
+    scores
+        Scores of all views by screening.
+    raced
+        Race of the promising views.
+    leaders
+        Best view of every measurement, and of all measurements.
+    """
+    folder, performance_map = session.folder, session.study.performance_map
+    assert performance_map is not None  # sensors are screened with a map
+    (folder / "run.json").unlink(missing_ok=True)
+    (folder / "clouds").mkdir(exist_ok=True)
+    performance_map.save(folder / "map.nc")
+    write_inputs(session)
+    write_raced(session, scores, raced)
+    drawn = sorted(set(leaders.values()))
+    draw_clouds(session, performance_map, drawn)
+    write_record(session, performance_map, raced, drawn, [], stated=True, leaders=leaders)

@@ -25,9 +25,7 @@ from mitsim.maps.prediction import Predictor
 from mitsim.running.executor import Executor
 from mitsim.running.progress import say
 from mitsim.running.time_limit import TimeLimit
-from mitsim.sensor.exposure import PlannedExposure
 from mitsim.study import StatementTable, Study
-from mitsim.study.exposures.planned import planned_for
 from mitsim.study.run_files import claim_folder
 from mitsim.study.virtual.mapped import MappedMeasurements
 from mitsim.study.virtual.plan import measured_by, measurements_of, race_rules, study_digest, trial_digest
@@ -160,17 +158,6 @@ class Session:
         rules = race_rules(self.study.file.race) if rules is None else rules
         limit = TimeLimit() if limit is None else limit
         return run_race(self.study.views, scores, self.runner, self.trials, rules, limit.over, after_round)
-
-    def exposures(self, view: View) -> PlannedExposure | None:
-        """Return the exposures of a view: those of the study, or planned ones; None for the sensor's own rule.
-
-        Raises
-        ------
-        InputError
-            If the sensor cannot take or merge the exposures, or measurements are drawn from a map, which holds only for
-            the exposure that it was made with.
-        """
-        return planned_for(self, view)
 
     def state(
         self,

@@ -59,7 +59,8 @@ class TimePlan:
 
     def statement_limit(self, limit: TimeLimit) -> TimeLimit:
         """Return the limit of the statement, which starts now."""
-        return limit.part(1.0 - self._remedies_share, self._pictures(limit))
+        both = self.statement + self.remedies
+        return limit.part(1.0 - (self.remedies / both if both > 0 else 0.0), self._pictures(limit))
 
     def remedies_limit(self, limit: TimeLimit) -> TimeLimit:
         """Return the limit of the remedies, which start now."""
@@ -68,12 +69,6 @@ class TimePlan:
     def _pictures(self, limit: TimeLimit) -> float:
         """Return the time [s] that is kept for pictures and report."""
         return max(self.page(limit), min(self.report, 0.2 * limit.left))
-
-    @property
-    def _remedies_share(self) -> float:
-        """Return the share of the remedies in the time of statement and remedies."""
-        both = self.statement + self.remedies
-        return self.remedies / both if both > 0 else 0.0
 
     def page(self, limit: TimeLimit) -> float:
         """Return the time [s] that clouds and page will take, on a machine as busy as it has been so far."""

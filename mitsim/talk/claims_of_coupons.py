@@ -239,10 +239,15 @@ def _multiple_reflections(talk: Talk, results: Results, slide: Slide) -> None:
         return
     words = "F captured over F from the map for the artefact's features, in direct light alone and in all light"
     slide.pictures["light"] = (figures.light_figure(pairs), words)
-    residuals = {name: [_residual(one) for one in pair] for name, pair in pairs.items()}
+    fractions = {name: [figures.fractions(one) for one in pair] for name, pair in pairs.items()}
+    residuals = {
+        name: [float(np.abs(captured - expected).mean()) if len(expected) else math.nan for expected, captured in both]
+        for name, both in fractions.items()
+    }
     added = {name: every - direct for name, (direct, every) in residuals.items()}
     last = list(added)[-1]
-    moved = _moved(*pairs[last])
+    (_, before), (_, after) = fractions[last]
+    moved = mean_of(after) - mean_of(before)
     slide.claims.append(
         Claim(
             "The reason for this is on the shiny surface at distance, multiple reflection effects dominate.",
@@ -260,14 +265,3 @@ def _multiple_reflections(talk: Talk, results: Results, slide: Slide) -> None:
             "light",
         )
     )
-
-
-def _moved(direct: xr.Dataset, every: xr.Dataset) -> float:
-    """Return the mean change of the captured F of features by light from other faces."""
-    (_, before), (_, after) = figures.fractions(direct), figures.fractions(every)
-    return mean_of(after) - mean_of(before)
-
-
-def _residual(one: xr.Dataset) -> float:
-    expected, captured = figures.fractions(one)
-    return float(np.abs(captured - expected).mean()) if len(expected) else math.nan

@@ -7,7 +7,7 @@ Virtual measurements are kept one by one, as in every run (:mod:`mitsim.study.vi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from mitsim.running.time_limit import TimeLimit
 from mitsim.study.session import Session
 from mitsim.study.virtual.race import Job
 from mitsim.study.virtual.spread_out import TrialOrder, make_trials
-from mitsim.study.virtual.trials import Outcome
 from mitsim.study.virtual.world import Trial
 from mitsim.talk.plan import Piece, make_piece, pieces_of
 from mitsim.talk.results import Results
@@ -41,21 +40,13 @@ class _Unfinished:
     missing: dict[int, tuple[Job, ...]]
 
 
-@dataclass(frozen=True)
-class _Order:
-    """One order for a worker: a piece, or the trials of a view."""
-
-    folder: str
-    piece: Piece | None = None
-    trials: TrialOrder | None = None
+#: one order for a worker: the talk's folder and a piece, or the trials of a view
+_Order = tuple[str, Piece] | TrialOrder
 
 
 def work(order: _Order) -> Any:
     """Work on one order; workers call this function."""
-    if order.piece is not None:
-        return make_piece(order.folder, order.piece)
-    assert order.trials is not None
-    return make_trials(order.trials)
+    return make_trials(order) if isinstance(order, TrialOrder) else make_piece(*order)
 
 
 def trials_name(sample: SampleEntry) -> str:
@@ -106,20 +97,24 @@ def make(
     samples = [_unfinished(talk, results, sample, folder) for sample in wanted]
     unfinished = [one for one in samples if one is not None]
     place = str(talk.folder)
-    orders: list[_Order] = [_Order(place, piece) for piece in missing]
-    orders += [_Order(place, trials=one) for found in unfinished for one in _trial_orders(talk, found)]
+    of_trials = [one for found in unfinished for one in _trial_orders(talk, found)]
+    orders: list[_Order] = [*((place, piece) for piece in missing), *of_trials]
     if orders:
-        trials = sum(len(one.trials.jobs) for one in orders if one.trials is not None)
+        trials = sum(len(one.jobs) for one in of_trials)
         seconds = _PIECE_S * len(missing) + _TRIAL_S * trials
         say_progress(
             f"{len(missing)} pieces of work and {trials} virtual measurements to make: about "
             f"{time_in_words(seconds)} of one quiet core"
         )
-    for order, result in track(_made(orders, workers), "the talk", len(orders)):
-        if order.piece is not None:
-            results.add(order.piece.name, result)
-        elif order.trials is not None:
-            _keep(unfinished, order.trials, result)
+    here = ((order, work(order)) for order in orders)
+    made = here if workers is None else workers.distribute(orders, lambda order: order, work)
+    for order, result in track(made, "the talk", len(orders)):
+        if isinstance(order, TrialOrder):
+            kept = next(one.session.trials for one in unfinished if one.session.digest == order.digest)
+            for job, outcome in zip(order.jobs, result, strict=True):
+                kept.add(job.view.number, job.trial, outcome)
+        else:
+            results.add(order[1].name, result)
         if limit.over():
             break
     for found in unfinished:
@@ -148,22 +143,6 @@ def _trial_orders(talk: Talk, found: _Unfinished) -> Iterator[TrialOrder]:
     for jobs in found.missing.values():
         path = str(talk.path.absolute())
         yield TrialOrder(path, session.study.file, session.unknowns, False, session.digest, jobs)
-
-
-def _made(orders: Sequence[_Order], workers: Executor | None) -> Iterator[tuple[_Order, Any]]:
-    if workers is None:
-        return ((order, work(order)) for order in orders)
-    return workers.distribute(orders, _itself, work)
-
-
-def _itself(order: _Order) -> _Order:
-    return order
-
-
-def _keep(unfinished: Sequence[_Unfinished], order: TrialOrder, outcomes: Sequence[Outcome]) -> None:
-    found = next(one for one in unfinished if one.session.digest == order.digest)
-    for job, outcome in zip(order.jobs, outcomes, strict=True):
-        found.session.trials.add(job.view.number, job.trial, outcome)
 
 
 def _finish(talk: Talk, results: Results, found: _Unfinished) -> None:

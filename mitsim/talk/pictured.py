@@ -43,10 +43,12 @@ def picture_of_finish(folder: str, file: StudyFile, number: int) -> xr.Dataset:
         slice(max(columns.min() - _MARGIN_PX, 0), columns.max() + _MARGIN_PX),
     )
     image = np.nan_to_num(image_on_grid(capture, cloud))
+    low, high = np.percentile(image, (0.5, 99.7))
+    shown = np.asarray(255 * np.clip((image - low) / max(high - low, 1), 0, 1) ** 0.6, np.uint8)
     depth = np.where(cloud.valid, cloud.points[..., 2], np.nan)
     pixel = ("row", "column")
     data = _counts(renderer, study.task.shapes, view, cloud.valid)
-    data["image"] = (pixel, _eight_bits(image)[window])
+    data["image"] = (pixel, shown[window])
     data["status"] = (pixel, cloud.status[window])
     data["depth"] = (pixel, depth[window].astype(np.float32), {"units": "mm"})
     return data
@@ -92,8 +94,3 @@ def _counts(
         {"possible": ("feature", possible), "points": ("feature", points), "expected": ("feature", expected)},
         {"feature": names},
     )
-
-
-def _eight_bits(image: NDArray[np.float64]) -> NDArray[np.uint8]:
-    low, high = np.percentile(image, (0.5, 99.7))
-    return np.asarray(255 * np.clip((image - low) / max(high - low, 1), 0, 1) ** 0.6, np.uint8)

@@ -24,7 +24,7 @@ from characterisation.files.atomic_io import write_folder
 from mitsim.running.progress import say
 from mitsim.running.version import __version__
 from mitsim.sensor.transforms import Transform
-from mitsim.views.candidates import Candidates, LeftOut, View
+from mitsim.views.candidates import Candidates, View
 from mitsim.views.table import ViewsTable
 
 _FRAMES = {
@@ -59,7 +59,9 @@ def write_views(folder: str | Path, candidates: Candidates, table: ViewsTable, s
     if table.stage is not None:
         files["stage.csv"] = _stage_csv(views, table)
     if left_out:
-        files["left_out.csv"] = _left_out_csv(left_out)
+        head = ["direction_x", "direction_y", "direction_z", "roll_deg", "standoff_mm", "reason"]
+        rows = [[*_written([*one.direction, one.roll_deg, one.standoff]), one.reason] for one in left_out]
+        files["left_out.csv"] = _csv(head, rows)
     write_folder(folder, {name: text.encode("utf-8") for name, text in files.items()}, overwrite=True)
     if candidates.moved_out:
         say(f"{candidates.moved_out} of {len(views)} views are moved farther out, clear of the part")
@@ -106,11 +108,6 @@ def _stage_csv(views: Sequence[View], table: ViewsTable) -> str:
         assert view.stage_angles is not None and view.stage_distance is not None  # views on a stage
         rows.append([str(view.number), *_written([*np.degrees(view.stage_angles), view.stage_distance])])
     return _csv(head, rows)
-
-
-def _left_out_csv(left_out: Sequence[LeftOut]) -> str:
-    head = ["direction_x", "direction_y", "direction_z", "roll_deg", "standoff_mm", "reason"]
-    return _csv(head, [[*_written([*one.direction, one.roll_deg, one.standoff]), one.reason] for one in left_out])
 
 
 def _poses_json(found: Candidates, table: ViewsTable, sensor: str) -> str:

@@ -244,9 +244,8 @@ def _limits(
 ) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
     """Return the limiting factor of each measurement in each view, and its feature, (measurement, view) each.
 
-    The feature is the one that contributes most to u. Its contribution is noise / sqrt(n) times a factor of geometry.
-    Each of the three is compared with its best value over all views; the one with the largest ratio is the limiting
-    factor.
+    The contribution to u is noise / sqrt(n) times a factor of geometry; the farthest of these from its best over all
+    views is the limiting factor.
     """
     shape = (len(task.measurements), len(scored))
     limit, feature = np.full(shape, "", object), np.full(shape, "", object)

@@ -15,6 +15,7 @@ plate's points by least squares along their rays. The columns are means over the
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +69,9 @@ def main(map_file: str = SENSOR, repeats: int = 6) -> None:
 
     def rendered(seed: int) -> PointCloud:
         capture = simulated.capture(scene, POSE, rendering=Rendering(samples=16), seed=seed)
-        return predictor.labelled(capture_cloud(capture, sensor.settings, geometry), scene, POSE)
+        labels = predictor.labels(scene, POSE, predictor.surfaces(scene, POSE))
+        cloud = capture_cloud(capture, sensor.settings, geometry)
+        return replace(cloud, feature=labels, feature_names=scene.names)
 
     ways = {
         "rendered": rendered,

@@ -15,6 +15,7 @@ from characterisation.files.atomic_io import write_netcdf
 from characterisation.files.errors import InputError
 from mitsim.report.page import write_report
 from mitsim.running.numbers import two_digits
+from mitsim.study.run_folder import read_run
 from tests.plain_pages import without_pictures
 
 from .conftest import CHECKED, FEATURES, HOSTILE, MEASUREMENTS, plain_pictures, write_run
@@ -194,6 +195,16 @@ def test_a_damaged_statement_is_named(run_folder, tmp_path, damage):
     (folder / "statement.json").write_text(damage)
     with pytest.raises(InputError, match=r"statement\.json"):
         write_report(folder)
+
+
+def test_a_statement_of_another_task_is_refused(run_folder, tmp_path):
+    shutil.copytree(run_folder, tmp_path / "run")
+    path = tmp_path / "run" / "statement.json"
+    document = json.loads(path.read_text())
+    document["measurements"]["of_another_task"] = next(iter(document["measurements"].values()))
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"statement\.json: measurements: found .*of_another_task"):
+        read_run(tmp_path / "run")
 
 
 def test_what_is_left_out_depends_on_what_the_map_knows(run_folder, tmp_path, written):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -319,7 +320,9 @@ def test_a_rendered_part_is_measured(n10, simulated, scenes):
     pose = look_at([0, -400, 290], [0, 0, 30], [0, 0, 1])
     capture = simulated.capture(scene, pose, rendering=Rendering(samples=16), seed=4)
     searched = narrow_search(n10, 380, 620).matcher
-    cloud = predictor.labelled(capture_cloud(capture, searched, geometry), scene, pose)
+    labels = predictor.labels(scene, pose, predictor.surfaces(scene, pose))
+    decoded = capture_cloud(capture, searched, geometry)
+    cloud = replace(decoded, feature=labels, feature_names=scene.names)
     task = read_task(scenes / "two_pillars/task.toml")
     result = measure(cloud, task, pose.inverse().matrix())
     for name, measured in result.items():

@@ -88,7 +88,9 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
     folder, digest = cache_folder(), one.digest(distance)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _remove_partial(folder)
+        for left in folder.glob("work-*"):
+            if time.time() - left.stat().st_mtime > _ABANDONED_S:
+                shutil.rmtree(left, ignore_errors=True)
         work = Path(tempfile.mkdtemp(prefix="work-", dir=folder))
     except OSError as error:
         raise InputError(
@@ -102,13 +104,6 @@ def made_finish(one: OneFinish, simulated: SimulatedSensor, distance: float) -> 
     made.data.attrs |= {_DIGEST: digest, "seconds": round(time.monotonic() - began, 1)}
     made.save(folder / f"{digest}.nc", compact=True)
     return PerformanceMap.load(folder / f"{digest}.nc")  # read back, so that new and cached maps are equal
-
-
-def _remove_partial(folder: Path) -> None:
-    """Remove folders that killed processes left at least a day ago."""
-    for left in folder.glob("work-*"):
-        if time.time() - left.stat().st_mtime > _ABANDONED_S:
-            shutil.rmtree(left, ignore_errors=True)
 
 
 def expected_seconds(one: OneFinish) -> float:

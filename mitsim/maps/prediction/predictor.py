@@ -12,7 +12,7 @@ same in one kernel on the device, for clouds.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -139,11 +139,6 @@ class Predictor:
         if surfaces.along is not None:
             along = in_frame(surfaces.along.reshape(-1, 3)[pixel].astype(float), frames)
         return Ideal(pixel, point, ray, distance, view, surfaces.shape.ravel()[pixel], status, along)
-
-    def labelled(self, cloud: PointCloud, scene: Scene, world_from_sensor: Transform) -> PointCloud:
-        """Return a decoded cloud, labelled with the shape that each pixel shows according to the part's geometry."""
-        labels = self.labels(scene, world_from_sensor, self.surfaces(scene, world_from_sensor))
-        return replace(cloud, feature=labels, feature_names=scene.names)
 
     def labels(self, scene: Scene, world_from_sensor: Transform, surfaces: Surfaces) -> NDArray[np.int16]:
         """Return the shape that each pixel shows, (H, W), for any cloud on this grid.

@@ -102,19 +102,14 @@ def read_results(folder: str | Path, task_file: str | Path | None = None) -> Run
 def write_results_csv(found: RunResults, path: str | Path) -> None:
     """Write one row for every measurement; missing numbers are empty fields."""
     out = io.StringIO()
-    rows = [
-        asdict(result) | {"features": " ".join(result.features), "tolerance": _in_a_field(result.tolerance)}
-        for result in found.results
-    ]
+    rows = [asdict(result) | {"features": " ".join(result.features)} for result in found.results]
+    for row in rows:  # lower and upper deviation have a space between
+        if isinstance(row["tolerance"], tuple):
+            row["tolerance"] = " ".join(map(repr, row["tolerance"]))
     writer = csv.DictWriter(out, list(ExpectedResult.__dataclass_fields__), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     write_text(path, out.getvalue())
-
-
-def _in_a_field(tolerance: float | tuple[float, float] | None) -> object:
-    """Format a tolerance as a field of CSV: lower and upper deviation with a space between."""
-    return " ".join(map(repr, tolerance)) if isinstance(tolerance, tuple) else tolerance
 
 
 def write_results_json(found: RunResults, path: str | Path) -> None:

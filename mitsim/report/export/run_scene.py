@@ -11,7 +11,6 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from characterisation.cloud_files import read_cloud
 from characterisation.files.errors import InputError
 from characterisation.point_cloud import PointCloud, ViewGrid
 from mitsim.sensor.transforms import Transform
@@ -64,7 +63,7 @@ def read_run_scene(folder: str | Path, views: str = "best") -> RunScene:
     run = read_run(folder)
     shown = []
     for number in chosen_views(run, views):
-        clouds = {kind: _read_own(run, kind, number) for kind in KINDS if run.has(_cloud_name(kind, number))}
+        clouds = {kind: run.cloud(kind, number) for kind in KINDS if run.has(_cloud_name(kind, number))}
         best_of = tuple(name for name, best in run.about.leaders.items() if best == number)
         shown.append(ShownView(number, view_pose(run, number), clouds, best_of))
     grids = [cloud.grid for view in shown for cloud in view.clouds.values()]
@@ -132,9 +131,3 @@ def sensor_from_grid(grid: ViewGrid) -> Transform:
 
 def _cloud_name(kind: str, number: int) -> str:
     return f"clouds/{kind}_{number:04d}.ply"
-
-
-def _read_own(run: Run, kind: str, number: int) -> PointCloud:
-    name = _cloud_name(kind, number)
-    run.check(name)
-    return read_cloud(run.folder / name)

@@ -128,7 +128,8 @@ def parse_board(text: str) -> Board:
         columns, rows, square = (float(part) for part in size.split("x"))
     except ValueError:
         raise InputError("--board", "", repr(text), allowed) from None
-    _grade(grade, "--board")
+    if grade not in GRADES:
+        raise InputError("--board", "grade", repr(grade), ", ".join(GRADES), nearest(grade, list(GRADES)))
     if not (columns % 1 == 0 and rows % 1 == 0 and 4 <= columns <= 30 and 4 <= rows <= 30 and 0.5 <= square <= 500):
         raise InputError("--board", "", repr(text), "4 to 30 squares a side, of 0.5 to 500 mm")
     return Board(int(columns), int(rows), square, grade)
@@ -223,9 +224,3 @@ def _middle(eyes: Mapping[str, Camera], distance: float) -> Floats:
         ray = eye.rays(np.array([(eye.width - 1) / 2, (eye.height - 1) / 2]))
         places.append(eye.centre + distance * eye.sensor_from_camera.directions(ray))
     return np.asarray(np.mean(places, axis=0))
-
-
-def _grade(name: str, where: str) -> BoardGrade:
-    if name not in GRADES:
-        raise InputError(where, "grade", repr(name), ", ".join(GRADES), nearest(name, list(GRADES)))
-    return GRADES[name]

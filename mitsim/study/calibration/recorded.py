@@ -288,10 +288,7 @@ class _Observations:
     def covariance(
         self, rig: Rig, places: list[Transform], noise: Floats, normal: Floats, own_units: bool
     ) -> tuple[Floats, Floats]:
-        """Return the covariance of the rig's parameters (p, p), and what the board's errors change of them (p, m).
-
-        ``normal`` (q, q) is the normal matrix of the adjustment.
-        """
+        """Return the covariance of the rig's parameters (p, p), and what the board's errors change of them (p, m)."""
         count, (modes, sigma) = len(parameter_names(rig)), self.board.imperfections()
         if own_units:
             sigma = np.concatenate([[0.0], sigma[1:]])  # the first is the scale

@@ -212,14 +212,15 @@ def verify(
     covariance = parameters_of(covariance, rig)
     rng = np.random.default_rng(_SEED)
     nominal = measured_points(measuring, known.points, rig)
-    scales, shifts = [], []
+    cameras, scales, shifts = list(rig.cameras.values()), [], []
     for stream in rng.spawn(_DRAWS):
         values = covariance.draw(stream)
         true = moved(rig, covariance.names, values)
         found = measured_points(measuring, known.points, true, path_error(covariance.names, values))
         scales.append(_spread(found) / _spread(nominal))
         if len(known.rows_px):
-            shifts.append(float(np.mean(row_errors(rig, *_seen(true, known.points)))))
+            pixels, others = (eye.project(known.points) for eye in list(true.cameras.values())[:2])
+            shifts.append(float(np.mean(triangulated(cameras[0], pixels, cameras[1], others)[1])))
     rigs = float(np.sqrt(np.mean((np.array(scales) - 1) ** 2)))
     distance = float(np.linalg.norm(known.points - rig.reference.centre, axis=1).mean())
     rows = known.rows_px
@@ -262,17 +263,6 @@ def triangulated(first: Camera, pixels: Floats, second: Camera, others: Floats) 
     depth = pair.depth(columns - right[:, 0] * f - pair.matrix_right[0, 2])
     points = first.sensor_from_camera.points((left * depth[:, None]) @ pair.rotation_left)
     return np.asarray(points), np.asarray(f * (right[:, 1] - left[:, 1]))
-
-
-def row_errors(rig: Rig, pixels: Floats, others: Floats) -> Floats:
-    """Return the row in the second camera less that in the first, after rectification by a rig, (n,) [px]."""
-    first, second = list(rig.cameras.values())[:2]
-    return triangulated(first, pixels, second, others)[1]
-
-
-def _seen(rig: Rig, points: Floats) -> tuple[Floats, Floats]:
-    first, second = list(rig.cameras.values())[:2]
-    return first.project(points), second.project(points)
 
 
 def _rectified(camera: Camera, pixels: Floats, rotation: Floats) -> Floats:

@@ -5,7 +5,7 @@ then by the worst of the others (:mod:`mitsim.study.choose.ranking`) -> exclusio
 measurements, or whose demand is far too large -> rounds of those that can still win, each with more trials than the
 round before: a short race -> a statement from the view that is best for all measurements -> a statement from a
 measurement's own best view, where the common view does not suffice -> more trials for the leader -> its folder, as of a
-run (:mod:`mitsim.study.choose.winner`), and ``choice.json``.
+run (:mod:`mitsim.study.run_record`), and ``choice.json``.
 
 The first round gives every sensor the same share of the time. Each later one keeps the sensors whose demand may still
 be the least, and gives each a share of half of the time that is left (successive halving: Karnin et al., ICML 2013).
@@ -45,7 +45,7 @@ from mitsim.running.time_limit import TimeLimit
 from mitsim.study import StatementTable
 from mitsim.study.choose.candidates import CandidateSensor
 from mitsim.study.choose.ranking import rank_keys, unpromising
-from mitsim.study.choose.winner import complete_winner
+from mitsim.study.run_record import complete_winner
 from mitsim.study.screened_errors import screened_errors, stated_shares
 from mitsim.study.session import Session
 from mitsim.study.virtual.plan import map_digest, trial_digest
@@ -360,10 +360,7 @@ def _say(found: list[SensorResult], done: str, limit: TimeLimit) -> None:
 
 
 def _own_views(one: SensorResult, names: list[str], view: int) -> list[int]:
-    """Return best views of measurements that do not fit from the common view and have a lower risk elsewhere.
-
-    They include those of measurements without a value from the common view, which another view may give.
-    """
+    """Return best views of measurements that do not fit, or have no value, from the common view and may elsewhere."""
     assert one.raced is not None
     out = list[int]()
     place = int(np.flatnonzero(one.raced.views == view)[0])

@@ -156,11 +156,7 @@ def shortfall(one: ExposureResult, limits: dict[str, FeatureResult]) -> float:
 def _sweep(
     search: _Results, own: PlannedExposure, limits_s: tuple[float, float], dimmable: bool
 ) -> list[ExposureResult]:
-    """Return the results of single exposures, shortest first.
-
-    The sweep goes from the sensor's own exposure to longer and to shorter ones. It ends if every feature has been found
-    and further exposures recover too few points, or at the limits of the device.
-    """
+    """Return the results of single exposures around the sensor's own, shortest first."""
     middle = math.exp(np.mean(np.log(own.exposures_s)))
     shortest, longest = limits_s
     best: dict[str, float] = {}
@@ -191,10 +187,7 @@ def _sweep(
 
 
 def _feasible_exposure(seconds: float, shortest: float, longest: float, dimmable: bool) -> PlannedExposure | None:
-    """Return a single exposure with this product of time [s] and power, if possible at full power.
-
-    It is the longest exposure if the product is larger. It is None if the product is too small.
-    """
+    """Return an exposure with this product of time [s] and power, or the longest; None if the product is too small."""
     if seconds >= longest:
         return PlannedExposure((longest,))
     if seconds >= shortest:
@@ -206,10 +199,7 @@ def _feasible_exposure(seconds: float, shortest: float, longest: float, dimmable
 def _greedy_sets(
     search: _Results, singles: Sequence[ExposureResult], names: Sequence[str], most: int
 ) -> list[PlannedExposure]:
-    """Decode sets of two to ``most`` single exposures, and return them.
-
-    Each set adds to the one before it the exposure with which the worst feature has the largest share of its points.
-    """
+    """Decode and return sets of two to ``most`` exposures; each adds the one that helps the worst feature most."""
     chosen, sets = list[ExposureResult](), list[PlannedExposure]()
     possible = {name: float(_union(singles, name).sum()) for name in names}
     recovered = [name for name in names if possible[name] > 0]
@@ -264,11 +254,7 @@ def _fewest_exposures(
     limits: dict[str, FeatureResult],
     rules: PlanRules,
 ) -> tuple[ExposureResult, bool]:
-    """Return the result with the fewest exposures that reaches the limits, and True; of equally few, the shortest.
-
-    If no set reaches them, return the one with the fewest exposures of those that come nearly as close as the best, and
-    False.
-    """
+    """Return the result with the fewest exposures that reaches the limits, or comes closest, and whether it does."""
     for size in range(1, rules.most + 1):
         if size > 1:
             candidates = [search(exposure) for exposure in _candidate_sets(full_power, size, limits, rules.within)]
@@ -307,17 +293,13 @@ def _by_usefulness(
     remaining, chosen, out = list(exposure.exposures_s), list[float](), list[tuple[float, ...]]()
 
     def shortage(seconds: float) -> tuple[float, float]:
-        return _shortage(search(PlannedExposure(tuple(sorted([*chosen, seconds])), exposure.power)), limits)
+        """Return the number of features without u, and minus the mean share of the points at the limits."""
+        features = search(PlannedExposure(tuple(sorted([*chosen, seconds])), exposure.power)).features
+        shares = [features[name].points / max(limits[name].points, 1.0) for name in limits]
+        return float(sum(not math.isfinite(features[name].u) for name in limits)), -float(np.mean(shares))
 
     while remaining:
         chosen.append(remaining[0] if len(remaining) == 1 else min(remaining, key=shortage))
         remaining.remove(chosen[-1])
         out.append(tuple(chosen))
     return out
-
-
-def _shortage(one: ExposureResult, limits: dict[str, FeatureResult]) -> tuple[float, float]:
-    """Return the number of features without u, and minus the mean share of the points at the limits."""
-    without = sum(not math.isfinite(one.features[name].u) for name in limits)
-    shares = [one.features[name].points / max(limits[name].points, 1.0) for name in limits]
-    return float(without), -float(np.mean(shares))

@@ -111,7 +111,8 @@ class ExposureSweep:
         results: dict[str, list[FeatureResult]] = {name: [] for name in self.possible}
         recovered: dict[str, NDArray[np.bool_]] = {}
         for k in range(draws):
-            seed = _seed(self.renderer.unknowns.seed, self.view.number, noise, k)
+            numbers = [_STREAM, self.renderer.unknowns.seed, self.view.number, noise, k]
+            seed = int(np.random.SeedSequence(numbers).generate_state(1)[0] >> 1)
             capture = self.renderer.exposed(self.lit, exposure, seed, keep=True)
             cloud = self.renderer.unlabelled_cloud(capture)
             for name, possible in self.possible.items():
@@ -192,11 +193,6 @@ def _possible_points(renderer: RenderedMeasurements, view: View) -> dict[str, _P
         facing = np.abs(surface.meet(point, ray).cosine) > GRAZING_COSINE
         out[name] = _PossiblePoints(ideal.pixel[mask][facing], derivatives[facing], surface)
     return out
-
-
-def _seed(*numbers: int) -> int:
-    """Return the seed of a noise sample, independent for different numbers."""
-    return int(np.random.SeedSequence([_STREAM, *numbers]).generate_state(1)[0] >> 1)
 
 
 def _mean_result(samples: Sequence[FeatureResult]) -> FeatureResult:

@@ -26,7 +26,7 @@ from mitsim.running.time_limit import TimeLimit
 from mitsim.scene.load import bounds_of
 from mitsim.sensor.drift import Drift
 from mitsim.sensor.working_volume import nearest_standoff
-from mitsim.study import ExposureTable, SetTable, StatementTable, StudyFile, finishes_of_features
+from mitsim.study import ExposureTable, SetTable, StatementTable, finishes_of_features
 from mitsim.study.remedies.bounds import EXPOSURE, SURFACE, Effect, can_fit, least_shares, least_uncertainty
 from mitsim.study.remedies.change import (
     SCREENING_FACTOR,
@@ -261,19 +261,14 @@ def _several_views(now: Shortfall) -> Iterator[Change]:
 
     def state(count: int, limit: TimeLimit) -> list[Statement]:
         joined = changed_file(study.file, {"set": table.model_copy(update={"trials": count}).model_dump()})
-        session = now.session
-        return state_set(_with_file(session, joined), chosen, limit.over)
+        own = now.session
+        session = Session(replace(own.study, file=joined), own.folder, own.workers, own.separate_light)
+        session.measurements = own.measurements
+        return state_set(session, chosen, limit.over)
 
     expected = {name: limits[name] for name in able}
     words = f"from views {listed} together, joined by a robot"
     yield Change("views", words, keys, chosen.views, expected, state)
-
-
-def _with_file(session: Session, file: StudyFile) -> Session:
-    """Return a session of the same measurements whose study has another file."""
-    other = Session(replace(session.study, file=file), session.folder, session.workers, session.separate_light)
-    other.measurements = session.measurements
-    return other
 
 
 def _spray(now: Shortfall) -> Iterator[Change]:

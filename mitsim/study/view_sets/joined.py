@@ -72,7 +72,9 @@ class JoinedMeasurements:
         renderer, first = self.renderer, self.renderer.unknowns.draw(Trial(day))
         drawn = replace(renderer.unknowns.draw(Trial(day, place)), placed=first.placed, assumed=first.assumed)
         cloud, assumed = renderer.cloud_of(view, drawn)
-        motion = motion_matrix(self._pose_error(place, day), self.centre) @ assumed.matrix()
+        rng = np.random.default_rng(np.random.SeedSequence([renderer.unknowns.seed, _POSE_STREAM, day, place]))
+        error = np.sqrt(np.diag(self.known)) * rng.standard_normal(6)  # of the assumed pose, a motion [w (rad), t (mm)]
+        motion = motion_matrix(error, self.centre) @ assumed.matrix()
         points = {}
         for name in renderer.study.task.shapes:
             found = cloud.of_feature(name)
@@ -80,11 +82,6 @@ class JoinedMeasurements:
             kept = found[belonging(found, nominal, cloud.grid.origin)] if len(found) else found
             points[name] = kept @ motion[:3, :3].T + motion[:3, 3]
         return _MeasuredView(points, assumed.matrix(), cloud)
-
-    def _pose_error(self, place: int, day: int) -> Floats:
-        """Return the error of the assumed pose of a view, as a motion [w (rad), t (mm)]."""
-        rng = np.random.default_rng(np.random.SeedSequence([self.renderer.unknowns.seed, _POSE_STREAM, day, place]))
-        return np.asarray(np.sqrt(np.diag(self.known)) * rng.standard_normal(6))
 
     def _measured(self, measured: Sequence[_MeasuredView], day: int) -> Outcome:
         task = self.renderer.study.task

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mitsim.sensor.unknowns import CoatUnknowns, UnknownsTable
+from mitsim.sensor.unknowns import UnknownsTable
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,9 @@ def influences(table: UnknownsTable, source: str, depth: int, sprayed: bool = Fa
     """
     rendered = source == "render"
     form, pose, temperature, light = table.form.features, table.pose, table.temperature, table.light
-    listed_influences = [
+    low, high = table.coat.thickness_um
+    coat = f"drawn: mean thickness {low:g} to {high:g} um, {100 * table.coat.spread:.0f} % from place to place"
+    return [
         Influence("calibration of the sensor", True, "drawn from the covariance of the calibration"),
         Influence(
             "drift since the calibration",
@@ -102,16 +104,10 @@ def influences(table: UnknownsTable, source: str, depth: int, sprayed: bool = Fa
             rendered,
         ),
         Influence("vibration, motion during a capture", False, "hold the sensor and the part still", False),
-        *([Influence("thickness of the spray on the part", True, _coat_in_words(table.coat))] if sprayed else []),
+        *([Influence("thickness of the spray on the part", True, coat)] if sprayed else []),
         Influence(
             "dirt, oil, other coats, marks on the part", False, "clean the part as for the characterisation", False
         ),
         Influence("deformation by clamping", False, "clamp as in use", False),
         Influence("datums and choice of features", False, "the task is assumed to agree with the drawing", False),
     ]
-    return listed_influences
-
-
-def _coat_in_words(coat: CoatUnknowns) -> str:
-    low, high = coat.thickness_um
-    return f"drawn: mean thickness {low:g} to {high:g} um, {100 * coat.spread:.0f} % from place to place"

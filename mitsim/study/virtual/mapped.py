@@ -100,7 +100,8 @@ class MappedMeasurements:
         rng = np.random.default_rng(drawn.seed)
         cloud = self.predictor.predict(self._scene(drawn.finish), true, rng, correlated=True)
         labels = self.predictor.quick_labels(self.study.scene, assumed)
-        surfaces = self.predictor.surfaces(self.study.scene, assumed) if self._moves_faces(drawn) else None
+        moves_faces = (self._has_form and drawn.form) or (self._has_coat and drawn.coat)
+        surfaces = self.predictor.surfaces(self.study.scene, assumed) if moves_faces else None
         return cloud, drawn, labels, surfaces
 
     def _finish(self, drawing: tuple[PointCloud, DrawnValues, NDArray[np.int16], Surfaces | None], job: Job) -> Outcome:
@@ -122,10 +123,6 @@ class MappedMeasurements:
 
         found = measured_with_form(self.study.task, evaluate, bool(self._has_form and drawn.form))
         return self._with_beyond(Outcome.of(found), job.view, drawn)
-
-    def _moves_faces(self, drawn: DrawnValues) -> bool:
-        """Return whether the faces of a draw lie off their nominal places, by form or coat."""
-        return bool((self._has_form and drawn.form) or (self._has_coat and drawn.coat))
 
     def _predict(self, views: dict[int, View]) -> None:
         """Compute and keep the predicted uncertainties of views."""

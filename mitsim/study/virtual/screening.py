@@ -97,10 +97,7 @@ def _places(study: Study) -> Floats:
 
 
 def _measurable(sensor: Sensor, points: Floats) -> NDArray[np.bool_]:
-    """Return which points (n, 3) all measuring eyes see and the nominal rig reconstructs.
-
-    Outside the image, and where it folds, a distortion polynomial is meaningless.
-    """
+    """Return which points (n, 3) all measuring eyes see and the nominal rig reconstructs."""
     rig = sensor.measuring_rig
     eyes = list(rig.cameras.values())
     if rig.projector is not None and len(eyes) == 1 and sensor.technology != "time_of_flight":

@@ -27,7 +27,7 @@ from mitsim.running.version import __version__
 from mitsim.sensor.exposure import PlannedExposure
 from mitsim.sensor.preset import Sensor
 from mitsim.study import StatementTable, Study
-from mitsim.study.exposures.planned import with_exposure
+from mitsim.study.exposures.planned import planned_for, with_exposure
 from mitsim.study.maker_accuracy import maker_sigma
 from mitsim.study.virtual.drawn_decoder import decoder_is_drawn
 from mitsim.study.virtual.drawn_numbers import drawn_numbers, related, seeds, statement_trials
@@ -115,10 +115,10 @@ def state_view(
 
 def source_of_trials(session: Session, view: View) -> tuple[TrialRunner, TrialFolder, PlannedExposure | None]:
     """Return what makes the trials of a statement of a view, where they are kept, and their planned exposures."""
-    runner, planned = session.runner, session.exposures(view)
+    runner, planned = session.runner, planned_for(session, view)
     if planned is None:
         return runner, session.trials, None
-    assert not isinstance(runner, MappedMeasurements)  # exposures() rejects a map
+    assert not isinstance(runner, MappedMeasurements)  # planned_for rejects a map
     digest = with_exposure(session.digest, planned)
     return (
         runner.exposed_as(planned),

@@ -252,10 +252,7 @@ def _products(residual: Floats) -> tuple[Floats, Floats]:
 
 
 def _in_disparity(noise: RayNoise, sigma: Floats, tiles: Floats, geometry: Geometry) -> Floats:
-    """Return sigma of patches as disparity [px], NaN without stereo.
-
-    Z^2 sigma_d = f B sigma_Z, and Z = V cos(off axis).
-    """
+    """Return sigma of patches as disparity [px], NaN without stereo: Z^2 sigma_d = f B sigma_Z, Z = V cos(off axis)."""
     if not isinstance(geometry, StereoGeometry):
         return np.full(len(sigma), np.nan)
     some = np.isfinite(tiles[..., 2]).any(axis=-1)
@@ -269,10 +266,7 @@ def _in_disparity(noise: RayNoise, sigma: Floats, tiles: Floats, geometry: Geome
 def _row_errors(
     capture: Capture, geometry: Geometry, cloud: PointCloud, places: list[tuple[int, int]], known: NDArray[np.bool_]
 ) -> Floats:
-    """Return the shift [rows] of the right image that fits best, for each patch with points.
-
-    See :mod:`mitsim.decoding.matching.row_error`.
-    """
+    """Return the shift [rows] of the right image that fits best (:mod:`mitsim.decoding.matching.row_error`)."""
     out = np.full(len(places), np.nan)
     if capture.technology == "structured_light" or not isinstance(geometry, StereoGeometry):
         return out  # stripes along the rows do not identify a row

@@ -176,10 +176,7 @@ def plane_points(points: Floats) -> NDArray[np.bool_]:
 
 
 def _frame(points: Floats) -> Transform:
-    """Return the transform from the sensor frame to that of a coupon, from its points (N, 3) [mm].
-
-    Its origin is the mean of the points. z is along the normal, toward the sensor; x points to the right.
-    """
+    """Return the frame of a coupon from the sensor's: the mean of its points (N, 3) [mm], z toward the sensor."""
     centre = points.mean(axis=0)
     axes = np.linalg.svd(points - centre, full_matrices=False)[2]
     normal = -axes[2] * np.sign(axes[2] @ centre)

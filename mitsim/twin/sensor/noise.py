@@ -155,10 +155,7 @@ def _specimen_mask(source: InputCapture, places: dict[str, Place]) -> NDArray[np
 
 
 def _with_curve(imager: Imager, groups: list[list[InputCapture]], sensor: Sensor) -> tuple[Imager, list[FittedKey]]:
-    """Return the imager with the knee of its curve, if one image shows it; only stereo sensor files may have one.
-
-    The whole image is used: a curve belongs to the imager, whatever it sees. Black and saturated pixels are left out.
-    """
+    """Return the imager with the knee of its curve, if one image shows it; only stereo sensor files may have one."""
     if sensor.technology != "active_stereo" or imager.companding or imager.gamma != 1:
         return imager, []
     for source in (group[0] for group in groups if group[0].kind == "off"):

@@ -129,11 +129,7 @@ def first_knee(image: Floats, mask: Mask, imager: Imager) -> Knee | None:
 
 
 def _bias(clean: Floats, mask: Mask, tiles: _Tiles, knee: Knee) -> tuple[float, float]:
-    """By how much a knee is off since levels come from an image without noise, not from the light; and its uncertainty.
-
-    The image without noise serves as light: noise is drawn, and the knee found once with the levels of that image after
-    its noise is taken off, once with the true ones.
-    """
+    """Return the bias of a knee whose levels come from a denoised image, from draws of noise, and its uncertainty."""
     numbers, found = tiles.fitted(knee.level, knee.slope), []
     k = knee.level - _ROUNDED_DOWN_DN
     every = np.linspace(0.0, k + (float(clean.max()) + 5 - k) / knee.slope, 1500)
@@ -155,10 +151,7 @@ def _bias(clean: Floats, mask: Mask, tiles: _Tiles, knee: Knee) -> tuple[float, 
 
 
 def _least(tiles: _Tiles, middle: float, slope: float, around: int) -> float:
-    """The level whose curve is most likely, by a parabola through three levels.
-
-    The best of ``middle`` and ``around`` levels to either side is the start; from there on, downhill.
-    """
+    """Return the most likely level of a knee, downhill from ``middle``, by a parabola through three levels."""
     total: dict[int, float] = {}
 
     def at(step: int) -> float:

@@ -64,10 +64,7 @@ def row_turns(
 
 
 def _line(design: Floats, values: Floats, prior: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return numbers with a normal prior about 0, their covariance, and the residuals of the values.
-
-    The variance of the values is that about the least-squares line, which knows no prior.
-    """
+    """Return numbers with a normal prior about 0, their covariance, and the residuals of the values."""
     free = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
     variance = max(float(free @ free) / max(len(values) - design.shape[1], 1), 1e-12)
     covariance = np.linalg.inv(design.T @ design / variance + np.diag(1 / np.maximum(prior, 1e-6) ** 2))

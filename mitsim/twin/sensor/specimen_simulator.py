@@ -53,18 +53,17 @@ class SpecimenSimulator:
         self.inner = Roi(roi.left - self.roi.left, roi.top - self.roi.top, roi.width, roi.height).slices
         self._scene: Scene = plate(place, sensor, None)
         self._kept: dict[Any, NDArray[np.float32]] = {}
-        self._room: NDArray[np.float32] | None = None
         self._device: SimulatedSensor | None = None
         rays = camera.rays_to_fold(np.stack(self.roi.pixels(), axis=-1).astype(float))
         self._directions = np.asarray(camera.sensor_from_camera.directions(rays))
         self._loss = lru_cache(maxsize=1)(self._corner_loss)  # of the light of the room and that of the projector
 
-    def levels(self, sensor: Sensor, seed: int, *, projector_on: bool = True) -> NDArray[Any]:
+    def levels(self, sensor: Sensor, seed: int) -> NDArray[Any]:
         """Return the grey levels (h, w) of the part in the first image of a capture by a sensor."""
-        light = self.room(sensor)
-        if projector_on:
-            lit, gain = self._lit(sensor, seed)
-            light = light + self._through(sensor, lit * np.float32(sensor.projector.flux)) * gain
+        lit, gain = self._lit(sensor, seed)
+        room = np.float32(REFLECTANCE / np.pi) * sensor.room_irradiance(self._directions)
+        light = self._through(sensor, np.asarray(room, np.float32))
+        light = light + self._through(sensor, lit * np.float32(sensor.projector.flux)) * gain
         assert sensor.exposure.base_s is not None
         chip, seconds = sensor.imager, sensor.exposure.base_s
         scale = electrons_per_radiance(chip, sensor.wavelength_nm, seconds)
@@ -77,15 +76,6 @@ class SpecimenSimulator:
     def projector_irradiance(self, sensor: Sensor, seed: int) -> float:
         """Return the mean irradiance [W/mm^2] of the projector, with its pattern, on the specimen."""
         return float(self._lit(sensor, seed)[0][self.inner].mean()) * np.pi / REFLECTANCE * sensor.projector.flux
-
-    def room(self, sensor: Sensor) -> NDArray[np.float32]:
-        """Return the radiance of the room behind the lens, in the wider part."""
-        if sensor.room is None:
-            return np.zeros((self.roi.height, self.roi.width), np.float32)
-        if self._room is None:
-            self._room = np.float32(REFLECTANCE / np.pi) * np.ones((self.roi.height, self.roi.width), np.float32)
-        irradiance = sensor.room_irradiance(self._directions)
-        return self._through(sensor, np.asarray(self._room * irradiance, np.float32))
 
     def _through(self, sensor: Sensor, image: NDArray[np.float32]) -> NDArray[np.float32]:
         loss = self._loss(sensor.imager.corner_illumination)

@@ -235,7 +235,9 @@ def _with_entry(text: str, table: str, key: str, entry: Entry) -> str:
         header = next((n for n, line in enumerate(lines) if _TABLE.match(line)), -1) if table else -1
         found = next((n for n, line in enumerate(lines) if (match := _KEY.match(line)) and match[2] == key), None)
         if found is None and not entry.optional:
-            at = _end(lines) if table else _first_key(lines)
+            # without a table, above the first key, below the title of the file
+            first = next((n for n, line in enumerate(lines) if _KEY.match(line)), len(lines))
+            at = _end(lines) if table else first
             lines.insert(at, f"{key} = {entry.value}")
             at = header if table else at
             lines[at:at] = comment
@@ -262,11 +264,6 @@ def _replaced(lines: list[str], index: int, new: str) -> list[str]:
 def _end(lines: list[str]) -> int:
     """Return the number of the line after the last one with a content."""
     return max((n for n, line in enumerate(lines) if line.strip()), default=-1) + 1
-
-
-def _first_key(lines: list[str]) -> int:
-    """Return the number of the first line of keys, below the title of the file."""
-    return next((n for n, line in enumerate(lines) if _KEY.match(line)), len(lines))
 
 
 def _value_and_remark(text: str) -> tuple[str, str]:
