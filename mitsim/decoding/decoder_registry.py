@@ -45,9 +45,8 @@ from mitsim.decoding.time_of_flight import TimeOfFlightGeometry, decode_time_of_
 from mitsim.sensor.camera import Rig
 from mitsim.sensor.decoder_settings import DecoderSettings
 from mitsim.sensor.image_role import Axis
-from mitsim.sensor.image_sequence import ImageSequence
 from mitsim.sensor.imager import Imager
-from mitsim.sensor.light_code import GrayCode, GrayCodePhaseShift, LightCode, PhaseShift, roles
+from mitsim.sensor.light_code import LightCode, roles
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
 from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
@@ -289,7 +288,7 @@ TECHNOLOGIES: dict[str, Technology] = {
         (RandomDots, DiffractionSpots, ProjectorImages, ImagesDescription), _reference_geometry, _reference
     ),
     "structured_light": Technology(
-        (PhaseShift, GrayCode, GrayCodePhaseShift, ImageSequence),
+        get_args(LightCode),
         _structured_light_geometry,
         _structured_light,
     ),
