@@ -116,7 +116,9 @@ def verify(
     ] = 2e-4,
     sensor: Annotated[
         str | None,
-        typer.Option(help="Preset or sensor file whose calibration is stated; default: the preset that the capture names."),
+        typer.Option(
+            help="Preset or sensor file whose calibration is stated; default: the preset that the capture names."
+        ),
     ] = None,
 ) -> None:
     """Verify a calibration by one capture of a board or a plate of dots: use it, or calibrate again.
