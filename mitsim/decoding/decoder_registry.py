@@ -49,7 +49,7 @@ from mitsim.sensor.imager import Imager
 from mitsim.sensor.light_code import LightCode, roles
 from mitsim.sensor.matcher import MatcherSettings
 from mitsim.sensor.modulation import AmplitudeModulation, TimeOfFlightSettings
-from mitsim.sensor.pattern import DiffractionSpots, DotPattern, RandomDots
+from mitsim.sensor.pattern import DotPattern
 from mitsim.sensor.projector_images import ImagesDescription, ProjectorImages
 
 #: range of depths to search if neither a preset nor the recording gives one [mm]
@@ -285,7 +285,7 @@ def _device_technology(name: MapName, prepare: Callable[[Rig], DeviceMapGeometry
 TECHNOLOGIES: dict[str, Technology] = {
     "active_stereo": Technology((), lambda rig, settings, pattern: stereo_geometry(rig), _stereo),
     "reference_stereo": Technology(
-        (RandomDots, DiffractionSpots, ProjectorImages, ImagesDescription), _reference_geometry, _reference
+        (*get_args(DotPattern), ProjectorImages, ImagesDescription), _reference_geometry, _reference
     ),
     "structured_light": Technology(
         get_args(LightCode),
